@@ -99,6 +99,8 @@ def errors_as_json(asked: bool) -> Iterator[None]:
         _print(stopped, asked)
         raise stopped from interrupt
     except Exception as error:
+        if isinstance(error, typer.BadParameter):  # typer checks choices by pydantic
+            error.message = error.message.removeprefix("Value error, ")
         _print(error, asked)
         raise
 

@@ -7,7 +7,7 @@ import os
 import shlex
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -17,7 +17,7 @@ from hil.campaign.plan import quick_settings
 from hil.campaign.trajectory_files import write_trajectories
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
-from hil.design import Method, load_settings, preset
+from hil.design import METHODS, Method, load_settings, preset
 from hil.design.advice import criteria_text
 from hil.design.run import Designed, DesignFolder, run_design
 from hil.design.settings import preset_text
@@ -26,7 +26,8 @@ from hil.plots import save
 from hil.progress import reporter as make_reporter
 from hil.progress import say
 from hil.terminal_text import printable
-from identification.excitation import coupling_index_max
+
+_METHODS: Final = ". ".join(f"{name}: {method.help}" for name, method in METHODS.items())
 
 
 def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
@@ -62,7 +63,9 @@ def _draw(folder: DesignFolder, done: Designed, cell: Cell) -> None:
 def design(
     cell: Annotated[Path | None, typer.Argument()] = None,
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/design"),
-    method: Method | None = None,
+    method: Annotated[
+        Method | None, typer.Option(help=f"Search method. {_METHODS}. Default: front.")
+    ] = None,
     settings: Path | None = None,
     show_settings: Method | None = None,
     quick: bool = False,
@@ -99,9 +102,6 @@ def design(
     Options:
         cell: The cell file.
         output: Folder for the result.
-        method: Search method. a: method A of the paper, sines of largest determinant. b: method B
-            of the paper, via points by the fitness of eq. 7. balanced: as b, with terms of equal
-            weight. front: both criteria, and the knee of their Pareto front. Default: front.
         settings: TOML file with search settings, or an earlier excitation.toml, in place of
             --method. --show-settings prints a template.
         show_settings: Print the commented settings of a method and exit.
@@ -165,12 +165,9 @@ def design(
             print_json(found)
         else:
             p = done.problem.objective.n_parameters
-            typer.echo(
-                printable(
-                    f"{criteria_text(excitation.criteria.measures)} of {coupling_index_max(p):.0f},"
-                    f" {excitation.trajectory.duration:.2f} s: {folder.result}"
-                )
-            )
+            figures = criteria_text(excitation.criteria.measures, n_parameters=p)
+            duration = excitation.trajectory.duration
+            typer.echo(printable(f"{figures}, {duration:.2f} s: {folder.result}"))
         _draw(folder, done, loaded)
 
     with stop_on_interrupt() as stop:

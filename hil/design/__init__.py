@@ -1,11 +1,11 @@
 """Design of an excitation for a cell: settings, search, result file."""
 
-from identification.excitation import Method
+from identification.excitation import METHODS, Method
 
 from .problem import problem_of, search_settings
 from .result import DesignResult, load_design
 from .run import run_search
-from .settings import METHODS, DesignSettings, SettingsError, load_settings, preset
+from .settings import DesignSettings, SettingsError, load_settings, preset
 
 __all__ = [
     "METHODS",

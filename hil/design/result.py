@@ -17,7 +17,6 @@ from hil.files import json_digest, write_atomically
 from hil.reading import read_text
 from hil.version import software
 from identification.excitation import (
-    CRITERIA,
     Criteria,
     Design,
     Excitation,
@@ -53,7 +52,7 @@ _COMMENTS: Final = {
     "criteria": "Of the motion sampled every millisecond. Compare log10_det only between motions "
     "of one\nrobot in the same units; coupling_index (0 to coupling_index_max) has no unit.",
     "search": "infeasible: number of motions that violated each kind of constraint.",
-    "front": "Pareto front by rising coupling index, at the sample period of the search. chosen: "
+    "front": "Pareto front by the second criterion, at the sample period of the search. chosen: "
     "index\n(from 0) of the motion in this file; without it the motion was polished, see "
     "polished_from.",
     "polished_from": "Index (from 0) in the front of the motion that the polish started from, and "
@@ -121,11 +120,11 @@ class DesignResult:
                 "infeasible": {name: int(n) for name, n in excitation.rejected.items()},
             },
             "front": {"chosen": design.chosen}
-            | {name: front.measure(name).tolist() for name in CRITERIA}
+            | {name: front.measure(name).tolist() for name in front.criteria}
             | {"duration": front.duration.tolist()},
         }
         if design.chosen is None:
-            measures = dict(zip(CRITERIA, origin.measures, strict=True))
+            measures = {name: getattr(origin, name) for name in front.criteria}
             data["polished_from"] = {"point": design.origin, **measures}
         data["settings"] = settings.to_dict()
         data["cell"] = {"name": cell.name, **fingerprint(cell)}

@@ -148,7 +148,11 @@ def run_design(
                 )
         else:
             folder.create(settings, force=force)
-        identity = {"settings": _flat(settings), "cell": fingerprint(cell)}
+        identity = {
+            "settings": _flat(settings),
+            "cell": fingerprint(cell),
+            "criteria": {"names": list(excitation.CRITERIA)},
+        }
         with folder.opened_journal() as file:
             journal = _journal(file, identity, reporter)
             design = run_search(

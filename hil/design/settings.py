@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, get_args
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
@@ -17,9 +17,7 @@ from hil.cell.errors import first_error
 from hil.cell.schema import Choice, NonNegative, Number, Positive, Table, Whole, field
 from hil.errors import InputError
 from hil.reading import parse_toml, read_text
-from identification.excitation import Method
-
-METHODS: Final[tuple[Method, ...]] = get_args(Method)
+from identification.excitation import METHODS, Method
 
 Share = Annotated[Number, Field(ge=0, le=1)]
 Eta = Annotated[Number, Field(ge=1, le=1000)]
@@ -161,7 +159,7 @@ class ObjectiveTable(Table):
 class DesignSettings(Table):
     """The whole file."""
 
-    method: Method = field('"a", "b", "balanced" or "front"')
+    method: Method = field(f"one of {', '.join(METHODS)}")
     seed: Whole = field("a whole number, 0 or more; one seed is one result", 1, ge=0, lt=2**63)
     search: SearchTable = field("a table [search]")
     via_points: ViaPointTable | None = field("a table [via_points]", None)

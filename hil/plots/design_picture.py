@@ -14,10 +14,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hil.cell import AngleFrame, Cell
+from hil.design.advice import criteria_text
 from hil.plots import style
 from hil.plots.plan_picture import draw_motion
 from hil.report.drawing import label
 from identification.excitation import (
+    CRITERIA,
     Design,
     correlation,
     coupling_index,
@@ -43,25 +45,29 @@ _LINE_LENGTH: Final = 1300.0  # Characters of a line times its font size in poin
 
 def draw_front(axes: Axes, design: Design) -> None:
     """Draw the front and the chosen motion, with a legend."""
-    front, chosen, origin = design.front, design.chosen, design.front.measures[design.origin]
+    front, chosen = design.front, design.chosen
+    upward, rightward = front.criteria
+    origin = front.measure(upward)[design.origin], front.measure(rightward)[design.origin]
     axes.plot(
-        front.measure("coupling_index"), front.measure("log10_det"), drawstyle="steps-post",
+        front.measure(rightward), front.measure(upward), drawstyle="steps-post",
         color=style.POSITION, linewidth=1.0, marker="o", markersize=3.4,
         label=f"front, {len(front)} motion{'s' * (len(front) > 1)}",
     )  # fmt: skip
 
     def mark(name: str, measures: Sequence[float], **look: Any) -> None:
-        size, index = measures
-        axes.plot(index, size, label=f"{label(name)} ({size:.1f}, {index:.1f})", **look)
+        y, x = measures
+        axes.plot(x, y, label=f"{label(name)} ({y:.1f}, {x:.1f})", **look)
 
     star = {"linestyle": "none", "marker": "*", "markersize": 13.0, "color": style.LIMIT}
     if chosen is None:
-        mark("chosen, polished", design.excitation.criteria.measures, **star, zorder=4.0)
+        found = design.excitation.criteria
+        polished = getattr(found, upward), getattr(found, rightward)
+        mark("chosen, polished", polished, **star, zorder=4.0)
         mark("grew from", origin, **_WHITE, marker="o", markeredgecolor=style.LIMIT)
     else:  # at the sample period of the front
         mark("chosen", origin, **star, zorder=4.0)
-    axes.set_xlabel("coupling index I_c (lower is better)")
-    axes.set_ylabel("log₁₀(det ΦᵀΦ / Nᵖ) (higher is better)")
+    axes.set_xlabel(f"{CRITERIA[rightward].title} ({CRITERIA[rightward].better})")
+    axes.set_ylabel(f"{CRITERIA[upward].title} ({CRITERIA[upward].better})")
     axes.legend(
         loc="lower left", bbox_to_anchor=(0.0, 1.02), frameon=False, borderaxespad=0.0,
         borderpad=0.0, labelspacing=0.35, fontsize=style.SMALL,
@@ -104,8 +110,7 @@ def _heading(
 ) -> Iterator[tuple[str, float, str]]:
     """Yield the lines of the heading with size in points and colour."""
     excitation = design.excitation
-    log10_det, index = excitation.criteria.measures
-    figures = f"log₁₀(det ΦᵀΦ / Nᵖ) {log10_det:.2f}, I_c {index:.1f}"
+    figures = criteria_text(excitation.criteria.measures)
     duration = f"{excitation.trajectory.duration:.2f} s"
     parts = (label(cell.name), f"method {excitation.method}", duration, figures)
     for text, size, colour in (

@@ -10,6 +10,7 @@ from hil.report import figures
 from hil.report.figures import ReportSeries
 from hil.report.rendering import environment, page_bytes
 from hil.results import Results, outside_mark
+from identification.excitation import CRITERIA, METHODS
 from identification.selection.inner_prediction import Choice
 
 _MOST_CANDIDATES: Final = 6
@@ -34,6 +35,8 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
         "by_name": {parameter.name: parameter for parameter in results.parameters},
         "outside_mark": outside_mark,
+        "criteria": CRITERIA,
+        "methods": METHODS,
         "unseen": np.median(errors, axis=0).tolist() if runs else None,
         "worst": max(runs, key=lambda run: run.overall_relative_error) if runs else None,
         "every_row_errors": every_row_errors(results),

@@ -34,9 +34,9 @@ from identification.excitation.errors import (
 from identification.excitation.excitation import Excitation, ViaPointMotion
 from identification.excitation.genomes import Genome, SineGenome, ViaPointGenome
 from identification.excitation.searches.journal import Journal
+from identification.excitation.searches.methods import METHODS, Method, SearchMethod
 from identification.excitation.searches.population import (
     Front,
-    Method,
     Population,
     Problem,
     Scale,

@@ -6,7 +6,7 @@ unit diagonal against overflow. For a singular matrix each returns its worst val
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, NamedTuple, Self
@@ -55,21 +55,61 @@ def _coupling_index(gram: _Cholesky, _: int) -> float:
     return float(np.abs(np.tril(gram.correlation, -1)).sum())
 
 
+def coupling_index_max(p: int) -> float:
+    """Return the largest coupling index of p parameters, p (p - 1) / 2."""
+    return p * (p - 1) / 2.0
+
+
 class Criterion(NamedTuple):
-    """An objective of the searches."""
+    """A criterion that searches can optimise."""
 
     score: Callable[[_Cholesky, int], float]  # of a factorised Gram matrix and N time samples
     label: str  # name in messages
     sense: float  # 1 to maximise, -1 to minimise
+    title: str  # name in tables and at axes
+    meaning: str  # explanation in the report
+    decimals: int  # in the report
+    relative: bool  # whether the report states its change in percent
+    largest: Callable[[int], float] | None = None  # largest value for p parameters
+
+    @property
+    def better(self) -> str:
+        """Which values are better."""
+        return "higher is better" if self.sense > 0.0 else "lower is better"
 
 
 CRITERIA: Final[Mapping[str, Criterion]] = {
-    "log10_det": Criterion(_log10_det, "log det", 1.0),
-    "coupling_index": Criterion(_coupling_index, "I_c", -1.0),
+    "log10_det": Criterion(
+        _log10_det,
+        "log det",
+        1.0,
+        "log₁₀ det(ΦᵀΦ / N)",
+        "eq. 9: information, in SI units",
+        2,
+        relative=False,
+    ),
+    "coupling_index": Criterion(
+        _coupling_index,
+        "I_c",
+        -1.0,
+        "Coupling index I_c",
+        "eq. 5: sum of |correlations|",
+        1,
+        relative=True,
+        largest=coupling_index_max,
+    ),
 }
-"""Objectives of the searches by the name of their field in :class:`Criteria`."""
+"""Criteria by the name of their field in :class:`Criteria`; of each motion all are computed."""
 
 SENSE: Final = np.array([criterion.sense for criterion in CRITERIA.values()])
+OF_PAPER: Final = ("log10_det", "coupling_index")
+"""The criteria of the paper."""
+
+
+def columns(values: Array, criteria: Sequence[str]) -> Array:
+    """Return some `CRITERIA` (..., k) of an array of all (..., d)."""
+    names = tuple(CRITERIA)
+    return np.take(values, [names.index(name) for name in criteria], axis=-1)
 
 
 def measures(gram: Array, n_samples: int) -> dict[str, float]:
@@ -92,11 +132,6 @@ def log10_det(gram: Array, n_samples: int) -> float:
 def coupling_index(gram: Array) -> float:
     """Return I_c (eq. 5), from 0 to :func:`coupling_index_max`; inf for a singular matrix."""
     return measures(gram, 1)["coupling_index"]
-
-
-def coupling_index_max(p: int) -> float:
-    """Return the largest coupling index of p parameters, p (p - 1) / 2."""
-    return p * (p - 1) / 2.0
 
 
 def correlation(gram: Array) -> Array:

@@ -84,5 +84,8 @@ def bits(design):
     """Return the fields of a design, arrays as bytes."""
     fields = vars(design) | {"genes": design.genes.tobytes()}
     fields["excitation"] = design.excitation.to_dict()
-    fields["front"] = [array.tobytes() for array in vars(design.front).values()]
+    fields["front"] = [
+        array.tobytes()
+        for array in (design.front.genes, design.front.measures, design.front.duration)
+    ]
     return fields

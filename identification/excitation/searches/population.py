@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Final, Literal, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from identification.excitation.constraints import SAMPLE_PERIOD, Constraints, midpoints, sampled
-from identification.excitation.criteria import CRITERIA, SENSE, Criteria, Objective
+from identification.excitation.criteria import (
+    CRITERIA,
+    OF_PAPER,
+    SENSE,
+    Criteria,
+    Objective,
+    columns,
+)
 from identification.excitation.errors import DesignError
 from identification.excitation.genomes import Genome, Motion
+from identification.excitation.searches.methods import Method
 from identification.excitation.violation import KINDS, Violation, excess_by_kind
 from planner import PlannerCrashed, PlannerError, PlanningTimedOut
 from planner.worker import WorkerProcess, chunks_of, load, map_in_children, pack
 
 Array = NDArray[np.float64]
 
-_NAMES: Final = tuple(CRITERIA)
-_MEASURES: Final = len(_NAMES)
+_MEASURES: Final = len(CRITERIA)
 
 ROW: Final = _MEASURES + 1 + len(KINDS)
 """Length of a row of scores: `CRITERIA`, duration, one excess for each of `KINDS`."""
@@ -38,7 +45,7 @@ class Scores(NamedTuple):
 
     def measure(self, name: str) -> Array:
         """Return one of `CRITERIA` (m,)."""
-        return self.measures[:, _NAMES.index(name)]
+        return columns(self.measures, (name,))[:, 0]
 
     @property
     def feasible(self) -> NDArray[np.bool_]:
@@ -48,7 +55,7 @@ class Scores(NamedTuple):
     @property
     def exciting(self) -> NDArray[np.bool_]:
         """Which motions excite every parameter, (m,)."""
-        return _finite(self.measures)
+        return finite(self.measures)
 
     @property
     def usable(self) -> NDArray[np.bool_]:
@@ -70,7 +77,8 @@ class Scores(NamedTuple):
         return cls(rows[:, :_MEASURES], rows[:, _MEASURES], rows[:, _MEASURES + 1 :])
 
 
-def _finite(measures: Array) -> NDArray[np.bool_]:
+def finite(measures: Array) -> NDArray[np.bool_]:
+    """Return which motions excite every parameter (...) by measures (..., d)."""
     return np.asarray(np.all(np.isfinite(measures), axis=-1))
 
 
@@ -89,18 +97,19 @@ _FEWEST: Final = 2
 
 
 class Scale(NamedTuple):
-    """Centre and spread of each of `CRITERIA` over random motions.
+    """Centre and spread of criteria over random motions.
 
     The two terms of eq. 7 differ in size (about 75 and 5 on a six-axis arm), so that its weights
     have little effect. Here each measure counts from its median over random motions of the same
     genome, in units of their interquartile range.
     """
 
-    centre: tuple[float, ...]  #: medians (d,)
-    spread: tuple[float, ...]  #: interquartile ranges (d,)
+    centre: tuple[float, ...]  #: medians (k,)
+    spread: tuple[float, ...]  #: interquartile ranges (k,)
+    criteria: tuple[str, ...] = OF_PAPER  #: their names
 
     @classmethod
-    def of(cls, scores: Scores) -> Self:
+    def of(cls, scores: Scores, criteria: tuple[str, ...] = OF_PAPER) -> Self:
         """Return the scale of random motions, `SAMPLE_COUNT` of them.
 
         Raises:
@@ -110,9 +119,10 @@ class Scale(NamedTuple):
         if np.count_nonzero(chosen) < _FEWEST_FEASIBLE:
             chosen = scores.exciting
         if np.count_nonzero(chosen) >= _FEWEST:
-            lower, median, upper = np.quantile(scores.measures[chosen], (0.25, 0.5, 0.75), axis=0)
+            values = columns(scores.measures[chosen], criteria)
+            lower, median, upper = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
             if np.all(upper > lower):
-                return cls(tuple(median.tolist()), tuple((upper - lower).tolist()))
+                return cls(tuple(median.tolist()), tuple((upper - lower).tolist()), criteria)
         raise DesignError(
             "random motions that excite all parameters",
             int(np.count_nonzero(chosen)),
@@ -120,19 +130,9 @@ class Scale(NamedTuple):
         )
 
     def gains(self, measures: ArrayLike) -> Array:
-        """Return the improvement of measures (..., d) over the median, in spreads."""
-        return np.asarray(SENSE * (np.asarray(measures) - self.centre) / self.spread)
-
-    def fitness(self, measures: ArrayLike, weights: tuple[float, ...]) -> Array:
-        """Return the balanced fitness (...) of measures (..., d) with weights (d,).
-
-        To be maximised; -inf for a motion that leaves a parameter without excitation.
-        """
-        values = np.asarray(measures, dtype=np.float64)
-        finite = _finite(values)
-        gains = self.gains(np.where(finite[..., None], values, 0.0))
-        total = sum(weight * gains[..., k] for k, weight in enumerate(weights))
-        return np.where(finite, total, -np.inf)
+        """Return the improvement (..., k) of measures (..., d) over the median, in spreads."""
+        values = columns(np.asarray(measures), self.criteria)
+        return np.asarray(columns(SENSE, self.criteria) * (values - self.centre) / self.spread)
 
 
 # Distances from the chord, between -1 and 1, that differ by less are equal.
@@ -141,7 +141,7 @@ _EQUAL: Final = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """Pareto front: the k motions not dominated in `CRITERIA`, by rising last measure (I_c).
+    """Pareto front: the k motions not dominated in some criteria, by rising last one (I_c).
 
     Of motions with equal measures it has one: the shortest, then the one whose genes come first.
     So it does not depend on the order in which motions are added.
@@ -150,24 +150,25 @@ class Front:
     genes: Array  #: (k, n_genes), within [0, 1]
     measures: Array  #: (k, d)
     duration: Array  #: (k,) [s]
+    criteria: tuple[str, ...] = OF_PAPER  #: in which motions compare
 
     @classmethod
-    def empty(cls, n_genes: int) -> Self:
+    def empty(cls, n_genes: int, criteria: tuple[str, ...] = OF_PAPER) -> Self:
         """Return the front of no motions."""
-        return cls(np.empty((0, n_genes)), np.empty((0, _MEASURES)), np.empty(0))
+        return cls(np.empty((0, n_genes)), np.empty((0, _MEASURES)), np.empty(0), criteria)
 
     @classmethod
-    def of(cls, genes: Array, scores: Scores) -> Self:
+    def of(cls, genes: Array, scores: Scores, criteria: tuple[str, ...] = OF_PAPER) -> Self:
         """Return the front of the usable motions among genes (m, n_genes)."""
-        usable = scores.usable
-        return cls(genes[usable], scores.measures[usable], scores.duration[usable])._nondominated()
+        every = cls(genes, scores.measures, scores.duration, criteria)
+        return every._part(scores.usable)._nondominated()
 
     def __len__(self) -> int:
         return len(self.measures)
 
     def measure(self, name: str) -> Array:
         """Return one of `CRITERIA` (k,)."""
-        return self.measures[:, _NAMES.index(name)]
+        return columns(self.measures, (name,))[:, 0]
 
     def scores(self, index: int) -> Scores:
         """Return the scores of one motion, m = 1."""
@@ -176,8 +177,12 @@ class Front:
 
     def merge(self, other: Self) -> Self:
         """Return the front of the motions of both."""
-        columns = zip(vars(self).values(), vars(other).values(), strict=True)
-        return type(self)(*map(np.concatenate, columns))._nondominated()
+        return replace(
+            self,
+            genes=np.concatenate((self.genes, other.genes)),
+            measures=np.concatenate((self.measures, other.measures)),
+            duration=np.concatenate((self.duration, other.duration)),
+        )._nondominated()
 
     def knee(self, scale: Scale | None = None) -> int:
         """Return the index of the knee of a non-empty front, farthest beyond the chord of its ends.
@@ -185,43 +190,39 @@ class Front:
         Das 1999, "On characterizing the knee of the Pareto curve based on normal-boundary
         intersection"; measures relative to the ranges of the front. With `scale` only motions
         better than the median random motion in all measures count, if any. Of several the knee has
-        the largest balanced fitness; without `scale` it is the first.
+        the largest sum of gains; without `scale` it is the first.
         """
         part = np.arange(len(self))
         if scale is not None:
             better = np.flatnonzero(np.all(scale.gains(self.measures) > 0.0, axis=1))
             part = better if len(better) else part
-        values = self.measures[part]
-        span = np.ptp(values, axis=0)
-        height = (values - values.min(axis=0)) / np.where(span > 0.0, span, 1.0) @ SENSE
+        values = columns(self.measures[part], self.criteria)
+        span, sense = np.ptp(values, axis=0), columns(SENSE, self.criteria)
+        height = (values - values.min(axis=0)) / np.where(span > 0.0, span, 1.0) @ sense
         highest = part[height >= height.max() - _EQUAL]
         if scale is None or len(highest) == 1:
             return int(highest[0])
-        balanced = scale.fitness(self.measures[highest], (1.0 / _MEASURES,) * _MEASURES)
-        return int(highest[np.argmax(balanced)])
+        return int(highest[np.argmax(scale.gains(self.measures[highest]).sum(axis=1))])
+
+    def _part(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Self:
+        arrays = self.genes[rows], self.measures[rows], self.duration[rows]
+        return type(self)(*arrays, self.criteria)
 
     def _nondominated(self) -> Self:
-        cost = -SENSE * self.measures
+        cost = columns(-SENSE * self.measures, self.criteria)
         left = np.lexsort((*self.genes.T[::-1], self.duration, *cost.T))
         found = []
         while len(left):  # no other one dominates the first in this order
             found.append(left[0])
             left = left[np.any(cost[left] < cost[left[0]], axis=1)]
-        rows = np.array(found, dtype=np.intp)
-        return type(self)(*(column[rows] for column in vars(self).values()))
-
-
-Method = Literal["a", "b", "balanced", "front"]
+        return self._part(np.array(found, dtype=np.intp))
 
 
 @dataclass(frozen=True)
 class SearchSettings:
     """Method and effort of a search."""
 
-    #: "a": largest log10 det (D-optimal, eq. 9); "b": largest fitness of eq. 7; "balanced": both
-    #: measures in units of their spread over random motions; "front": Pareto front of the two
-    #: (NSGA-II), of which the knee is chosen
-    method: Method = "front"
+    method: Method = "front"  #: one of `METHODS`
     population: int = 150  #: individuals in a generation
     generations: int = 120  #: number of generations, the random first one included
     crossover: float = 0.9  #: probability that two parents are crossed (Table 1)

@@ -11,10 +11,11 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from identification.excitation.criteria import SENSE, Criteria, fitness_eq7
+from identification.excitation.criteria import OF_PAPER, SENSE, Criteria, columns
 from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation
 from identification.excitation.searches.journal import Journal
+from identification.excitation.searches.methods import METHODS, SearchMethod
 from identification.excitation.searches.population import (
     CHUNK,
     SAMPLE_COUNT,
@@ -23,6 +24,7 @@ from identification.excitation.searches.population import (
     Scale,
     Scores,
     SearchSettings,
+    finite,
 )
 from identification.excitation.violation import KINDS, NoFeasibleMotionError
 
@@ -53,7 +55,7 @@ class Design:
     chosen: int | None  #: index of the motion in the front; None if the polish improved it
     origin: int  #: index in the front of the motion, or of the one that the polish started from
     #: criteria of that motion, sampled every `RESCORE_PERIOD`; the chosen motion is not worse in
-    #: its fitness or, with "front", in any measure
+    #: its fitness or, with "front", in either criterion
     origin_criteria: Criteria
     generations: int  #: number of scored generations
     complete: bool  #: whether the search ran to its end
@@ -118,7 +120,9 @@ def polish(
     return best
 
 
-def dominating(reference: Scores, scale: Scale | None = None) -> Fitness:
+def dominating(
+    reference: Scores, scale: Scale | None = None, criteria: tuple[str, ...] = OF_PAPER
+) -> Fitness:
     """Return a fitness above 0 only for motions that dominate a reference (m = 1).
 
     It is the smallest gain, in units of the scale if given (Wierzbicki 1980); if no gain is
@@ -127,7 +131,7 @@ def dominating(reference: Scores, scale: Scale | None = None) -> Fitness:
     spread = 1.0 if scale is None else np.array(scale.spread)
 
     def fitness(scores: Scores) -> Array:
-        gains = SENSE * (scores.measures - reference.measures) / spread
+        gains = columns(SENSE * (scores.measures - reference.measures), criteria) / spread
         least = gains.min(axis=1)
         merit: Array = np.where(least < 0.0, least, least + _SECOND * gains.max(axis=1))
         return merit
@@ -251,44 +255,40 @@ class Goal:
     scale: Scale | None  # units of the measures; None if not used
 
     @property
-    def single(self) -> bool:
-        """Whether there is a single objective."""
-        return self.settings.method != "front"
+    def method(self) -> SearchMethod:
+        """The method."""
+        return METHODS[self.settings.method]
 
     def objectives(self, measures: Array) -> Array:
-        """Return the objectives to minimise, (m, 1) or (m, d), for measures (m, d)."""
-        return -self.fitness(measures)[:, None] if self.single else -SENSE * measures
-
-    def fitness(self, measures: Array) -> Array:
-        """Return the fitness (m,) to maximise for measures (m, d); -inf without excitation."""
-        settings = self.settings
-        if self.scale is not None:
-            return self.scale.fitness(measures, settings.weights)
-        if settings.method == "a":
-            return np.asarray(measures[:, 0])
-        return np.array(
-            [
-                fitness_eq7(size, coupled, self.p, settings.weights)
-                for size, coupled, *_ in measures.tolist()
-            ]
+        """Return the objectives to minimise, (m, 1) or (m, 2), for measures (m, d)."""
+        method = self.method
+        if method.fitness is None:
+            return columns(-SENSE * measures, method.criteria)
+        exciting = finite(measures)
+        values = np.where(exciting[:, None], measures, 0.0)
+        values = (
+            columns(values, method.criteria) if self.scale is None else self.scale.gains(values)
         )
+        by_name = dict(zip(method.criteria, values.T, strict=True))
+        fitness = method.fitness(by_name, self.settings.weights, self.p)
+        return np.where(exciting, -fitness, np.inf)[:, None]
 
     def choice(self, front: Front) -> int:
         """Return the index of the best motion of a non-empty front."""
-        if self.single:
-            return int(np.argmax(self.fitness(front.measures)))
-        return front.knee(self.scale)
+        if self.method.fitness is None:
+            return front.knee(self.scale)
+        return int(np.argmin(self.objectives(front.measures)[:, 0]))
 
     def is_worse(self, one: Criteria, other: Criteria) -> bool:
-        """Return whether a motion is worse than another, with "front" in any measure."""
+        """Return whether a motion is worse than another, without a fitness in any criterion."""
         first, second = self.objectives(np.array((one.measures, other.measures)))
         return not bool(np.all(first <= second))
 
     def polish_fitness(self, start: Scores) -> Fitness:
         """Return the fitness that a polish from a motion (scores, m = 1) maximises."""
-        if self.single:
-            return lambda scores: self.fitness(scores.measures)
-        return dominating(start, self.scale)
+        if self.method.fitness is None:
+            return dominating(start, self.scale, self.method.criteria)
+        return lambda scores: -self.objectives(scores.measures)[:, 0]
 
 
 def search(
@@ -314,7 +314,7 @@ def search(
 
 def most_evaluations(settings: SearchSettings) -> int:
     """Return the largest number of motions that a search scores in all its phases."""
-    sampled = SAMPLE_COUNT if _needs_scale(settings) else 0
+    sampled = SAMPLE_COUNT if METHODS[settings.method].scaled else 0
     return sampled + settings.population * settings.generations + settings.polish
 
 
@@ -337,7 +337,8 @@ class _Search:
         self._phase: Phase = "sample"
         self._goal: Goal | None = None
         self._generations = 0
-        self._front = Front.empty(self._genome.n_genes)
+        self._method = METHODS[settings.method]
+        self._front = Front.empty(self._genome.n_genes, self._method.criteria)
         self._tried = self._feasible = 0
         self._rejected: Counter[str] = Counter()
         # Smallest positive excess of each kind, with the genes.
@@ -349,7 +350,7 @@ class _Search:
         self._phase = "search"
         random = np.random.default_rng((_FIRST, settings.seed))
         first = self._genome.sample(random, settings.population)
-        evolution = Evolution(settings, first, 1 if goal.single else len(SENSE))
+        evolution = Evolution(settings, first, 2 if goal.method.fitness is None else 1)
         while self._generations < settings.generations and not self._should_stop():
             children = evolution.ask()
             if children is None:
@@ -402,13 +403,13 @@ class _Search:
 
     def _make_goal(self) -> Goal:
         """Return the goal, with a scale from random motions if the method needs one."""
-        scale, settings = None, self._settings
-        if _needs_scale(settings):
+        scale, method, settings = None, self._method, self._settings
+        if method.scaled:
             scores = self._score(self._genome.sample(np.random.default_rng(_SCALE), SAMPLE_COUNT))
             try:
-                scale = Scale.of(scores)
+                scale = Scale.of(scores, method.criteria)
             except DesignError:  # a front can do without a scale
-                if settings.method != "front":
+                if method.fitness is not None:
                     raise self._failure() from None
         return Goal(settings, self._population.problem.objective.n_parameters, scale)
 
@@ -428,7 +429,7 @@ class _Search:
                 index = int(broken[np.argmin(excess[broken])])
                 if kind not in self._nearest or excess[index] < self._nearest[kind][0]:
                     self._nearest[kind] = float(excess[index]), genes[index].copy()
-        self._front = self._front.merge(Front.of(genes, scores))
+        self._front = self._front.merge(Front.of(genes, scores, self._method.criteria))
         self._report()
         return scores
 
@@ -471,7 +472,3 @@ class _Search:
     def _should_stop(self) -> bool:
         self._stopped = self._stopped or self._stop()
         return self._stopped
-
-
-def _needs_scale(settings: SearchSettings) -> bool:
-    return settings.method in ("balanced", "front")

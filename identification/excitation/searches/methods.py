@@ -1,0 +1,65 @@
+"""Search methods: which criteria they seek, and how one motion is chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.excitation.criteria import OF_PAPER, fitness_eq7
+
+Array = NDArray[np.float64]
+Method = Literal["a", "b", "balanced", "front"]
+
+
+class SearchMethod(NamedTuple):
+    """A search method; its default settings are `hil/design/presets/NAME.toml`."""
+
+    help: str  #: in the help of `hil design`
+    label: str  #: in the report
+    #: fitness (m,) to maximise, for finite values (m,) of `criteria` by name, the weights of the
+    #: settings, and the number of parameters; it must not fall where one of the criteria improves.
+    #: None: the knee of the Pareto front is chosen
+    fitness: Callable[[Mapping[str, Array], tuple[float, float], int], Array] | None
+    #: of the Pareto front that is stored and drawn; the second one is the horizontal axis
+    criteria: tuple[str, str] = OF_PAPER
+    #: whether values count from their median over random motions, in interquartile ranges, and
+    #: larger ones are better
+    scaled: bool = False
+
+
+def _eq7(values: Mapping[str, Array], weights: tuple[float, float], p: int) -> Array:
+    pairs = zip(values["log10_det"].tolist(), values["coupling_index"].tolist(), strict=True)
+    return np.array([fitness_eq7(size, coupled, p, weights) for size, coupled in pairs])
+
+
+def _balanced(values: Mapping[str, Array], weights: tuple[float, float], _: int) -> Array:
+    return weights[0] * values["log10_det"] + weights[1] * values["coupling_index"]
+
+
+METHODS: Final[Mapping[Method, SearchMethod]] = {
+    "a": SearchMethod(
+        "method A of the paper, sines of largest determinant",
+        "designed by method A of the paper",
+        lambda values, _weights, _p: values["log10_det"],
+    ),
+    "b": SearchMethod(
+        "method B of the paper, via points by the fitness of eq. 7",
+        "designed by method B of the paper",
+        _eq7,
+    ),
+    "balanced": SearchMethod(
+        "as b, with terms of equal weight",
+        "designed for balanced criteria",
+        _balanced,
+        scaled=True,
+    ),
+    "front": SearchMethod(
+        "both criteria, and the knee of their Pareto front",
+        "designed as the knee of log det and I_c",
+        None,
+        scaled=True,
+    ),
+}
