@@ -165,7 +165,7 @@ def design(
             print_json(found)
         else:
             p = done.problem.objective.n_parameters
-            figures = criteria_text(excitation.criteria.measures, n_parameters=p)
+            figures = criteria_text(excitation.criteria.measures, p)
             duration = excitation.trajectory.duration
             typer.echo(printable(f"{figures}, {duration:.2f} s: {folder.result}"))
         _draw(folder, done, loaded)

@@ -249,7 +249,7 @@ def _note(progress: excitation.Progress) -> str:
     }[progress.phase]
     if math.isnan(progress.best[0]):
         return f"{where}, {progress.feasible} feasible"
-    return f"{where}, {criteria_text(progress.best, 1)}"
+    return f"{where}, {criteria_text(progress.best)}"
 
 
 def _journal(file: BinaryIO, identity: Mapping[str, Any], reporter: Reporter) -> excitation.Journal:

@@ -47,6 +47,7 @@ def draw_front(axes: Axes, design: Design) -> None:
     """Draw the front and the chosen motion, with a legend."""
     front, chosen = design.front, design.chosen
     upward, rightward = front.criteria
+    over, beside = CRITERIA[upward], CRITERIA[rightward]
     origin = front.measure(upward)[design.origin], front.measure(rightward)[design.origin]
     axes.plot(
         front.measure(rightward), front.measure(upward), drawstyle="steps-post",
@@ -56,7 +57,8 @@ def draw_front(axes: Axes, design: Design) -> None:
 
     def mark(name: str, measures: Sequence[float], **look: Any) -> None:
         y, x = measures
-        axes.plot(x, y, label=f"{label(name)} ({y:.1f}, {x:.1f})", **look)
+        figures = f"({y:.{over.decimals}f}, {x:.{beside.decimals}f})"
+        axes.plot(x, y, label=f"{label(name)} {figures}", **look)
 
     star = {"linestyle": "none", "marker": "*", "markersize": 13.0, "color": style.LIMIT}
     if chosen is None:
@@ -66,8 +68,8 @@ def draw_front(axes: Axes, design: Design) -> None:
         mark("grew from", origin, **_WHITE, marker="o", markeredgecolor=style.LIMIT)
     else:  # at the sample period of the front
         mark("chosen", origin, **star, zorder=4.0)
-    axes.set_xlabel(f"{CRITERIA[rightward].title} ({CRITERIA[rightward].better})")
-    axes.set_ylabel(f"{CRITERIA[upward].title} ({CRITERIA[upward].better})")
+    axes.set_xlabel(f"{beside.title} ({beside.better})")
+    axes.set_ylabel(f"{over.title} ({over.better})")
     axes.legend(
         loc="lower left", bbox_to_anchor=(0.0, 1.02), frameon=False, borderaxespad=0.0,
         borderpad=0.0, labelspacing=0.35, fontsize=style.SMALL,

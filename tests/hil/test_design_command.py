@@ -18,11 +18,13 @@ from typer.testing import CliRunner
 
 from hil.cell import Cell
 from hil.cli import app
-from hil.design import DesignResult, load_design
+from hil.design import METHODS, DesignResult, load_design
 from hil.design.advice import NoExcitationError
+from hil.design.settings import preset_text
 from hil.errors import InputError
 from hil.files import lock_folder
 from hil.plots import design_picture
+from identification.excitation import CRITERIA
 from sim_fixtures.ns16 import CELL_PATH
 
 SETTINGS = """\
@@ -263,6 +265,23 @@ def test_other_settings_or_another_cell_cannot_resume_a_search(invoke, bare, tmp
     path = edited(tmp_path, "[155.0, 155.0,", "[150.0, 155.0,")
     with pytest.raises(InputError, match=r"search\.journal: this journal .* cell limits was"):
         invoke(path, "--resume", "-o", bare[0])
+
+
+def test_a_journal_with_other_criteria_is_refused(invoke, copied, monkeypatch):
+    monkeypatch.setitem(CRITERIA, "condition", CRITERIA["log10_det"])
+    with pytest.raises(InputError, match=r"criteria names was \['log10_det', 'coupling_index'\]"):
+        invoke(CELL_PATH, "--resume", "-o", copied)
+
+
+def test_every_method_is_offered_with_its_words(invoke):
+    """A wrong name is refused with the names."""
+    shown = " ".join(invoke("--help").stdout.replace("│", " ").split())
+    for name, method in METHODS.items():
+        assert f"{name}: {method.help}" in " ".join(shown.split())
+        assert invoke("--show-settings", name).stdout == preset_text(name)
+    for option in ("--method", "--show-settings"):
+        output = invoke(CELL_PATH, option, "x").output
+        assert "Value error" not in output and all(f"'{name}'" in output for name in METHODS)
 
 
 def test_settings_are_read_from_a_result_file(invoke, bare, tmp_path):

@@ -14,8 +14,9 @@ from matplotlib.text import Text
 from hil.cell import Cell
 from hil.plots import save, style
 from hil.plots.design_picture import draw_design
-from identification.excitation import Design, Objective, information
+from identification.excitation import CRITERIA, Design, Objective, information
 from identification.excitation.constraints import sampled
+from identification.excitation.criteria import Criterion
 from identification.excitation.excitation import Excitation
 from identification.excitation.searches.population import Front
 from identification.factor.factor import Factor
@@ -48,6 +49,9 @@ def ns16() -> Cell:
 @pytest.fixture(scope="module")
 def two_link() -> Cell:
     return Cell.from_texts(TWO_LINK_CELL, TWO_LINK.read_text(), Path("cell.toml"))
+
+
+OTHER = Criterion(lambda *_: 1.0, "κ", -1.0, "Spread of Φ", "of all", 3, relative=True)
 
 
 def design_of(cell: Cell, trajectory: Trajectory, chosen: int | None = 1) -> Design:
@@ -103,11 +107,22 @@ class TestPage:
 
     def test_a_polished_motion_is_not_on_the_front(self, two_link):
         design = design_of(two_link, wandering(two_link))
-        assert "chosen (105.7, 80.0)" in texts(draw_design(design, two_link))
+        assert "chosen (105.70, 80.0)" in texts(draw_design(design, two_link))
         figure = draw_design(replace(design, chosen=None), two_link)
         log10_det, index = design.excitation.criteria.measures
-        assert f"chosen, polished ({log10_det:.1f}, {index:.1f})" in texts(figure)
-        assert "grew from (105.7, 80.0)" in texts(figure)
+        assert f"chosen, polished ({log10_det:.2f}, {index:.1f})" in texts(figure)
+        assert "grew from (105.70, 80.0)" in texts(figure)
+
+    def test_the_axes_of_the_front_are_its_criteria(self, two_link, monkeypatch):
+        """By name, with the words of `CRITERIA`, which the heading follows too."""
+        design = design_of(two_link, wandering(two_link))
+        monkeypatch.setitem(CRITERIA, "condition", OTHER)
+        measures = np.column_stack((design.front.measures, [9.0, 8.0, 7.0]))
+        names = ("condition", "coupling_index")
+        front = Front(np.zeros((3, 1)), measures, np.ones(3), names)
+        words = texts(draw_design(replace(design, front=front), two_link))
+        assert {"Spread of Φ (lower is better)", "chosen (8.000, 80.0)"} <= set(words)
+        assert any(f", κ {design.excitation.criteria.condition:.3f}" in text for text in words)
 
     def test_warnings_are_red(self, two_link):
         design = replace(design_of(two_link, wandering(two_link)), complete=False)

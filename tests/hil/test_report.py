@@ -31,6 +31,8 @@ from hil.report import (
 from hil.report.drawing import thinned
 from hil.report.rendering import environment
 from hil.results import Results
+from identification.excitation import CRITERIA, METHODS
+from identification.excitation.criteria import Criterion
 from identification.selection.inner_prediction import Choice
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2
 
@@ -390,6 +392,17 @@ class TestPage:
         }  # fmt: skip
         found = Page(render(Results.model_validate(alone), make_series(joints=1)))
         assert "Nothing was held out" in found.text
+
+    def test_shows_every_criterion_and_the_words_of_the_method(self, monkeypatch):
+        """Rows of `CRITERIA` and `METHODS`."""
+        other = Criterion(lambda *_: 1.0, "κ", -1.0, "Spread of Φ", "of all", 3, relative=True)
+        monkeypatch.setitem(CRITERIA, "condition", other)
+        text = rendered(make_results()).text
+        assert "Spread of Φ" in text and "of all; lower is better" in text
+        assert "48210.000" in text
+        for name, method in METHODS.items():
+            motion = make_results().excitation.model_copy(update={"method": name})
+            assert method.label in render(make_results().model_copy(update={"excitation": motion}))
 
     def test_shows_the_chosen_candidate_and_the_best(self, results, whole):
         estimator = results.choices[1]

@@ -21,6 +21,7 @@ from identification.excitation.errors import JournalError
 from identification.excitation.genomes import SineGenome
 from identification.excitation.searches import journal
 from identification.excitation.searches.journal import Journal
+from identification.excitation.searches.methods import METHODS, SearchMethod
 from identification.excitation.searches.population import (
     ROW,
     Front,
@@ -37,7 +38,6 @@ from planner.errors import LimitExceeded
 from tests.identification.searching import LIMITS, bits, faulty, problem
 
 SETTINGS = SearchSettings(population=12, generations=4, seed=3)
-METHODS = ("a", "b", "balanced", "front")
 
 
 class RecordingPopulation(Population):
@@ -125,6 +125,17 @@ class TestChoice:
         fitness = fitness_of(chosen, population.everything, random)
         best = np.concatenate(population.genes)[np.argmax(fitness)]
         assert best.tobytes() == design.genes.tobytes()
+
+    def test_a_method_is_a_row_of_the_table(self, population, monkeypatch):
+        """Its fitness is of criteria by name, and its front compares in them, in this order."""
+        names = ("coupling_index", "log10_det")
+        row = SearchMethod("", "", lambda values, *_: -values["coupling_index"], names)
+        monkeypatch.setitem(METHODS, "decoupled", row)
+        design = search(population, asked("decoupled"))
+        everything = population.everything
+        coupled = everything.measure("coupling_index")[everything.usable]
+        assert design.front.measure("coupling_index")[design.chosen] == coupled.min()
+        assert np.all(np.diff(design.front.measure("log10_det")) < 0.0)
 
     def test_the_front_is_not_dominated_and_its_knee_is_chosen(self, population):
         design = search(population, asked("front"))

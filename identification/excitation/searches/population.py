@@ -141,7 +141,7 @@ _EQUAL: Final = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """Pareto front: the k motions not dominated in some criteria, by rising last one (I_c).
+    """Pareto front: the k motions not dominated in some criteria, the best in the last first.
 
     Of motions with equal measures it has one: the shortest, then the one whose genes come first.
     So it does not depend on the order in which motions are added.
