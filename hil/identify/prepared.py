@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.cell.robot import ripples
-from hil.errors import ArchiveError
+from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification.errors import IdentificationError
 from identification.estimators.consistent import Shrinkage
@@ -339,10 +339,12 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
 
     Raises:
         ArchiveError: there are currents only, and no way to convert them to torques.
+        InputError: too few fitted rows are slow enough for a stated Stribeck term.
         RecordingError: a recording cannot be prepared.
         IdentificationError: a delay was requested and no row is usable.
     """
     notes = []
+    stated = stated_settings(sources.cell, options).with_friction_law(sources.cell).model
     for source in (*sources.training, *sources.held_out):
         notes += [f"{source.name}: {line}" for line in (source.merged, *source.clock) if line]
         base = time_base(source.recording.time, source.recording.gap_before)
@@ -361,6 +363,7 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
         for source in sources.training:
             fitted.append(samples_of(source, cell, settings))
             task.advance(1, source.name)
+        _require_slow_rows(stated, fitted)
         for source in unseen:
             held_out.append(validation_samples(source, cell, settings))
             task.advance(1, source.name)
@@ -415,6 +418,32 @@ def _require_torques(sources: Sources) -> None:
             field="torque",
             remedy="give drive.torque_constant in the column map, or identify it by `hil gains`",
         )
+
+
+_SLOW: Final = 2.0  # times the Stribeck speed, where its term has fallen to 2 %
+_FEWEST_SLOW: Final = 0.01  # share of the fitted rows
+
+
+def _require_slow_rows(stated: RobotModel, fitted: Sequence[Samples]) -> None:
+    """Raise InputError if the fitted rows are too fast for a stated Stribeck term.
+
+    Its coefficient would be arbitrary, and the prediction of slower rows with it.
+    """
+    for joint, law in enumerate(stated.friction.laws):
+        if law.stribeck is None:
+            continue
+        speeds = [np.abs(one.motion.velocity[one.usable[:, joint], joint]) for one in fitted]
+        slow = np.concatenate(speeds) < _SLOW * law.stribeck
+        if slow.size and slow.mean() < _FEWEST_SLOW:
+            raise InputError(
+                None,
+                f"{slow.mean():.2%} of the fitted rows of {stated.joint_names[joint]} are slower "
+                f"than {_SLOW:g} times the Stribeck speed of {law.stribeck:g} rad/s, which do not "
+                "determine that term",
+                field="robot.friction.stribeck",
+                remedy="state a larger speed, record slow motion, or leave the term out "
+                "(--friction coulomb,viscous)",
+            )
 
 
 def executed_rows(source: Source, samples: Samples) -> slice:
