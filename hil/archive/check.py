@@ -50,8 +50,8 @@ def check_archive(path: str | PathLike[str]) -> Check:
     if found.metadata is None:
         open_archive(path, fields=())  # raises with the reason
     faults = [*_entry_faults(path, found)]
-    if found.damage is not None and found.header is not None:
-        faults.append(f"the record at byte {found.damage.offset} {found.damage.reason}")
+    if found.header is not None:
+        faults += found.faults
     if not faults and not is_intact(path, found):
         faults.append("the message indexes or the summary do not fit the content")
     return Check(

@@ -111,12 +111,15 @@ class ChunkParser:
 
     def define(self, record: Record) -> None:
         """Read a schema or channel; other records are ignored. `Damage` if it is one redefined."""
-        if record.opcode not in (container.SCHEMA, container.CHANNEL):
-            return
-        item, again = container.parse_item(record), ""
+        if record.opcode in (container.SCHEMA, container.CHANNEL):
+            self.add(container.parse_item(record), record.offset)
+
+    def add(self, item: Schema | Channel, offset: int) -> None:
+        """Add a definition; `Damage` at `offset` if it is one redefined."""
+        again = ""
         if isinstance(item, Schema):
             if not item.id:
-                raise Damage(record.offset, "(schema) has the number 0, which means none")
+                raise Damage(offset, "(schema) has the number 0, which means none")
             if self.schemas.setdefault(item.id, item) != item:
                 again = f"schema {item.id}"
         else:
@@ -126,7 +129,7 @@ class ChunkParser:
                 again = f"channel {item.id}"
             self.channels.setdefault(item.id, item)
         if again:
-            raise Damage(record.offset, f"defines {again} a second time, differently")
+            raise Damage(offset, f"defines {again} a second time, differently")
 
     def messages(self, chunk: Content, offset: int) -> dict[int, Messages]:
         """Return the messages of one chunk, or of several consecutive ones, by channel.

@@ -1,8 +1,9 @@
 """The MCAP container (https://mcap.dev/spec): records in file order, each verified.
 
 The fields of records are read and written by the `mcap` library. Its stream reader parses every
-message index and does not tell where a record is; the walk is therefore here, twice as fast, and a
-truncated or forged record becomes `Damage` with its place.
+message index, returns a record that the end of the file cuts short as if it were whole, and bounds
+no decompression; the walk is therefore here, twice as fast, and can skip chunks. A truncated or
+forged record becomes `Damage` with its place.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from mcap.records import (
     Chunk,
     ChunkIndex,
     Footer,
+    Header,
     McapRecord,
     Metadata,
     Schema,
@@ -47,6 +49,7 @@ _CRC = struct.Struct("<I")
 _NO_CRC = 0
 _UNCOVERED = _CRC.size + len(MAGIC)  # bytes at the end of a file, not covered by the checksum
 _KINDS: dict[int, type[McapRecord]] = {
+    HEADER: Header,
     SCHEMA: Schema,
     CHANNEL: Channel,
     METADATA: Metadata,
@@ -203,8 +206,8 @@ def check_end(stream: BinaryIO, size: int, offset: int) -> None:
         raise Damage(offset, "(index and footer) is cut off, or fails its checksum")
 
 
-def read_chunk_index(stream: BinaryIO, size: int) -> list[ChunkIndex]:
-    """Return the index of chunks in the summary; empty where it is missing or damaged."""
+def read_summary(stream: BinaryIO, size: int, *kinds: int) -> list[Any]:
+    """Return the records of these kinds in the summary; none where it is missing or damaged."""
     last = size - FOOTER_SIZE - len(MAGIC)
     if last < 0:
         return []
@@ -212,16 +215,16 @@ def read_chunk_index(stream: BinaryIO, size: int) -> list[ChunkIndex]:
     footer = _footer(stream.read(size - last))
     if footer is None or footer.summary_crc == _NO_CRC:
         return []
-    if not len(MAGIC) <= footer.summary_start <= last <= footer.summary_start + LARGEST_RECORD:
+    start = footer.summary_start
+    if not len(MAGIC) <= start <= last <= start + LARGEST_RECORD:
         return []
-    stream.seek(footer.summary_start)
-    data = stream.read(size - footer.summary_start)
+    stream.seek(start)
+    data = stream.read(size - start)
     if crc32(data[:-_UNCOVERED]) != footer.summary_crc:
         return []
-    summary = data[: last - footer.summary_start]
+    summary = data[: last - start]
     try:
-        found = [one for one in split_records(summary, 0) if one.opcode == CHUNK_INDEX]
-        return [parse(ChunkIndex, one) for one in found]
+        return [parse_item(one) for one in split_records(summary, 0) if one.opcode in kinds]
     except Damage:
         return []
 
@@ -236,7 +239,7 @@ def _footer(tail: bytes) -> Footer | None:
 
 
 def parse_item(record: Record) -> Any:
-    """Return a schema, channel, metadata record or attachment, its checksum verified."""
+    """Return a record of `_KINDS`, or an attachment, its checksum verified."""
     if record.opcode == ATTACHMENT:
         return parse_attachment(record)
     if record.opcode not in _KINDS:

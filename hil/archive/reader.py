@@ -1,23 +1,25 @@
-"""Reading of archives: complete ones, and truncated ones up to their last complete chunk.
+"""Reading of archives: of a truncated or damaged one all that is whole, also behind damage.
 
-Records are verified in order, up to the first damage. The checksum of a chunk does not show that it
-belongs to this recording: a file system may put a chunk of another archive in its place. The
-outcome therefore lists the checksums of all chunks in order; where this list is missing, cycle
-numbers must increase.
+Each record is verified. The checksum of a chunk does not show that it belongs to this recording: a
+file system may put a chunk of another archive in its place. The outcome therefore lists the
+checksums of all chunks in order; where this list is missing, cycle numbers must increase, behind
+damage by as much as samples are missing.
 """
 
 from __future__ import annotations
 
 import os
+from bisect import bisect_right
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 import numpy as np
-from mcap.records import Header
+from mcap.records import Channel, Header, Schema
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
@@ -32,10 +34,10 @@ from hil.archive.header import (
     ArchiveHeader,
     ArchiveOutcome,
     HeaderError,
-    checksum,
     is_supported,
 )
 from hil.archive.schema import ArchivedEvent
+from hil.archive.search import find_records, verified_metadata, verify
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import open_file, parse_json
 
@@ -45,6 +47,9 @@ ALWAYS: Final = -(1 << 63), 1 << 63  # ns, before and after every stamp
 
 _BATCH: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
 _SEQUENCES = 1 << 32  # message numbers are modulo this
+_MOST_DAMAGES = 1000  # of one file; what follows is not read
+_LOST_PACKETS = 10  # that a gap may have beside one for each missing sample
+_MOST_SHOWN = 5  # faults in one message
 _LEAST = 8  # bytes of a file for one sample, of an arm at rest
 _COLUMN_OF: Final = {"effort": "torque"}  # names of message fields that differ from the column's
 _DEFINITIONS = (container.SCHEMA, container.CHANNEL)
@@ -62,16 +67,18 @@ class Scan:
         all_channels: whether to verify also the channels that only viewers read.
 
     Attributes:
-        heads: of the records with content.
+        heads: of the records with content that were not left out.
         metadata, header: the ``hil`` record as read, and parsed: None where invalid
             (`header_error`) or of another version.
-        outcome: the ``hil.outcome`` record, None if it was not reached.
-        stated: the outcome wherever it is in the file, empty if it cannot be found.
+        outcome: the ``hil.outcome`` record, None if it is lost.
+        stated: the same before it was read, empty if it is lost.
         mixed: whether begin and end are of two recordings; the samples may be of either.
         events: those of the times wanted.
         counts: verified messages by topic.
         chunks: number of valid chunks.
-        damage: the first one, None without.
+        damages: what is wrong, by the place of the record.
+        shortfalls: a sentence for what the file states to contain and does not.
+        lost: whether content is missing.
     """
 
     def __init__(
@@ -93,8 +100,13 @@ class Scan:
         self.parser = ChunkParser()
         self.counts: dict[str, int] = {}
         self.chunks = 0
-        self.damage: Damage | None = None
+        self.damages: dict[int, str] = {}
+        self.shortfalls: list[str] = []
+        self.lost = False
+        self._stream = stream
         self._fields, self._times, self._all_channels = fields, times, all_channels
+        self._left_out: set[int] = set()
+        self._gap = False  # whether something was left out behind the last chunk
         self._skipped = False  # whether chunks were left out: channels continue at any number
         self._buffer = memoryview(bytearray(_BATCH))
         self._pending: list[tuple[int, slice]] = []  # offset of each chunk, its place in the buffer
@@ -106,14 +118,14 @@ class Scan:
         self._raw: dict[tuple[str, str], Rows] = {}  # columns as bytes, which are copied faster
         self._stamps = np.zeros(0, np.int64)
         self._count = 0
-        end = self._find_heads(stream)
-        self.stated, self.mixed, self._chunk_list = self._stated_outcome(stream)
+        found = self._find_heads()
+        self.stated, self.mixed, self._chunk_list = self._stated_outcome()
+        if self.mixed and found:  # what was found behind damage is of another recording
+            del self.heads[-found:]
+            self.mixed = False
         expected = min(self.stated.samples or 0, self.size // _LEAST)
         self._room = expected if times == ALWAYS and fields != () else 0
-        try:
-            self._read(stream, end)
-        except Damage as damage:
-            self.damage = damage
+        self._read()
 
     @property
     def topics(self) -> Collection[str]:
@@ -139,7 +151,24 @@ class Scan:
         """Number of valid samples."""
         return max(self.counts.get(topic, 0) for topic in NUMBERS)
 
-    def shortfalls(self) -> Iterator[str]:
+    @property
+    def faults(self) -> list[str]:
+        """What is wrong, a sentence each: damages in the order of the file, then shortfalls."""
+        sentences, used = [], [head.offset for head in self.heads]
+        for offset, reason in sorted(self.damages.items()):
+            sentence, behind = f"the record at byte {offset} {reason}", bisect_right(used, offset)
+            end = used[behind] if behind < len(used) else self.size
+            if offset < end and (not behind or used[behind - 1] != offset):
+                sentence += f" (bytes {offset} to {end} are left out)"
+            sentences.append(sentence)
+        return [*sentences, *self.shortfalls]
+
+    @cached_property
+    def definitions(self) -> list[Schema | Channel]:
+        """Schemas and channels of the summary, for chunks that follow a lost one."""
+        return container.read_summary(self._stream, self.size, *_DEFINITIONS)
+
+    def _find_shortfalls(self) -> Iterator[str]:
         """Yield a sentence for what the file states to contain and does not."""
         for name in self.header.attachments if self.header else ():
             if name not in self.attachments:
@@ -158,71 +187,102 @@ class Scan:
             if stated != count:
                 yield f"{stated} {key} were written, {count} are there"
 
-    def _find_heads(self, stream: BinaryIO) -> int | Damage:
-        """Find the records with content; return the end of the data section, or the damage."""
+    def _find_heads(self) -> int:
+        """Find the records with content; return how many of them were found by search."""
+        stream, heads = self._stream, self.heads
         try:
-            self.heads += container.heads(stream, self.size, _CONTENT)
+            heads += container.heads(stream, self.size, _CONTENT)
+            container.check_end(stream, self.size, heads.pop().end)
+            return 0
         except Damage as damage:
-            return damage
-        return self.heads.pop().end
+            lost = damage
+        while heads:  # lengths are right up to the last record that is whole
+            try:
+                verify(container.read_record(stream, heads[-1]))
+                break
+            except Damage as damage:
+                lost = damage
+                heads.pop()
+        self.damages[lost.offset] = lost.reason
+        start = heads[-1].end if heads else len(container.MAGIC)
+        found = [*find_records(stream, start, self.size)]
+        heads += found
+        return len(found)
 
-    def _stated_outcome(
-        self, stream: BinaryIO
-    ) -> tuple[ArchiveOutcome, bool, NDArray[np.uint32] | None]:
+    def _stated_outcome(self) -> tuple[ArchiveOutcome, bool, NDArray[np.uint32] | None]:
         """Return the outcome, whether it is of another recording, and its list of chunks.
 
         The outcome is empty where it is damaged or of another recording; there is no list in older
         files, and in those that another program has copied, maybe into other chunks: it has written
         its own name.
         """
-        found: dict[str, dict[str, str]] = {}
-        library = ""
+        header: ArchiveHeader | None = None
+        mixed, library = False, schema.LIBRARY
         for head in self.heads:
-            with suppress(Damage):
-                if head.opcode == container.METADATA:
-                    name, entries = self._verified_metadata(container.read_record(stream, head))
-                    found.setdefault(name, entries)
-                elif head.opcode == container.HEADER:
-                    record = container.read_record(stream, head)
-                    library = library or container.parse(Header, record).library
-        try:
-            header, outcome = ArchiveHeader.of(found[METADATA]), ArchiveOutcome.of(found[OUTCOME])
-        except (HeaderError, KeyError):
-            return ArchiveOutcome(), False, None
-        if not outcome.belongs_to(header):
-            return ArchiveOutcome(), True, None
-        checksums = outcome.chunks if library == schema.LIBRARY else None
-        return outcome, False, None if checksums is None else np.array(checksums, np.uint32)
+            with suppress(Damage, HeaderError):
+                if head.opcode == container.HEADER:
+                    record = container.read_record(self._stream, head)
+                    library = container.parse(Header, record).library
+                if head.opcode != container.METADATA:
+                    continue
+                name, entries = verified_metadata(container.read_record(self._stream, head))
+                if name == METADATA and header is None:
+                    header = ArchiveHeader.of(entries)
+                elif name == OUTCOME and header is not None:
+                    outcome = ArchiveOutcome.of(entries)
+                    mixed = not outcome.belongs_to(header)
+                    if mixed:
+                        continue
+                    checksums = outcome.chunks if library == schema.LIBRARY else None
+                    chunks = None if checksums is None else np.array(checksums, np.uint32)
+                    return outcome, False, chunks
+        return ArchiveOutcome(), mixed, None
 
-    def _read(self, stream: BinaryIO, end: int | Damage) -> None:
-        """Read the wanted records in order, up to the first damage, which is raised."""
-        outside = _chunks_outside(stream, self.size, self._times)
-        try:
-            for head in self.heads:
-                if head.opcode == container.CHUNK and head.offset in outside:
-                    self._flush()
-                    self._place, self._skipped = self._place + 1, True
-                    self._next.clear()
-                else:
-                    self._add(container.read_record(stream, head))
-        finally:
-            self._flush()  # pending chunks precede any damage found so far
-        if isinstance(end, Damage):
-            raise end
-        container.check_end(stream, self.size, end)
+    def _read(self) -> None:
+        """Read the wanted records in order."""
+        outside = _chunks_outside(self._stream, self.size, self._times)
+        for place, head in enumerate(self.heads):
+            if head.opcode == container.CHUNK and head.offset in outside:
+                self._flush()
+                self._place, self._skipped = self._place + 1, True
+                self._next.clear()
+                continue
+            try:
+                self._add(container.read_record(self._stream, head))
+            except Damage as damage:
+                self._flush()  # pending chunks precede it
+                self._leave_out(damage)
+            if len(self.damages) >= _MOST_DAMAGES:
+                del self.heads[place + 1 :]
+                break
+        self._flush()
+        self.heads = [head for head in self.heads if head.offset not in self._left_out]
         chunks = self._chunk_list
         if outside and chunks is not None and self._place < len(chunks):
-            raise Damage(self.size, "is not there: a chunk is missing")
+            self.shortfalls = ["a chunk is missing"]
         if not outside and self.header is not None:  # else some other MCAP file
-            for text in self.shortfalls():
-                raise Damage(self.size, f"is not there: {text}")
+            self.shortfalls = [*self._find_shortfalls()]
+        self.lost |= bool(self.shortfalls)
+
+    def _leave_out(self, damage: Damage) -> None:
+        """Leave out the record at the place of the damage."""
+        self.damages.setdefault(damage.offset, damage.reason)
+        self._left_out.add(damage.offset)
+        self._gap = True
+
+    def _note_gap(self, offset: int) -> None:
+        """Note that a chunk is missing in front of that at `offset`, unless damage explains it."""
+        if not self._gap:
+            reason = "(chunk) does not continue the one before it: a chunk is missing"
+            self.damages.setdefault(offset, reason)
+        self.lost = True
 
     def _add(self, record: Record) -> None:
         """Verify the next record, and add its content; `Damage` if it is not the next one."""
         offset = record.offset
         if record.opcode == container.CHUNK:
-            if self.metadata is None:
-                return  # some other MCAP file
+            if self.header is None or self.mixed:
+                return  # some other MCAP file, or of either of two recordings
             head = container.parse_chunk(record)
             data = container.chunk_data(head, offset)
             self._check_order(head.uncompressed_crc, offset)
@@ -237,19 +297,10 @@ class Scan:
         elif record.opcode in _DEFINITIONS:
             self.parser.define(record)
 
-    @staticmethod
-    def _verified_metadata(record: Record) -> tuple[str, dict[str, str]]:
-        """Return name and entries, without the checksum that they must have if they are ours."""
-        name, entries = container.parse_metadata(record)
-        ours = name in (METADATA, OUTCOME)
-        if ours and entries.pop("checksum", None) != checksum(entries):
-            raise Damage(record.offset, f"(metadata {name!r}) fails its checksum")
-        return name, entries
-
     def _add_metadata(self, record: Record) -> None:
         """Add header or outcome: one each, of this version and of the same recording."""
         offset = record.offset
-        name, entries = self._verified_metadata(record)
+        name, entries = verified_metadata(record)
         if name not in (METADATA, OUTCOME):
             return
         if (self.metadata if name == METADATA else self.outcome) is not None:
@@ -271,19 +322,19 @@ class Scan:
             raise Damage(offset, problem) from error
 
     def _check_order(self, crc: int, offset: int) -> None:
-        """Check that the chunk with this checksum is the next of those that were written."""
-        if self.mixed:
-            reason = "(chunk) may be of either of two: the outcome is that of another recording"
-            raise Damage(offset, reason)
+        """Check that the chunk with this checksum is one that was written behind those before."""
         chunks = self._chunk_list
         if chunks is None:
             return
-        if self._place < len(chunks) and chunks[self._place] == crc:
-            self._place += 1
-        elif crc in chunks:
-            raise Damage(offset, "(chunk) does not continue the one before, by the outcome's list")
-        else:
-            raise Damage(offset, "(chunk) is of another recording, by the outcome's list")
+        if not (self._place < len(chunks) and chunks[self._place] == crc):
+            later = np.flatnonzero(chunks[self._place :] == crc)
+            if not len(later):
+                why = "is out of order" if crc in chunks else "is of another recording"
+                raise Damage(offset, f"(chunk) {why}, by the outcome's list")
+            self._note_gap(offset)
+            self._place += int(later[0])
+        self._place += 1
+        self._gap = False
 
     def _add_chunk(self, data: bytes, offset: int) -> None:
         """Decode the content of a chunk, or buffer it to decode several at once."""
@@ -311,8 +362,11 @@ class Scan:
             except Damage:
                 pass  # in one of them
         for offset, place in pending:
-            self._decode(self._buffer[place], offset)
-            self.chunks += 1
+            try:
+                self._decode(self._buffer[place], offset)
+                self.chunks += 1
+            except Damage as damage:
+                self._leave_out(damage)
 
     def _decode(self, data: Content, offset: int, *, several: bool = False) -> None:
         """Add messages that must be the next of their channels; else none of them.
@@ -325,6 +379,9 @@ class Scan:
             by_number = parser.messages(data, offset)
             if several and parser.channels.keys() != before[1].keys():
                 raise Damage(offset, "(chunk) defines a channel")
+            if not by_number.keys() <= parser.channels.keys():
+                for definition in self.definitions:
+                    parser.add(definition, offset)
             if unknown := by_number.keys() - parser.channels.keys():
                 raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
             found = {parser.channels[number].topic: one for number, one in by_number.items()}
@@ -334,13 +391,17 @@ class Scan:
             if numbers and new:
                 raise Damage(offset, "(chunk) has samples in other channels than those before")
             verified = found if self._all_channels else {topic: found[topic] for topic in wanted}
-            self._check_sequences(verified, offset)
+            missing = self._missing_messages(verified, offset)
             newest = self._check_times(verified, offset)
+            if self._chunk_list is None and (missing or self.damages):
+                self._check_gap(verified, missing, offset)
             layouts = self._check_layouts(verified, offset)
             events = self._decode_events(verified, offset)
         except Damage:
             parser.schemas, parser.channels = before
             raise
+        if self._chunk_list is None:
+            self._gap = False
         self._newest = max(self._newest, newest)
         self._numbers = self._numbers or numbers
         for topic, messages in verified.items():
@@ -414,8 +475,9 @@ class Scan:
                 for raw, start in columns:
                     raw[now] = rows[:, start : start + raw.itemsize].view(raw.dtype)[:, 0]
 
-    def _check_sequences(self, found: Mapping[str, Messages], offset: int) -> None:
-        """Check that no message is missing or repeated, but for those that a repair has lost."""
+    def _missing_messages(self, found: Mapping[str, Messages], offset: int) -> dict[str, int]:
+        """Return how many messages of topics are missing before these; `Damage` if some repeat."""
+        missing = {}
         for topic, messages in found.items():
             sequence = messages.of_heads("sequence")
             if (np.diff(sequence) != 1).any():
@@ -425,9 +487,31 @@ class Scan:
             gap %= _SEQUENCES
             if gap > _SEQUENCES // 2:
                 raise Damage(offset, "(chunk) repeats messages of those before")
-            if gap and not self.stated.repaired:
-                reason = "(chunk) does not continue the one before it: a chunk is missing"
-                raise Damage(offset, reason)
+            if gap:
+                missing[topic] = gap
+        return missing
+
+    def _check_gap(
+        self, found: Mapping[str, Messages], missing: Mapping[str, int], offset: int
+    ) -> None:
+        """Check that a chunk that is in no list can be of this recording, behind damage or a gap.
+
+        As many cycles as samples must be missing, or up to twice as many: packets may be lost.
+        """
+        if missing and self.stated.repaired and not self.damages:
+            return
+        assert self.header is not None
+        period = self.header.period
+        if not self._next.keys().isdisjoint(found.keys() & set(NUMBERS)):
+            if schema.CYCLE not in found or period is None:
+                raise Damage(offset, "(chunk) follows damage: nothing shows that it belongs here")
+            elapsed = int(found[schema.CYCLE].stamps[0]) - self._newest
+            cycles, samples = round(elapsed * 1e-9 / period) - 1, missing.get(schema.CYCLE, 0)
+            if not samples <= cycles <= 2 * samples + _LOST_PACKETS:
+                problem = f"(chunk) follows a gap of {samples} samples and {cycles} cycles"
+                raise Damage(offset, problem)
+        if missing:
+            self._note_gap(offset)
 
     def _check_times(self, found: Mapping[str, Messages], offset: int) -> int:
         """Check that cycles increase, and that all channels have the same times without cycles.
@@ -461,7 +545,7 @@ def _chunks_outside(stream: BinaryIO, size: int, times: tuple[int, int]) -> Coll
     """
     if times == ALWAYS:
         return ()
-    chunks = container.read_chunk_index(stream, size)
+    chunks = container.read_summary(stream, size, container.CHUNK_INDEX)
     first = min((one.chunk_start_offset for one in chunks), default=0)
     return {
         one.chunk_start_offset
@@ -586,9 +670,9 @@ def open_archive(
 ) -> Archive:
     """Read an archive.
 
-    A damaged file is read up to its last complete chunk before the damage, and `Archive.damage`
-    states what is missing. Where only some times are wanted and the index of the file is intact,
-    other chunks are not read, nor is their damage detected.
+    Of a damaged file all that is whole is read, and `Archive.damage` states what is missing. Where
+    only some times are wanted and the index of the file is intact, other chunks are not read, nor
+    is their damage detected.
 
     Args:
         path: the file.
@@ -629,13 +713,10 @@ def scan_archive(path: str | PathLike[str], **options: Any) -> tuple[Archive, Sc
 
 def _describe(scan: Scan, read: int) -> str | None:
     """Return a sentence about the damage, with the number of samples that were read."""
-    damage = scan.damage
-    if damage is None:
+    faults = scan.faults
+    if not faults:
         return None
-    text = f"the record at byte {damage.offset} {damage.reason}"
-    text += f" ({scan.size - damage.offset} bytes from there on are unused)"
-    text += f"; {read} samples could be read"
-    return text + ("; the outcome is missing" if scan.outcome is None else "")
+    return "; ".join([*faults[:_MOST_SHOWN], f"{read} samples could be read"])
 
 
 def scan_file(path: Path, **options: Any) -> Scan:
@@ -665,11 +746,10 @@ def _unreadable(path: Path, scan: Scan) -> ArchiveError:
             f"is of profile version {version}; this software reads version {FORMAT_VERSION}",
             remedy="install a newer hil",
         )
-    if scan.damage is None:
+    if not scan.damages:
         problem = f"is an MCAP file, but not an archive: it has no {METADATA!r} metadata record"
-    elif scan.damage.offset == 0:
+    elif 0 in scan.damages:
         problem = "is not an MCAP file"
     else:
-        place = f"the record at byte {scan.damage.offset} {scan.damage}"
-        problem = f"is truncated before its first data: {place}"
+        problem = f"is truncated before its first data: {scan.faults[0]}"
     return NotAnArchiveError(path, problem, remedy="name a file that hil recorded or imported")

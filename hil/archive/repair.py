@@ -1,6 +1,6 @@
 """Repair of truncated or damaged archives.
 
-What `hil.archive.reader` finds before the first damage is copied; message indexes and summary are
+What `hil.archive.reader` finds whole is copied, also behind damage; message indexes and summary are
 regenerated, and the outcome states what is lost.
 """
 
@@ -99,7 +99,7 @@ def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
 
 def is_intact(path: Path, found: Scan) -> bool:
     """Return whether the file has no damage, and its message indexes and summary fit."""
-    if found.damage is not None:
+    if found.faults:
         return False
     with open_file(path) as stream, open_file(path) as other:
         same = True
@@ -132,8 +132,7 @@ def _rewrite(
                 raise ArchiveError(
                     path,
                     f"cannot be rewritten: {back.damage}",
-                    remedy="it is unchanged and can be read as far as it opens: restore it from a "
-                    "copy, or record again",
+                    remedy="it is unchanged: restore it from a copy, or record again",
                 )
         sync_folder(target.parent)
     except OSError as error:
@@ -154,16 +153,17 @@ def _copy(
     writer, parser = McapWriter(write, schema.PROFILE, schema.LIBRARY), ChunkParser()
     described = _description(found)
     writer.put(Metadata(METADATA, header.with_checksum(described)))
-    whole = found.size if found.damage is None else found.damage.offset
     for head in found.heads:
-        if head.offset >= whole:
-            break
         if head.opcode == container.HEADER:
             continue
         record = container.read_record(stream, head)
         if head.opcode == container.CHUNK:
             chunk = container.parse_chunk(record)
             messages = parser.messages(container.chunk_data(chunk, head.offset), head.offset)
+            if not messages.keys() <= parser.channels.keys():
+                for definition in found.definitions:
+                    parser.add(definition, head.offset)
+                    writer.put(definition)
             for definition in parser.definitions:
                 writer.note(definition)
             entries = entries_of(messages)
@@ -182,10 +182,7 @@ def _copy(
 
 def _losses(found: Scan) -> tuple[str, ...]:
     """Return what is lost, and where; empty if all that was written is there."""
-    shortfalls = tuple(found.shortfalls())
-    if not shortfalls or found.damage is None or found.damage.offset == found.size:
-        return shortfalls
-    return (f"the record at byte {found.damage.offset} {found.damage.reason}", *shortfalls)
+    return tuple(found.faults) if found.lost else ()
 
 
 def _samples_lost(found: Scan) -> int | None:

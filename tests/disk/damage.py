@@ -2,8 +2,9 @@
 
 Each round damages an archive or two by its number (`draw`) and runs all readers: `hil archive
 check`, `hil.open_recording`, `hil plot`, `hil identify` of archives or of the folder. Each must
-raise a named error, return what it returned before, or state what was left out
-(`broken`). A failure is printed with the command that repeats it.
+raise a named error, return what it returned before, or state what was left out; and `hil archive
+repair` saves the samples of each undamaged chunk (`broken`). A failure is printed with the command
+that repeats it.
 """
 
 from __future__ import annotations
@@ -23,13 +24,14 @@ from numpy.typing import NDArray
 
 from hil.archive import Archive, container, open_archive
 from hil.archive.check import check_archive
+from hil.archive.repair import repair
 from hil.errors import HilError
 from hil.identify import Identification, identify_archives, identify_campaign
 from hil.plots.archive_view import view_of
 from hil.progress import Silent
 from tests.arguments import parser_of, whole_number
 from tests.hil.fast_cell import fast_campaign, fast_cell
-from tests.hil.mcap_bytes import chunks
+from tests.hil.mcap_bytes import chunks, heads
 
 Columns = Mapping[str, NDArray[Any]]
 
@@ -75,7 +77,7 @@ def broken(truth: Undamaged, harmed: Sequence[Path], number: int) -> Iterator[st
     Even rounds identify the archives, the others the folder, which has their checksums.
     """
     readers: list[Callable[[], Iterator[str]]] = [
-        partial(law, truth, path) for path in harmed for law in (_reads, _checks, _shows)
+        partial(law, truth, path) for path in harmed for law in (_reads, _checks, _shows, _repairs)
     ]
     if any(path in truth.paths for path in harmed):  # moves are never read for it
         readers.append(partial(_identifies, truth, harmed, campaign=bool(number % 2)))
@@ -110,6 +112,34 @@ def _reads(truth: Undamaged, path: Path) -> Iterator[str]:
 def _checks(truth: Undamaged, path: Path) -> Iterator[str]:
     if check_archive(path).conforms and not _same(open_archive(path), truth.archives[path]):
         yield f"{path.name}: conforms with other content"
+
+
+def _repairs(truth: Undamaged, path: Path) -> Iterator[str]:
+    """Check that the samples of all undamaged chunks are saved, of a file with chunks in order."""
+    before, now = truth.files[path], path.read_bytes()
+    whole = [before[begin:end] for begin, end in chunks(before)]
+    places = [now.find(one) for one in whole]
+    found = [at for at in places if at >= 0]
+    defined = places[0] >= 0 or now.endswith(before[chunks(before)[-1][1] :])
+    with tempfile.TemporaryDirectory() as folder:
+        saved = open_archive(repair(path, Path(folder) / path.name).output or path)
+    if not _written(saved.columns, truth):
+        yield f"{path.name}: repaired with a sample that was never written"
+    if saved.missing:
+        yield f"repaired, and not complete: {saved.missing}"
+    if defined and found == sorted(found):
+        needed = set().union(
+            *(_stamps(one) for one, at in zip(whole, places, strict=True) if at >= 0)
+        )
+        if lost := needed - set(saved.columns["stamp"].tolist()):
+            yield f"{path.name}: {len(lost)} samples of undamaged chunks are lost"
+
+
+def _stamps(chunk: bytes) -> set[int]:
+    """Stamps of the cycles in a chunk [ns]."""
+    record = container.Record(0, container.CHUNK, chunk[container.RECORD.size :])
+    content = container.chunk_data(container.parse_chunk(record), 0)
+    return {one.log_time for one in heads(content) if one.channel == 1}
 
 
 def _shows(truth: Undamaged, path: Path) -> Iterator[str]:

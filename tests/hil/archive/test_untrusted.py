@@ -236,13 +236,13 @@ def second_cycles(chunk: bytes) -> bytes:
 
 CONTENTS = {
     "channel number": (
-        [bytes, lambda chunk: channel(CYCLE, "/elsewhere") + chunk], "channel 1 a second time", 10
+        [bytes, lambda chunk: channel(CYCLE, "/elsewhere") + chunk], "channel 1 a second time", 33
     ),
-    "channel topic": ([bytes, second_cycles], "channel 9 a second time", 10),
-    "schema": ([bytes, another_schema], "schema 1 a second time", 10),
-    "cycles begin later": ([without_cycles, with_cycles], "other channels than those before", 10),
-    "imported: other times": ([bytes, later_currents], "channels of different times", 20),
-    "imported: cycles": ([bytes, second_cycles], "other channels than those before", 20),
+    "channel topic": ([bytes, second_cycles], "channel 9 a second time", 33),
+    "schema": ([bytes, another_schema], "schema 1 a second time", 33),
+    "cycles begin later": ([without_cycles, with_cycles], "other channels than those before", 33),
+    "imported: other times": ([bytes, later_currents], "channels of different times", 40),
+    "imported: cycles": ([bytes, second_cycles], "other channels than those before", 40),
 }  # fmt: skip
 
 
@@ -260,7 +260,7 @@ class TestContents:
         return path.read_bytes()
 
     @pytest.mark.parametrize("what", CONTENTS)
-    def test_reading_ends_before_it(self, what, written, imported, tmp_path):
+    def test_such_a_chunk_is_left_out(self, what, written, imported, tmp_path):
         changes, why, sound = CONTENTS[what]
         data = imported if "imported" in what else written.data
         path = forged(data, tmp_path / "x.mcap", chunk=in_turn(*changes))
@@ -335,9 +335,7 @@ class TestSizes:
         path.write_bytes(change(written.data, at))
         if "1099" in reason:  # a record as long as a sparse file
             os.truncate(path, (1 << 40) + at + container.RECORD.size)
-        messages: dict[str, str] = {}
-        assert peak(lambda: messages.update(outcomes(path))) < MEMORY
-        assert reason in messages["open_recording"]
+        assert peak(lambda: outcomes(path)) < MEMORY
         assert any(reason in fault for fault in check_archive(path).faults)
 
     def test_a_tail_as_long_as_a_sparse_file(self, written, path):
