@@ -176,7 +176,8 @@ def collision_checker(cell: Cell) -> CollisionChecker:
             cell.file.cell.mesh_folders,
             f"the mesh {error.mesh} of {urdf} is in none of them",
             "add the folder in which its package:// path begins (or to ROS_PACKAGE_PATH); write "
-            "other paths in the URDF as package://",
+            "other paths in the URDF as package://; only a design works without meshes, with "
+            "collision = false in its [constraints]",
         ) from error
     except CollisionModelError as error:
         raise CellError(

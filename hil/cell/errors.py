@@ -98,7 +98,8 @@ def _short(value: object) -> str:
 UNKNOWN: Final = "?"
 
 WHERE: Final[Mapping[str, str]] = {
-    "cell.mesh_folders": "folder that contains the packages of package:// mesh paths",
+    "cell.mesh_folders": "for package://NAME/... the folder that contains NAME. Without the meshes "
+    "write []: only a design with collision = false in its [constraints] works then",
     "limits.lower_deg": "data sheet, or the controller's stroke ends ($STRK_END_N)",
     "limits.upper_deg": "data sheet, or the controller's stroke ends ($STRK_END_P)",
     "limits.velocity_deg": "data sheet, largest joint speeds",

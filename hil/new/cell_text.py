@@ -302,8 +302,9 @@ def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
     shapes = _COLLISION.findall(text)
     if not shapes:
         notes.append(
-            "the URDF has no <collision> shapes: add some (boxes, cylinders or spheres) before "
-            "the arm is moved"
+            "the URDF has no <collision> shapes: add some (boxes, cylinders or spheres). Without "
+            "them only a design works, with collision = false in the settings that `hil design "
+            "--show-settings front` prints"
         )
     name = re.search(r"<robot\b[^>]*\bname\s*=\s*[\"']([^\"']*)[\"']", used)
     return NewCell(
