@@ -67,9 +67,7 @@ class CanControllerLink(CanLink):
         return self.discarded["foreign"]
 
 
-def open_controller_link(
-    spec: CanSpec, mode: int | None = None, *, start_patience: float = START_PATIENCE
-) -> CanControllerLink:
+def open_controller_link(spec: CanSpec, mode: int | None = None) -> CanControllerLink:
     """Open the controller's end on a bus of python-can; `mode` is None where no axis is opened.
 
     Raises:
@@ -77,4 +75,4 @@ def open_controller_link(
     """
     spec.check(mode)
     bus = open_bus(spec.interface, spec.channel, spec.rates, spec.options)
-    return CanControllerLink(bus, spec.rates, start_patience=start_patience)
+    return CanControllerLink(bus, spec.rates)
