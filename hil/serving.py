@@ -7,7 +7,7 @@ import gc
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -25,46 +25,36 @@ _PR_SET_TIMERSLACK: Final = 29
 
 
 def open_controller_link(
-    udp: str | None,
-    can: str | None,
-    settings: ControllerSettings,
-    n_axes: int,
-    *,
-    link: str | None = None,
+    addresses: Mapping[str, str | None], settings: ControllerSettings, n_axes: int
 ) -> serve.ControllerLink:
-    """Open the controller's end at the address of exactly one option; `link` is "NAME:ADDRESS".
+    """Open the controller's end at the one address, by option; that of --link is "NAME:ADDRESS".
 
     Raises:
         InputError: not one link, or an invalid one, that cannot be opened or cannot carry the
             session.
     """
-    name, _, address = (link or "").partition(":")
-    options = (
-        ("--udp", "udp", udp),
-        ("--can", "can", can),
-        ("--link", name, None if link is None else address),
-    )
-    given = [(option, name, text) for option, name, text in options if text is not None]
+    given = [(option, text) for option, text in addresses.items() if text is not None]
     if len(given) != 1:
         remedy = "give --udp or --can, not both"
         raise InputError(None, "one link is needed", remedy=remedy)
-    option, name, text = given[0]
+    option, text = given[0]
+    name, address = option.removeprefix("--"), text
+    if option == "--link":
+        name, _, address = text.partition(":")
     kind = LINKS.get(name)
     if kind is None:
         remedy = f"write NAME:ADDRESS; names are {', '.join(LINKS)}"
-        raise InputError(None, f"--link {link!r} names no transport", remedy=remedy)
-    if (fields := kind.parse(text)) is None:
+        raise InputError(None, f"{option} {text!r} names no transport", remedy=remedy)
+    if (fields := kind.parse(address)) is None:
         noun, form = kind.form
         raise InputError(None, f"{option} {text!r} is not {noun}", remedy=f"write {form}")
     cycle_ms = round(1e3 * settings.period)
     table = ControllerTable.model_validate({"transport": name, "cycle_ms": cycle_ms, **fields})
     spec = kind.spec(table, n_axes)
     moved_by_pc = settings.corrected or not settings.own_motion
-    ends = import_module(kind.controller)
+    mode = settings.open_mode if moved_by_pc else None
     try:
-        end: serve.ControllerLink = ends.open_controller_link(
-            spec, settings.open_mode if moved_by_pc else None
-        )
+        end: serve.ControllerLink = import_module(kind.controller).open_controller_link(spec, mode)
     except TransportError as error:
         raise InputError(None, str(error)) from error
     return end

@@ -171,7 +171,8 @@ def simulate(
             loaded, effects=effects, settings=settings, seed=seed, faults=in_controller
         )
 
-    end = open_controller_link(udp, can, settings, len(loaded.joint_names), link=link)
+    addresses = {"--udp": udp, "--can": can, "--link": link}
+    end = open_controller_link(addresses, settings, len(loaded.joint_names))
     status = Status(settings, quiet=json)
     status.say(
         f"{loaded.name}: a SIMULATED controller for {udp or can or link}; nothing moves.\n"

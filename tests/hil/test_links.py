@@ -54,7 +54,7 @@ class TestLinks:
         assert pickle.loads(pickle.dumps(spec)) == spec
         assert len(link_checks(spec, System())) == len(spec.needs) > 0
         settings = replace(controller_settings(CELL), period=0.002)
-        open_controller_link(None, None, settings, 6, link=f"{name}:{ADDRESSES[name]}").close()
+        open_controller_link({"--link": f"{name}:{ADDRESSES[name]}"}, settings, 6).close()
 
     def test_without_a_local_rule_it_is_real(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """A loopback address says nothing of a transport that does not judge it."""
@@ -67,4 +67,4 @@ class TestLinks:
     @pytest.mark.parametrize("link", ["no-such:127.0.0.1:1", "", "udp:127.0.0.1", "can:x"])
     def test_a_wrong_link_is_refused(self, link: str) -> None:
         with pytest.raises(InputError, match=r"--link .* write"):
-            open_controller_link(None, None, controller_settings(CELL), 6, link=link)
+            open_controller_link({"--link": link}, controller_settings(CELL), 6)

@@ -52,7 +52,7 @@ def opened(mode: int = 4) -> str:
 
 def link_at(udp: str | None = None, can: str | None = None) -> Any:
     settings = replace(controller_settings(Cell.load(CELL_PATH)), period=0.002)
-    return open_controller_link(udp, can, settings, 6)
+    return open_controller_link({"--udp": udp, "--can": can}, settings, 6)
 
 
 @contextmanager
