@@ -9,9 +9,8 @@ damage by as much as samples are missing.
 from __future__ import annotations
 
 import os
-from bisect import bisect_right
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import suppress
+from bisect import bisect_left
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
@@ -70,8 +69,7 @@ class Scan:
         heads: of the records with content that were not left out.
         metadata, header: the ``hil`` record as read, and parsed: None where invalid
             (`header_error`) or of another version.
-        outcome: the ``hil.outcome`` record, None if it is lost.
-        stated: the same before it was read, empty if it is lost.
+        outcome: the ``hil.outcome`` record, None if it is lost or of another recording.
         mixed: whether begin and end are of two recordings; the samples may be of either.
         events: those of the times wanted.
         counts: verified messages by topic.
@@ -95,6 +93,7 @@ class Scan:
         self.header: ArchiveHeader | None = None
         self.header_error: HeaderError | None = None
         self.outcome: ArchiveOutcome | None = None
+        self.mixed = False
         self.attachments: dict[str, bytes] = {}
         self.events: list[ArchivedEvent] = []
         self.parser = ChunkParser()
@@ -104,6 +103,7 @@ class Scan:
         self.shortfalls: list[str] = []
         self.lost = False
         self._stream = stream
+        self._library = schema.LIBRARY  # that wrote the file
         self._fields, self._times, self._all_channels = fields, times, all_channels
         self._left_out: set[int] = set()
         self._gap = False  # whether something was left out behind the last chunk
@@ -119,11 +119,13 @@ class Scan:
         self._stamps = np.zeros(0, np.int64)
         self._count = 0
         found = self._find_heads()
-        self.stated, self.mixed, self._chunk_list = self._stated_outcome()
+        self._chunk_list = self._read_metadata()
         if self.mixed and found:  # what was found behind damage is of another recording
             del self.heads[-found:]
             self.mixed = False
-        expected = min(self.stated.samples or 0, self.size // _LEAST)
+        stated = self.outcome or ArchiveOutcome()
+        self._repaired = stated.repaired
+        expected = min(stated.samples or 0, self.size // _LEAST)
         self._room = expected if times == ALWAYS and fields != () else 0
         self._read()
 
@@ -154,13 +156,11 @@ class Scan:
     @property
     def faults(self) -> list[str]:
         """What is wrong, a sentence each: damages in the order of the file, then shortfalls."""
-        sentences, used = [], [head.offset for head in self.heads]
+        sentences, used = [], [*(head.offset for head in self.heads), self.size]
         for offset, reason in sorted(self.damages.items()):
-            sentence, behind = f"the record at byte {offset} {reason}", bisect_right(used, offset)
-            end = used[behind] if behind < len(used) else self.size
-            if offset < end and (not behind or used[behind - 1] != offset):
-                sentence += f" (bytes {offset} to {end} are left out)"
-            sentences.append(sentence)
+            end = used[bisect_left(used, offset)]
+            left_out = f" (bytes {offset} to {end} are left out)" if end > offset else ""
+            sentences.append(f"the record at byte {offset} {reason}{left_out}")
         return [*sentences, *self.shortfalls]
 
     @cached_property
@@ -209,34 +209,44 @@ class Scan:
         heads += found
         return len(found)
 
-    def _stated_outcome(self) -> tuple[ArchiveOutcome, bool, NDArray[np.uint32] | None]:
-        """Return the outcome, whether it is of another recording, and its list of chunks.
+    def _read_metadata(self) -> NDArray[np.uint32] | None:
+        """Read header and outcome; return the list of chunks, None where there is none.
 
-        The outcome is empty where it is damaged or of another recording; there is no list in older
-        files, and in those that another program has copied, maybe into other chunks: it has written
-        its own name.
+        Older files have none, nor have those that another program has copied, maybe into other
+        chunks: it has written its own name.
         """
-        header: ArchiveHeader | None = None
-        mixed, library = False, schema.LIBRARY
         for head in self.heads:
-            with suppress(Damage, HeaderError):
-                if head.opcode == container.HEADER:
-                    record = container.read_record(self._stream, head)
-                    library = container.parse(Header, record).library
-                if head.opcode != container.METADATA:
-                    continue
-                name, entries = verified_metadata(container.read_record(self._stream, head))
-                if name == METADATA and header is None:
-                    header = ArchiveHeader.of(entries)
-                elif name == OUTCOME and header is not None:
-                    outcome = ArchiveOutcome.of(entries)
-                    mixed = not outcome.belongs_to(header)
-                    if mixed:
-                        continue
-                    checksums = outcome.chunks if library == schema.LIBRARY else None
-                    chunks = None if checksums is None else np.array(checksums, np.uint32)
-                    return outcome, False, chunks
-        return ArchiveOutcome(), mixed, None
+            if head.opcode in (container.HEADER, container.METADATA):
+                self._try(self._add_metadata, head)
+        own = self._library == schema.LIBRARY
+        checksums = self.outcome.chunks if self.outcome and own else None
+        return None if checksums is None else np.array(checksums, np.uint32)
+
+    def _add_metadata(self, record: Record) -> None:
+        """Add header or outcome: one each, of this version and of the same recording."""
+        offset = record.offset
+        if record.opcode == container.HEADER:
+            self._library = container.parse(Header, record).library
+            return
+        name, entries = verified_metadata(record)
+        if name == METADATA and self.metadata is None:
+            self.metadata = entries
+            if not is_supported(entries):
+                raise Damage(offset, "is of another version")
+            try:
+                self.header = ArchiveHeader.of(entries)
+            except HeaderError as error:
+                self.header_error = error
+                problem = f"(metadata {METADATA!r}) cannot be used: {error}"
+                raise Damage(offset, problem) from error
+        elif name == OUTCOME and self.outcome is None:
+            outcome = ArchiveOutcome.of(entries)
+            self.mixed = not outcome.belongs_to(self.header)
+            if self.mixed:
+                raise Damage(offset, "(metadata 'hil.outcome') is that of another recording")
+            self.outcome = outcome
+        elif name in (METADATA, OUTCOME):
+            raise Damage(offset, f"(metadata {name!r}) is there a second time")
 
     def _read(self) -> None:
         """Read the wanted records in order."""
@@ -247,11 +257,7 @@ class Scan:
                 self._place, self._skipped = self._place + 1, True
                 self._next.clear()
                 continue
-            try:
-                self._add(container.read_record(self._stream, head))
-            except Damage as damage:
-                self._flush()  # pending chunks precede it
-                self._leave_out(damage)
+            self._try(self._add, head)
             if len(self.damages) >= _MOST_DAMAGES:
                 del self.heads[place + 1 :]
                 break
@@ -263,6 +269,14 @@ class Scan:
         if not outside and self.header is not None:  # else some other MCAP file
             self.shortfalls = [*self._find_shortfalls()]
         self.lost |= bool(self.shortfalls)
+
+    def _try(self, add: Callable[[Record], None], head: Head) -> None:
+        """Add a record, or leave it out if it is damaged."""
+        try:
+            add(container.read_record(self._stream, head))
+        except Damage as damage:
+            self._flush()  # pending chunks precede it
+            self._leave_out(damage)
 
     def _leave_out(self, damage: Damage) -> None:
         """Leave out the record at the place of the damage."""
@@ -292,34 +306,8 @@ class Scan:
             if attachment.name in self.attachments:
                 raise Damage(offset, f"(attachment {attachment.name!r}) is there a second time")
             self.attachments[attachment.name] = attachment.data
-        elif record.opcode == container.METADATA:
-            self._add_metadata(record)
         elif record.opcode in _DEFINITIONS:
             self.parser.define(record)
-
-    def _add_metadata(self, record: Record) -> None:
-        """Add header or outcome: one each, of this version and of the same recording."""
-        offset = record.offset
-        name, entries = verified_metadata(record)
-        if name not in (METADATA, OUTCOME):
-            return
-        if (self.metadata if name == METADATA else self.outcome) is not None:
-            raise Damage(offset, f"(metadata {name!r}) is there a second time")
-        if name == OUTCOME:
-            outcome = ArchiveOutcome.of(entries)
-            if not outcome.belongs_to(self.header):
-                raise Damage(offset, "(metadata 'hil.outcome') is that of another recording")
-            self.outcome = outcome
-            return
-        self.metadata = entries
-        if not is_supported(entries):
-            raise Damage(offset, "is of another version")
-        try:
-            self.header = ArchiveHeader.of(entries)
-        except HeaderError as error:
-            self.header_error = error
-            problem = f"(metadata {METADATA!r}) cannot be used: {error}"
-            raise Damage(offset, problem) from error
 
     def _check_order(self, crc: int, offset: int) -> None:
         """Check that the chunk with this checksum is one that was written behind those before."""
@@ -393,15 +381,14 @@ class Scan:
             verified = found if self._all_channels else {topic: found[topic] for topic in wanted}
             missing = self._missing_messages(verified, offset)
             newest = self._check_times(verified, offset)
-            if self._chunk_list is None and (missing or self.damages):
+            if self._chunk_list is None and (self.damages or (missing and not self._repaired)):
                 self._check_gap(verified, missing, offset)
             layouts = self._check_layouts(verified, offset)
             events = self._decode_events(verified, offset)
         except Damage:
             parser.schemas, parser.channels = before
             raise
-        if self._chunk_list is None:
-            self._gap = False
+        self._gap = False
         self._newest = max(self._newest, newest)
         self._numbers = self._numbers or numbers
         for topic, messages in verified.items():
@@ -498,8 +485,6 @@ class Scan:
 
         As many cycles as samples must be missing, or up to twice as many: packets may be lost.
         """
-        if missing and self.stated.repaired and not self.damages:
-            return
         assert self.header is not None
         period = self.header.period
         if not self._next.keys().isdisjoint(found.keys() & set(NUMBERS)):

@@ -80,7 +80,8 @@ def repair(
     if not intact or (output is not None and not in_place):
         _rewrite(path, found, target)
         written = target
-    return Repair(path, written, intact, _losses(found), found.samples, _samples_lost(found))
+    losses = tuple(found.faults) if found.lost else ()
+    return Repair(path, written, intact, losses, found.samples, _samples_lost(found))
 
 
 def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
@@ -180,16 +181,11 @@ def _copy(
     writer.finish()
 
 
-def _losses(found: Scan) -> tuple[str, ...]:
-    """Return what is lost, and where; empty if all that was written is there."""
-    return tuple(found.faults) if found.lost else ()
-
-
 def _samples_lost(found: Scan) -> int | None:
     """Return the number of lost samples, None where unknown."""
-    if not _losses(found):
+    if not found.lost:
         return 0
-    stated = found.stated.samples
+    stated = None if found.outcome is None else found.outcome.samples
     return None if stated is None else max(0, stated - found.samples)
 
 
@@ -205,11 +201,10 @@ def _description(found: Scan) -> dict[str, str]:
 def _outcome(found: Scan, described: Mapping[str, str], chunks: Sequence[int]) -> dict[str, str]:
     """Return the ``hil.outcome`` record of a file with these chunks, unchanged without loss."""
     chunk_list = {header.CHUNKS: header.format_chunk_list(chunks)}
-    before, losses, lost = found.stated, _losses(found), _samples_lost(found)
-    if not losses:  # other chunks than before if another program cut them
+    unknown = ArchiveOutcome.of({"outcome": "unknown", "reason": "the outcome is lost"})
+    before, lost = found.outcome or unknown, _samples_lost(found)
+    if not found.lost:  # other chunks than before if another program cut them
         return {**before.record, **(chunk_list if header.CHUNKS in before.record else {})}
-    if not before.record:
-        before = ArchiveOutcome.of({"outcome": "unknown", "reason": "the outcome is lost"})
     earlier = before.samples_lost
     return {
         **before.record,
@@ -221,5 +216,5 @@ def _outcome(found: Scan, described: Mapping[str, str], chunks: Sequence[int]) -
         "repaired.samples_lost": (
             "unknown" if lost is None or earlier is None else str(lost + earlier)
         ),
-        "repaired.losses": json.dumps([*before.losses, *losses]),
+        "repaired.losses": json.dumps([*before.losses, *found.faults]),
     }

@@ -7,7 +7,6 @@ and its checksum decides.
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Iterator
 from typing import BinaryIO, Final
 
@@ -19,7 +18,6 @@ MOST_SEARCHED: Final = 1 << 26  # bytes, beside as many as whole records have
 
 _BLOCK = 1 << 14  # bytes read at once
 _ZEROS = bytes(_BLOCK)
-_DATA_LENGTH = struct.Struct("<45xQ")  # in the beginning of a chunk
 _BEGINS: Final = re.compile(
     # a chunk: length, times, size of the content, checksum, compression, length of the data
     rb"\x06.{4}\0{4}.{16}.{4}\0{4}.{4}\x04\0{3}zstd.{4}\0{4}"
@@ -29,7 +27,7 @@ _BEGINS: Final = re.compile(
     rb"|\x0c.{4}\0{4}(?:\x03\0{3}hil|\x0b\0{3}hil\.outcome)",
     re.DOTALL,
 )
-_LONGEST = 53  # bytes of such a beginning
+_LONGEST = 53  # bytes of such a beginning, that of a chunk
 
 
 def verified_metadata(record: Record) -> tuple[str, dict[str, str]]:
@@ -69,10 +67,8 @@ def find_records(stream: BinaryIO, start: int, size: int) -> Iterator[Head]:
             continue
         opcode, length = RECORD.unpack_from(match[0])
         head = Head(opcode, at, at + RECORD.size + length)
-        fits = head.end <= size
-        if opcode == container.CHUNK:
-            fits &= head.end == at + _LONGEST + _DATA_LENGTH.unpack(match[0])[0]
-        if fits:
+        data = int.from_bytes(match[0][-8:], "little")
+        if head.end <= size and (opcode != container.CHUNK or head.end == at + _LONGEST + data):
             yield head
             try:
                 verify(container.read_record(stream, head))
