@@ -206,8 +206,11 @@ def check_end(stream: BinaryIO, size: int, offset: int) -> None:
         raise Damage(offset, "(index and footer) is cut off, or fails its checksum")
 
 
-def read_summary(stream: BinaryIO, size: int, *kinds: int) -> list[Any]:
-    """Return the records of these kinds in the summary; none where it is missing or damaged."""
+def read_summary(stream: BinaryIO, size: int, *kinds: int, start: int | None = None) -> list[Any]:
+    """Return the records of these kinds in the summary; none where it is missing or damaged.
+
+    It begins at `start`, None for where the footer says: records in front of it may be missing.
+    """
     last = size - FOOTER_SIZE - len(MAGIC)
     if last < 0:
         return []
@@ -215,7 +218,7 @@ def read_summary(stream: BinaryIO, size: int, *kinds: int) -> list[Any]:
     footer = _footer(stream.read(size - last))
     if footer is None or footer.summary_crc == _NO_CRC:
         return []
-    start = footer.summary_start
+    start = footer.summary_start if start is None else start
     if not len(MAGIC) <= start <= last <= start + LARGEST_RECORD:
         return []
     stream.seek(start)

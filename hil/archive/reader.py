@@ -103,6 +103,7 @@ class Scan:
         self.shortfalls: list[str] = []
         self.lost = False
         self._stream = stream
+        self._data_end: int | None = None  # None where a length does not lead to it
         self._library = schema.LIBRARY  # that wrote the file
         self._fields, self._times, self._all_channels = fields, times, all_channels
         self._left_out: set[int] = set()
@@ -166,7 +167,8 @@ class Scan:
     @cached_property
     def definitions(self) -> list[Schema | Channel]:
         """Schemas and channels of the summary, for chunks that follow a lost one."""
-        return container.read_summary(self._stream, self.size, *_DEFINITIONS)
+        start = self._data_end
+        return container.read_summary(self._stream, self.size, *_DEFINITIONS, start=start)
 
     def _find_shortfalls(self) -> Iterator[str]:
         """Yield a sentence for what the file states to contain and does not."""
@@ -192,7 +194,8 @@ class Scan:
         stream, heads = self._stream, self.heads
         try:
             heads += container.heads(stream, self.size, _CONTENT)
-            container.check_end(stream, self.size, heads.pop().end)
+            self._data_end = heads.pop().end
+            container.check_end(stream, self.size, self._data_end)
             return 0
         except Damage as damage:
             lost = damage
