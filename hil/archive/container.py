@@ -83,14 +83,9 @@ class Record(NamedTuple):
     body: bytes
 
     @property
-    def size(self) -> int:
-        """Number of bytes with its head."""
-        return RECORD.size + len(self.body)
-
-    @property
     def end(self) -> int:
         """Where the next record begins."""
-        return self.offset + self.size
+        return self.offset + RECORD.size + len(self.body)
 
 
 class _Body(ReadDataStream):
@@ -256,12 +251,6 @@ def parse_attachment(record: Record) -> Attachment:
     if _CRC.unpack(record.body[-_CRC.size :]) != (crc32(record.body[: -_CRC.size]),):
         raise Damage(record.offset, f"(attachment {found.name!r}) fails its checksum")
     return found
-
-
-def parse_metadata(record: Record) -> tuple[str, dict[str, str]]:
-    """Return name and entries of a metadata record."""
-    found = parse(Metadata, record)
-    return found.name, found.metadata
 
 
 def parse_chunk(record: Record) -> Chunk:

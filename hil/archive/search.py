@@ -10,6 +10,8 @@ import re
 from collections.abc import Iterator
 from typing import BinaryIO, Final
 
+from mcap.records import Metadata
+
 from hil.archive import container
 from hil.archive.container import RECORD, Damage, Head, Record
 from hil.archive.header import METADATA, OUTCOME, checksum
@@ -32,10 +34,11 @@ _LONGEST = 53  # bytes of such a beginning, that of a chunk
 
 def verified_metadata(record: Record) -> tuple[str, dict[str, str]]:
     """Return name and entries, without the checksum that they must have if they are ours."""
-    name, entries = container.parse_metadata(record)
-    if name in (METADATA, OUTCOME) and entries.pop("checksum", None) != checksum(entries):
-        raise Damage(record.offset, f"(metadata {name!r}) fails its checksum")
-    return name, entries
+    found = container.parse(Metadata, record)
+    ours, entries = found.name in (METADATA, OUTCOME), found.metadata
+    if ours and entries.pop("checksum", None) != checksum(entries):
+        raise Damage(record.offset, f"(metadata {found.name!r}) fails its checksum")
+    return found.name, entries
 
 
 def verify(record: Record) -> None:

@@ -147,7 +147,8 @@ def body_of(record: Attachment | Chunk | Metadata) -> bytes:
 
 
 def entries_of(one: Record) -> tuple[str, dict[str, str]]:
-    return container.parse_metadata(container.Record(0, one.opcode, one.body))
+    found = container.parse(Metadata, container.Record(0, one.opcode, one.body))
+    return found.name, found.metadata
 
 
 def _change(records: list[Record], rng: random.Random) -> None:

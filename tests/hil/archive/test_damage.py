@@ -59,11 +59,11 @@ def earlier(data: bytes, path: Path) -> bytes:
     at = data.index(b"\x0b\x00\x00\x00hil.outcome") - container.RECORD.size
     _, end = container.record_bounds(data, at, 0)
     record = container.Record(at, container.METADATA, data[at + container.RECORD.size : end])
-    name, entries = container.parse_metadata(record)
+    entries = container.parse_item(record).metadata
     for key in (header.CHUNKS, header.DESCRIPTION, "checksum"):
         del entries[key]
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data[:at] + mcap_bytes.metadata(name, header.with_checksum(entries)))
+    path.write_bytes(data[:at] + mcap_bytes.metadata("hil.outcome", header.with_checksum(entries)))
     assert repair(path, in_place=True).losses == ()  # regenerates the index
     return path.read_bytes()
 
