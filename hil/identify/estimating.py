@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,6 @@ from identification.estimators.consistent import (
 )
 from identification.estimators.delay import rate_products, with_uncertain_delay
 from identification.estimators.instrumental import (
-    InstrumentalEstimate,
     estimate_instrumental,
     planned_motion,
     same_plan,
@@ -111,8 +110,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         task.advance(1, name)
         prior = cad_prior(cell)
         if name == "iv":
-            found = fit_instrumental(model, prepared, fitted)
-            result, warnings = _instrumental(model, fitted, found)
+            result, warnings = _instrumental(model, prepared, fitted)
         elif name in _LOSSES:
             result, warnings = _robust(model, fitted, name)
         else:
@@ -307,13 +305,6 @@ def _prior_contradictions(model: RobotModel, posterior: PosteriorEstimate) -> li
 # Instruments
 
 
-class InstrumentalFit(NamedTuple):
-    """Instrumental-variable estimates, pooled and per recording."""
-
-    pooled: InstrumentalEstimate
-    each: tuple[Estimate, ...]
-
-
 def smoothed_for_instruments(model: RobotModel, prepared: Prepared) -> tuple[Samples, ...]:
     """Return the fitted samples, smoothed with a bandwidth of at least `MIN_IV_BANDWIDTH`."""
     wide = prepared.settings.preprocessed(rigid_bandwidth=MIN_IV_BANDWIDTH)
@@ -326,40 +317,30 @@ def smoothed_for_instruments(model: RobotModel, prepared: Prepared) -> tuple[Sam
     )
 
 
-def fit_instrumental(
+def _instrumental(
     model: RobotModel, prepared: Prepared, fitted: Sequence[Samples]
-) -> InstrumentalFit | str:
-    """Fit with the commanded motion as instruments, or return the reason why that is impossible."""
+) -> tuple[RepeatedEstimate, list[str]]:
+    """Fit with the commanded motion as instruments."""
     factors = []
     plans: list[_Plan] = []
     try:
         for samples, source in zip(fitted, prepared.sources.training, strict=True):
             commanded = source.recording.commanded_position
             if commanded is None:
-                return "the recordings hold no commanded positions"
+                raise IdentificationError("the recordings hold no commanded positions")
             plan = samples.motion.time - samples.origin, commanded
             lag = next((known for one, known in plans if same_plan(one, plan)), None)
             planned = planned_motion(samples, commanded, lag=lag)
             if lag is None:
                 plans.append((plan, planned.lag))
             factors.append(instrument_factor(model, samples, planned.motion, planned.usable))
-        total = sum(factors[1:], factors[0])
-        pooled = estimate_instrumental(model, total)
+        pooled = estimate_instrumental(model, sum(factors[1:], factors[0]))
         each = tuple(estimate_instrumental(model, factor).estimate for factor in factors)
     except IdentificationError as error:
-        return str(error)
-    return InstrumentalFit(pooled, each)
-
-
-def _instrumental(
-    model: RobotModel, fitted: Sequence[Samples], found: InstrumentalFit | str
-) -> tuple[RepeatedEstimate, list[str]]:
-    if isinstance(found, str):
-        problem = f"there are no instruments: {found}"
+        problem = f"there are no instruments: {error}"
         remedy = "record the commanded positions as well, or use --estimator wls"
-        raise InputError(None, problem, field="--estimator iv", remedy=remedy)
-    result = RepeatedEstimate.of(
-        model, found.pooled.estimate, found.each, total_factor(model, fitted)
-    )
-    weak = found.pooled.weak
-    return result, [f"the instruments are too weak for {joined(weak)}"] if weak else []
+        raise InputError(None, problem, field="--estimator iv", remedy=remedy) from error
+    result = RepeatedEstimate.of(model, pooled.estimate, each, total_factor(model, fitted))
+    return result, [
+        f"the instruments are too weak for {joined(pooled.weak)}"
+    ] if pooled.weak else []

@@ -268,12 +268,6 @@ def frames(chain: Chain, q: Array) -> Frames:
     return Frames(rotation, translation)
 
 
-def joint_poses(chain: Chain, q: Array) -> tuple[Array, Array]:
-    """Return base and joint frames at postures (m, n): (1 + n, m, 3, 3), (1 + n, m, 3) [m]."""
-    rotation, translation = frames(chain, q)
-    return rotation.transpose(0, 3, 1, 2), translation.transpose(0, 2, 1)
-
-
 def placed(bodies: Sequence[Body], at: Frames) -> Bodies:
     """Return the positions of the hulls of bodies, which are sorted by joint."""
     centre, axis = np.empty((2, 3, len(bodies), at.translation.shape[2]))

@@ -101,18 +101,6 @@ def load_truth() -> Ns16Truth:
     )
 
 
-def standard_parameters() -> dict[str, float]:
-    """Return every standard parameter by name: m1, mc1x, ..., I1xx, ..., I6zz, then I1m ... I6m."""
-    truth = load_truth()
-    named: dict[str, float] = {}
-    for i, link in enumerate(truth.links, start=1):
-        named[f"m{i}"] = link.mass
-        named |= {f"mc{i}{a}": v for a, v in zip("xyz", link.first_moment, strict=True)}
-        named |= {f"I{i}{k}": v for k, v in zip(TENSOR_KEYS, link.tensor, strict=True)}
-    named |= {f"I{i}m": value for i, value in enumerate(truth.rotor_inertia, start=1)}
-    return named
-
-
 Array = NDArray[np.float64]
 Terms = dict[str, float]
 
@@ -197,12 +185,6 @@ def table2() -> tuple[Table2Row, ...]:
                 )
             )
     return tuple(rows)
-
-
-def base_from_standard(standard: Mapping[str, float]) -> Array:
-    """Return the 40 essential parameters of Table 2 (rows 1 ... 40) from standard parameters."""
-    rows = table2()[:N_ESSENTIAL]
-    return np.array([sum(f * standard[name] for name, f in row.terms.items()) for row in rows])
 
 
 FOLDER = Path(__file__).parent

@@ -21,13 +21,8 @@ from hil.progress import Silent
 from hil.recordings import recording_of
 from hil.simulation import planted_truth, planted_values, simulated_controller, simulated_drive
 from identification.model.friction import COULOMB
-from sim_fixtures.ns16 import (
-    CELL_PATH,
-    base_from_standard,
-    load_truth,
-    standard_parameters,
-    urdf_text,
-)
+from sim_fixtures.ns16 import CELL_PATH, load_truth, urdf_text
+from tests.sim_fixtures.bench import base_from_standard, standard_parameters
 
 slow = pytest.mark.slow
 

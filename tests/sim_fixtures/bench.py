@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import pi, radians
 from typing import Any
@@ -145,3 +146,21 @@ def play(
     targets = angles @ turn.T + drive.calibration
     deltas = (SMOOTH_QD * drive.joint_sign) @ turn.T * PERIOD
     return controller, MinimalPC(controller, targets, deltas).run()
+
+
+def standard_parameters() -> dict[str, float]:
+    """Return every standard parameter by name: m1, mc1x, ..., I1xx, ..., I6zz, then I1m ... I6m."""
+    truth = ns16.load_truth()
+    named: dict[str, float] = {}
+    for i, link in enumerate(truth.links, start=1):
+        named[f"m{i}"] = link.mass
+        named |= {f"mc{i}{a}": v for a, v in zip("xyz", link.first_moment, strict=True)}
+        named |= {f"I{i}{k}": v for k, v in zip(ns16.TENSOR_KEYS, link.tensor, strict=True)}
+    named |= {f"I{i}m": value for i, value in enumerate(truth.rotor_inertia, start=1)}
+    return named
+
+
+def base_from_standard(standard: Mapping[str, float]) -> Array:
+    """Return the 40 essential parameters of Table 2 (rows 1 ... 40) from standard parameters."""
+    rows = ns16.TABLE2[: ns16.N_ESSENTIAL]
+    return np.array([sum(f * standard[name] for name, f in row.terms.items()) for row in rows])

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_fixtures import ControllerSettings, ns16
-from tests.sim_fixtures.bench import CELL
+from tests.sim_fixtures.bench import CELL, base_from_standard, standard_parameters
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ def dh(controller_deg: list[float]) -> Array:
 
 
 def test_pinocchio_reads_the_planted_standard_parameters(model: pin.Model) -> None:
-    planted = ns16.standard_parameters()
+    planted = standard_parameters()
     for i in range(1, 7):
         keys = [f"m{i}", *(f"mc{i}{a}" for a in "xyz")]
         keys += [f"I{i}{k}" for k in ("xx", "xy", "yy", "xz", "yz", "zz")]
@@ -96,7 +96,7 @@ def base_regressor(model: pin.Model, q: Array, qd: Array, qdd: Array) -> Array:
 
 
 def test_the_planted_base_vector_is_column_c_of_all_forty_rows() -> None:
-    base = ns16.base_from_standard(ns16.standard_parameters())
+    base = base_from_standard(standard_parameters())
     printed = np.array([row.pi_c for row in ns16.TABLE2[: ns16.N_ESSENTIAL]])
     np.testing.assert_allclose(base, printed, rtol=0.0, atol=1e-6)
 
@@ -113,7 +113,7 @@ def test_the_friction_is_column_c_without_the_interleaving() -> None:
 
 def test_base_torques_are_those_of_rigid_bodies_and_rotors(model: pin.Model) -> None:
     rng = np.random.default_rng(2)
-    base = ns16.base_from_standard(ns16.standard_parameters())
+    base = base_from_standard(standard_parameters())
     rotors = np.array(ns16.load_truth().rotor_inertia)
     data = model.createData()
     for _ in range(50):
