@@ -199,11 +199,11 @@ class ExcitationResult(Frozen):
 
     method: str | None = None  #: Of the design
     duration: float
-    n_via: int | None
-    fly: float | None
+    n_via: int | None = None
+    fly: float | None = None
     n_sines: int | None = None  #: Sines per joint of a sum of sines
     coupling_index_max: float
-    planned: Criteria | None
+    planned: Criteria | None = None
     executed: Criteria
 
 

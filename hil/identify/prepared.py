@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
@@ -420,30 +421,21 @@ def _require_torques(sources: Sources) -> None:
         )
 
 
-_SLOW: Final = 2.0  # times the Stribeck speed, where its term has fallen to 2 %
-_FEWEST_SLOW: Final = 0.01  # share of the fitted rows
-
-
 def _require_slow_rows(stated: RobotModel, fitted: Sequence[Samples]) -> None:
     """Raise InputError if the fitted rows are too fast for a stated Stribeck term.
 
-    Its coefficient would be arbitrary, and the prediction of slower rows with it.
+    Its coefficient would be arbitrary. At twice its speed the term has fallen to 2 %.
     """
     for joint, law in enumerate(stated.friction.laws):
-        if law.stribeck is None:
-            continue
         speeds = [np.abs(one.motion.velocity[one.usable[:, joint], joint]) for one in fitted]
-        slow = np.concatenate(speeds) < _SLOW * law.stribeck
-        if slow.size and slow.mean() < _FEWEST_SLOW:
-            raise InputError(
-                None,
+        slow = np.concatenate(speeds) < 2.0 * (law.stribeck or math.inf)
+        if slow.size and slow.mean() < 0.01:
+            problem = (
                 f"{slow.mean():.2%} of the fitted rows of {stated.joint_names[joint]} are slower "
-                f"than {_SLOW:g} times the Stribeck speed of {law.stribeck:g} rad/s, which do not "
-                "determine that term",
-                field="robot.friction.stribeck",
-                remedy="state a larger speed, record slow motion, or leave the term out "
-                "(--friction coulomb,viscous)",
+                f"than twice {law.stribeck:g} rad/s, too few to determine the Stribeck term"
             )
+            remedy = "state a larger speed, or leave the term out: --friction coulomb,viscous"
+            raise InputError(None, problem, field="robot.friction.stribeck", remedy=remedy)
 
 
 def executed_rows(source: Source, samples: Samples) -> slice:

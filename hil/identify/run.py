@@ -458,12 +458,7 @@ def _excitation(prepared: Prepared) -> tuple[results.ExcitationResult, Array]:
     if planned is None:
         duration = lengths[0] * _period(prepared.training[0])
         return results.ExcitationResult(
-            duration=duration,
-            n_via=None,
-            fly=None,
-            coupling_index_max=most,
-            planned=None,
-            executed=executed,
+            duration=duration, coupling_index_max=most, executed=executed
         ), gram
     trajectory, via_points = planned.trajectory, planned.via_points
     n_via = None

@@ -359,7 +359,7 @@ class TestEstimators:
 def test_a_stribeck_speed_below_the_recorded_ones_is_refused(campaign):
     """Its coefficient would be arbitrary: 58 % of error on held-out motion, or infinite torques."""
     options = Options(friction={"stribeck": 1e-4}, estimator="wls", standstill="rests")
-    with pytest.raises(InputError, match=r"stribeck.*slower than 2 times .* larger speed"):
+    with pytest.raises(InputError, match=r"stribeck.*slower than twice .* larger speed"):
         prepare_sources(gather_sources(paths(campaign), 0.7), options, Silent())
 
 
