@@ -20,11 +20,11 @@ from typer.testing import CliRunner
 from benchmarks import archive_files
 from hil.archive import ArchiveWriter, Samples, write_samples
 from hil.archive.repair import repair, repaired_name
-from hil.batch import discovery, factors
+from hil.batch import discovery
+from hil.batch import run as batch_run
 from hil.batch.cache import CacheLocation
 from hil.batch.discovery import discover, open_ref
-from hil.batch.factors import cached_bundle, reduce_bundle
-from hil.batch.run import BatchEstimator, reidentify
+from hil.batch.run import BatchEstimator, cached_bundle, reduce_bundle, reidentify
 from hil.batch.workers import Workers
 from hil.cell import Cell
 from hil.cli import app
@@ -150,7 +150,7 @@ class TestNumbers:
             return found._replace(settings=replace(found.settings, shrinkage=Shrinkage(0.1)))
 
         monkeypatch.setattr("hil.identify.prepared.decide", shrunk)
-        monkeypatch.setattr(factors, "decide", shrunk)
+        monkeypatch.setattr(batch_run, "decide", shrunk)
         options = replace(FIXED, estimator="auto")
         one = estimate_with(prepare(campaign, options), options, Silent()).result
         found = batch(campaign.folder.root, options=options)
@@ -202,7 +202,7 @@ class TestNumbers:
             read.append([source.name for source in sources.training])
             return decide(sources, options, reporter)
 
-        monkeypatch.setattr(factors, "decide", spied)
+        monkeypatch.setattr(batch_run, "decide", spied)
         found = batch(tmp_path, friction="auto")
         assert read == [["excitation_001_a1.mcap"]]
         assert [Path(one.campaign).name for one in found.campaigns] == ["b", "c"]
@@ -211,7 +211,7 @@ class TestNumbers:
 
     @pytest.mark.slow
     def test_do_not_depend_on_workers_order_or_cache(self, folder, tmp_path, monkeypatch):
-        monkeypatch.setattr(factors, "BUNDLE", 1)
+        monkeypatch.setattr(batch_run, "BUNDLE", 1)
         with Workers(2) as workers:
             alone = batch(folder, workers=workers)
         files = sorted((folder / "archives").glob("*.mcap"), reverse=True)
@@ -498,13 +498,13 @@ class TestGroups:
             victim, tmp_path / victim.name, "delay_cycles = 0.2", "delay_cycles = 4.2"
         )
         other.replace(victim)
-        used, reduce_one = {}, factors.archive_factor
+        used, reduce_one = {}, batch_run.archive_factor
 
         def spied(ref, settings):
             used[ref.name] = settings.preprocessing.torque_delay
             return reduce_one(ref, settings)
 
-        monkeypatch.setattr(factors, "archive_factor", spied)
+        monkeypatch.setattr(batch_run, "archive_factor", spied)
         result = batch(loose)
         assert not result.broken
         assert [one.repetitions for one in result.campaigns] == [2, 1]

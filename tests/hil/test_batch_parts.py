@@ -29,15 +29,16 @@ from hil.batch.cache import (
     encoded,
 )
 from hil.batch.discovery import ArchiveRef, arm_digest
-from hil.batch.factors import (
+from hil.batch.run import (
     BUNDLE,
+    Arm,
+    BatchResult,
     Bundle,
     cached_bundle,
     settings_digest,
     split_bundles,
     sum_key,
 )
-from hil.batch.run import Arm, BatchResult
 from hil.batch.table import COLUMNS, write_tables
 from hil.batch.workers import Unused, Workers
 from hil.cell import Cell
@@ -148,7 +149,7 @@ class TestCache:
 
 class TestDigests:
     @pytest.mark.parametrize(
-        "name", ["batch/discovery.py", "batch/factors.py", "signals/samples.py", "record.py"]
+        "name", ["batch/discovery.py", "batch/run.py", "signals/samples.py", "record.py"]
     )
     def test_that_of_the_programs_depends_on_each(self, name, monkeypatch):
         here, read = code_digest(), Path.read_bytes
