@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from identification.excitation import KINDS
 from identification.excitation.constraints import CurrentModel, check_motion, midpoints
-from identification.excitation.criteria import coupling_index_max
+from identification.excitation.criteria import columns, coupling_index_max
 from identification.excitation.errors import JournalError
 from identification.excitation.genomes import SineGenome
 from identification.excitation.searches import journal
@@ -103,7 +103,7 @@ def asked(method, **others):
 
 def fitness_of(settings, scores, scale=None):
     """Return the fitness of the three methods with a single objective."""
-    size, coupled = scores.measure("log10_det"), scores.measure("coupling_index")
+    size, coupled = columns(scores.measures, ("log10_det", "coupling_index")).T
     if settings.method == "a":
         return size
     first, second = settings.weights
@@ -133,7 +133,7 @@ class TestChoice:
         monkeypatch.setitem(METHODS, "decoupled", row)
         design = search(population, asked("decoupled"))
         everything = population.everything
-        coupled = everything.measure("coupling_index")[everything.usable]
+        coupled = columns(everything.measures, ("coupling_index",))[everything.usable, 0]
         assert design.front.measure("coupling_index")[design.chosen] == coupled.min()
         assert np.all(np.diff(design.front.measure("log10_det")) < 0.0)
 
@@ -421,7 +421,7 @@ class Bowl:
 
 
 def size_of(scores):
-    return scores.measure("log10_det")
+    return columns(scores.measures, ("log10_det",))[:, 0]
 
 
 def polished(population, genes, fitness=size_of, **others):

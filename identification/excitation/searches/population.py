@@ -43,10 +43,6 @@ class Scores(NamedTuple):
     #: unplannable
     excess: Array
 
-    def measure(self, name: str) -> Array:
-        """Return one of `CRITERIA` (m,)."""
-        return columns(self.measures, (name,))[:, 0]
-
     @property
     def feasible(self) -> NDArray[np.bool_]:
         """Which motions satisfy all constraints, (m,)."""
