@@ -253,6 +253,7 @@ _AFTERWARDS: Final = 400  # cycles of the controller without a PC after a run, a
 _HURRIES: Final = 500
 """Cycles after the last scripted one in which runs are repeated at once."""
 _GIVES_UP: Final = 3000  # cycles without an init packet after which the operator ends a run
+_LONGEST_WAIT: Final = 100_000  # cycles with the drive off, where the PC's clock was set back
 _JOG: Final = "jog the arm"  # remedy in the error of a run without a free path
 
 
@@ -385,6 +386,8 @@ class World:
             raise EndlessError
         if cycle - self._begun > _GIVES_UP and self._session.state is State.SYNC:
             self._stop.requested = True  # the controller is within a session
+        if cycle - self._begun > _LONGEST_WAIT and self._session.state is State.DRIVE_OFF:
+            self._stop.requested = True
         while self._due and self._due[0].at <= cycle:
             event = self._due.pop(0)
             self._struck.append(event.line)
