@@ -137,6 +137,11 @@ class Refused:
     error: RefusalError
     flight_recorder: NDArray[np.void] = field(repr=False)
 
+    @property
+    def cycle(self) -> int:
+        """The controller's cycle in which it was due."""
+        return self.error.cycle
+
 
 @dataclass(frozen=True)
 class LinkLost:

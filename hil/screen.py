@@ -408,6 +408,9 @@ class Screen:
             if motion is not None:
                 override = min(override, motion.override)
             self._request = after(self._request, key, override)
+        if _ACTIONS.get(key) not in ("hold", "resume"):
+            # An override chosen after the dry run is for what follows.
+            self._slow_phase &= self._status is not None and self._status.phase == "dry run"
 
     @property
     def age(self) -> float:
@@ -455,7 +458,7 @@ class Screen:
         return page
 
     def _leave_dry_run(self, status: RunStatus) -> None:
-        """Reset the override after the dry run; a hold remains."""
+        """Reset an override that was set in the dry run; a hold remains."""
         if status.phase == "dry run":
             self._slow_phase = True
         elif self._slow_phase and status.phase != "move":

@@ -65,7 +65,7 @@ _TEXTS: Final[Mapping[type, tuple[Level, str]]] = {
         Level.ERROR,
         "events that were overwritten before they could be archived: {0.count}",
     ),
-    CommandRefused: (Level.WARN, "no {0.command}: {0.reason}"),
+    CommandRefused: (Level.WARN, "{0.command} refused: {0.reason}"),
 }
 
 

@@ -228,7 +228,7 @@ class Connection:
     Attributes:
         unusable: why the arm cannot be moved, None if it can.
         differences: figures in which it differs from the cell.
-        refused: the last refusal of the session.
+        refused: the last refusal since a motion was requested.
         report: receives a line for each refusal at once.
         cell: of the link, for these lines.
     """
@@ -341,7 +341,7 @@ class MotionLink(ABC):
                 is to be slowed and supports no override.
             ArchiveWriteError: the archive cannot be written; the motion was stopped.
         """
-        steering = Steering(source, watch, override, self._counts)
+        steering, self.connection.refused = Steering(source, watch, override, self._counts), None
         steering.begin(stop, self._poll)  # no archive is open during a hold
         self._poll()
         with self.open_archive(spec, own_motion=False):

@@ -171,6 +171,7 @@ def test_a_refusal_comes_with_its_flight_recorder(
     (refusal,) = (event for event in archive.events if event.name == "Refused")
     assert refusal.data["check"] == "following error"
     assert refusal.data["joint"] == 1
+    assert refusal.time == pytest.approx(recorder["cycle"][-1] * cell.period)
     assert refusal.data["value"] > refusal.data["bound"]
     assert str(failed.value).endswith(f"; {failed.value.refused.error.remedy}.")
     assert recorder["cycle"][-1] in archive.columns["cycle"]

@@ -173,17 +173,24 @@ def test_sequences_and_pasted_text_are_no_keys(sent: str, keys: str) -> None:
 
 
 def test_the_override_of_a_dry_run_ends_with_it() -> None:
+    """One that is set in the move after it stays: the operator lowers the speed of what follows."""
     screen = Screen(NAMES, Stop(), quiet=True)
-    for phase in ("dry run", "move"):
-        screen.show(RunStatus(phase, 1, 1, 1.0))
-        screen.press("1")
-        screen.press("h")
+    screen.show(RunStatus("dry run", 1, 1, 1.0))
+    screen.press("1")
+    screen.press("h")
+    screen.show(RunStatus("move", 1, 1, 1.0))
+    screen.press("h")
     assert screen.request() == OperatorRequest(0.1, held=True)
     screen.show(RunStatus("warm-up", 1, 1, 1.0))
     assert screen.request() == OperatorRequest(1.0, held=True)
     screen.press("5")
     screen.show(RunStatus("repetition", 1, 4, 1.0))
     assert screen.request().override == 0.5
+    for phase in ("dry run", "move", "repetition"):
+        screen.show(RunStatus(phase, 1, 4, 1.0))
+        if phase == "move":
+            screen.press("2")
+    assert screen.request().override == 0.2
     # Resumed at 20 % by the run, one key lowers it to 10 %, not to 90 %.
     screen = Screen(NAMES, Stop(), quiet=True)
     screen.show(status(override=0.2))

@@ -10,7 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers import State
+from drivers.errors import SourceFailed
+from drivers.events import Refused
 from drivers.exchange.loop import exchange
+from drivers.record import cycle_dtype
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveOutcome, ArchiveSpec, open_archive
 from hil.campaign import VirtualLink
@@ -62,6 +65,17 @@ class TestControllerWithoutInitPacket:
         with pytest.raises(ControllerFault, match="ended the session within 0") as raised:
             link.connect(Stop())
         assert "60 s" not in str(raised.value)
+
+
+def test_a_refusal_belongs_to_its_motion(
+    cell: Cell, controller: SimulatedController, tmp_path: Path
+) -> None:
+    """Else a motion that fails otherwise would name the remedy of an earlier one."""
+    link = VirtualLink.over(SimulatedTransport(controller), cell)
+    motion, spec = short_way(cell, link.connect(Stop()), tmp_path)
+    link.connection.refused = Refused(SourceFailed("earlier", 1), np.zeros(0, cycle_dtype(2)))
+    assert link.run(motion, spec, Stop()).outcome == "completed"
+    assert link.connection.refused is None
 
 
 def test_a_motion_does_not_wait_for_a_drive_that_went_off(
