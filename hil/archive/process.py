@@ -298,7 +298,7 @@ class ArchiveProcess:
 
     def _fill_buffer(self) -> None:
         """Buffer what has come while no archive is open."""
-        records, events = self._ring.drain(), self._events.drain()
+        events, records = self._events.drain(), self._ring.drain()  # rows up to the newest event
         if self._live is not None:
             self._live.publish(records, events)
         self._buffer.add(records, events)
