@@ -39,8 +39,8 @@ def require(
 
 def require_finite(values: Array, where: Joints, cycle: int) -> None:
     """Raise for the first joint of `where` (n,) whose value (n,) is not finite."""
-    finite = np.where(np.isfinite(values), 0.0, values)
-    require(where, np.abs(finite), np.zeros_like(values), Check.FINITE, cycle)
+    offending = np.where(np.isfinite(values), 0.0, values)
+    require(where, np.abs(offending), np.zeros_like(values), Check.FINITE, cycle)
 
 
 def raise_first(
