@@ -35,7 +35,7 @@ def open_controller_link(
     """
     given = [(option, text) for option, text in addresses.items() if text is not None]
     if len(given) != 1:
-        remedy = "give --udp or --can, not both"
+        remedy = "give one of --udp, --can and --link"
         raise InputError(None, "one link is needed", remedy=remedy)
     option, text = given[0]
     name, address = option.removeprefix("--"), text

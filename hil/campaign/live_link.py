@@ -665,8 +665,8 @@ class LiveLink(MotionLink):
 
     def _waiting(self) -> str:
         """Return what was received from a controller without a session."""
-        table, problem = self.cell.controller, self.view.not_understood
-        who = table.host if table.transport == "udp" else "the controller"
+        spec, problem = self.cell.link_spec, self.view.not_understood
+        who = "the controller" if spec is None else spec.description
         what = f"{who}: {problem}" if problem else f"no packet from {who}"
         return f"{what} ({self.view.status.foreign} packets from other addresses)"
 

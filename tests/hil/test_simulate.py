@@ -273,7 +273,7 @@ def invoke(*options: str) -> Any:
         (["--can", "virtual:can0:foo"], "fd or :classic"),
         (["--udp", "127.0.0.1:2001", "--fault", "lose@1x100000000000000000000"], "KIND@CYCLE"),
         ([], "give --udp or --can"),
-        (["--udp", "127.0.0.1:2001", "--can", "virtual:0"], "not both"),
+        (["--udp", "127.0.0.1:2001", "--can", "virtual:0"], "give one of"),
         (["--udp", "127.0.0.1"], "HOST:PORT"),
         (["--udp", "no.such.host.invalid:1"], "no such IPv4 host"),
         (["--can", "socketcan"], "INTERFACE:CHANNEL"),
