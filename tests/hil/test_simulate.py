@@ -272,7 +272,7 @@ def invoke(*options: str) -> Any:
         (["--can", "virtual:0:fd", "--cycle", "2", "--mode", "8"], "mode 8 does not fit"),
         (["--can", "virtual:can0:foo"], "fd or :classic"),
         (["--udp", "127.0.0.1:2001", "--fault", "lose@1x100000000000000000000"], "KIND@CYCLE"),
-        ([], "give --udp or --can"),
+        ([], "give one of --udp, --can"),
         (["--udp", "127.0.0.1:2001", "--can", "virtual:0"], "give one of"),
         (["--udp", "127.0.0.1"], "HOST:PORT"),
         (["--udp", "no.such.host.invalid:1"], "no such IPv4 host"),
