@@ -249,6 +249,8 @@ class WorkerProcess:
 
 _lock = threading.Lock()
 _warm: list[WorkerProcess] = []
+# A fork that shared the child with its parent could receive the parent's results.
+os.register_at_fork(after_in_child=_warm.clear)
 
 
 def in_child(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:

@@ -183,6 +183,21 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert gone(int(done.stdout), 2.0), done.stderr
 
 
+def test_a_forked_process_plans_in_a_child_of_its_own():
+    """Else it could receive the motions of its parent, and run them."""
+    script = """
+import os
+from planner.worker import in_child
+ours = in_child(os.getpid)
+if os.fork() == 0:
+    os._exit(7 if in_child(os.getpid) not in (ours, os.getpid()) else 1)
+assert os.waitstatus_to_exitcode(os.wait()[1]) == 7
+assert in_child(os.getpid) == ours, "the parent keeps its child"
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_a_crash_costs_a_search_one_individual(aborting_solver):
     points = np.array([random_points(seed) for seed in range(80)])
     speed = np.ones((80, 6))
