@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.exchange.event_log import NO_ARCHIVE
 from drivers.states import State
 from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
 from hil.campaign import Campaign
@@ -32,6 +33,7 @@ NAMED: Final = {
     "exchange": tuple(f"the exchange process {what}" for what in GONE),
     "archive": (
         *(f"the archive process {what}" for what in (*GONE, "sent no heartbeat")),
+        NO_ARCHIVE,  # of the exchange, where the supervisor is late to notice
         "cannot be written further",
     ),
     "controller": ("controller", "link", "silent", "nothing received", "no packet", "packet"),

@@ -88,6 +88,7 @@ def test_only_the_newest_archive_may_be_truncated(
         ("exchange", "repetition 1 was lost: nothing was received from the controller", False),
         ("exchange", "the controller did not answer the exchange process", False),
         ("archive", "the archive process ended (exit status -9); nothing was sent", True),
+        ("archive", "validation 1 was stopped: the archive process sends no heartbeat", True),
         ("archive", "the disk of the archive process is full", False),
         ("controller", "move 1 was lost: nothing was received from the controller", True),
         ("controller", "the exchange process ended", False),
