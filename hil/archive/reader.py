@@ -47,7 +47,7 @@ ALWAYS: Final = -(1 << 63), 1 << 63  # ns, before and after every stamp
 _BATCH: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
 _SEQUENCES = 1 << 32  # message numbers are modulo this
 _MOST_DAMAGES = 1000  # of one file; what follows is not read
-_LOST_PACKETS = 10  # that a gap may have beside one for each missing sample
+_LOST_PACKETS = 100  # that a gap may have beside one for each missing sample
 _MOST_SHOWN = 5  # faults in one message
 _LEAST = 8  # bytes of a file for one sample, of an arm at rest
 _COLUMN_OF: Final = {"effort": "torque"}  # names of message fields that differ from the column's
@@ -345,7 +345,7 @@ class Scan:
     def _flush(self) -> None:
         """Decode the buffered chunks: all at once, or one by one where that fails."""
         pending, self._pending = self._pending, []
-        if len(pending) > 1:
+        if len(pending) > 1 and pending[-1][0] <= min(self.damages, default=self.size):
             try:
                 self._decode(self._buffer[: pending[-1][1].stop], pending[0][0], several=True)
                 self.chunks += len(pending)
@@ -384,7 +384,8 @@ class Scan:
             verified = found if self._all_channels else {topic: found[topic] for topic in wanted}
             missing = self._missing_messages(verified, offset)
             newest = self._check_times(verified, offset)
-            if self._chunk_list is None and (self.damages or (missing and not self._repaired)):
+            damaged = min(self.damages, default=offset) < offset
+            if self._chunk_list is None and (damaged or (missing and not self._repaired)):
                 self._check_gap(verified, missing, offset)
             layouts = self._check_layouts(verified, offset)
             events = self._decode_events(verified, offset)
@@ -496,8 +497,7 @@ class Scan:
             elapsed = int(found[schema.CYCLE].stamps[0]) - self._newest
             cycles, samples = round(elapsed * 1e-9 / period) - 1, missing.get(schema.CYCLE, 0)
             if not samples <= cycles <= 2 * samples + _LOST_PACKETS:
-                problem = f"(chunk) follows a gap of {samples} samples and {cycles} cycles"
-                raise Damage(offset, problem)
+                raise Damage(offset, f"(chunk) follows a gap of {samples} samples, {cycles} cycles")
         if missing:
             self._note_gap(offset)
 

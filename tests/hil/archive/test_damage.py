@@ -31,10 +31,13 @@ from tests.hil.archive.conftest import FIRST, NAME, Written, write
 from tests.hil.mcap_bytes import Content, chunks
 
 
-def recorded(path: Path, first: int = FIRST) -> bytes:
-    """Return an archive with the same header as the small one and other cycles and positions."""
+def recorded(path: Path, first: int = FIRST, missed: int = 0) -> bytes:
+    """Return an archive with the same header as the small one and other cycles and positions.
+
+    Packets are missed between its chunks.
+    """
     rows = np.zeros(43, cycle_dtype(2))
-    rows["cycle"] = first + np.arange(43)
+    rows["cycle"] = first + np.arange(43) + missed * (np.arange(43) // 10)
     rows["number"] = np.arange(43)
     rows["position"] = np.random.default_rng(2).normal(size=(43, 2))
     return write(path, rows)
@@ -441,6 +444,16 @@ class TestNothingLost:
         assert open_archive(path).complete
         assert not check_archive(path).conforms
         assert_valid(repair(path), written)
+
+    @pytest.mark.parametrize("missed", [0, 20, 50])
+    def test_chunks_behind_missed_packets_are_whole(self, path, missed):
+        """Seed 200168 of the simulation: the end is torn, and the PC had stalled before it."""
+        data = recorded(path, missed=missed)
+        torn = data[: chunks(data)[4][0] + 60]
+        path.write_bytes(torn)
+        assert open_archive(path).n_samples == 40
+        path.write_bytes(flipped(torn, chunks(data)[1][1] - 9))
+        assert open_archive(path).n_samples == 30
 
     def test_archive_repaired_by_an_earlier_version_is_read(self, written, path):
         """It continued behind damage: the numbers of its messages show the gap."""
