@@ -189,7 +189,8 @@ class Reception:
                 return "nothing"
             self.synced = True
             return "echo"
-        if self.at_init and self.cold and number in (11, 12) and not on:
+        # A silence, or a clock set forward, ends the start as well.
+        if self.at_init and self.cold and not self.silent and number in (11, 12) and not on:
             return "echo" if len(packet) < 1200 else "nothing"
         ahead = (number - self.last) % LAST
         if self.silent and not on and number < 10 and ahead != 1:
