@@ -74,7 +74,9 @@ def _judged(talk: Talk, conduct: Conduct) -> Iterator[int]:
         record, one = talk.records[row], talk.life.exchanged[index]
         # Superseded packets count as missing. The session counts those with a corrupted number
         # twice, as stale and as missing, unless they are no packets at all.
-        gap, between = int(record["gap"]), talk.life.exchanged[last + 1 : index]
+        newest, *between = talk.life.exchanged[last:index]
+        between = [other for other in between if other.packet != newest.packet]  # no duplicates
+        gap = int(record["gap"])
         missed = max(gap, len(between))
         last = index
         stale = [other for other in between if other.given and _well_formed(other.packet)]
