@@ -448,7 +448,7 @@ class TestHold:
         for _ in range(2):
             rig.session.override(0.5)
             rig.session.hold()
-        rig.cycle(20)
+            rig.cycle(10)
         for _ in range(2):
             rig.session.resume()
         cycle = rig.session.cycle
