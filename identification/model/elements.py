@@ -316,13 +316,6 @@ class JointElements:
         """Given values of the e parameters, else zero."""
         return np.array([one.value or 0.0 for one in self._coefficients], dtype=np.float64)
 
-    def torque(self, values: Array, q: Array) -> Array:
-        """Return the torque (m, n) [N·m] of e parameter values, without the known part."""
-        torque = np.zeros(q.shape)
-        for one in self.identified:
-            torque[:, one.joint] += one.columns(q) @ values[one.part]
-        return torque
-
     def known(self, q: Array) -> Array:
         """Return the known part of the torque (m, n) [N·m] at positions (m, n)."""
         torque = np.zeros(q.shape)

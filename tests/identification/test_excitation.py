@@ -247,6 +247,7 @@ class TestExcitation:
             {"seed": "first"},
             {"rejected": {"limits": "many"}},
             {"via_points": None},
+            {"via_points": [[0.0]]},
         ],
     )
     def test_invalid_data_are_refused(self, damage):

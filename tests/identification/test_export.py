@@ -128,6 +128,7 @@ FAULTS = {
     robot(LINKS + joint("revolute", "c", LIMIT)): "child link 'c'",
     robot(LINKS + '<joint name="j" type="fixed"><parent link="a"/></joint>'): "no <child",
     robot(LINKS + joint("fixed") + joint("fixed", name="k")): "child of 2 joints",
+    robot(LINKS + joint("fixed") + joint("fixed", "a", name="k")): "a closed chain",
     **{
         arm('xyz="0.2 0 0"', f'xyz="0.2{blank}0 0"'): (
             "tab or line end in an attribute of the <origin>"

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import identification
 from identification.errors import ModelError, ShapeError
 from identification.estimators.consistent import consistent_estimate
 from identification.export.urdf import write_urdf
@@ -465,6 +466,21 @@ def torque_of(law, coefficients, v):
         "fo": 1.0,
     }
     return float(sum(value * terms[symbol] for symbol, value in coefficients.items()))
+
+
+def test_a_law_states_its_terms():
+    assert FrictionLaw(tanh=0.05).summary()[1] == "tanh(v / 0.05 rad/s)"
+    assert FrictionLaw(presliding=1e-3).summary()[1] == "presliding over 0.001 rad"
+    assert FrictionLaw(coulomb=False, viscous=False, third=None).summary() == (
+        "no friction",
+        "sgn(v)",
+    )
+
+
+def test_the_package_lists_its_names():
+    assert {*identification.__all__} <= {*dir(identification)}
+    with pytest.raises(AttributeError, match="no attribute 'robot_model'"):
+        _ = identification.robot_model
 
 
 class TestLawsOfJoints:

@@ -94,6 +94,8 @@ class TestPayload:
         for mass in (-1.0, np.nan):
             with pytest.raises(ModelError, match="weighs"):
                 Payload(mass, at)
+        with pytest.raises(ModelError, match="not finite"):
+            Payload(1.0, (np.inf, 0.0, 0.0))
         assert Payload(1.0, at).possible
         assert Payload(1.0, at, (0.1, 0.0, 0.0, 0.2, 0.0, 0.3)).possible, "a flat body"
         assert not Payload(1.0, at, (0.1, 0.0, 0.0, 0.1, 0.0, 0.3)).possible

@@ -14,7 +14,7 @@ from identification.errors import ShapeError
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
-from identification.signals.clock import time_base
+from identification.signals.clock import time_base, true_times
 from identification.signals.masks import (
     EDGE,
     END_PERIODS,
@@ -36,6 +36,7 @@ from identification.signals.smoothing import (
     difference_variance,
     fit_smoothing_spline,
     low_pass,
+    noiseless_above,
     standstill_variance,
 )
 from tests.identification.two_link import MODEL, URDF, one_sine, sine_motion, truth
@@ -142,6 +143,8 @@ class TestRecording:
         for name, values in (("torque", recording.torque[:-1]), ("gap_before", np.zeros(3, bool))):
             with pytest.raises(ShapeError, match=name):
                 replace(recording, **{name: values})
+        with pytest.raises(ShapeError, match="time"):
+            replace(recording, time=recording.time[:, None])
 
     def test_gaps_split_it_but_jitter_does_not(self):
         recording = a_recording()
@@ -162,6 +165,8 @@ class TestRecording:
         command[:10] = np.nan
         assert replace(recording, commanded_position=command).motion_start == recording.time[41]
         assert a_recording(commanded=False).motion_start == 0.0
+        command[:] = np.nan
+        assert replace(recording, commanded_position=command).motion_start == 0.0
 
 
 STEP = 2e-3
@@ -176,6 +181,38 @@ def recorded(seed, *, start=0.0, clock=0.0, pace=1.0, noise=0):
     position = (amplitude * np.sin(angle)).sum(axis=1)
     position += 1e-4 * np.random.default_rng(noise).standard_normal(position.shape)
     return Recording(time=time + clock, position=position, joint_names=("a", "b"))
+
+
+def resting():
+    return replace(recorded(1), position=np.ones((4000, 2)))
+
+
+class TestTrueTimes:
+    @pytest.mark.parametrize("with_velocity", [False, True])
+    @pytest.mark.parametrize("is_even", [False, True])
+    def test_positions_tell_late_stamps_from_uneven_samples(self, is_even, with_velocity):
+        rng = np.random.default_rng(3)
+        even = 1e-3 * np.arange(4000)
+        stamps = even + rng.uniform(0.0, 3e-4, 4000)
+        true = even if is_even else stamps
+        position, velocity, _ = motion(true)
+        gap = np.isin(np.arange(4000), [3990])  # few samples behind it tell nothing
+        recording = Recording(
+            time=stamps,
+            position=position + 1e-6 * rng.standard_normal(position.shape),
+            velocity=velocity if with_velocity else None,
+            joint_names=("a", "b"),
+            gap_before=gap,
+        )
+        found, words = true_times(recording)
+        rows = slice(0, 3990)
+        np.testing.assert_allclose(np.diff(found.time[rows]), np.diff(true[rows]), atol=2e-5)
+        assert ("used: even times" if is_even else "used: the stamps") in words[0]
+
+    def test_a_resting_arm_confirms_neither(self):
+        stamps = 1e-3 * np.arange(400.0) + np.random.default_rng(4).uniform(0.0, 3e-4, 400)
+        found, _ = true_times(Recording(stamps, np.ones((400, 2)), ("a", "b")))
+        np.testing.assert_array_equal(found.time, stamps)
 
 
 class TestRepetitions:
@@ -198,6 +235,8 @@ class TestRepetitions:
             [recorded(1), recorded(1, pace=1.05)],
             [recorded(1), recorded(1, start=4.0)],
             [recorded(1), recorded(1, noise=1), recorded(2)],
+            [recorded(1), recorded(1).rows(slice(0, 800))],  # too short to tell
+            [resting(), resting()],
         ],
     )
     def test_other_motions_are_no_repetitions(self, runs):
@@ -401,6 +440,12 @@ class TestNoise:
         values = 0.4 + creeps * (1e-4 * time + slip)[:, None] + noise
         np.testing.assert_allclose(np.sqrt(standstill_variance(time, values)), size, rtol=0.1)
 
+    @pytest.mark.parametrize("measure", [standstill_variance, difference_variance])
+    def test_a_few_samples_show_none(self, measure):
+        with pytest.raises(RecordingError, match=r"requires .* samples, got 3"):
+            measure(np.arange(3.0), np.zeros((3, 1)))
+        assert noiseless_above(np.arange(3.0), np.zeros((3, 1)), [slice(0, 3)]) is None
+
 
 class TestSamples:
     def test_smoothed_motion_is_accurate_in_usable_rows(self):
@@ -461,6 +506,28 @@ class TestSamples:
             return float(np.sqrt(np.mean(error[1000:-1000] ** 2)))
 
         assert misfit(Preprocessing(torque_bandwidth=4.0)) < 0.05 * misfit(Preprocessing())
+
+    def test_the_torque_is_smoothed_to_its_noise(self):
+        """The default bandwidth of `--method paper`."""
+        recording = smooth_recording(noise=0.5)
+        options = Preprocessing(smooth_torque=True)
+        samples = prepare(recording, MODEL, noise_variance=QUANTISATION, options=options)
+        exact = MODEL.torque(TRUTH, *motion(recording.time))
+        rows = samples.usable.all(axis=1)
+        noise = np.std((samples.torque - exact)[rows], axis=0)
+        assert (noise < 0.15).all()
+
+    def test_measured_velocities_are_used(self):
+        recording = smooth_recording()
+        exact = motion(recording.time)
+        rows = recording.time < 3.0  # and a segment too short to smooth
+        gaps = np.isin(np.arange(6000), [3000, 3002])
+        recording = replace(recording, velocity=exact[1] + 0.1, gap_before=gaps)
+        options = Preprocessing(velocity="measured")
+        found = prepare(recording, MODEL, noise_variance=QUANTISATION, options=options).motion
+        inner = np.flatnonzero(rows)[9:-9]
+        np.testing.assert_allclose(found.velocity[inner], exact[1][inner] + 0.1, atol=0.01)
+        assert not found.velocity[3000:3002].any()
 
     def test_invalid_recordings_and_bandwidths_raise(self):
         valid = smooth_recording()

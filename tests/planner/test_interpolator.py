@@ -13,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from scipy.spatial import cKDTree
 
 from planner import JointLimits
-from planner.errors import PlannerCrashed, PlannerNotStarted
+from planner.errors import InvalidSetting, PlannerCrashed, PlannerNotStarted
 from planner.interpolator import (
     AccelerationKind,
     EventKind,
@@ -202,6 +202,23 @@ def test_a_motion_time_is_met(seed, factor):
     first = plan_moves(b, [Move(c)], SIX_AXES).trajectory.duration
     last = steps_to_rest(interpolator)[-1].elapsed_time
     assert last == pytest.approx(factor * shortest + first, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("period", "options"),
+    [(0.0, {}), (1e-3, {"override_bounds": (0.9, 1.7)}), (1e-3, {"override_bounds": (1.3, 3.5)})],
+)
+def test_settings_without_sense_are_refused(period, options):
+    with pytest.raises(InvalidSetting):
+        Interpolator(SIX_AXES, period, **options)
+
+
+def test_without_a_position_there_is_no_motion():
+    interpolator = Interpolator(SIX_AXES, 1e-3)
+    interpolator.initialize()
+    assert interpolator.set_next_target(1, random_points(1, 1)[0]) == Status.INCONSISTENT
+    assert "initial position" in interpolator.refusal
+    assert interpolator.get_next_step().status == Status.INCONSISTENT
 
 
 def test_a_motion_time_too_short_is_refused():

@@ -15,7 +15,7 @@ from planner import InvalidSetting, JointLimits, plan, to_csv
 from planner.errors import InvalidPlanFile
 from planner.moves import Move, Overrides, plan_moves
 from planner.plan_file import PlanFile
-from planner.toml_text import degrees_text, radians_of, toml_key, toml_value
+from planner.toml_text import degrees_text, from_text, radians_of, toml_key, toml_value
 from tests.motion_table import MotionTable
 from tests.planner.six_axes import SIX_AXES, random_points
 from tests.planner.test_moves import problems
@@ -39,6 +39,20 @@ def files(draw):
 def test_json_restores_every_bit(file):
     data = json.dumps(file.to_dict())  # distinguishes -0.0 from 0.0
     assert json.dumps(PlanFile.from_dict(json.loads(data)).to_dict()) == data
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a = 1.0\na_deg = 2.0", "both 'a' and 'a_deg'"),
+        ("a_deg = [1.0, true]", "a_deg: True is not a number of degrees"),
+        ("a_deg = 1e9999999999999999999", "out of range"),
+        ("a = " + "[" * 5000 + "]" * 5000, "nested too deep"),
+    ],
+)
+def test_other_texts_are_no_degrees(text, words):
+    with pytest.raises(ValueError, match=words):
+        from_text(text)
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False, min_value=-1e6, max_value=1e6))

@@ -322,6 +322,7 @@ DAMAGE = (
     {"frequency": None},
     *({"length": length} for length in (0.0, "long")),
     *({"ramp": ramp} for ramp in (0.6, -0.1, float("inf"))),
+    *({name: good[name], "type": "line"} for name, good in (("knots", CUBIC), ("offset", SINES))),
 )
 
 
