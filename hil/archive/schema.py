@@ -43,9 +43,6 @@ MOTOR_CURRENT = "/motor_currents"
 EVENTS = "/hil/events"
 DESCRIPTION = "/robot_description"
 
-PER_CYCLE = frozenset((CYCLE, MEASURED, COMMANDED))
-"""Channels with one message per cycle, where there are cycles."""
-
 LATER_FIELDS = frozenset(("age",))
 """Fields of a cycle that older archives do not have; they read as zero."""
 

@@ -593,7 +593,8 @@ def no_rows_message(model: RobotModel) -> str:
     slowest = float(np.min(model.friction.standstill))
     return (
         "there is not one usable sample: no joint moves faster than the standstill speed of"
-        f" {slowest:g} rad/s or m/s away from ends and gaps of the recording"
+        f" {slowest:g} rad/s or m/s away from ends and gaps of the recordings; record a longer or"
+        " faster motion"
     )
 
 
