@@ -343,7 +343,9 @@ class Conduct:
 
     def _lag(self, target: np.ndarray) -> int:
         back = np.abs(np.array(self.motors[::-1]) - target)
-        behind = back[0] > self.limits.standstill
+        ahead = np.abs(self._extrapolated() - target).min(axis=0, initial=np.inf)
+        # Where a joint turned, a target ahead may be near an older set-point.
+        behind = (back[0] > self.limits.standstill) & (back.min(axis=0) <= ahead)
         return int(back.argmin(axis=0)[behind].max(initial=0))
 
     def _again(self, target: np.ndarray) -> None:

@@ -175,6 +175,8 @@ HELD_OR_EXTRAPOLATED = (1555, 1799, 3704, 4160, 5326, 6080, 7154, 8192, 22400, 2
 CLOSED_BY_THE_CONTROLLER = (20738, 22032)
 SHUT_DOWN_AT_A_SAVE = (21048, 21634, 22291)
 MALFORMED_BESIDE_A_GAP = (100543,)  # a packet that is none counts once
+LOST_AT_A_REVERSAL = (207153,)  # the extrapolated target passed an older set-point
+RECEIVED_TWICE = (202544,)  # beside a packet with another number
 CLOCK_SET_FORWARD = (201111,)  # behind an init packet: the start is over
 CLOCK_SET_BACK = (101575,)  # a start timeout of an hour, with the drive off
 SCATTERED_REPETITIONS = (100232,)  # they rejected one another in turn
@@ -187,6 +189,8 @@ SCATTERED_REPETITIONS = (100232,)  # they rejected one another in turn
         *CLOSED_BY_THE_CONTROLLER,
         *SHUT_DOWN_AT_A_SAVE,
         *MALFORMED_BESIDE_A_GAP,
+        *LOST_AT_A_REVERSAL,
+        *RECEIVED_TWICE,
         *CLOCK_SET_FORWARD,
         *CLOCK_SET_BACK,
         *SCATTERED_REPETITIONS,
