@@ -47,7 +47,7 @@ ALWAYS: Final = -(1 << 63), 1 << 63  # ns, before and after every stamp
 _BATCH: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
 _SEQUENCES = 1 << 32  # message numbers are modulo this
 _MOST_DAMAGES = 1000  # of one file; what follows is not read
-_LOST_PACKETS = 100  # that a gap may have beside one for each missing sample
+_LOST_PACKETS = 10  # that a gap may have beside one for each missing sample
 _MOST_SHOWN = 5  # faults in one message
 _LEAST = 8  # bytes of a file for one sample, of an arm at rest
 _COLUMN_OF: Final = {"effort": "torque"}  # names of message fields that differ from the column's
@@ -104,6 +104,7 @@ class Scan:
         self.lost = False
         self._stream = stream
         self._data_end: int | None = None  # None where a length does not lead to it
+        self._searched = self.size  # from here on records were found by search
         self._library = schema.LIBRARY  # that wrote the file
         self._fields, self._times, self._all_channels = fields, times, all_channels
         self._left_out: set[int] = set()
@@ -207,8 +208,8 @@ class Scan:
                 lost = damage
                 heads.pop()
         self.damages[lost.offset] = lost.reason
-        start = heads[-1].end if heads else len(container.MAGIC)
-        found = [*find_records(stream, start, self.size)]
+        self._searched = heads[-1].end if heads else len(container.MAGIC)
+        found = [*find_records(stream, self._searched, self.size)]
         heads += found
         return len(found)
 
@@ -345,7 +346,7 @@ class Scan:
     def _flush(self) -> None:
         """Decode the buffered chunks: all at once, or one by one where that fails."""
         pending, self._pending = self._pending, []
-        if len(pending) > 1 and pending[-1][0] <= min(self.damages, default=self.size):
+        if len(pending) > 1 and pending[-1][0] < min((self._searched, *self.damages)):
             try:
                 self._decode(self._buffer[: pending[-1][1].stop], pending[0][0], several=True)
                 self.chunks += len(pending)
@@ -384,7 +385,7 @@ class Scan:
             verified = found if self._all_channels else {topic: found[topic] for topic in wanted}
             missing = self._missing_messages(verified, offset)
             newest = self._check_times(verified, offset)
-            damaged = min(self.damages, default=offset) < offset
+            damaged = min((self._searched, *self.damages)) <= offset
             if self._chunk_list is None and (damaged or (missing and not self._repaired)):
                 self._check_gap(verified, missing, offset)
             layouts = self._check_layouts(verified, offset)

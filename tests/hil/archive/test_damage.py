@@ -445,15 +445,21 @@ class TestNothingLost:
         assert not check_archive(path).conforms
         assert_valid(repair(path), written)
 
-    @pytest.mark.parametrize("missed", [0, 20, 50])
+    @pytest.mark.parametrize("missed", [0, 20, 100])
     def test_chunks_behind_missed_packets_are_whole(self, path, missed):
         """Seed 200168 of the simulation: the end is torn, and the PC had stalled before it."""
         data = recorded(path, missed=missed)
         torn = data[: chunks(data)[4][0] + 60]
         path.write_bytes(torn)
         assert open_archive(path).n_samples == 40
-        path.write_bytes(flipped(torn, chunks(data)[1][1] - 9))
-        assert open_archive(path).n_samples == 30
+
+    @pytest.mark.parametrize("place", [2, 3])
+    def test_a_chunk_of_another_recording_in_an_index_is_left_out(self, written, path, place):
+        """A power failure left the block of an older file behind the head of a record."""
+        other = recorded(path, 9000)
+        end = written.chunks[place - 1].end + container.RECORD.size
+        path.write_bytes(written.data[:end] + other[slice(*chunks(other)[place])])
+        assert open_archive(path).n_samples == 10 * place
 
     def test_archive_repaired_by_an_earlier_version_is_read(self, written, path):
         """It continued behind damage: the numbers of its messages show the gap."""
