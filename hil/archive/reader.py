@@ -171,6 +171,11 @@ class Scan:
         start = self._data_end
         return container.read_summary(self._stream, self.size, *_DEFINITIONS, start=start)
 
+    @property
+    def _damaged_from(self) -> int:
+        """The place from which chunks lie behind damage, the end of a file without."""
+        return min((self._searched, *self.damages))
+
     def _find_shortfalls(self) -> Iterator[str]:
         """Yield a sentence for what the file states to contain and does not."""
         for name in self.header.attachments if self.header else ():
@@ -346,7 +351,7 @@ class Scan:
     def _flush(self) -> None:
         """Decode the buffered chunks: all at once, or one by one where that fails."""
         pending, self._pending = self._pending, []
-        if len(pending) > 1 and pending[-1][0] < min((self._searched, *self.damages)):
+        if len(pending) > 1 and pending[-1][0] < self._damaged_from:
             try:
                 self._decode(self._buffer[: pending[-1][1].stop], pending[0][0], several=True)
                 self.chunks += len(pending)
@@ -385,7 +390,7 @@ class Scan:
             verified = found if self._all_channels else {topic: found[topic] for topic in wanted}
             missing = self._missing_messages(verified, offset)
             newest = self._check_times(verified, offset)
-            damaged = min((self._searched, *self.damages)) <= offset
+            damaged = offset >= self._damaged_from
             if self._chunk_list is None and (damaged or (missing and not self._repaired)):
                 self._check_gap(verified, missing, offset)
             layouts = self._check_layouts(verified, offset)
