@@ -179,6 +179,11 @@ class TestPositions:
         error = refused(Check.POSITION, guard.check_set_point, beyond, -speed, "plan", 3)
         assert (error.joint, error.bound) == (joint, pytest.approx(2.0))
 
+    @joints
+    def test_a_position_at_its_bound_passes_at_any_speed_limit(self, joint):
+        guard = Guard(limits(velocity=np.full(N, 0.01)), PERIOD)
+        guard.check_position(at(joint, 2.0 * (1.0 + 1e-6)), 0)
+
 
 RATE_EDGES = {
     # Kind, bound in reach, its factor; what is at it: limit, step, velocity stated.
@@ -444,6 +449,12 @@ class TestCorrectionRates:
         assert (error.joint, error.cycle) == (joint, 9)
         assert abs(error.value) == pytest.approx(factor * value, rel=1e-5)
         assert error.bound == pytest.approx(factor * value, rel=1e-5)
+
+    @signs
+    def test_a_velocity_at_its_bound_may_last(self, sign):
+        checks = correcting_only("velocity", velocity=V)
+        for cycle in range(8):
+            checks.check_motion(np.full(N, sign * V * (1.0 + 1e-6)), "plan", cycle)
 
     def test_duration_of_wider_bounds(self):
         checks = correcting("velocity")

@@ -166,6 +166,13 @@ def lose(rig: Rig, count: int):
 class TestLostReplies:
     """The motion waits, and continues by one step from the target that is held."""
 
+    @pytest.mark.parametrize("field", ["commanded_position", "commanded_velocity"])
+    def test_set_point_sent_again_is_recorded_as_before(self, field):
+        rig = at_speed()
+        lose(rig, 3)
+        first, second, third = rig.records[field][-3:]
+        np.testing.assert_array_equal([second, third], [first] * 2)
+
     @pytest.mark.parametrize("share", [0.25, 0.5, 0.8, 1.0])
     @pytest.mark.parametrize(("lost", "continues"), [(1, True), (2, True), (5, False)])
     def test_one_step_at_each_speed(self, share, lost, continues):
@@ -375,6 +382,29 @@ class TestLongGaps:
         assert spread == [cycles]
         assert rig.state is State.OPEN
 
+    @pytest.mark.parametrize(
+        ("speed", "factor", "found"),
+        [(0.5, 1.2, 0.6), (0.5, 0.8, 0.4), (0.01, 1.2, 0.01), (0.01, 0.0, 0.01)],
+    )
+    def test_the_motion_continues_with_the_velocity_of_its_target(self, speed, factor, found):
+        """Not that of the arm; below standstill, where a velocity says little, with its own."""
+        rig = at_speed(1200, speed=speed)
+        source, velocities = rig.session.execution._source, []
+
+        def resume_from(position, velocity, cycles):
+            source._position = position
+            velocities.append(velocity)
+
+        source.resume_from = resume_from
+        rig.miss(5)
+        d = rig.axes["d"]
+        d[:, [0, 2]] += 5 * d[:, [1]]
+        d[:, 1] *= factor
+        d[:, 3] *= 0.9
+        rig.cycle()
+        (velocity,) = velocities
+        np.testing.assert_allclose(velocity, found * np.eye(N)[0], rtol=1e-4, atol=1e-6)
+
     @pytest.mark.parametrize("late", [0, 1, 2])
     def test_a_target_reported_late_is_further_on_by_now(self, late):
         """The set-point after the gap is one step from where the controller has its target."""
@@ -384,7 +414,8 @@ class TestLongGaps:
         def report():
             now, before = targets[-1 - late], targets[-2 - late]
             d[:, 0], d[:, 1] = now, now - before
-            d[:, 2], d[:, 3] = targets[-1], targets[-1] - targets[-2]
+            # An arm that lags behind.
+            d[:, 2], d[:, 3] = targets[-1], 0.9 * (targets[-1] - targets[-2])
 
         for _ in range(200):
             report()
@@ -701,3 +732,15 @@ class TestSentAgain:
             if not stopping:
                 sent.set_points.repeat()
                 sent.check(0.0)
+
+    @pytest.mark.parametrize("cycles", [0, 1])
+    def test_after_a_resumption_nothing_was_repeated(self, cycles):
+        """A stop after it counts the first target behind as a loss."""
+        sent = Sent(SLOW)
+        sent.check(-1.0)
+        sent.set_points.repeat()
+        sent.add(1.0)
+        sent.set_points.resume_from(sent.last, sent.step)
+        for _ in range(cycles):
+            sent.add(1.0)
+        assert sent.check(-1.0, stopping=True) == 1

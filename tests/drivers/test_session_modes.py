@@ -373,6 +373,29 @@ class TestCorrections:
         rig.cycle()
         assert rig.state is State.OPEN
 
+    def test_current_fed_forward_is_limited_by_itself(self):
+        """It is part of the current that the servo reports, not an addition to that."""
+        rig = begun(2, Correction(current=np.full((400, N), 5.0)), guard_limits=AT_ONCE)
+        rig.axes["d"][:, 4] = 19.0
+        rig.cycle(3)
+        assert rig.state is State.OPEN
+
+    @pytest.mark.parametrize(
+        ("age", "cycles", "state"),
+        [(0, 1.9, State.FAULTED), (1, 1.9, State.OPEN), (1, 2.1, State.FAULTED)],
+    )
+    def test_an_old_target_had_one_cycle_more(self, age, cycles, state):
+        """A target that is new after one that was `age` cycles old moved for `age` + 1 cycles."""
+        rig = begun(7, Correction(rows=400), guard_limits=limits(**UNBOUNDED))
+        rig.ages = np.zeros((N, 8), np.uint16)
+        rig.cycle(5)
+        for old, share in ((age, 0.0), (0, cycles)):
+            rig.ages[:, 0] = old
+            step = share * limits().velocity[2] * PERIOD
+            rig.axes["d"][:, [0, 2]] += rig.train.motor_from_joint[:, [2]] * step / (2 * np.pi)
+            rig.cycle()
+        assert rig.state is state
+
 
 def player() -> TrajectoryPlayer:
     rates = ("lower", "upper", "velocity", "acceleration", "jerk")
@@ -404,6 +427,26 @@ def at_rest(rig: Rig) -> bool:
     return not rig.records[-1]["commanded_velocity"].any()
 
 
+class Ramp(Correction):
+    """A velocity of joint 3, which a hold brings to zero, at first as fast as a stop may be."""
+
+    def __init__(self):
+        super().__init__(rows=1000)
+        self.velocity, self.target, self.rate = 0.0, 0.5, 7.0
+
+    def advance(self):
+        change = np.clip(self.target - self.velocity, -self.rate * PERIOD, self.rate * PERIOD)
+        self.velocity += float(change)
+        _, nothing = super().advance()
+        return self.velocity * np.eye(N)[2], nothing
+
+    def hold(self):
+        self.target, self.rate = 0.0, 15.0
+
+    def resume(self):
+        self.target = 0.5
+
+
 class TestHold:
     def test_hold_without_limit_and_resume(self):
         rig = playing()
@@ -429,6 +472,22 @@ class TestHold:
         rig.cycle(cycles)
         rig.session.stop()
         rig.run_to("stopped")
+
+    @pytest.mark.parametrize(("rate", "state"), [(7.0, State.OPEN), (15.0, State.FAULTED)])
+    def test_hold_of_a_correction(self, rate, state, monkeypatch):
+        """It has the bounds of a stop until it rests, and is held for longer than a stop takes."""
+        monkeypatch.setattr("drivers.session.STOP_TIMEOUT", 0.2)
+        source = Ramp()
+        rig = begun(8, source, cycles=60, guard_limits=limits(jerk=np.full(N, 1e9)))
+        rig.session.hold()
+        rig.cycle(20)
+        assert source.velocity == 0.0
+        rig.cycle(200)
+        assert (rig.state, rig.ended) == (State.OPEN, None)
+        source.rate = rate
+        rig.session.resume()
+        rig.cycle(40)
+        assert rig.state is state
 
     def test_source_without_hold_is_stopped(self):
         rig, source = moving()

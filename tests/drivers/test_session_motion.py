@@ -157,6 +157,17 @@ class TestOnlyAxis:
         assert type(rig.refusal) is AxisNotInMode
         assert f"joint {joint + 1} is in mode 0;" in str(rig.refusal)
 
+    def test_closed_axes_have_no_velocity_after_a_long_gap(self):
+        rig, _ = self.moving(0)
+        source, velocities = rig.session.execution._source, []
+        source.resume_from = lambda position, velocity, cycles: velocities.append(velocity)
+        rig.miss(5)
+        rig.axes["d"][0, [0, 2]] += 5 * rig.axes["d"][0, 1]
+        rig.cycle()
+        (velocity,) = velocities
+        assert abs(velocity[0]) > 0.1
+        assert not velocity[1:].any()
+
     def test_another_open_axis_ends_the_motion(self):
         rig, _ = self.moving(0, cycles=1)
         rig.modes[2] = Mode.POSITION

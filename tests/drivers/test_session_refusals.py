@@ -529,6 +529,9 @@ class TestLongGap:
         rig.cycle()
         rig.miss(10)
         rig.cycle()
+        rig.now += 0.9  # a pause
+        rig.axes["d"][2, 3] = 1.0
+        rig.cycle()
         assert rig.state is State.EXITING
         assert not rig.seen(Refused)
 

@@ -161,6 +161,20 @@ class TestReplies:
         (event,) = rig.seen(PacketRejected)
         assert words in event.reason
 
+    @pytest.mark.parametrize(
+        ("status", "length", "words"),
+        [
+            (DRIVE_ON, 732, "status is '05000000'; expected no drive on before init"),
+            (0, INIT_LENGTH, f"length is {INIT_LENGTH}; expected less than {INIT_LENGTH} bytes"),
+        ],
+    )
+    def test_malformed_packets_before_init(self, status, length, words):
+        rig = Rig()
+        rig.sync(1)
+        assert rig.send(struct.pack("<2i", 2, status) + bytes(length - 8)) is None
+        (event,) = rig.seen(PacketRejected)
+        assert event.reason == f"{length} bytes: packet {words}"
+
 
 class TestSilence:
     def test_deadline(self):
