@@ -706,15 +706,16 @@ class TestSentAgain:
         assert sent.check(-1.0) == 1
         assert sent.set_points.again is again
 
+    @pytest.mark.parametrize("behind", [1, 2])
     @pytest.mark.parametrize("count", [5, REPETITIONS])
-    def test_repetition_counts_until_accepted_or_refused(self, count):
+    def test_repetition_counts_until_accepted_or_refused(self, count, behind):
         sent = Sent(SLOW)
-        for _ in range(count):
-            assert sent.check(-1.0) == 1
+        for repeated in range(count):
+            assert sent.check(-behind) == (1 if repeated else behind)
             assert sent.set_points.again
             sent.set_points.repeat()
         if count == REPETITIONS:
-            sent.refuse(-1.0)
+            sent.refuse(-behind)
         assert sent.check(0.0) == 0
         assert not sent.set_points.again
 
