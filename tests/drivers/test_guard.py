@@ -336,6 +336,11 @@ def test_bounds_of_feedback_and_start(edge, joint, sign):
     assert error.bound == pytest.approx(bound, rel=1e-5)
 
 
+def test_joints_left_out_of_feedback_pass_any_threshold():
+    guard = begun(limits(following_error=np.full(N, 1e-3), current=np.full(N, 1e-3)))
+    guard.check_feedback(REST, at(1, 9.0), at(1, 9.0), REST, 1, np.arange(N) != 1)
+
+
 def test_narrower_limits_of_the_controller():
     """NaN is no limit; new limits replace old ones."""
     guard, nothing = Guard(limits(), PERIOD), np.full(N, np.nan)

@@ -258,11 +258,21 @@ class TestConstruction:
                 ({"mode": mode}, f"mode {mode} is not served; modes 1, 2, 4, 5, 7, 8, 9 are")
                 for mode in (0, 3, 6, 10, 11, 12, 14, 15, 17, 501)
             ),
+            *(
+                ({"only_axis": axis, "mode": mode}, f"only axis {axis} of 6 is not served in mode")
+                for axis, mode in ((0, 4), (N + 1, 4), (1, 7))
+            ),
         ],
     )
     def test_invalid_options(self, options, words):
         with pytest.raises(ValueError, match=words):
             Rig(**options)
+
+    @pytest.mark.parametrize(
+        "options", [{"max_gap": 0}, {"max_gap": 100}, {"arm": 4}, {"only_axis": N}]
+    )
+    def test_options_at_their_ends(self, options):
+        assert Rig(**options).state is State.SYNC
 
     def test_parts_for_different_numbers_of_joints_are_refused(self):
         rig = Rig()
