@@ -554,6 +554,9 @@ def test_records_of_an_arm_without_axis_map():
     assert (record["mode"] == -1).all()
     assert np.isnan([record["position"], record["target_position"]]).all()
     assert record["age"].tolist() == [0, 0, 7, 0, 0, 0, 0, 0]
+    rig.ages = None
+    rig.cycle()
+    assert not rig.records["age"][-1].any()
 
 
 def leaving(axis: int | None = None, mode: int = Mode.POSITION) -> Rig:

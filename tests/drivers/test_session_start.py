@@ -366,6 +366,17 @@ ANOTHER_ARM = [
 ]  # fmt: skip
 
 
+def test_axes_of_another_arm_do_not_open_an_arm_that_cannot_be_moved():
+    init = beside(2, 1)
+    init.record["gear_ratio"][0, 0, 2] = 1.0
+    rig, event = received(init, other_axes={(2, 1)})
+    assert event.unusable
+    rig.close()
+    rig.modes[N] = rig.mode
+    rig.cycle()
+    assert rig.state is State.CLOSED
+
+
 class TestInit:
     """Differences are named with the axis and both values; with one of them nothing moves."""
 
