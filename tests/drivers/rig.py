@@ -420,6 +420,18 @@ def moving(cycles: int = 300, **options) -> tuple[Rig, Cruise]:
     return rig, source
 
 
+def resumptions(rig: Rig) -> list:
+    """Position, velocity and cycles of each resumption of a motion, from now on."""
+    source, found = rig.session.execution._source, []
+
+    def resume_from(*arguments):
+        found.append(arguments)
+        source._position = arguments[0]
+
+    source.resume_from = resume_from
+    return found
+
+
 def exiting(**options) -> Rig:
     """A short motion is over, and the end of open mode was asked for."""
     rig = running(still(2), 6, **options)

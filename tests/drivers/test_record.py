@@ -196,15 +196,12 @@ def test_guard_error_states_check_joint_value_bound_and_cycle(check):
     assert through_pickle(error).check is check
 
 
-def _nothing(self, *_):
-    pass
-
-
 def test_events_of_a_session_pickle():
     rig, _ = moving()
     rig.session.stop()
     rig.run()
-    steered = type("Steered", (Cruise,), dict.fromkeys(("hold", "resume", "override"), _nothing))
+    requests = dict.fromkeys(("hold", "resume", "override"), lambda *_: None)
+    steered = type("Steered", (Cruise,), requests)
     rig.session.request(steered())
     rig.session.override(0.5)
     rig.session.hold()

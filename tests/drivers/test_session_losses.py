@@ -29,6 +29,7 @@ from tests.drivers.rig import (
     moving,
     opened,
     refused,
+    resumptions,
     running,
     smooth_move,
     still,
@@ -368,18 +369,12 @@ class TestLongGaps:
     def test_jerk_has_no_bound_for_30_ms_at_most(self, missed, cycles):
         """Depends on the number of steps that the controller extrapolated."""
         rig = at_speed(1200, speed=0.2)
-        source, spread = rig.session.execution._source, []
-
-        def resume_from(position, velocity, cycles):
-            source._position = position
-            spread.append(cycles)
-
-        source.resume_from = resume_from
+        resumed = resumptions(rig)
         rig.miss(missed)
         rig.axes["d"][:, 0] += missed * rig.axes["d"][:, 1]
         rig.axes["d"][:, 2] = rig.axes["d"][:, 0]
         rig.cycle()
-        assert spread == [cycles]
+        assert [spread for _, _, spread in resumed] == [cycles]
         assert rig.state is State.OPEN
 
     @pytest.mark.parametrize(
@@ -389,20 +384,14 @@ class TestLongGaps:
     def test_the_motion_continues_with_the_velocity_of_its_target(self, speed, factor, found):
         """Not that of the arm; below standstill, where a velocity says little, with its own."""
         rig = at_speed(1200, speed=speed)
-        source, velocities = rig.session.execution._source, []
-
-        def resume_from(position, velocity, cycles):
-            source._position = position
-            velocities.append(velocity)
-
-        source.resume_from = resume_from
+        resumed = resumptions(rig)
         rig.miss(5)
         d = rig.axes["d"]
         d[:, [0, 2]] += 5 * d[:, [1]]
         d[:, 1] *= factor
         d[:, 3] *= 0.9
         rig.cycle()
-        (velocity,) = velocities
+        ((_, velocity, _),) = resumed
         np.testing.assert_allclose(velocity, found * np.eye(N)[0], rtol=1e-4, atol=1e-6)
 
     @pytest.mark.parametrize("late", [0, 1, 2])

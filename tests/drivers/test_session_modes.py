@@ -430,15 +430,12 @@ def at_rest(rig: Rig) -> bool:
 class Ramp(Correction):
     """A velocity of joint 3, which a hold brings to zero, at first as fast as a stop may be."""
 
-    def __init__(self):
-        super().__init__(rows=1000)
-        self.velocity, self.target, self.rate = 0.0, 0.5, 7.0
+    velocity, target, rate = 0.0, 0.5, 7.0
 
     def advance(self):
-        change = np.clip(self.target - self.velocity, -self.rate * PERIOD, self.rate * PERIOD)
-        self.velocity += float(change)
-        _, nothing = super().advance()
-        return self.velocity * np.eye(N)[2], nothing
+        step = self.rate * PERIOD
+        self.velocity += float(np.clip(self.target - self.velocity, -step, step))
+        return self.velocity * np.eye(N)[2], np.zeros(N)
 
     def hold(self):
         self.target, self.rate = 0.0, 15.0
@@ -477,7 +474,7 @@ class TestHold:
     def test_hold_of_a_correction(self, rate, state, monkeypatch):
         """It has the bounds of a stop until it rests, and is held for longer than a stop takes."""
         monkeypatch.setattr("drivers.session.STOP_TIMEOUT", 0.2)
-        source = Ramp()
+        source = Ramp(rows=1)
         rig = begun(8, source, cycles=60, guard_limits=limits(jerk=np.full(N, 1e9)))
         rig.session.hold()
         rig.cycle(20)

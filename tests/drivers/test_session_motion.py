@@ -24,6 +24,7 @@ from tests.drivers.rig import (
     kind_of,
     moving,
     opened,
+    resumptions,
     running,
     smooth_move,
     still,
@@ -159,12 +160,11 @@ class TestOnlyAxis:
 
     def test_closed_axes_have_no_velocity_after_a_long_gap(self):
         rig, _ = self.moving(0)
-        source, velocities = rig.session.execution._source, []
-        source.resume_from = lambda position, velocity, cycles: velocities.append(velocity)
+        resumed = resumptions(rig)
         rig.miss(5)
         rig.axes["d"][0, [0, 2]] += 5 * rig.axes["d"][0, 1]
         rig.cycle()
-        (velocity,) = velocities
+        ((_, velocity, _),) = resumed
         assert abs(velocity[0]) > 0.1
         assert not velocity[1:].any()
 

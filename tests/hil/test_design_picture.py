@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
@@ -84,17 +83,13 @@ def texts(figure: Figure) -> list[str]:
     return [text.get_text() for text in figure.findobj(Text)]
 
 
-def axes_of(figure: Figure, xlabel: str) -> Axes:
-    (axes,) = (axes for axes in figure.axes if axes.get_xlabel().startswith(xlabel))
-    return axes
-
-
 class TestPage:
     def test_a_design_of_an_industrial_arm(self, ns16):
         """Correlations of its motion without friction; positions in angles of the cell."""
         design = design_of(ns16, wandering(ns16))
         figure = draw_design(design, ns16)
-        (image,) = axes_of(figure, "parameters").images
+        (axes,) = (axes for axes in figure.axes if axes.get_xlabel().startswith("parameters"))
+        (image,) = axes.images
         motion = sampled(design.excitation.trajectory, 0.001)
         factor = Factor.from_samples(ns16.model, motion, np.zeros_like(motion.position))
         inverse = np.linalg.inv(information(factor))

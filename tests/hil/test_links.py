@@ -36,10 +36,6 @@ class Unjudged(TransportSpec):
         pytest.fail("it is not opened by what only describes a link")
 
 
-def unjudged(*_: object) -> TransportSpec:
-    return Unjudged()
-
-
 class TestLinks:
     def test_every_transport_has_a_row(self) -> None:
         names = get_args(ControllerTable.model_fields["transport"].annotation)
@@ -58,7 +54,8 @@ class TestLinks:
 
     def test_without_a_local_rule_it_is_real(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """A loopback address says nothing of a transport that does not judge it."""
-        monkeypatch.setitem(LINKS, "udp", replace(LINKS["udp"], spec=unjudged))  # type: ignore[arg-type]
+        link = replace(LINKS["udp"], spec=lambda *_: Unjudged())  # type: ignore[arg-type]
+        monkeypatch.setitem(LINKS, "udp", link)
         cell = CELL.with_link(transport="udp", host="127.0.0.1")
         assert not cell.only_simulated
         unknown = Check("controller link", Status.UNKNOWN, "not checked: the controller")

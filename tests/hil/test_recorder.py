@@ -75,10 +75,6 @@ def ended(outcome: str, cycle: int) -> MotionEnded:
     return MotionEnded(outcome, "as it came", 0, cycle)  # type: ignore[arg-type]
 
 
-def a_new_session() -> InitReceived:
-    return InitReceived(InitPacket.decode(bytes_of_an_init()), None)
-
-
 def bytes_of_an_init() -> bytes:
     controller = simulated_controller(Cell.load(CELL_PATH))
     for _ in range(9):
@@ -114,7 +110,8 @@ class TestRecorder:
     def test_new_session_is_not_in_the_same_file(self, recorder: Recorder) -> None:
         new = [StateChanged(State.INIT, State.DRIVE_OFF, 3)]
         both = np.concatenate([cycles(1000, 50), cycles(0, 30)])
-        recorder.record(both, [ended("lost", 1049), a_new_session(), *new])
+        session = InitReceived(InitPacket.decode(bytes_of_an_init()), None)
+        recorder.record(both, [ended("lost", 1049), session, *new])
         assert recorder.restarted
         assert recorder.complete
         recorder.record(cycles(30, 5000), new)

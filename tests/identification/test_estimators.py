@@ -402,16 +402,6 @@ def noisy(held_elbow=False):
     return simulated(MODEL, truth(), one_sine_each(held_elbow=held_elbow), NOISE)
 
 
-def some_covariance(seed, size=1.0):
-    root = np.random.default_rng(seed).standard_normal((P, P))
-    return size * (root @ root.T + 0.1 * np.eye(P))
-
-
-def prior_of(mean, covariance):
-    root = np.linalg.cholesky(covariance)
-    return GaussianPrior.of_combinations(root, np.linalg.solve(root, mean), np.ones(len(mean)))
-
-
 def independent(mean, std):
     return GaussianPrior.of_combinations(np.eye(len(mean)), mean, std)
 
@@ -437,13 +427,15 @@ class TestGaussianPrior:
 class TestPosterior:
     @given(seed=st.integers(0, 999), size=st.floats(1e-3, 1e3))
     def test_it_is_that_of_the_textbook(self, seed, size):
-        mean = np.random.default_rng(seed).standard_normal(P)
-        covariance, weights = some_covariance(seed, size), 1.0 / NOISE**2
+        mean, *root = np.random.default_rng(seed).standard_normal((P + 1, P))
+        covariance = size * (np.transpose(root) @ root + 0.1 * np.eye(P))
+        weights = 1.0 / NOISE**2
         factor = Factor.of(MODEL, noisy())
         equations, precision = factor.weighted(weights), np.linalg.inv(covariance)
         posterior = np.linalg.inv(equations.A + precision)
         expected = posterior @ (equations.b + precision @ mean)
-        prior = prior_of(mean, covariance)
+        root = np.linalg.cholesky(covariance)
+        prior = GaussianPrior.of_combinations(root, np.linalg.solve(root, mean), np.ones(P))
         for kind in (factor, Factor.of(MODEL, noisy(), "qr")):
             found = with_prior(MODEL, kind, prior, weights)
             np.testing.assert_allclose(found.estimate.values, expected, rtol=1e-6, atol=1e-7)

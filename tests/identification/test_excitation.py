@@ -204,10 +204,6 @@ def sines(seed):
     )
 
 
-def through_json(excitation):
-    return Excitation.from_dict(json.loads(json.dumps(excitation.to_dict())))
-
-
 class TestExcitation:
     @given(
         make=st.sampled_from([planned, lambda seed: planned(seed, 0.0), sines]),
@@ -216,7 +212,7 @@ class TestExcitation:
     @settings(max_examples=30, deadline=None)
     def test_it_is_restored_bit_for_bit(self, make, seed):
         excitation = make(seed)
-        restored = through_json(excitation)
+        restored = Excitation.from_dict(json.loads(json.dumps(excitation.to_dict())))
         assert restored.to_dict() == excitation.to_dict()
         assert restored.criteria == excitation.criteria
         assert type(restored.trajectory) is type(excitation.trajectory)
@@ -501,15 +497,6 @@ class TestSamples:
 HAND = np.array([[2.0, 1.0], [1.0, 3.0]])  # det = 5, inverse [[3, -1], [-1, 2]] / 5
 
 
-def random_columns(seed, rows=40, p=5):
-    random = np.random.default_rng(seed)
-    return random.normal(size=(rows, p)) @ random.normal(size=(p, p))
-
-
-def gram_of(columns):
-    return columns.T @ columns
-
-
 class TestCriteria:
     def test_a_small_case_by_hand(self):
         found = Criteria.of_gram(HAND, 10)
@@ -542,7 +529,9 @@ class TestCriteria:
 
     @given(seed=st.integers(0, 99))
     def test_the_coupling_index_sums_the_correlations(self, seed):
-        gram = gram_of(random_columns(seed))
+        random = np.random.default_rng(seed)
+        columns = random.normal(size=(40, 5)) @ random.normal(size=(5, 5))
+        gram = columns.T @ columns
         matrix = correlation(gram)
         assert np.array_equal(matrix, matrix.T)
         assert np.array_equal(np.diag(matrix), np.ones(5))

@@ -192,13 +192,9 @@ def runs_of(model, truth, seed, count):
     return [simulated(model, truth, three_sines(k), ARM_NOISE, k) for k in seeds]
 
 
-def factors_of(model, runs):
-    return [Factor.by_time(model, run) for run in runs]
-
-
 class TestChoice:
     def test_empty_factors_raise(self):
-        (training,) = factors_of(ARM, runs_of(ARM, TRUTH, 1, 1))
+        training = Factor.by_time(ARM, runs_of(ARM, TRUTH, 1, 1)[0])
         with pytest.raises(IdentificationError, match="no usable held-out sample"):
             choose_essential(ARM, training, [Factor.zero(ARM)])
         with pytest.raises(IdentificationError, match="no usable fitted"):

@@ -399,11 +399,6 @@ def straight(start, end, limits, deceleration=None):
     return StraightMoves.between(start[None], end[None], bounds, slowing)
 
 
-def straight_table(moves, begin=0.0, end=np.inf):
-    (motion,) = moves.tables(np.array([begin]), np.minimum(moves.durations, end))
-    return motion
-
-
 def test_the_line_is_straight_for_any_slowest_joint():
     # Joint 0 has the least velocity, joint 1 the least acceleration, joint 2 the least jerk: here
     # ruckig's phase synchronisation leaves the line without an error.
@@ -415,7 +410,8 @@ def test_the_line_is_straight_for_any_slowest_joint():
         jerk=[50.0, 100.0, 5.0],
     )
     start, end = np.array([0.1, -0.2, 0.3]), np.array([1.1, 0.9, -1.2])
-    motion = straight_table(straight(start, end, limits))
+    moves = straight(start, end, limits)
+    (motion,) = moves.tables(np.zeros(1), moves.durations)
     q, qd, _ = motion.sample(np.linspace(0.0, motion.duration, 200))
     share = (q[:, :1] - start[0]) / (end[0] - start[0])
     np.testing.assert_allclose(q, start + share * (end - start), atol=1e-12)
@@ -713,15 +709,12 @@ joints = st.lists(st.tuples(rates, rates, rates), min_size=1, max_size=4)
 shares = st.floats(0.0, 1.5)
 
 
-def limits_of(velocity, acceleration, jerk):
-    return JointLimits(-np.ones(len(jerk)), np.ones(len(jerk)), velocity, acceleration, jerk)
-
-
 @given(joints, rates, rates)
 def test_the_worst_path_just_satisfies_the_bounds(joints, more, much_more):
     # Velocity, acceleration and jerk at their limits at once, with the worst signs.
     velocity, acceleration, jerk = np.array(joints).T
-    bounds = slowing_bounds(limits_of(velocity, acceleration, jerk), 1.0 + more, 1.0 + much_more)
+    limits = JointLimits(-np.ones_like(jerk), np.ones_like(jerk), velocity, acceleration, jerk)
+    bounds = slowing_bounds(limits, 1.0 + more, 1.0 + much_more)
     assert bounds.slope > 0.0
     assert bounds.change > 0.0
     used_acceleration = (acceleration + velocity * bounds.slope) / acceleration

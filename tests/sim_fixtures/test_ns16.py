@@ -81,18 +81,14 @@ def column_names() -> list[str]:
     return names + [f"I{i}m" for i in range(1, 7)]
 
 
-def full_regressor(model: pin.Model, q: Array, qd: Array, qdd: Array) -> Array:
-    links = pin.computeJointTorqueRegressor(model, model.createData(), q, qd, qdd)
-    return np.hstack([links, np.diag(qdd)])
-
-
 def base_regressor(model: pin.Model, q: Array, qd: Array, qdd: Array) -> Array:
     """Each base column is the column of the row's pivot, with its sign."""
     names = column_names()
     rows = ns16.TABLE2[: ns16.N_ESSENTIAL]
     columns = [names.index(row.pivot) for row in rows]
     signs = np.array([row.sign for row in rows])
-    return full_regressor(model, q, qd, qdd)[:, columns] * signs
+    links = pin.computeJointTorqueRegressor(model, model.createData(), q, qd, qdd)
+    return np.hstack([links, np.diag(qdd)])[:, columns] * signs
 
 
 def test_the_planted_base_vector_is_column_c_of_all_forty_rows() -> None:

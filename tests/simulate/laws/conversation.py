@@ -76,12 +76,6 @@ def heard(observed: Observed) -> tuple[Heard, ...]:
     return tuple(_Classifier(life, n_joints).done() for life in observed.runs)
 
 
-def talks_of(observed: Observed) -> Iterator[Talk]:
-    """Yield all sessions of all lives."""
-    for one in heard(observed):
-        yield from one.talks
-
-
 @dataclass
 class _Part:
     init: bytes
