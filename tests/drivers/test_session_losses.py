@@ -67,7 +67,7 @@ class TestLostMotion:
         else:
             rig.cycle(**change)
         assert rig.state is state
-        assert rig.ended.outcome == "lost"
+        assert (rig.ended.outcome, rig.ended.interval) == ("lost", 0)
         assert reason in rig.ended.reason
         advances = source.advances
         if state not in (State.CLOSED, State.DRIVING_ON, State.ENDED):

@@ -126,6 +126,22 @@ class TestStaggeredOpening:
         assert (rig.state, rig.exits_asked) == (State.OPEN, 0)
 
 
+def test_a_motion_refused_at_its_first_set_point_has_an_interval():
+    rig = closed()
+    rig.session.request(still(3))
+    rig.axes["d"][1, 1] = 0.1
+    rig.cycle(mode=Mode.POSITION)
+    assert (rig.ended.outcome, rig.ended.interval) == ("refused", 0)
+
+
+def test_a_stop_is_over_when_the_drive_goes_off():
+    rig = opened(3)
+    rig.session.stop()
+    rig.cycle(status=0)
+    rig.session.request(still(3))
+    assert rig.session.requested
+
+
 class TestOnlyAxis:
     """One axis is open and moved; the others get the safe reply of closed ones."""
 

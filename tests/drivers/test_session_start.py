@@ -53,20 +53,22 @@ class TestHandShake:
         assert rig.sync(1, INIT_LENGTH) is None
         assert (rig.session.counters.malformed, rig.state) == (1, State.SYNC)
         assert len(rig.sync(1, length)) == length
+        assert rig.send(struct.pack("<3i", 2, 0, DRIVE_ON)), "only four bytes are its status"
 
     def test_duplicates_get_the_same_reply(self):
         rig = started()
-        assert rig.send(rig.init.encode()) == rig.transcript[0][1]
+        for _ in range(2):
+            assert rig.send(rig.init.encode()) == rig.transcript[0][1]
         assert len(rig.seen(InitReceived)) == 1
         rig.close()
         packet, reply = rig.transcript[-1]
         for _ in range(3):
             assert rig.send(packet) == reply
         counters = rig.session.counters
-        assert (counters.duplicates, counters.replied, len(rig.records)) == (4, 2, 1)
+        assert (counters.duplicates, counters.replied, len(rig.records)) == (5, 2, 1)
         rig.now += 2.0
         assert rig.send(packet) == reply, "after a silence it is a new packet"
-        assert (counters.duplicates, counters.replied, len(rig.records)) == (4, 3, 2)
+        assert (counters.duplicates, counters.replied, len(rig.records)) == (5, 3, 2)
 
     @pytest.mark.parametrize("mode", [Mode.CLOSED, Mode.POSITION, Mode.DELTA_POSITION])
     @pytest.mark.parametrize("arm", range(4))
@@ -287,7 +289,8 @@ def test_discarded_packets_are_reported_once():
     assert (session.counters.discarded, session.events()) == ({}, [])
     for kind, count in (("foreign", 3), ("torn", 1), ("foreign", 2), ("malformed", 3)):
         session.discarded(kind, count)
-    session.reply(b"short", 0.0)
+    session.reply(b"short", 3.0)
+    assert session.deadline == 303.0, "from the first packet on, whatever it is"
     assert session.counters.discarded == {"foreign": 5, "torn": 1, "malformed": 3}
     assert session.counters.malformed == 1, "which the link discarded is not the session's"
     counts = {event.kind: event.count for event in session.events()}

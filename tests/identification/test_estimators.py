@@ -427,8 +427,8 @@ class TestGaussianPrior:
 class TestPosterior:
     @given(seed=st.integers(0, 999), size=st.floats(1e-3, 1e3))
     def test_it_is_that_of_the_textbook(self, seed, size):
-        mean, *root = np.random.default_rng(seed).standard_normal((P + 1, P))
-        covariance = size * (np.transpose(root) @ root + 0.1 * np.eye(P))
+        mean, *rows = np.random.default_rng(seed).standard_normal((P + 1, P))
+        covariance = size * (np.transpose(rows) @ rows + 0.1 * np.eye(P))
         weights = 1.0 / NOISE**2
         factor = Factor.of(MODEL, noisy())
         equations, precision = factor.weighted(weights), np.linalg.inv(covariance)

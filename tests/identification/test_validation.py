@@ -158,16 +158,13 @@ def least_squares(factor):
     return solve(factor.weighted(joint_weights(factor))).values
 
 
-def calibrated(fitted, held_out):
-    result = estimate_repetitions(MODEL, [fitted])
-    means = [TorqueMeans.of(MODEL, [one]) for one in (fitted, held_out)]
-    return calibrate(result.pooled, result.factor, means[0], means[1], least_squares)
-
-
 def split(error):
     """Fit the beginning of a motion, hold out the rest."""
     samples = recording(error, MOTION)
-    return calibrated(samples.between(0, CUT), samples.between(CUT, LENGTH))
+    parts = samples.between(0, CUT), samples.between(CUT, LENGTH)
+    result = estimate_repetitions(MODEL, parts[:1])
+    means = [TorqueMeans.of(MODEL, [one]) for one in parts]
+    return calibrate(result.pooled, result.factor, means[0], means[1], least_squares)
 
 
 def shares(correlation, model_error=0.0, seeds=50):

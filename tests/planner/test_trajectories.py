@@ -59,18 +59,14 @@ def tables(draw):
     return PiecewiseCubic(tuple(block.knots[0]), tuple(block.coefficients[0]))
 
 
-def polynomial_of(table: PiecewiseCubic, joint: int) -> PPoly:
-    keep = np.diff(table.knots[joint]) > 0
-    breaks = np.append(table.knots[joint][:-1][keep], table.duration)
-    p, v, a, j = table.coefficients[joint][keep].T
-    return PPoly(np.array([j / 6, a / 2, v, p]), breaks)
-
-
 @given(tables(), arrays(np.float64, 20, elements=st.floats(0.0, 2.0)))
 def test_samples_agree_with_an_independent_polynomial(table, t):
     q, qd, qdd = table.sample(t)
     for joint in range(table.n_joints):
-        polynomial = polynomial_of(table, joint)
+        keep = np.diff(table.knots[joint]) > 0
+        breaks = np.append(table.knots[joint][:-1][keep], table.duration)
+        p, v, a, j = table.coefficients[joint][keep].T
+        polynomial = PPoly(np.array([j / 6, a / 2, v, p]), breaks)
         np.testing.assert_allclose(q[:, joint], polynomial(t), atol=1e-10)
         np.testing.assert_allclose(qd[:, joint], polynomial(t, 1), atol=1e-10)
         np.testing.assert_allclose(qdd[:, joint], polynomial(t, 2), atol=1e-10)

@@ -79,13 +79,10 @@ def _judged(talk: Talk, conduct: Conduct) -> Iterator[int]:
         gap = int(record["gap"])
         missed = max(gap, len(between))
         last = index
-        stale = [other for other in between if other.given and _well_formed(other.packet)]
+        given = [other.packet for other in between if other.given]
+        stale = [packet for packet in given if 1 <= number_of(packet) <= LAST_NUMBER]
         at_most = gap + len(stale)
         conduct.judge(one.packet, one.replies[0], record, missed, at_most)
-
-
-def _well_formed(packet: bytes) -> bool:
-    return 1 <= number_of(packet) <= LAST_NUMBER
 
 
 def _note(conduct: Conduct, what: str) -> None:

@@ -43,7 +43,8 @@ def resume(observed: Observed) -> Iterator[str]:
     for number, life in enumerate(observed.runs, 1):
         yield from _ended(number, life)
     whole = _whole(observed)
-    wanted = _wanted(observed)
+    counts = (1, observed.cell.campaign.repetitions, len(observed.plan.validation))
+    wanted = ((kind, i) for kind, n in zip(WANTED, counts, strict=True) for i in range(n))
     missing = [f"{kind} {index}" for kind, index in wanted if (kind, index) not in whole]
     if observed.complete and missing:
         yield f"the last run reports a complete campaign, and {', '.join(missing)} are missing"
@@ -68,13 +69,6 @@ def _ended(number: int, life: Life) -> Iterator[str]:
         return
     if not isinstance(error, HilError) or name not in ALLOWED_ERRORS:
         yield f"life {number} ended with {name}: {error}"
-
-
-def _wanted(observed: Observed) -> list[tuple[str, int]]:
-    counts = (1, observed.cell.campaign.repetitions, len(observed.plan.validation))
-    return [
-        (kind, index) for kind, count in zip(WANTED, counts, strict=True) for index in range(count)
-    ]
 
 
 def _whole(observed: Observed) -> dict[tuple[str, int], Archived]:
