@@ -9,7 +9,7 @@ from hil.archive import open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError
 
-from .dry_run import DryRunStage, not_accepted, yes_or_no
+from .dry_run import not_accepted, yes_or_no
 from .errors import CampaignFolderError, DryRunError, NotRehearsedError
 from .folder import CampaignFolder
 from .link import Connection, narrower_limits
@@ -22,7 +22,7 @@ _ADDRESS: Final = {"transport", "host", "port", "bind", "can"}
 """Keys of `[controller]` with its address, which do not affect what is exchanged."""
 
 
-def require_gates(run: Run, dry_run: DryRunStage) -> None:
+def require_gates(run: Run) -> None:
     """Require a passed rehearsal, and a dry run that is accepted or can be, before anything moves.
 
     Raises:
@@ -43,7 +43,7 @@ def require_gates(run: Run, dry_run: DryRunStage) -> None:
         return
     require_rehearsed(run.campaign.folder, run.plan_hash)
     # Refused before anything moves if the dry run could not be accepted afterwards.
-    found, first = dry_run.found(), f"run `hil run {root} --dry-run`"
+    found, first = run.dry_run.found(), f"run `hil run {root} --dry-run`"
     if found is None and run.choices.accept_dry_run and not run.simulated:
         remedy = f"{first}, watch the arm, and accept it then"
         raise DryRunError(root, "cannot be accepted before it was done", remedy)

@@ -127,39 +127,44 @@ class Run:
         """Its archives."""
         return RunArchives(self)
 
+    @cached_property
+    def dry_run(self) -> DryRunStage:
+        """Its slow motions."""
+        return DryRunStage(self)
+
+    @cached_property
+    def warm_up(self) -> WarmUpStage:
+        """Its motions before the repetitions."""
+        return WarmUpStage(self)
+
 
 def execute(run: Run) -> RunResult:
     """Run the missing motions; a controller is connected only where some are missing."""
-    dry_run, warm_up = DryRunStage(run), WarmUpStage(run)
-    require_gates(run, dry_run)
-    run.archives.adopt(dry_run.intervals)
-    slow, full = dry_run.missing(), [] if run.choices.dry_run_only else run.campaign.missing()
+    require_gates(run)
+    run.archives.adopt(run.dry_run.intervals)
+    slow, full = run.dry_run.missing(), [] if run.choices.dry_run_only else run.campaign.missing()
     if not slow:
-        dry_run.accept()
+        run.dry_run.accept()
     if slow or full:
-        with _connected(run, slow, full, warm_up) as runner:
-            dry_run.run(runner)
+        with _connected(run, slow, full) as runner:
+            run.dry_run.run(runner)
             if full:
-                warm_up.run(runner)
-                _run_missing("standstill", runner, warm_up)
-                _run_missing("excitation", runner, warm_up)
-                # Later repetitions may have shown that the first one was disturbed.
-                _run_missing("excitation", runner, warm_up)
-                _run_missing("validation", runner, warm_up)
+                run.warm_up.run(runner)
+                # Later repetitions may show that the first one was disturbed.
+                for kind in ("standstill", "excitation", "excitation", "validation"):
+                    _run_missing(runner, kind)
             runner.go_back(OVERRIDE if run.choices.dry_run_only else 1.0)
-    return _result(run, dry_run, warm_up)
+    return _result(run)
 
 
 @contextmanager
-def _connected(
-    run: Run, slow: Sequence[Interval], full: Sequence[Interval], warm_up: WarmUpStage
-) -> Iterator[Runner]:
+def _connected(run: Run, slow: Sequence[Interval], full: Sequence[Interval]) -> Iterator[Runner]:
     """Connect the controller, check all motions with its limits, and close the link after."""
     cell, reporter, stop = run.campaign.cell, run.reporter, run.watch.stop
     checks = MotionChecks.of(cell)
     if checks.not_checked is not None:
         reporter.say(checks.not_checked)
-    sent = [*slow, *full, *(warm_up.next_motion() if full else ())]
+    sent = [*slow, *full, *(run.warm_up.next_motion() if full else ())]
     # What is wrong with a motion itself is reported before anything is connected.
     require_allowed(sent, checks)
     own = cell_link(cell, live=run.choices.live) if run.link is None else nullcontext(run.link)
@@ -185,7 +190,7 @@ def _connected(
         runner = Runner(run, link, straight, start)
         times = runner.times(joined, len(slow))
         if any(one.kind != "standstill" for one in full):
-            times += warm_up.expected()
+            times += run.warm_up.expected()
         run.watch.expect(times)
         with reporter.task("running the campaign (s of motion)", sum(times)) as runner.task:
             yield runner
@@ -193,19 +198,18 @@ def _connected(
     run.archives.cycles = runner.cycles
 
 
-def _run_missing(kind: str, runner: Runner, warm_up: WarmUpStage) -> None:
+def _run_missing(runner: Runner, kind: str) -> None:
     """Run the missing motions of a kind; repetitions only while the joints are warm."""
-    campaign = runner.run.campaign
-    _, total = campaign.progress(kind)
-    for interval in campaign.missing(kind):
-        warm = warm_up if kind == "excitation" else None
-        runner.run_until_accepted(interval, interval.index + 1, total, warm)
+    run = runner.run
+    _, total = run.campaign.progress(kind)
+    for interval in run.campaign.missing(kind):
+        runner.run_until_accepted(interval, interval.index + 1, total)
         if kind == "validation":
-            warm_up.motion_ended()
+            run.warm_up.motion_ended()
 
 
-def _result(run: Run, dry_run: DryRunStage, warm_up: WarmUpStage) -> RunResult:
-    campaign, archives, found = run.campaign, run.archives, dry_run.found()
+def _result(run: Run) -> RunResult:
+    campaign, archives, found = run.campaign, run.archives, run.dry_run.found()
     return RunResult(
         campaign=str(campaign.folder.root),
         plan_hash=run.plan_hash,
@@ -213,9 +217,9 @@ def _result(run: Run, dry_run: DryRunStage, warm_up: WarmUpStage) -> RunResult:
         archives=tuple(archives.names),
         rejected=tuple(archives.review.rejected),
         adopted=tuple(archives.review.adopted),
-        dry_run=dry_run.state,
+        dry_run=run.dry_run.state,
         against_gravity=() if found is None else found.against_gravity,
-        warm_up=warm_up.outcome,
+        warm_up=run.warm_up.outcome,
         repetitions=campaign.progress("excitation"),
         validations=campaign.progress("validation"),
         complete=not campaign.missing(),
@@ -223,7 +227,7 @@ def _result(run: Run, dry_run: DryRunStage, warm_up: WarmUpStage) -> RunResult:
         notes=(
             *archives.notes,
             *(f"dry run: {text}" for text in (() if found is None else found.warnings)),
-            *warm_up.notes,
+            *run.warm_up.notes,
             *archives.review.notes,
             *run.watch.problems,
         ),
@@ -335,17 +339,16 @@ class Runner:
         self._position = end
         return name
 
-    def run_until_accepted(
-        self, interval: Interval, number: int, total: int, warm_up: WarmUpStage | None = None
-    ) -> str:
+    def run_until_accepted(self, interval: Interval, number: int, total: int) -> str:
         """Run motion `number` (from 1) of `total` until it passes its check; return its archive.
 
-        `warm_up` warms the arm up before each attempt, and judges whether it was warm at its start.
+        An arm that has cooled down is warmed up before a repetition; one begun cold is rejected.
 
         Raises:
             RepetitionsRejectedError: it failed too often.
         """
         run, reasons = self.run, list[str]()
+        warm_up = run.warm_up if interval.kind == "excitation" else None
         while len(reasons) <= run.campaign.cell.campaign.bad_repetitions:
             if warm_up is not None:
                 warm_up.rewarm(self)
