@@ -118,7 +118,7 @@ class TestEnd:
         execution.stop("first", 1)
         execution.stop("second", 2)
         run(execution, cycles)
-        fails(execution, f"did not come to rest in the {STOP} cycles", late)
+        fails(execution, f"to rest in the {STOP} cycles after a stop was requested", late)
         assert (execution.outcome, execution.reason) == ("stopped", "first")
         assert source.calls == ["stop"]
         assert execution.hold(0) is None
@@ -172,6 +172,8 @@ def test_arrays_of_the_session_are_not_those_of_the_source():
     before = first.copy()
     execution.advance(2)
     execution.resume_from(here, speed, 1, 3)
+    with pytest.raises(SourceFailed, match="the motion source cannot continue: AttributeError"):
+        execution.resume_from(here, None, 1, 3)
     np.testing.assert_array_equal([first, here, speed], [before, HERE, np.zeros(N)])
 
 

@@ -210,11 +210,19 @@ class TestPositionWithFeedForward:
         error = assert_refused(rig, rig.cycle(), Check.CORRECTION_END)
         assert error.unit == {"velocity": "rad/s", "current": "A"}[part]
 
-    @pytest.mark.parametrize("given", [None, (1.0, 2.0), (np.zeros(5), np.zeros(6)), ("a", "b")])
-    def test_invalid_feed_forward(self, given):
+    @pytest.mark.parametrize(
+        ("given", "words"),
+        [
+            *((None, "TypeError"), (("a", "b"), "ValueError")),
+            ((np.zeros(5), np.zeros(6)), "ValueError: a feed-forward velocity of shape"),
+            ((np.zeros(6), 2.0), "ValueError: a feed-forward current of shape"),
+        ],
+    )
+    def test_invalid_feed_forward(self, given, words):
         source = WithFeedForward(np.tile(START, (10, 1)))
         source.feed_forward = lambda: given
-        assert_refused((rig := begun(1, source)), rig.cycle(), SourceFailed)
+        error = assert_refused((rig := begun(1, source)), rig.cycle(), SourceFailed)
+        assert f"the motion source failed to feed forward: {words}" in str(error)
 
 
 SPOILED = [  # mode; part, row, and what is added to it; what is refused
@@ -294,7 +302,7 @@ class TestCorrections:
         error = assert_refused(rig, answer, kind)
         assert np.isfinite(answer.axes["d"]).all()
         if kind is SourceFailed:
-            assert "no field" in str(error)
+            assert f"mode {mode} has no field for a {part}: [" in str(error)
         else:
             assert error.joint == 3
         if kind is Check.CORRECTION_END:
@@ -492,7 +500,7 @@ class TestHold:
         rig.run()
         assert source.stops == 1
         assert rig.ended.outcome == "stopped"
-        assert "cannot" in rig.ended.reason
+        assert rig.ended.reason == "held, which this motion cannot: it was stopped instead"
         rig = closed()  # one that has not begun is dropped
         rig.session.request(Cruise())
         rig.session.hold()
@@ -555,7 +563,8 @@ class TestSourcesThatRaise:
             assert rig.state is State.OPEN
             rig.session.stop()
             rig.cycle()
-        assert "SystemExit: no" in str(rig.refusal)
+        what = "cannot begin" if name == "begin" else "failed to stop"
+        assert f"the motion source {what}: SystemExit: no" in str(rig.refusal)
         assert type(rig.refusal) is SourceFailed
 
     def test_source_that_fails_to_hold(self):
@@ -621,14 +630,16 @@ def test_override_and_its_bounds():
             assert rig.state is State.OPEN
 
 
+STOPPING = "the motion is being stopped"
+WHAT = {"override": "change of override", "hold": "hold", "resume": "resumption"}
 NOT_FITTING = [
-    (lambda: Rig(), "override", "no change of override can be requested"),
-    (lambda: moving(10)[0], "override", "has no override"),
-    (lambda: stopping(Overridable(np.tile(START, (20, 1)))), "override", "is being stopped"),
-    (lambda: opened(), "hold", "no hold can be requested in state 'open'"),
+    (lambda: Rig(), "override", "no motion was requested"),
+    (lambda: moving(10)[0], "override", "this motion has no override"),
+    (lambda: stopping(Overridable(np.ones((20, 1)) * START)), "override", STOPPING),
+    (lambda: opened(), "hold", "no motion was requested"),
     (lambda: Rig(), "resume", "no motion was requested"),
-    (lambda: moving(10)[0], "resume", "cannot be held"),
-    (lambda: stopping(player()), "resume", "is being stopped"),
+    (lambda: moving(10)[0], "resume", "this motion cannot be held"),
+    (lambda: stopping(player()), "resume", STOPPING),
 ]
 
 
@@ -645,6 +656,7 @@ def stopping(source) -> Rig:
 def test_refused_overrides_and_resumptions(situation, request_, words):
     rig = situation()
     state = rig.state
-    with pytest.raises(RequestError, match=words):
+    message = f"no {WHAT[request_]} can be requested in state '{state.name.lower()}': {words}"
+    with pytest.raises(RequestError, match=f"^{message}$"):
         getattr(rig.session, request_)(*[0.5] * (request_ == "override"))
     assert rig.state is state

@@ -30,10 +30,6 @@ def loses_axes(whole: Callable[..., bytes | None]) -> Callable[..., bytes | None
     return emptied
 
 
-def unnamed_errors(entries: dict[str, str]) -> ArchiveHeader:
-    return ArchiveHeader.model_validate({**entries, "entries": entries})
-
-
 encode = CyclicPacket.encode
 IN_THE_CODEC = "AssertionError-tests.fuzz.targets.codec"
 IN_THE_JUDGE = "AssertionError-tests.drivers.judge"
@@ -57,7 +53,8 @@ PLANTED: dict[str, tuple[str, Any, str, Callable[..., Any], str]] = {
     "a controller that loses axes":
         ("codec", ControllerEnd, "_packet", loses_axes(ControllerEnd._packet), IN_THE_CODEC),
     "a header whose errors are not named":
-        ("archive", ArchiveHeader, "of", unnamed_errors, "ValidationError"),
+        ("archive", ArchiveHeader, "of",
+         lambda text: ArchiveHeader.model_validate({**text, "entries": text}), "ValidationError"),
 }  # fmt: skip
 """Target, what is replaced by what, and the beginning of the cause that shows it."""
 

@@ -81,9 +81,6 @@ class Terminal:
     def clear(self) -> None:
         self.seen = b""
 
-    def stop_reading(self) -> None:
-        self.reads = False
-
     def press(self, keys: str) -> None:
         os.write(self.near, keys.encode())
 

@@ -319,7 +319,7 @@ def test_a_dry_run_is_accepted_by_one_word_only(
 def test_a_blocked_terminal_delays_no_stop(tmp_path: Path) -> None:
     with terminal(tmp_path) as end:
         end.await_seen(b"repetition 3 of 30")
-        end.stop_reading()
+        end.reads = False
         time.sleep(1.5)  # some hundred kB of pictures later it blocks
         end.process.send_signal(signal.SIGTERM)
         until = time.monotonic() + 3.0

@@ -675,10 +675,6 @@ def apart(anchors, q):
     return np.asarray(np.linalg.norm(link - base, axis=1))
 
 
-def torsion_energy(q):
-    return np.asarray(0.5 * 40.0 * (q - 0.3) ** 2)
-
-
 def extension_energy(q):
     longer = apart(ANCHORS, q) - 0.4
     return np.asarray(0.5 * 900.0 * longer**2 + 60.0 * longer)
@@ -695,7 +691,7 @@ class TestElementTorque:
     @pytest.mark.parametrize(
         ("element", "energy"),
         [
-            (TORSION, torsion_energy),
+            (TORSION, lambda q: np.asarray(0.5 * 40.0 * (q - 0.3) ** 2)),
             (EXTENSION, extension_energy),
             (BALANCER, lambda q: gas_energy(BALANCER, q)),
             (GAS_SPRING, lambda q: gas_energy(GAS_SPRING, q)),

@@ -163,11 +163,6 @@ def init_of(
     return init.encode()
 
 
-def controller_of(arm: Arm) -> Controller:
-    """One that begins with its arm in the middle of its range."""
-    return Controller(arm.train, arm.middle, arm=arm.number, n_axes=len(arm.axes), slots=arm.slots)
-
-
 SILENCE = 1.0  # s that a session bears while no axis is open
 STRANGE = (0, 10, 501, 3, 6, 11, 12, 14, 17, 500, 502, 504, 505, 506, 508, -1, 1 << 30, 99)
 FREE = ((16, 228), (388, 548), (708, 1040))
@@ -198,7 +193,9 @@ class Conversation(Judged):
             other_axes={(owner, axis + 1) for owner, axis in arm.axes},
         )
         self.obedient = not draw.chance(64)
-        self.controller = controller_of(arm)
+        self.controller = Controller(
+            arm.train, arm.middle, arm=arm.number, n_axes=len(arm.axes), slots=arm.slots
+        )
         conduct = Conduct(
             arm.limits, arm.train, self.mode, arm.number, arm.slots, arm.arms,
             threshold=np.full(arm.n, 2.0), current=np.full(arm.n, 20.0), period=arm.period,

@@ -224,7 +224,7 @@ def _decoded(
         if column in (0, 2):
             good = np.abs(recorded - gears.joint(d[finite, :, column])) <= bound
         elif column in (1, 3):
-            expected = gears.joint_step(d[finite, :, column]) / period
+            expected = np.linalg.solve(gears.matrix, d[finite, :, column].T).T / period
             good = np.abs(recorded - expected) <= bound / period
         else:
             good = recorded == d[finite, :, column]

@@ -128,7 +128,3 @@ class Gears:
     def joint(self, motor: Array) -> Array:
         """Return joint angles [rad] of motor revolutions (m, n)."""
         return np.asarray(np.linalg.solve(self.matrix, (motor - self.offset).T).T, np.float64)
-
-    def joint_step(self, motor: Array) -> Array:
-        """Return differences of joint angles [rad] of those of motor revolutions (m, n)."""
-        return np.asarray(np.linalg.solve(self.matrix, motor.T).T, np.float64)
