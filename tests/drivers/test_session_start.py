@@ -125,6 +125,7 @@ class TestReplies:
         assert rig.send(last_packet) is None
         assert rig.send(rig.init.encode()) is None
         assert rig.session.counters.ended == 3
+        assert rig.seen(PacketRejected) == [PacketRejected("ended", 1)] * 3
         assert rig.session.deadline == np.inf
 
     def test_reply_to_a_longer_packet(self):
