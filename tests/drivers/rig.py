@@ -358,6 +358,7 @@ class Rig:
         """To the end of open mode, and that outcome of the motion."""
         self.run()
         assert self.ended.outcome == outcome
+        assert outcome != "completed" or self.ended.reason == "the motion is complete"
 
     def seen(self, kind):
         return [event for event in self.events if isinstance(event, kind)]

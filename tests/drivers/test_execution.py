@@ -20,21 +20,14 @@ class Correction:
         self.finished = False
         self.calls = []
         self.rows = (np.array([0.1, 0.0]), np.array([0.0, 2.0]))
+        for name in ("stop", "hold", "resume"):
+            setattr(self, name, lambda name=name: self.calls.append(name))
 
     def begin(self):
         pass
 
     def advance(self):
         return self.rows
-
-    def stop(self):
-        self.calls.append("stop")
-
-    def hold(self):
-        self.calls.append("hold")
-
-    def resume(self):
-        self.calls.append("resume")
 
 
 class Motion(Correction):
@@ -124,6 +117,15 @@ class TestEnd:
         assert execution.hold(0) is None
         assert not execution.held
         assert execution.resume() == "the motion is being stopped"
+
+    def test_values_of_another_shape_are_named(self, kind):
+        names = ("correction", "current") if kind is Correction else ("position", "velocity")
+        for place, name in enumerate(names):
+            rows = [np.zeros(N), np.zeros(N)]
+            rows[place] = np.zeros(1)
+            source = kind()
+            source.advance = lambda rows=rows: rows
+            fails(begun(source), rf"source failed: ValueError: a {name} of shape \(1,\), not \(2,")
 
     def test_end_of_a_stop_is_held_without_limit(self, kind):
         execution = begun(source := kind())

@@ -92,7 +92,8 @@ class TestEveryMode:
     def test_a_source_of_another_kind_is_refused(self, mode):
         other = correction(2) if mode in POSITION_MODES else Cruise()
         for source in (other, None, object(), 3, "begin"):
-            with pytest.raises(RequestError, match=f"kind of source mode {mode} needs"):
+            words = f"a {type(source).__name__} is not the kind of source mode {mode} needs"
+            with pytest.raises(RequestError, match=words):
                 Rig(mode=mode).session.request(source)
 
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES | POSITION_MODES))
