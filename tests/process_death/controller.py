@@ -52,10 +52,7 @@ _PDEATHSIG: Final = 1
 
 def _word(place: int) -> Any:
     """A number in a page's header."""
-
-    def set_to(page: Page, value: int) -> None:
-        page.words[place] = value
-
+    set_to = lambda page, value: page.words.__setitem__(place, value)  # noqa: E731
     return property(lambda page: int(page.words[place]), set_to)
 
 
