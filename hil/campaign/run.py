@@ -129,7 +129,7 @@ class Run:
 
     @cached_property
     def dry_run(self) -> DryRunStage:
-        """Its slow motions."""
+        """Its slow motions; made by the gates, before anything moves."""
         return DryRunStage(self)
 
     @cached_property
