@@ -111,7 +111,7 @@ class TestEnd:
         execution.stop("first", 1)
         execution.stop("second", 2)
         run(execution, cycles)
-        fails(execution, f"to rest in the {STOP} cycles after a stop was requested", late)
+        fails(execution, f"not come to rest in the {STOP} cycles after a stop was requested", late)
         assert (execution.outcome, execution.reason) == ("stopped", "first")
         assert source.calls == ["stop"]
         assert execution.hold(0) is None
@@ -121,8 +121,7 @@ class TestEnd:
     def test_values_of_another_shape_are_named(self, kind):
         names = ("correction", "current") if kind is Correction else ("position", "velocity")
         for place, name in enumerate(names):
-            rows = [np.zeros(N), np.zeros(N)]
-            rows[place] = np.zeros(1)
+            rows = [np.zeros(1 if k == place else N) for k in range(2)]
             source = kind()
             source.advance = lambda rows=rows: rows
             fails(begun(source), rf"source failed: ValueError: a {name} of shape \(1,\), not \(2,")

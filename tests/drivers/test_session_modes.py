@@ -214,7 +214,9 @@ class TestPositionWithFeedForward:
     @pytest.mark.parametrize(
         ("given", "words"),
         [
-            *((None, "TypeError"), (("a", "b"), "ValueError")),
+            (None, "TypeError"),
+            (("a", "b"), "ValueError: could not convert"),
+            ((1.0, 2.0), "ValueError: a feed-forward velocity of shape"),
             ((np.zeros(5), np.zeros(6)), "ValueError: a feed-forward velocity of shape"),
             ((np.zeros(6), 2.0), "ValueError: a feed-forward current of shape"),
         ],
@@ -636,7 +638,7 @@ WHAT = {"override": "change of override", "hold": "hold", "resume": "resumption"
 NOT_FITTING = [
     (lambda: Rig(), "override", "no motion was requested"),
     (lambda: moving(10)[0], "override", "this motion has no override"),
-    (lambda: stopping(Overridable(np.ones((20, 1)) * START)), "override", STOPPING),
+    (lambda: stopping(Overridable(np.tile(START, (20, 1)))), "override", STOPPING),
     (lambda: opened(), "hold", "no motion was requested"),
     (lambda: Rig(), "resume", "no motion was requested"),
     (lambda: moving(10)[0], "resume", "this motion cannot be held"),

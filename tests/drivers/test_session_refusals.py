@@ -367,6 +367,7 @@ def test_request_is_refused_by_state(text):
     with pytest.raises(RequestError) as caught:
         rig.session.request(still(3))
     assert f"{caught.value.state}: {caught.value.reason}" == text
+    assert caught.value.state == rig.state.name.lower()
 
 
 class TestNumbers:

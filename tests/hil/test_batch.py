@@ -563,8 +563,12 @@ class TestMetadata:
         monkeypatch.setattr(discovery, "_UNTOUCHED", 0)
         time.sleep(0.01)  # then its time stamps are trusted
         opened, read = [], discovery.open_archive
-        spy = lambda path, **how: opened.append(path) or read(path, **how)  # noqa: E731
-        monkeypatch.setattr(discovery, "open_archive", spy)
+
+        def counting(path, **how):
+            opened.append(path)
+            return read(path, **how)
+
+        monkeypatch.setattr(discovery, "open_archive", counting)
         first = found_in(path, cache=CacheLocation())
         assert found_in(path, cache=CacheLocation()) == first
         assert len(opened) == 1

@@ -52,7 +52,10 @@ _PDEATHSIG: Final = 1
 
 def _word(place: int) -> Any:
     """A number in a page's header."""
-    set_to = lambda page, value: page.words.__setitem__(place, value)  # noqa: E731
+
+    def set_to(page: Page, value: int) -> None:
+        page.words[place] = value
+
     return property(lambda page: int(page.words[place]), set_to)
 
 
@@ -82,10 +85,8 @@ class Page:
 
 def listening(port: int) -> bool:
     """Whether a process of this computer has a UDP port."""
-    for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
-        if line.split()[1].endswith(f":{port:04X}"):
-            return True
-    return False
+    lines = Path("/proc/net/udp").read_text().splitlines()[1:]
+    return any(line.split()[1].endswith(f":{port:04X}") for line in lines)
 
 
 class _Life:

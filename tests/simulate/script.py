@@ -94,14 +94,9 @@ def parse_script(lines: Iterable[str]) -> Script:
     """Parse a script, without empty lines and comments (#); ValueError for an invalid line."""
     stripped = [line.strip() for line in lines]
     used = [line for line in stripped if line and not line.startswith("#")]
-    faults: list[tuple[str, Fault]] = []
-    events: list[ScriptedEvent] = []
-    for line in used:
-        if kind_of(line) in KINDS:
-            events.append(_event(line))
-        else:
-            faults.append((line, _fault(line)))
-    return Script(tuple(used), tuple(faults), tuple(events))
+    faults = tuple((line, _fault(line)) for line in used if kind_of(line) not in KINDS)
+    events = tuple(_event(line) for line in used if kind_of(line) in KINDS)
+    return Script(tuple(used), faults, events)
 
 
 def _fault(line: str) -> Fault:

@@ -425,10 +425,8 @@ class World:
         found = [*self._struck, *self.controller.struck, *self.disk.struck]
         found += [*self._clock.struck, *self._operator.struck]
         found += [one.line for one in self.script.of("always") if one.kind == "with-dry-run"]
-        on_link = [line for line, fault in self.script.faults if line not in found]
-        for line, fault in self.script.faults:
-            if line in on_link and fault.cycle < self.controller.cycle and _of_link(fault):
-                found.append(line)
+        past = [one for one in self.script.faults if one[1].cycle < self.controller.cycle]
+        found += [line for line, fault in past if line not in found and _of_link(fault)]
         return tuple(dict.fromkeys(found))
 
 
