@@ -256,8 +256,13 @@ class Campaign:
             ControllerFault: the controller was not ready.
             OperatorStopError: the operator stopped instead of accepting the dry run.
             CampaignFolderError: the folder was changed, or is in use by another run.
+            InputError: a joint to accept is none of the cell.
             OutputError: a result cannot be written.
         """
+        if unknown := [one for one in accept_torque if one not in self.cell.joint_names]:
+            remedy = f"the joints are {', '.join(self.cell.joint_names)}"
+            problem = f"no joint {', '.join(unknown)} whose torque can be accepted"
+            raise InputError(None, problem, remedy=remedy)
         watch = RunWatch(operator or Unattended(), stop or Stop())
         choices = Choices(
             provenance=provenance,

@@ -187,7 +187,7 @@ def _connected(run: Run, slow: Sequence[Interval], full: Sequence[Interval]) -> 
         # Dry run and warm-up use the moves of the motions that they are made of.
         straight = StraightMoves(cell, narrowed)
         joined = straight.joining([*slow, *full], start)
-        runner = Runner(run, link, straight, start)
+        runner, before = Runner(run, link, straight, start), link.cycles
         times = runner.times(joined, len(slow))
         if any(one.kind != "standstill" for one in full):
             times += run.warm_up.expected()
@@ -195,7 +195,7 @@ def _connected(run: Run, slow: Sequence[Interval], full: Sequence[Interval]) -> 
         with reporter.task("running the campaign (s of motion)", sum(times)) as runner.task:
             yield runner
         link.close()
-    run.archives.cycles = runner.cycles
+    run.archives.cycles = link.cycles - before
 
 
 def _run_missing(runner: Runner, kind: str) -> None:
@@ -305,13 +305,8 @@ class Runner:
 
     def __init__(self, run: Run, link: MotionLink, straight: StraightMoves, start: Array) -> None:
         self.run, self._link, self._straight, self._start = run, link, straight, start
-        self._position, self._before, self._moves = start, link.cycles, 0
+        self._position, self._moves = start, 0
         self._seen = None if run.choices.unrehearsed else seen_in_dry_run(run.campaign.folder)
-
-    @property
-    def cycles(self) -> int:
-        """Cycles archived so far."""
-        return self._link.cycles - self._before
 
     def times(self, joined: Sequence[Interval], slow: int) -> list[float]:
         """Return the seconds of each motion and way; the first `slow` motions are run slowly."""

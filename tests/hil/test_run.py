@@ -56,7 +56,7 @@ from hil.campaign.warmup import (
     change_per_motion,
 )
 from hil.cli import app
-from hil.errors import ControllerFault, HilError, OperatorStopError, OutputError
+from hil.errors import ControllerFault, HilError, InputError, OperatorStopError, OutputError
 from hil.identify.sources import gather_sources
 from hil.motion_checks import MotionChecks
 from hil.move import plan_move, send
@@ -341,17 +341,17 @@ def test_a_mirrored_joint_is_accepted_by_its_name_only(tmp_path: Path, designed:
     step = campaign.status().steps[2]
     assert "runs against the model's gravity" in step.sentence
     assert step.command.endswith(f"--accept-torque {against[0]}")
-    for wrong in ((), ("nothing",)):
+    for wrong in ((), ("elbow",)):
         with pytest.raises(AgainstGravityError):
             campaign.run(accept_dry_run=True, accept_torque=wrong)
-    asked = Operator(accepts=False)
+    with pytest.raises(InputError, match=r"no joint knee .*; the joints are shoulder, elbow"):
+        campaign.run(accept_dry_run=True, accept_torque=["shoulder", "knee"])
     with pytest.raises(DryRunError):
-        campaign.run(operator=asked, accept_dry_run=True)
+        campaign.run(operator=(asked := Operator(accepts=False)), accept_dry_run=True)
     assert asked.asked[0].against_gravity == against
     assert not campaign.folder.completed("excitation")
     done = campaign.run(accept_dry_run=True, accept_torque=against)
-    assert done.complete
-    assert done.against_gravity == against
+    assert (done.complete, done.against_gravity) == (True, against)
 
 
 def test_a_torque_is_judged_by_weight_beside_friction() -> None:
