@@ -283,11 +283,6 @@ def cached_bundle(
     return Bundle(summaries, found.total, cached=len(refs))
 
 
-def is_cached(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation) -> bool:
-    """Return whether there is a cache entry of these archives, intact or not."""
-    return cache.has(refs[0].location, sum_key(refs, settings))
-
-
 @dataclass(frozen=True, eq=False)
 class Arm:
     """A robot by its digest, see :class:`GroupKey`, with one of its cells."""
@@ -503,7 +498,7 @@ class _Batch:
         tasks = []
         for one in campaigns:
             for refs in split_bundles([ref for ref in one.refs if ref.use != "standstill"]):
-                known = is_cached(refs, one.ready, self.cache)
+                known = self.cache.has(refs[0].location, sum_key(refs, one.ready))  # intact or not
                 one.bundles.append((refs, known))
                 tasks += [] if known else [self._reducing(one, refs)]
         self.stream = self.workers.results(tasks)

@@ -261,8 +261,7 @@ class Campaign:
         """
         if unknown := [one for one in accept_torque if one not in self.cell.joint_names]:
             remedy = f"the joints are {', '.join(self.cell.joint_names)}"
-            problem = f"no joint {', '.join(unknown)} whose torque can be accepted"
-            raise InputError(None, problem, remedy=remedy)
+            raise InputError(None, f"no joint {', '.join(unknown)} to accept", remedy=remedy)
         watch = RunWatch(operator or Unattended(), stop or Stop())
         choices = Choices(
             provenance=provenance,

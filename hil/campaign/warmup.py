@@ -100,11 +100,6 @@ class WarmUpRecord:
         """Write the file (OutputError if the disk refuses)."""
         save_record(path, self, FORMAT_VERSION)
 
-    @property
-    def next_index(self) -> int:
-        """Index of the next motion; none is used twice."""
-        return len(self.earlier) + len(self.motions)
-
     def cold(self, now: float) -> bool:
         """Return whether the joints have cooled down by `now` [s since 1970].
 
@@ -277,8 +272,8 @@ class WarmUpStage:
         return found if found is not None and found.motions and found.cold(when) else None
 
     def _interval(self, state: WarmUpRecord) -> Interval:
-        plan = self._run.campaign.plan
-        return Interval("warmup", state.next_index, plan.excitation.trajectory, plan.moves)
+        plan, index = self._run.campaign.plan, len(state.earlier) + len(state.motions)
+        return Interval("warmup", index, plan.excitation.trajectory, plan.moves)
 
     def _present(self) -> WarmUpRecord:
         """Return the warm-up to continue; a new one if the joints have cooled down."""

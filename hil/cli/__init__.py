@@ -127,6 +127,10 @@ class LazyCommands(UserDict[str, Any]):
         text = source.splitlines()[0].partition(": ")[2].removesuffix('"""')
         return text[0].upper() + text[1:]
 
+    def by_purpose(self) -> dict[str, Any]:
+        """Return commands that have only a purpose, for help and completion."""
+        return {name: TyperCommand(name, help=self.purpose(name)) for name in self}
+
 
 def _module(name: str) -> str:
     return "imports" if name == "import" else name  # a Python keyword
@@ -183,13 +187,18 @@ class Group(TyperGroup):
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**{**settings, "commands": COMMANDS})
-        presented(self)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Show the commands by their purposes, without importing them."""
-        self.commands = {name: TyperCommand(name, help=COMMANDS.purpose(name)) for name in COMMANDS}
+        presented(self)
+        self.commands = COMMANDS.by_purpose()
         super().format_help(ctx, formatter)
         self.commands = COMMANDS
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+        """Complete the name of a command, without importing one."""
+        self.commands = COMMANDS.by_purpose()
+        return super().shell_complete(ctx, incomplete)
 
     def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> Any:
         """Return the context of one call; it records whether JSON is requested."""
@@ -235,7 +244,6 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
-    add_completion=False,
 )
 
 

@@ -291,8 +291,7 @@ class TestEstimate:
         found, weights = [], np.ones(2)
         motion = a_motion(11, step=0.4)
         for seed in range(300):
-            torque = noisy(motion, 1.0, seed).torque
-            factor = Factor.from_samples(MODEL, motion, torque)
+            factor = Factor.from_samples(MODEL, motion, noisy(motion, 1.0, seed).torque)
             solution = factor.solve(weights)
             found.append(residual_variance(factor, solution.values, solution.root, weights))
         np.testing.assert_allclose(np.mean(found, axis=0), 1.0, rtol=0.15)
