@@ -1,6 +1,6 @@
-"""Size and order of the source code, beside the targets of its rebuilding.
+"""Order of the source code, held at its ceilings, and its size, as information.
 
-Run with ``python -m tests.house [--list NAME]``; NAME is a row of the table.
+Run with ``python -m tests.house [--list NAME]``; NAME is a row of the table with a ceiling.
 """
 
 from __future__ import annotations
@@ -17,38 +17,20 @@ from typing import Final
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 PACKAGES: Final = ("drivers", "planner", "identification", "sim_fixtures", "hil")
-TARGETS: Final[Mapping[str, int | None]] = {
-    "product lines": 62_000,
-    "product files": 380,
-    "test lines": 55_000,
-    "test files": 260,
-    "import circles": 0,
-    "imports inside functions": None,
-    "files with one importer": None,
-    "banned names": 0,
-    "functions over 60 lines": None,
-    "long names of tests": 0,
-}
 CEILINGS: Final[Mapping[str, int]] = {
-    "product lines": 62_000,
-    "product files": 290,
-    "test lines": 55_000,
-    "test files": 220,
     "import circles": 0,
     "imports inside functions": 25,
-    "files with one importer": 10,
     "banned names": 0,
     "functions over 60 lines": 18,
     "long names of tests": 0,
 }
-"""Figures that no change may exceed: targets that are met, else those of today, to be lowered."""
+"""Figures that no change may exceed. Size has none: features are not traded for lines."""
 BANNED: Final = {
     *("kept", "told", "taken", "answers", "announced", "standing", "sight", "wish", "doubts"),
     *("strangers", "plain", "ways", "drawn", "listed", "counted", "settling"),
     *("anew", "mishap", "mishaps", "hopeless", "mend", "mended", "trouble", "troubles", "suffer"),
 }
 _LONG: Final = 60  # Lines of a function, characters of a test's name
-_LINES: Final = ("product lines", "test lines")
 
 
 @dataclass(frozen=True)
@@ -185,13 +167,10 @@ def _loaded(tree: ast.AST) -> Iterator[ast.AST]:
 
 
 def lists(sources: Sources) -> dict[str, list[str]]:
-    """Each row of the table that is not lines, in full."""
+    """Each row of the table that has a ceiling, in full."""
     return {
-        "product files": [str(path.relative_to(ROOT)) for path in sources.files.values()],
-        "test files": [str(path.relative_to(ROOT)) for path in _tests()],
         "import circles": sources.circles(),
         "imports inside functions": sources.inner_imports(),
-        "files with one importer": sources.single_importers(),
         "banned names": sources.banned_names(),
         "functions over 60 lines": sources.long_functions(),
         "long names of tests": long_test_names(),
@@ -199,34 +178,60 @@ def lists(sources: Sources) -> dict[str, list[str]]:
 
 
 def figures(sources: Sources) -> dict[str, int]:
-    """The table."""
-    return {name: len(one) for name, one in lists(sources).items()} | {
-        "product lines": _lines([*sources.files.values()]),
-        "test lines": _lines(_tests()),
+    """The rows that have a ceiling."""
+    return {name: len(entries) for name, entries in lists(sources).items()}
+
+
+def statements(tree: ast.AST) -> int:
+    """Number of statements, docstrings left out."""
+    return sum(
+        isinstance(node, ast.stmt)
+        and not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))
+        for node in ast.walk(tree)
+    )
+
+
+def sizes(sources: Sources) -> dict[str, int]:
+    """Size of the packages and of the tests, as information."""
+    trees = {
+        package: [tree for name, tree in sources.trees.items() if name.split(".")[0] == package]
+        for package in PACKAGES
+    }
+    trees["tests"] = [ast.parse(path.read_text("utf-8")) for path in _tests()]
+    table = {f"statements of {name}": sum(map(statements, some)) for name, some in trees.items()}
+    classes = [
+        node
+        for tree in sources.trees.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+    ]
+    errors = [node for node in classes if node.name.endswith(("Error", "Fault", "Refused"))]
+    return table | {
+        "product files": len(sources.files),
+        "files with one importer": len(sources.single_importers()),
+        "classes": len(classes),
+        "exceptions": len(errors),
     }
 
 
 def main() -> None:
     """Print the table, or one row in full."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--list", choices=[name for name in TARGETS if name not in _LINES])
+    parser.add_argument("--list", choices=[*CEILINGS])
     wanted = parser.parse_args().list
     sources = Sources.read()
     if wanted is not None:
         print(*lists(sources)[wanted], sep="\n")
         return
-    print(f"{'':26}{'now':>8}{'ceiling':>9}{'target':>8}")
+    print(f"{'':32}{'now':>8}{'ceiling':>9}")
     for name, figure in figures(sources).items():
-        target = TARGETS[name]
-        print(f"{name:26}{figure:8}{CEILINGS[name]:9}{'' if target is None else target:>8}")
+        print(f"{name:32}{figure:8}{CEILINGS[name]:9}")
+    for name, figure in sizes(sources).items():
+        print(f"{name:32}{figure:8}")
 
 
 def _tests() -> list[Path]:
     return sorted((ROOT / "tests").rglob("*.py"))
-
-
-def _lines(paths: list[Path]) -> int:
-    return sum(len(path.read_text("utf-8").splitlines()) for path in paths)
 
 
 if __name__ == "__main__":
