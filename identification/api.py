@@ -23,10 +23,11 @@ from identification.estimators.least_squares import (
 )
 from identification.estimators.losses import Huber, Tukey
 from identification.estimators.prior import (
+    BodyPrior,
     GaussianPrior,
     PosteriorEstimate,
-    fit_with_prior,
-    nominal_prior,
+    body_prior,
+    fit_posterior,
     with_prior,
 )
 from identification.estimators.robust import RobustEstimate, robust_estimate

@@ -1,8 +1,8 @@
-"""Estimation of parameters from samples, and the prior from CAD."""
+"""Estimation of parameters from samples, with the prior of the arm."""
 
 from __future__ import annotations
 
-import math
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,11 +16,9 @@ from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification import IdentificationError, RobotModel
 from identification.estimators.consistent import (
-    Shrinkage,
     SolverError,
     consistent_estimate,
-    fit_shrunk,
-    fitted_values,
+    consistent_values,
 )
 from identification.estimators.delay import rate_products, with_uncertain_delay
 from identification.estimators.instrumental import (
@@ -37,18 +35,21 @@ from identification.estimators.least_squares import (
 )
 from identification.estimators.losses import Huber, Loss, Tukey
 from identification.estimators.prior import (
-    GaussianPrior,
+    BODY_SHARE,
+    NOMINAL_SHARE,
+    BodyPrior,
     PosteriorEstimate,
-    fit_with_prior,
-    nominal_prior,
-    with_prior,
+    body_prior,
+    design_effect_of,
+    fit_posterior,
+    posterior_values,
 )
-from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.factor.columns import instrument_factor
 from identification.factor.factor import (
     QR_CONDITION,
     Estimate,
     Factor,
+    joint_weights,
     no_rows_message,
     total_factor,
 )
@@ -57,7 +58,9 @@ from identification.validation.calibration import Refit
 from identification.validation.finding import joined
 
 from .options import Estimator, Options
-from .prepared import Prepared, samples_of
+from identification.selection.inner_prediction import Strength
+
+from .prepared import Prepared, known_parameters, samples_of
 
 # Hz. A narrower smoother removes part of the motion from the regressor, a bias that instruments
 # cannot correct. On simulated NS 16 logs with 100 to 1000 times the encoder noise, instrumental
@@ -66,9 +69,6 @@ from .prepared import Prepared, samples_of
 MIN_IV_BANDWIDTH: Final = 20.0
 # Difference between data and prior, in standard deviations, that is reported.
 _MAX_PRIOR_DEVIATION: Final = 4.0
-FRICTION_SHARE: Final = 0.5
-"""Relative standard deviation of nominal friction, which varies by tens of per cent with
-temperature, lubricant and wear (Bittencourt and Gunnarsson 2012)."""
 
 Array = NDArray[np.float64]
 
@@ -84,8 +84,7 @@ class Estimation:
     estimator: Estimator
     result: RepeatedEstimate  #: pooled and per repetition
     held_out: tuple[Factor, ...]  #: one per held-out recording
-    #: estimate with the prior from CAD, or the reason why there is none
-    posterior: PosteriorEstimate | str
+    posterior: PosteriorEstimate  #: estimate with the prior; the result of "auto" and "prior"
     refit: Refit  #: parameters by the estimator from a factor, to predict parts of the fitted rows
     warnings: tuple[str, ...]
 
@@ -108,157 +107,151 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
     with reporter.task("estimating", 4) as task:
         fitted = smoothed_for_instruments(model, prepared) if name == "iv" else prepared.fitted
         task.advance(1, name)
-        prior = cad_prior(cell)
+        total = total_factor(model, fitted)
+        posterior = Posterior.of(cell, total, name, prepared.settings.strength)
         if name == "iv":
             result, warnings = _instrumental(model, prepared, fitted)
         elif name in _LOSSES:
             result, warnings = _robust(model, fitted, name)
+        elif name in _OF_PRIOR:
+            result, warnings = _posterior(model, fitted, posterior)
         else:
-            result, warnings = _by_factor(model, fitted, name, prepared.settings.shrinkage, prior)
+            result, warnings = _by_factor(model, fitted, name)
         if prepared.sources.same_motion:
             result = result.with_scatter()
         if variance:
             products = np.asarray(sum(rate_products(model, samples) for samples in fitted))
-            pooled = with_uncertain_delay(result.pooled, result.factor, products, variance)
+            precision = posterior.precision if name in _OF_PRIOR else None
+            pooled = with_uncertain_delay(
+                result.pooled, result.factor, products, variance, precision
+            )
             result = replace(result, pooled=pooled)
         task.advance(1, "prior")
-        posterior: PosteriorEstimate | str = ""
-        try:
-            posterior = fit_with_prior(model, fitted, require_prior(prior), factor=result.factor)
-        except (IdentificationError, InputError) as error:
-            posterior = prior if isinstance(prior, str) else str(error)
-        if name == "prior" and isinstance(posterior, PosteriorEstimate):
-            warnings += _prior_contradictions(model, posterior)
+        beside = posterior.fit(result.factor)
+        if name in _OF_PRIOR:
+            beside = replace(beside, estimate=result.pooled)
+        if name == "prior":
+            warnings += _prior_contradictions(model, beside)
         task.advance(1, "held-out motion")
-        held_out = tuple(Factor.by_time(model, one) for one in prepared.held_out)
+        held_out = tuple(Factor.by_time(model, samples) for samples in prepared.held_out)
         task.advance(1)
     pooled = result.pooled
-    if not pooled.undetermined and pooled.condition > QR_CONDITION:
+    if name not in _OF_PRIOR and not pooled.undetermined and pooled.condition > QR_CONDITION:
         warnings.append(
             f"the scaled condition number is {pooled.condition:.2g}: the motion separates some"
             " parameters poorly (solved by QR)"
         )
-    refit = refit_of(model, name, prepared.settings.shrinkage, prior, posterior)
-    return Estimation(name, result, held_out, posterior, refit, tuple(warnings))
+    refit = refit_of(model, name, posterior)
+    return Estimation(name, result, held_out, beside, refit, tuple(warnings))
 
 
-def cad_prior(cell: Cell) -> GaussianPrior | str:
-    """Return the prior from the URDF and `[nominal]`, or the reason why there is none."""
-    model, table = cell.model, cell.file.nominal
-    known: dict[str, tuple[float, float]] = {}  # mean and standard deviation
-    if table is not None:
-        share = table.uncertainty or FRICTION_SHARE
-        known |= {
-            f"I{j}m": (value, share * value) for j, value in enumerate(table.rotor_inertia, 1)
-        }
-        for name, term, owner, motor, _ in model.friction.terms:
-            values = getattr(table, term.option, None)
-            if values and not motor:
-                known[name] = values[owner], FRICTION_SHARE * abs(values[owner])
-    names = {*model.layout.names, *model.friction.names}
-    known = {name: one for name, one in known.items() if one[0] != 0.0 and name in names}
-    try:
-        if table is None or table.uncertainty == 0.0:
-            return nominal_prior(model, known=known)
-        return nominal_prior(model, table.uncertainty, known)
-    except IdentificationError as error:
-        return str(error)
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Prior of an arm, and how strongly it counts."""
 
+    model: RobotModel
+    prior: BodyPrior
+    design_effect: float  #: rows that count as one
+    consistent: bool  #: whether parameters that no bodies have are excluded
 
-def require_prior(prior: GaussianPrior | str) -> GaussianPrior:
-    """Return the prior of a cell.
+    @classmethod
+    def of(cls, cell: Cell, factor: Factor, name: Estimator, strength: Strength) -> Posterior:
+        """Return the posterior of an estimator; all but "auto" have the strength of the residuals.
 
-    Raises:
-        InputError: there is none.
-    """
-    if isinstance(prior, str):
-        problem = f"there is no prior: {prior}"
-        remedy = "give inertias in the URDF, or use --estimator wls"
-        raise InputError(None, problem, field="--estimator prior", remedy=remedy)
-    return prior
+        The estimator "prior" takes the uncertainty that `[nominal]` states.
+        """
+        table = cell.file.nominal
+        share = BODY_SHARE
+        if name == "prior":
+            share = NOMINAL_SHARE if table is None else table.uncertainty or NOMINAL_SHARE
+        prior = body_prior(cell.model, factor, share, known_parameters(cell))
+        if name != "auto":
+            strength = Strength()
+        effect = strength.design_effect(design_effect_of(factor, prior.gaussian))
+        return cls(cell.model, prior, effect, strength.consistent)
+
+    @property
+    def precision(self) -> Array:
+        """Information of the prior as it counts beside that of all rows (p, p)."""
+        return self.design_effect * self.prior.gaussian.information
+
+    def fit(self, factor: Factor, share: float = 1.0) -> PosteriorEstimate:
+        """Fit a factor that is this share of the rows, with the prior counting as for all."""
+        effect = share * self.design_effect
+        result = fit_posterior(self.model, factor, self.prior.gaussian, effect)
+        if not self.consistent:
+            return result
+        values = self.values(factor, share)
+        variance = factor.squared_errors(values) / np.maximum(factor.samples, 1)
+        noise = np.where(factor.samples > 0, np.sqrt(variance), np.nan)
+        return replace(result, estimate=replace(result.estimate, values=values, noise_std=noise))
+
+    def values(self, factor: Factor, share: float = 1.0) -> Array:
+        """Return the parameters (p,) from a factor that is this share of the rows."""
+        effect = share * self.design_effect
+        values, weights = posterior_values(factor, self.prior.gaussian, effect)
+        if not self.consistent:
+            return values
+        try:
+            return consistent_values(self.model, factor, weights, values, self.prior, effect)
+        except SolverError:
+            return values
 
 
 # Estimators
 
 
-def fit_of(
-    model: RobotModel,
-    name: str,
-    shrinkage: Shrinkage = Shrinkage(),  # noqa: B008 - frozen
-    centre: Array | None = None,
-    prior: GaussianPrior | None = None,
-) -> Fit:
-    """Return the fit function of an estimator that works on factors.
-
-    `centre` (p,) is the consistent solution to shrink to, None for least squares; `prior` is that
-    of the estimator "prior".
-    """
+def fit_of(model: RobotModel, name: str) -> Fit:
+    """Return the fit function of an estimator that works on factors, without prior."""
 
     def fit(some: Sequence[Samples], factor: Factor) -> Estimate:
-        if centre is not None:
-            return fit_shrunk(model, some, shrinkage, centre=centre, factor=factor)
-        if prior is not None:
-            return fit_with_prior(model, some, prior, factor=factor).estimate
         weighting: Weighting = "ordinary" if name == "ols" else "weighted"
-        found = fit_least_squares(model, some, weighting, factor=factor)
+        result = fit_least_squares(model, some, weighting, factor=factor)
         if name == "consistent":
-            found = consistent_estimate(model, factor, found).estimate
-        return found
+            result = consistent_estimate(model, factor, result).estimate
+        return result
 
     return fit
 
 
-def refit_of(
-    model: RobotModel,
-    name: Estimator,
-    shrinkage: Shrinkage,
-    prior: GaussianPrior | str,
-    posterior: PosteriorEstimate | str,
-) -> Refit:
+def refit_of(model: RobotModel, name: Estimator, posterior: Posterior) -> Refit:
     """Return the parameters (p,) by an estimator as a function of a factor.
 
     Robust losses and instruments need samples; weighted least squares represents them.
     """
+    if name in _OF_PRIOR:
+        return posterior.values
     if name == "ols":
         return lambda factor: factor.solve(np.ones(model.n_joints)).values
-    if name == "prior" and not isinstance(prior, str) and not isinstance(posterior, str):
-        effect = posterior.design_effect
-        return lambda factor: with_prior(model, factor, prior, design_effect=effect).estimate.values
     if name == "consistent":
-        shrinkage = Shrinkage(strength=math.inf)
-    elif name != "auto":
-        shrinkage = Shrinkage()
-    return lambda factor: fitted_values(model, factor, shrinkage)
+        return lambda factor: consistent_estimate(model, factor).estimate.values
+    return lambda factor: factor.solve(joint_weights(factor)).values
 
 
-def centre_of(
-    model: RobotModel, total: Factor, shrinkage: Shrinkage
-) -> tuple[Array | None, list[str]]:
-    """Return the consistent solution (p,) that estimates are shrunk towards; and warnings."""
-    try:
-        found = consistent_estimate(model, total, prior_weight=shrinkage.prior_weight)
-    except SolverError as error:
-        return None, [f"least squares is reported because {error}"]
-    return found.estimate.values, []
+_OF_PRIOR: Final = ("auto", "prior")
+
+
+def _posterior(
+    model: RobotModel, fitted: Sequence[Samples], posterior: Posterior
+) -> tuple[RepeatedEstimate, list[str]]:
+    share = 1.0 / len(fitted)
+    result = estimate_repetitions(
+        model,
+        fitted,
+        lambda _, factor: posterior.fit(factor).estimate,
+        # The prior counts for a part as for the whole, so that the scatter is that of the noise.
+        each=lambda _, factor: posterior.fit(factor, share).estimate,
+    )
+    return result, []
 
 
 def _by_factor(
-    model: RobotModel,
-    fitted: Sequence[Samples],
-    name: Estimator,
-    shrinkage: Shrinkage,
-    prior: GaussianPrior | str,
+    model: RobotModel, fitted: Sequence[Samples], name: Estimator
 ) -> tuple[RepeatedEstimate, list[str]]:
-    centre, warnings = None, list[str]()
-    if name == "auto" and shrinkage.strength > 0.0:
-        centre, warnings = centre_of(model, total_factor(model, fitted), shrinkage)
-    own = require_prior(prior) if name == "prior" else None
-    fit = fit_of(model, name, shrinkage, centre, own)
-    free = name == "consistent" or (centre is not None and math.isinf(shrinkage.strength))
     try:
         # The scatter over repetitions shows noise; least squares is enough for it.
-        each = fit_of(model, "wls") if free else fit
-        return estimate_repetitions(model, fitted, fit, each=each), warnings
+        each = fit_of(model, "wls" if name == "consistent" else name)
+        return estimate_repetitions(model, fitted, fit_of(model, name), each=each), []
     except IdentificationError as error:
         if name != "consistent":
             raise

@@ -16,13 +16,13 @@ Method = Literal["default", "paper"]
 Estimator = Literal["auto", "wls", "ols", "huber", "tukey", "prior", "consistent", "iv"]
 
 ESTIMATORS: Final[dict[Estimator, str]] = {
-    "auto": "weighted least squares, regularised towards the consistent solution as far as that "
-    "predicts better (chosen by inner prediction)",
+    "auto": "posterior of a prior on bodies, drives and friction, as strong as the residuals and "
+    "inner prediction say",
     "wls": "weighted least squares (eq. 4), residuals weighted by the noise of their joint",
     "ols": "ordinary least squares, equal weights of all joints",
     "huber": "iteratively reweighted least squares, Huber loss",
     "tukey": "iteratively reweighted least squares, Tukey's bisquare loss",
-    "prior": "weighted least squares with a Gaussian prior from CAD",
+    "prior": "posterior of the bodies of the URDF to the uncertainty of [nominal]",
     "consistent": "weighted least squares over physically consistent parameters",
     "iv": "instrumental variables, with the commanded motion as instruments",
 }

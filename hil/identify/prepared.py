@@ -16,12 +16,18 @@ from hil.cell.robot import ripples
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification.errors import IdentificationError
-from identification.estimators.consistent import Shrinkage
 from identification.estimators.delay import DelayEstimate, estimate_delay
 from identification.estimators.torque_channel import possible_low_passes
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
-from identification.selection.inner_prediction import Choice, Question, choose_settings
+from identification.selection.inner_prediction import (
+    RATE,
+    Choice,
+    Known,
+    Question,
+    Strength,
+    choose_settings,
+)
 from identification.selection.inner_prediction import Settings as Candidate
 from identification.signals.clock import time_base
 from identification.signals.recording import Recording
@@ -48,7 +54,7 @@ class Settings:
     torque_variance: tuple[float, ...] | None = None
     stated_delay: float = 0.0  #: of the torque, by cell or options [s]
     delay_variance: float = 0.0  #: of an estimated delay [s²]; zero for a stated one
-    shrinkage: Shrinkage = Shrinkage()  # noqa: RUF009 - frozen
+    strength: Strength = Strength()  # noqa: RUF009 - frozen
     choices: tuple[Choice, ...] = ()  #: made by inner prediction
 
     def preprocessed(self, **changes: Any) -> Settings:
@@ -128,6 +134,11 @@ MAX_RECORDINGS: Final = 32
 _DELAY_SAMPLES: Final = 8000  # A stated delay is checked on the first samples of a recording
 RIPPLE: Final = ((1,), (2,), (1, 2))
 """Periods of a torque ripple per motor turn: rotor eccentricity, wave generator, both."""
+
+
+FRICTION_SHARE: Final = 0.5
+"""Relative standard deviation of nominal friction, which varies by tens of per cent with
+temperature, lubricant and wear (Bittencourt and Gunnarsson 2012)."""
 
 
 class Decided(NamedTuple):
@@ -222,19 +233,62 @@ def _questions(sources: Sources, options: Options, suggested: Sequence[float]) -
     return {question for question, wanted in questions.items() if wanted}
 
 
+def averaged_source(source: Source, rate: float) -> Source:
+    """Return a source whose recording is averaged to about a rate [Hz]."""
+    if source.context is None:
+        return replace(source, recording=source.recording.averaged(rate))
+    whole, start = source.context
+    mean, part = whole.averaged(rate), source.recording
+    first, last = np.searchsorted(mean.time, [whole.time[start], part.time[-1]])
+    return replace(
+        source, recording=mean.between(int(first), int(last)), context=(mean, int(first))
+    )
+
+
+def averaged_noise(settings: Settings, source: Source, mean: Source) -> Settings:
+    """Return settings with the noise of a source's average."""
+    step, longer = (
+        float(np.median(np.diff(recording.time)))
+        for recording in (source.recording, mean.recording)
+    )
+    position, torque = (
+        None if variance is None else tuple(value * step / longer for value in variance)
+        for variance in (settings.noise_variance, settings.torque_variance)
+    )
+    return replace(settings, noise_variance=position, torque_variance=torque)
+
+
+def known_parameters(cell: Cell) -> Known:
+    """Return mean and standard deviation of the parameters that `[nominal]` states."""
+    table = cell.file.nominal
+    if table is None:
+        return {}
+    model, share = cell.model, table.uncertainty or FRICTION_SHARE
+    known = {f"I{j}m": (value, share * value) for j, value in enumerate(table.rotor_inertia, 1)}
+    for term in model.friction.terms:
+        values = getattr(table, term.term.option, None)
+        if values and not term.motor:
+            value = values[term.owner]
+            known[term.name] = value, FRICTION_SHARE * abs(value)
+    names = {*model.layout.names, *model.friction.names}
+    return {name: pair for name, pair in known.items() if pair[0] != 0.0 and name in names}
+
+
 def _chosen(
     sources: Sources,
-    settings: Settings,
+    stated: Settings,
     suggested: Sequence[float],
     options: Options,
     reporter: Reporter,
 ) -> Settings:
     """Choose the automatic settings by inner prediction; `suggested` delays [s] are candidates."""
-    cell, questions = sources.cell, _questions(sources, options, suggested)
+    cell, questions, settings = sources.cell, _questions(sources, options, suggested), stated
     if not questions:
         return settings
     # One repetition of a motion is enough.
-    read = sources.training[:1] if sources.same_motion else sources.training
+    some = sources.training[:1] if sources.same_motion else sources.training
+    read = [averaged_source(source, RATE) for source in some]
+    settings = averaged_noise(settings, some[0], read[0])
 
     def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
         trial = replace(settings, preprocessing=how)
@@ -244,7 +298,7 @@ def _chosen(
         return possible_low_passes(
             read[0].recording,
             model,
-            noise_variance=sources.noise_variance,
+            noise_variance=_array(settings.noise_variance),
             options=how,
             undelayed=settings.preprocessing.torque_delay,
         )
@@ -252,7 +306,13 @@ def _chosen(
     start = Candidate(cell.model, settings.preprocessing)
     with reporter.task("choosing settings by inner prediction", 1) as task:
         best, choices = choose_settings(
-            ready, start, questions, low_passes, suggested, _ripples(cell)
+            ready,
+            start,
+            questions,
+            low_passes,
+            suggested,
+            _ripples(cell),
+            known_parameters(cell),
         )
         task.advance(1)
     law, friction = best.model.friction.laws[0], dict(settings.friction)
@@ -263,10 +323,10 @@ def _chosen(
     if "ripple" in questions and best.ripple:
         friction |= {"ripple": [*best.ripple]}
     return replace(
-        settings,
+        stated,
         preprocessing=best.preprocessing,
         friction=friction,
-        shrinkage=best.shrinkage,
+        strength=best.strength,
         choices=choices,
     )
 

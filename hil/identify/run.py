@@ -335,7 +335,7 @@ def summarise(
             words=pooled.method
             if estimation.estimator == "auto"
             else ESTIMATORS[estimation.estimator],
-            prior=posterior if isinstance(posterior, str) else posterior.words,
+            prior=posterior.words,
             condition=pooled.condition,
             grouping=model.base.explanation(),
         ),
@@ -495,7 +495,6 @@ def _parameters(
     # Rows 29 and 31 of the paper's Table 2 have the other sign.
     ids = {row.pivot or row.parameter: row.id for row in TABLE2}
     is_ns16 = cell.urdf == URDF_PATH.read_text(encoding="utf-8")
-    known = None if isinstance(posterior, str) else posterior
     return results.ParameterResult.rows(
         name=model.parameter_names,
         expression=[*model.base.expressions(), *model.parameter_names[len(model.base.names) :]],
@@ -508,9 +507,9 @@ def _parameters(
         truth=truth,
         undetermined=[name in pooled.undetermined for name in model.parameter_names],
         of_this_run=model.friction_columns,
-        prior_std=known and known.prior_std,
-        prior_ratio=known and known.ratio,
-        learned=known and known.learned,
+        prior_std=posterior.prior_std,
+        prior_ratio=posterior.ratio,
+        learned=posterior.learned,
     )
 
 

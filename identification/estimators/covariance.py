@@ -54,6 +54,8 @@ _FEWEST_BLOCKS: Final = 20  # fewer blocks make the covariance itself too uncert
 # 80 % without this.
 _LOW_LEVERAGE: Final = 0.5
 _HIGH_LEVERAGE: Final = 0.9
+# With a prior all directions are determined, up to rounding.
+_WORST_WITH_PRIOR: Final = 1e7
 _AT_ONCE: Final = 8  # blocks whose matrices fit the cache
 
 
@@ -62,6 +64,7 @@ class Clustered:
     """Covariance of an estimate by blocks of time."""
 
     covariance: Array  # (p, p), infinite variances of undetermined parameters
+    root: Array  # S (p, k) with S S' the inverse of the information, with that of a prior
     determined: NDArray[np.bool_]  # (p,)
     design_effect: float  # mean ratio of the variance to that of white residuals
     interval_factor: float  # standard deviations in half a 95 % interval
@@ -70,29 +73,35 @@ class Clustered:
 
 
 def block_covariance(
-    factor: Factor, weights: Array, values: Array, prior: Array | None = None
+    factor: Factor,
+    weights: Array,
+    values: Array,
+    prior: Array | None = None,
+    design_effect: float = 1.0,
 ) -> Clustered:
     """Return the cluster-robust covariance of a weighted least-squares estimate by its factor.
 
-    `values` (p,) solve the factor with weights (n,). With the information (p,) of a Gaussian
-    prior, H = A + diag(prior) replaces A, and ``H^-1 diag(prior) H^-1`` times the design effect is
-    added.
+    `values` (p,) solve the factor with weights (n,). With the information P (p, p) of a Gaussian
+    prior, of which `design_effect` times d counts, H = A + d P replaces A, and the prior's scatter
+    ``d² H^-1 P H^-1`` is added to that of the data.
     """
     used = factor.occupied()
     scores = used.scores(weights, values)
     length = block_length(scores)
     longer = used.merged(length)
     equations = factor.weighted(weights)
-    if prior is not None:
-        equations = equations._replace(A=equations.A + np.diag(prior))
     solution = solve(equations)
+    if prior is not None:
+        equations = equations._replace(A=equations.A + design_effect * prior)
+        solution = solve(equations, _WORST_WITH_PRIOR)
     root, scores = solution.root, merged(scores, length)
     shares = np.empty((len(scores), root.shape[1], root.shape[1]))
     for start in range(0, len(scores), _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
         information = longer.blocks(part).by_block(weights)[:, :-1, :-1]
         shares[part] = _shares(information, root, root)
-    return _sandwich(shares, scores, solution, length * FINE_BLOCK, prior)
+    spread = None if prior is None else design_effect**2 * prior
+    return _sandwich(shares, scores, solution, length * FINE_BLOCK, spread)
 
 
 def cluster_covariance(
@@ -113,7 +122,13 @@ def cluster_covariance(
     length = block_length(scores)
     length = max(length, min(stretch * length, len(scores) // _FEWEST_BLOCKS))
     shares = _shares(merged(information, length), solution.root, solution.root)
-    return _sandwich(shares, merged(scores, length), solution, length * block, prior)
+    result = _sandwich(shares, merged(scores, length), solution, length * block)
+    if prior is not None:
+        added = max(1.0, result.design_effect) * (solution.inverse * prior) @ solution.inverse
+        covariance = result.covariance + added
+        mark_undetermined(covariance, solution.determined)
+        result = replace(result, covariance=covariance)
+    return result
 
 
 def _sandwich(
@@ -122,6 +137,7 @@ def _sandwich(
     """Return the covariance by shares of information (B, k, k) and scores (B, p) of blocks.
 
     A correlation r of neighbouring scores, its mean or zero, multiplies the variance by 1 + 2 r.
+    `prior` (p, p) is the scatter of a prior's scores, to be added.
     """
     scores = scores @ solution.root
     corrected = leverage_corrected(shares, scores)
@@ -130,11 +146,12 @@ def _sandwich(
     covariance = np.asarray(moved.T @ moved)
     effect = float((corrected**2).sum() / max(1, corrected.shape[1]))
     if prior is not None:
-        covariance += max(1.0, effect) * (solution.inverse * prior) @ solution.inverse
+        covariance += solution.inverse @ prior @ solution.inverse
     mark_undetermined(covariance, solution.determined)
     count = len(scores)
     return Clustered(
         covariance=covariance,
+        root=solution.root,
         determined=solution.determined,
         design_effect=effect,
         interval_factor=float(student_limit(0.025, max(1, count - 1))),

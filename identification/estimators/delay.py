@@ -94,16 +94,23 @@ def rate_products(model: RobotModel, samples: Samples) -> Array:
 
 
 def with_uncertain_delay(
-    estimate: Estimate, factor: Factor, products: Array, variance: float
+    estimate: Estimate,
+    factor: Factor,
+    products: Array,
+    variance: float,
+    precision: Array | None = None,
 ) -> Estimate:
     """Return the estimate with the variance [s²] of its given delay in the covariance.
 
     The parameters change by the fit of the torque's rate; `products` are the `rate_products` of the
-    factor's samples (n, p, p + 1).
+    factor's samples (n, p, p + 1), `precision` (p, p) is that of a prior beside them.
     """
     weights = inverse_variance(estimate.noise_std**2)
     rate = np.tensordot(weights, products, axes=1) @ np.append(estimate.values, 1.0)
-    moved = solve(factor.weighted(weights)._replace(b=rate)).values
+    equations = factor.weighted(weights)._replace(b=rate)
+    if precision is not None:
+        equations = equations._replace(A=equations.A + precision)
+    moved = solve(equations).values
     known = np.where(np.isfinite(np.diag(estimate.covariance)), moved, 0.0)
     return replace(estimate, covariance=estimate.covariance + variance * np.outer(known, known))
 

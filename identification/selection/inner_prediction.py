@@ -2,7 +2,9 @@
 
 Each recording is cut into `FOLDS` segments. Parameters are estimated from all segments but one and
 predict all rows of that one, including rest. The score of a candidate is ``||e|| / ||tau||`` over
-all joints, averaged over the segments. Held-out data are not read.
+all joints, geometric mean over the segments, so that no hard one decides alone. A candidate replaces the one before it only if its error is
+lower by more than the standard error of the difference over the segments (one-standard-error rule,
+Breiman et al. 1984). Held-out data are not read.
 """
 
 from __future__ import annotations
@@ -10,25 +12,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal, NamedTuple, get_args
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.estimators.consistent import (
-    Shrinkage,
-    SolverError,
-    consistent_estimate,
-    shrunk_values,
+from identification.estimators.consistent import SolverError, consistent_values
+from identification.estimators.prior import (
+    BodyPrior,
+    body_prior,
+    design_effect_of,
+    posterior_values,
+    torque_scatter,
 )
-from identification.factor.factor import (
-    Factor,
-    augmented_rows,
-    count_by_block,
-    joint_weights,
-    solve,
-)
+from identification.factor.factor import Factor, augmented_rows, count_by_block
 from identification.model.elements import Element, TorqueRipple
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
@@ -36,6 +34,7 @@ from identification.signals.masks import LeftOut
 from identification.signals.samples import Preprocessing, Samples, VelocitySource
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
 Question = Literal[
     "delay",
     "bandwidth",
@@ -48,37 +47,73 @@ Question = Literal[
     "estimator",
 ]
 
-FOLDS: Final = 5
+FOLDS: Final = 10
+RATE: Final = 125.0
+"""Rate [Hz] to which recordings are averaged for choices: three times the widest bandwidth."""
+SHORT: Final = 15.0
+"""Time of motion [s] below which questions about details are not asked: ten segments of less than
+a second and a half show no period of an exciting motion."""
+IF_LONG: Final[frozenset[str]] = frozenset({"bandwidth", "presliding", "strength"})
+"""Questions that are asked of long recordings only: their answers correct small errors, and a wrong
+one costs much on another motion."""
 LOW_PASS: Final = "low-pass of the torque"
 DELAY: Final = "delay of the torque"
+STRENGTH: Final = "strength of the prior"
+CONSISTENT: Final = "physical consistency"
 """Names of decisions."""
-# Unmodelled dynamics start at about 10 Hz on most arms: the default.
-BANDWIDTHS: Final = (10.0, 5.0, 7.0, 14.0, 20.0, 40.0)  # Hz
+# A drive differentiates its encoder at a higher rate than the log has.
+VELOCITIES: Final[tuple[VelocitySource, ...]] = ("measured", "position")
+# Unmodelled dynamics start at about 10 Hz on most arms. The smoother of 14 Hz, the default, leaves
+# nine tenths of an amplitude there, and half of it at 14 Hz.
+BANDWIDTHS: Final = (14.0, 7.0, 10.0, 20.0, 40.0)  # Hz
 # A typical value of gears first. Zero is no candidate: its sign at rest is noise.
 PRESLIDING: Final = (1e-4, 1e-6, 1e-5, 3e-5, 3e-4, 1e-3)  # rad or m
-# Rows near a reversal show presliding, but bias intervals of sliding friction.
-LEFT_OUT: Final[tuple[LeftOut, ...]] = ("slow", "rests")
+# Rows of a joint that stands while another moves hold its load; but those near a reversal, or at
+# rest by brake or static friction, can mislead.
+LEFT_OUT: Final[tuple[LeftOut, ...]] = ("rests", "halts", "slow")
 NEARBY: Final = (1.0, 0.9, 0.95, 1.05, 1.1)  # factors of the bandwidth of a low-pass
-STRENGTHS: Final = (0.0, 1e-3, 1e-2, 0.1, 1.0, math.inf)
-PRIOR_WEIGHTS: Final = (0.01, 0.1, 1.0, 10.0)
-# Terms beside Coulomb and viscous friction; they correlate, so one at most. A stated Stribeck speed
-# is a candidate too.
+STRENGTHS: Final = (1.0, 4.0, 0.25)
+"""Weights of the prior: factors of the rows that count as one by the correlation of residuals."""
+# Terms beside Coulomb and viscous friction; they correlate, so one at most. The stated law comes
+# first.
 FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
     {"third": None, "stribeck": None},
     {"third": "quadratic", "stribeck": None},
     {"third": "cubic", "stribeck": None},
     {"third": None, "stribeck": 0.1},
 )
-# Improvement required to replace the first, simpler candidate; more for a low-pass, which
-# correlates with other settings. Estimators and rows have no order of simplicity: the best is used.
-# Less than a tie is rounding.
-TIE: Final = 1e-4
+# Improvement required to replace the first, simpler candidate, beside its standard error; more for
+# a low-pass, which correlates with other settings.
 WORTHWHILE: Final = 0.01
 LOW_PASS_WORTHWHILE: Final = 0.05
 TERM_WORTHWHILE: Final = 0.02
-# Sufficient to compare bandwidths up to 40 Hz.
-_RATE: Final = 250.0  # Hz
-_MOST_SWEEPS: Final = 4
+# An error above the torque itself chooses nothing.
+_MEANINGLESS: Final = 1.0
+# Speeds above this share of the largest are predicted from slower ones to try friction terms.
+_FAST: Final = 0.85
+# Smallest friction within the range of speeds, as a share of Coulomb friction.
+_LEAST_FRICTION: Final = 0.5
+_SHOWN: Final = 0.1  # share of the torque's scatter from which on friction is judged
+_SPEEDS: Final = 20  # points of that test
+_MOST_SWEEPS: Final = 2
+
+
+@dataclass(frozen=True)
+class Strength:
+    """How strongly the prior counts against the data."""
+
+    #: factor of the rows that count as one by the correlation of the residuals
+    weight: float = 1.0
+    consistent: bool = False  #: whether parameters that no bodies have are excluded
+
+    def design_effect(self, of_residuals: float) -> float:
+        """Return how many rows count as one."""
+        return max(1.0, self.weight * of_residuals)
+
+    def describe(self) -> str:
+        """Return the strength as a phrase."""
+        bodies = "physically consistent" if self.consistent else "not restricted to possible bodies"
+        return f"prior weighs {self.weight:g} times as the residuals suggest, {bodies}"
 
 
 @dataclass(frozen=True)
@@ -87,12 +122,12 @@ class Settings:
 
     model: RobotModel  # with its friction
     preprocessing: Preprocessing  # of recordings into samples
-    shrinkage: Shrinkage = Shrinkage()  # noqa: RUF009 - frozen  # of the estimate
+    strength: Strength = Strength()  # noqa: RUF009 - frozen  # of the prior
 
     @property
-    def key(self) -> tuple[Columns, Preprocessing, Shrinkage]:
+    def key(self) -> tuple[Columns, Preprocessing, Strength]:
         """Key of the settings of one robot."""
-        return *self.factor_key, self.shrinkage
+        return *self.factor_key, self.strength
 
     @property
     def factor_key(self) -> tuple[Columns, Preprocessing]:
@@ -103,11 +138,17 @@ class Settings:
     def ripple(self) -> tuple[int, ...]:
         """Orders of the estimated torque ripple, periods per motor turn."""
         elements = self.model.elements.elements
-        return next((one.orders for one in elements if isinstance(one, TorqueRipple)), ())
+        return next((part.orders for part in elements if isinstance(part, TorqueRipple)), ())
 
     def describe(self) -> tuple[str, ...]:
         """Return descriptions of the settings, one by one."""
         how, width = self.preprocessing, self.preprocessing.torque_bandwidth
+        left_out = {
+            "slow": "slow rows and reversals",
+            "halts": "long halts of each joint",
+            "rests": "rests of the whole arm",
+            "none": "none",
+        }
         return (
             f"{how.rigid_bandwidth:g} Hz",
             "measured velocity" if how.velocity == "measured" else "velocity from positions",
@@ -115,12 +156,10 @@ class Settings:
             f"torque ripple, {' and '.join(map(str, self.ripple))} per motor turn"
             if self.ripple
             else "no torque ripple",
-            {"slow": "slow rows and reversals", "rests": "long rests", "none": "none"}.get(
-                how.left_out or "", "by the friction law"
-            ),
+            left_out.get(how.left_out or "", "by the friction law"),
             f"delay of {1e3 * how.torque_delay:.3g} ms",
             "no low-pass" if width is None else f"low-pass of {width:.3g} Hz, {how.torque_shape}",
-            self.shrinkage.describe(),
+            self.strength.describe(),
         )
 
 
@@ -130,17 +169,48 @@ class Choice:
 
     name: str  # of the setting
     candidates: tuple[str, ...]  # descriptions
-    # ``||e|| / ||tau||`` over all joints, mean over the segments; of a low-pass by joint (geometric
-    # mean)
+    # ``||e|| / ||tau||`` over all joints, of a low-pass their geometric mean by joint; geometric mean
+    # over the segments
     errors: tuple[float, ...]
     chosen: int  # index of the candidate
 
 
-class Errors(NamedTuple):
-    """Prediction errors, infinite if some segment cannot be predicted."""
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Prediction errors of the segments."""
 
-    overall: float = math.inf  # ``||e|| / ||tau||`` over all joints, mean over the segments
-    by_joint: float = math.inf  # geometric mean of the relative errors of the joints
+    squares: Array  # of the errors of each segment and joint (FOLDS, n); infinite if not predicted
+    torque: Array  # squares of the torque (FOLDS, n)
+
+    @property
+    def segments(self) -> Array:
+        """``||e|| / ||tau||`` over all joints of each segment with torque (k,)."""
+        loaded = self.torque.sum(axis=1) > 0.0
+        return _relative(self.squares.sum(axis=1)[loaded], self.torque.sum(axis=1)[loaded])
+
+    @property
+    def joints(self) -> Array:
+        """Geometric mean over the joints of their relative error in each segment (k,)."""
+        both = self.torque > 0.0
+        ratio = _relative(self.squares, np.where(both, self.torque, 1.0))
+        count = np.maximum(both.sum(axis=1), 1)
+        means = np.exp(np.where(both, np.log(ratio), 0.0).sum(axis=1) / count)
+        return np.asarray(means[both.any(axis=1)])
+
+    @property
+    def overall(self) -> float:
+        """Geometric mean of the segments' errors, infinite if a segment is not predicted."""
+        return _mean(self.segments)
+
+
+def _mean(errors: Array) -> float:
+    """Return the geometric mean of errors (k,), NaN of none."""
+    return float(np.exp(np.mean(np.log(errors)))) if errors.size else math.nan
+
+
+def _relative(squares: Array, torque: Array) -> Array:
+    """Return relative errors of sums of squares with torque, above zero."""
+    return np.sqrt(np.maximum(squares / torque, np.finfo(np.float64).tiny))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,17 +221,30 @@ class Folds:
     predicted: Factor  # of all rows
 
     @classmethod
-    def of(cls, model: RobotModel, recordings: Iterable[Samples]) -> Folds:
-        """Reduce recordings, each cut into `FOLDS` segments of equal length."""
+    def of(
+        cls, model: RobotModel, recordings: Iterable[Samples], fast: Array | None = None
+    ) -> Folds:
+        """Reduce recordings, each cut into `FOLDS` segments of equal length.
+
+        With speeds `fast` (n,), slower rows are fitted and faster ones are predicted.
+        """
         fitted, predicted = Factor.zero(model, FOLDS), Factor.zero(model, FOLDS)
         for samples in recordings:
-            usable, m = samples.usable, len(samples.torque)
+            usable = samples.usable
+            asked = np.ones_like(usable)
+            if fast is not None:
+                asked = np.abs(samples.motion.velocity) > fast
+                usable = usable & ~asked
+            m = len(samples.torque)
             edges = np.linspace(0, m, FOLDS + 1).round().astype(int)
             index = np.repeat(np.arange(FOLDS), np.diff(edges))
-            predicted.counts[:] += np.diff(edges)[:, None]
+            predicted.counts[:] += count_by_block(index, asked)
             fitted.counts[:] += count_by_block(index, usable)
-            for part, rows in augmented_rows(model, replace(samples, usable=usable | True)):
-                predicted.add_rows(index[part], rows)
+            for part, rows in augmented_rows(model, replace(samples, usable=asked | usable)):
+                both = [table.copy() for table in rows]
+                for table, lost in zip(both, ~asked[part].T, strict=True):
+                    table[:, lost] = 0.0
+                predicted.add_rows(index[part], both)
                 for table, lost in zip(rows, ~usable[part].T, strict=True):
                     table[:, lost] = 0.0
                 fitted.add_rows(index[part], rows)
@@ -172,38 +255,28 @@ class Folds:
         return self.fitted.blocks(np.arange(FOLDS) != k)
 
     def errors(
-        self, estimate: Callable[[int, Factor], Array], rows: Literal["all", "fitted"] = "all"
+        self, estimate: Callable[[Factor], Array], rows: Literal["all", "fitted"] = "all"
     ) -> Errors:
-        """Return prediction errors of ``estimate(k, factor without segment k)`` on these rows."""
+        """Return prediction errors of ``estimate(factor without a segment)`` on its rows."""
         targets = self.predicted if rows == "all" else self.fitted
         squares = np.zeros((FOLDS, targets.n_joints))
         for k in range(FOLDS):
             segment = targets.blocks(np.arange(FOLDS) == k)
-            squares[k] = segment.squared_errors(estimate(k, self.without(k)))
-        torque = np.array([own[:, -1, -1] for own in targets.matrices]).T
-        if not torque.any():
-            return Errors(math.nan, math.nan)
-        return Errors(
-            float(np.mean(_relative(squares.sum(axis=1), torque.sum(axis=1)))),
-            math.exp(float(np.log(_relative(squares.sum(axis=0), torque.sum(axis=0))).mean())),
-        )
-
-
-def _relative(squares: Array, torque: Array) -> Array:
-    """Return relative errors of sums of squares with torque, above zero."""
-    loaded = torque > 0.0
-    shares = squares[loaded] / torque[loaded]
-    return np.sqrt(np.maximum(shares, np.finfo(np.float64).tiny))
+            squares[k] = segment.squared_errors(estimate(self.without(k)))
+        return Errors(squares, np.array([table[:, -1, -1] for table in targets.matrices]).T)
 
 
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
-"""Prepares the fitted data for a model."""
+"""Prepares the fitted data for a model, averaged to `RATE`."""
 
 Columns = tuple[tuple[FrictionLaw, ...], tuple[Element, ...]]
 """Friction and elements of a model."""
 
 LowPasses = Callable[[RobotModel, Preprocessing], Sequence[Preprocessing]]
 """Returns settings with candidate low-passes of the torque."""
+
+Known = Mapping[str, tuple[float, float]]
+"""Mean and standard deviation of parameters that are known beforehand."""
 
 
 def choose_settings(
@@ -213,53 +286,71 @@ def choose_settings(
     low_passes: LowPasses,
     delays: Sequence[float] = (),
     ripples: Sequence[Sequence[TorqueRipple]] = (),
+    known: Known | None = None,
 ) -> tuple[Settings, tuple[Choice, ...]]:
     """Choose settings one after the other, from data that `ready` prepares.
 
     Significant `delays` of the torque [s] are candidates for "delay" that must predict no worse
-    than that of `start`. Returns settings and decisions; `start` alone if the data are too short.
+    than that of `start`. Returns settings and decisions; `start` alone if the data are too short,
+    or predict no part of themselves.
     """
-    trial = _Trial(ready)
+    trial = _Trial(ready, known)
     now = start
     if "bandwidth" in questions:
         now = _with(now, rigid_bandwidth=BANDWIDTHS[0])
+    if "velocity" in questions:
+        now = _with(now, velocity=VELOCITIES[0])
     if "rows" in questions:
         now = _with(now, left_out=LEFT_OUT[0])
     if "presliding" in questions:
         now = _friction(now, presliding=PRESLIDING[0])
-    if "estimator" in questions:
-        # During the sweep estimators without consistent solution are used.
-        quick = [Shrinkage(strength) for strength in STRENGTHS if math.isfinite(strength)]
-        now = trial.decide("", [replace(now, shrinkage=one) for one in quick]).settings
+    asked: set[str] = {*questions}
+    if "estimator" in asked:
+        asked |= {"strength", "consistency"}
+    if trial.duration(now) < SHORT:
+        asked -= IF_LONG
     first = now
-    now, choices = _sweep(trial, first, questions)
-    if "delay" in questions:
-        first, now, choices = _compare_delays(trial, first, now, choices, questions, delays)
-    if "low-pass" in questions:
-        now, choices = _compare_low_passes(trial, first, now, choices, questions, low_passes)
-    # The following models have other columns and need their own centres.
-    trial.clear_centres()
-    if "friction" in questions:
-        law = now.model.friction.laws[0]
-        stated = {"third": law.third, "stribeck": law.stribeck}
-        terms = FRICTION_TERMS if stated in FRICTION_TERMS else (stated, *FRICTION_TERMS)
-        found = trial.decide(
-            "friction at speed", [_friction(now, **one) for one in terms], TERM_WORTHWHILE
-        )
-        now, choices = found.settings, [*choices, found.choice]
-    if "ripple" in questions:
-        rippled = [replace(now, model=now.model.with_elements(one)) for one in ripples]
-        found = trial.decide("torque ripple", [now, *rippled])
-        now, choices = found.settings, [*choices, found.choice]
-    if "estimator" in questions:
-        weights = PRIOR_WEIGHTS if now.shrinkage.strength > 0.0 else (now.shrinkage.prior_weight,)
-        some = [strength for strength in STRENGTHS if strength > 0.0]
-        each = [Shrinkage(), *(Shrinkage(strength, w) for w in weights for strength in some)]
-        found = trial.decide("estimator", [replace(now, shrinkage=one) for one in each], TIE)
-        now, choices = found.settings, [*choices, found.choice]
-    if not math.isfinite(trial.errors(now).overall):
+    now, choices = _sweep(trial, first, asked)
+    if "delay" in asked:
+        first, now, choices = _compare_delays(trial, first, now, choices, asked, delays)
+    if "low-pass" in asked:
+        now, choices = _compare_low_passes(trial, first, now, choices, asked, low_passes)
+    if "friction" in asked:
+        decision = _friction_terms(trial, now)
+        now, choices = decision.settings, [*choices, decision.choice]
+    if "ripple" in asked:
+        rippled = [replace(now, model=now.model.with_elements(elements)) for elements in ripples]
+        decision = trial.decide("torque ripple", [now, *rippled])
+        now, choices = decision.settings, [*choices, decision.choice]
+    if "strength" in asked:
+        weights = [replace(now.strength, weight=weight) for weight in STRENGTHS]
+        decision = trial.decide(STRENGTH, [replace(now, strength=weight) for weight in weights])
+        now, choices = decision.settings, [*choices, decision.choice]
+    if "consistency" in asked:
+        possible = replace(now, strength=replace(now.strength, consistent=True))
+        decision = trial.decide(CONSISTENT, [possible, now])
+        now, choices = decision.settings, [*choices, decision.choice]
+    if not trial.errors(now).overall < _MEANINGLESS:
         return start, ()
     return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
+
+
+def _friction_terms(trial: _Trial, now: Settings) -> _Decision:
+    """Choose the terms beside Coulomb and viscous friction, the stated ones first.
+
+    A term must also predict fast motion from slower one no worse, and leave friction at all speeds:
+    the law is the choice that carries over to another motion least.
+    """
+    law = now.model.friction.laws[0]
+    stated = {"third": law.third, "stribeck": law.stribeck}
+    terms = [stated, *(term for term in FRICTION_TERMS if term != stated)]
+    candidates = [_friction(now, **term) for term in terms]
+    slow_error = trial.fast_error(candidates[0])
+    possible = [
+        k == 0 or (trial.fast_error(each) <= slow_error and trial.has_friction(each))
+        for k, each in enumerate(candidates)
+    ]
+    return trial.decide("friction at speed", candidates, TERM_WORTHWHILE, possible=possible)
 
 
 def _compare_delays(
@@ -267,7 +358,7 @@ def _compare_delays(
     first: Settings,
     now: Settings,
     choices: list[Choice],
-    questions: Collection[Question],
+    questions: Collection[str],
     delays: Sequence[float],
 ) -> tuple[Settings, Settings, list[Choice]]:
     """Compensate a significant delay unless it predicts worse, and choose the other settings again.
@@ -279,9 +370,12 @@ def _compare_delays(
     for delay in delays:
         sliding = _with(now, left_out="slow")
         late = _with(sliding, torque_delay=delay)
-        found = trial.decide(DELAY, [late, sliding], TIE, rows="fitted")
-        compared.append(found.choice)
-        if not found.choice.chosen:
+        # A short recording has to show that the delay predicts better.
+        short = trial.duration(now) < SHORT
+        pair = [sliding, late] if short else [late, sliding]
+        decision = trial.decide(DELAY, pair, 0.0, rows="fitted")
+        compared.append(decision.choice)
+        if decision.settings.preprocessing.torque_delay == delay:
             first = _with(first, torque_delay=delay)
             now, choices = _sweep(trial, first, questions)
     return first, now, [*compared, *choices]
@@ -292,7 +386,7 @@ def _compare_low_passes(
     first: Settings,
     now: Settings,
     choices: list[Choice],
-    questions: Collection[Question],
+    questions: Collection[str],
     low_passes: LowPasses,
 ) -> tuple[Settings, list[Choice]]:
     """Add a low-pass of the torque, or its delay alone, if that predicts better.
@@ -302,22 +396,22 @@ def _compare_low_passes(
     possible = low_passes(first.model, first.preprocessing)
     if not possible:
         return now, choices
-    some = [replace(first, preprocessing=one) for one in possible]
-    filtered, behind = _sweep(trial, trial.best(some), questions)
+    candidates = [replace(first, preprocessing=how) for how in possible]
+    filtered, behind = _sweep(trial, trial.best(candidates), questions)
     # Refined by prediction, as the residual's minimum is flat.
     filtered = trial.decide("", _nearby_bandwidths(filtered), share=0.0).settings
     # Compared by joint, as the channel is common to all.
-    found = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
-    if found.choice.chosen and filtered.preprocessing.torque_shape.causal:
+    decision = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
+    if decision.choice.chosen and filtered.preprocessing.torque_shape.causal:
         # A lag that predicts as well is called a delay.
         late = trial.decide("", _nearby_lags(now, filtered), share=0.0).settings
         delay = trial.decide(DELAY, [now, late], LOW_PASS_WORTHWHILE, by_joint=True)
         both = trial.decide(LOW_PASS, [late, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
         if delay.choice.chosen and not both.choice.chosen:
             return late, [*choices, delay.choice, both.choice]
-    if found.choice.chosen:
-        return filtered, [*behind, found.choice]
-    return now, [*choices, found.choice]
+    if decision.choice.chosen:
+        return filtered, [*behind, decision.choice]
+    return now, [*choices, decision.choice]
 
 
 class _Decision(NamedTuple):
@@ -325,17 +419,31 @@ class _Decision(NamedTuple):
     choice: Choice
 
 
+class _Reduced(NamedTuple):
+    """Rows of settings, with the prior of their model."""
+
+    folds: Folds
+    prior: BodyPrior
+
+
 class _Trial:
     """Scores of settings, with cached factors."""
 
-    def __init__(self, ready: Ready) -> None:
-        self._ready = ready
+    def __init__(self, ready: Ready, known: Known | None) -> None:
+        self._ready, self._known = ready, known
         self._samples: dict[Preprocessing, list[Samples]] = {}
-        self._folds: dict[tuple[Columns, Preprocessing], Folds] = {}
-        self._errors: dict[tuple[Columns, Preprocessing, Shrinkage, str], Errors] = {}
-        self._centres: dict[tuple[tuple[str, ...], float, int], Array] = {}
-        self._near: dict[tuple[str, ...], Array] = {}  # solutions to start from
-        self._unsolved: set[tuple[tuple[str, ...], float]] = set()
+        self._tables: dict[tuple[Columns, Preprocessing], _Reduced] = {}
+        self._errors: dict[tuple[Columns, Preprocessing, Strength, str], Errors] = {}
+        self._effects: dict[tuple[Columns, Preprocessing], float] = {}
+
+    def duration(self, settings: Settings) -> float:
+        """Return the time of motion of the recordings [s], in which at least one joint moves."""
+        samples = self.samples(settings)
+        return sum(
+            float(np.count_nonzero(settings.model.moving(each.motion.velocity).any(axis=1)))
+            * float(np.median(np.diff(each.motion.time)))
+            for each in samples
+        )
 
     def decide(
         self,
@@ -345,19 +453,30 @@ class _Trial:
         *,
         by_joint: bool = False,
         rows: Literal["all", "fitted"] = "all",
+        possible: Sequence[bool] | None = None,
     ) -> _Decision:
-        """Return the first candidate, or the best one if better by a share (`WORTHWHILE`)."""
+        """Return the first candidate, or the best one if it is clearly better.
+
+        Better by a share (`WORTHWHILE`), and by more than the standard error of the difference over
+        the segments.
+        """
         share = WORTHWHILE if share is None else share
-        each = [self.errors(one, rows) for one in candidates]
-        errors = [one.by_joint if by_joint else one.overall for one in each]
-        best = int(np.nanargmin(errors)) if np.any(np.isfinite(errors)) else 0
-        chosen = best if errors[best] < (1.0 - share) * errors[0] else 0
+        scores = [self.errors(each, rows) for each in candidates]
+        segments = [score.joints if by_joint else score.segments for score in scores]
+        means = [_mean(part) for part in segments]
+        chosen = 0
+        for k, mean in enumerate(means):
+            allowed = possible is None or possible[k]
+            if not (allowed and mean < means[chosen] and mean < _MEANINGLESS):
+                continue
+            if _clearly_better(segments[k], segments[0], share):
+                chosen = k
         words = _differences(candidates)
-        return _Decision(candidates[chosen], Choice(name, words, tuple(errors), chosen))
+        return _Decision(candidates[chosen], Choice(name, words, tuple(means), chosen))
 
     def best(self, candidates: Sequence[Settings]) -> Settings:
         """Return the candidate with the least error by joint."""
-        return min(candidates, key=lambda one: self.errors(one).by_joint)
+        return min(candidates, key=lambda each: _mean(self.errors(each).joints))
 
     def errors(self, settings: Settings, rows: Literal["all", "fitted"] = "all") -> Errors:
         """Return the errors of predicting these rows of each segment from the others."""
@@ -367,87 +486,120 @@ class _Trial:
         return self._errors[key]
 
     def _predicted(self, settings: Settings, rows: Literal["all", "fitted"]) -> Errors:
-        shrinkage, folds = settings.shrinkage, self._reduced(settings)
-        centre_key = settings.model.parameter_names, shrinkage.prior_weight
-        if shrinkage.strength > 0.0 and centre_key in self._unsolved:
-            return Errors()
-        if not all(folds.without(k).samples.any() for k in range(FOLDS)):
-            return Errors()
-
-        def estimate(k: int, factor: Factor) -> Array:
-            weights = joint_weights(factor)
-            if shrinkage.strength == 0.0:
-                return solve(factor.weighted(weights)).values
-            key = *centre_key, k
-            if key not in self._centres:
-                near = self._near.get(settings.model.parameter_names)
-                found = consistent_estimate(
-                    settings.model,
-                    factor,
-                    weights=weights,
-                    prior_weight=shrinkage.prior_weight,
-                    near=near,
-                )
-                self._centres[key] = found.estimate.values
-                self._near[settings.model.parameter_names] = found.solution
-            return shrunk_values(factor.weighted(weights), self._centres[key], shrinkage.strength)
-
+        reduced = self._reduced(settings)
+        n = settings.model.n_joints
+        unknown = Errors(np.full((FOLDS, n), np.inf), np.ones((FOLDS, n)))
+        if not all(reduced.folds.without(k).samples.any() for k in range(FOLDS)):
+            return unknown
+        estimate = self._estimator(settings, reduced.prior)
         try:
-            return folds.errors(estimate, rows)
-        except SolverError:  # slow, not repeated
-            self._unsolved.add(centre_key)
-        except IdentificationError:
-            pass
-        return Errors()
+            return reduced.folds.errors(estimate, rows)
+        except (IdentificationError, np.linalg.LinAlgError):
+            return unknown
 
-    def clear_centres(self) -> None:
-        """Discard consistent solutions, to solve again with the next settings."""
-        self._centres.clear()
-        self._unsolved.clear()
-        self._errors.clear()
+    def _estimator(self, settings: Settings, prior: BodyPrior) -> Callable[[Factor], Array]:
+        effect = settings.strength.design_effect(self.effect(settings))
 
-    def _reduced(self, settings: Settings) -> Folds:
-        key = settings.factor_key
-        if key not in self._folds:
-            if settings.preprocessing not in self._samples:
-                samples = self._ready(settings.model, settings.preprocessing)
-                self._samples[settings.preprocessing] = [*samples]
-            samples = self._samples[settings.preprocessing]
+        def estimate(factor: Factor) -> Array:
+            values, weights = posterior_values(factor, prior.gaussian, effect)
+            if settings.strength.consistent:
+                values = consistent_values(
+                    settings.model, factor, weights, values, prior, effect
+                )
+            return values
+
+        return estimate
+
+    def effect(self, settings: Settings) -> float:
+        """Return how many rows count as one by the correlation of the residuals.
+
+        Computed for the settings of the preprocessing: terms of friction change it little.
+        """
+        key = ((), ()), settings.preprocessing
+        if key not in self._effects:
+            samples = self.samples(settings)
             model = settings.model
-            ready = (_thinned(one.with_friction_direction(model)) for one in samples)
-            self._folds[key] = Folds.of(model, ready)
-        return self._folds[key]
+            total = sum((Factor.by_time(model, each) for each in samples), Factor.zero(model))
+            prior = self._reduced(settings).prior.gaussian
+            self._effects[key] = design_effect_of(total, prior) if total.samples.any() else 1.0
+        return self._effects[key]
+
+    def fast_error(self, settings: Settings) -> float:
+        """Return the error of fast motion predicted from slower one; zero if there is none."""
+        samples = self.samples(settings)
+        speeds = [np.abs(each.motion.velocity).max(axis=0) for each in samples]
+        fast = _FAST * np.max(speeds, axis=0)
+        folds = Folds.of(settings.model, samples, fast)
+        if not (folds.fitted.samples.any() and folds.predicted.samples.any()):
+            return 0.0
+        estimate = self._estimator(settings, self._reduced(settings).prior)
+        return folds.predicted.relative_error(estimate(folds.fitted))
+
+    def has_friction(self, settings: Settings) -> bool:
+        """Return whether the fitted friction of every joint stays near Coulomb's at all speeds."""
+        model, reduced = settings.model, self._reduced(settings)
+        values = self._estimator(settings, reduced.prior)(reduced.folds.fitted)
+        table = model.friction.table(values[model.friction_part])
+        fastest = np.max(
+            [np.abs(each.motion.velocity).max(axis=0) for each in self.samples(settings)], axis=0
+        )
+        scatters = torque_scatter(model, reduced.folds.fitted)
+        for law, coefficients, speed, scatter in zip(
+            model.friction.laws, table, fastest, scatters, strict=False
+        ):
+            along = np.linspace(0.0, speed, _SPEEDS)[1:]
+            columns = law.columns(along, np.ones_like(along))
+            forces = [
+                coefficients[symbol] * column
+                for symbol, column in zip(law.symbols, columns, strict=True)
+                if symbol != "fo"
+            ]
+            coulomb = coefficients.get("f0", 0.0)
+            # Friction that hardly shows in the torque is not worth a judgement.
+            if coulomb > _SHOWN * scatter and np.sum(forces, axis=0).min() < _LEAST_FRICTION * coulomb:
+                return False
+        return True
+
+    def samples(self, settings: Settings) -> list[Samples]:
+        """Return the samples of settings, with their friction's direction."""
+        if settings.preprocessing not in self._samples:
+            samples = self._ready(settings.model, settings.preprocessing)
+            self._samples[settings.preprocessing] = [*samples]
+        samples = self._samples[settings.preprocessing]
+        return [each.with_friction_direction(settings.model) for each in samples]
+
+    def _reduced(self, settings: Settings) -> _Reduced:
+        key = settings.factor_key
+        if key not in self._tables:
+            folds = Folds.of(settings.model, self.samples(settings))
+            prior = body_prior(settings.model, folds.fitted, known=self._known)
+            self._tables[key] = _Reduced(folds, prior)
+        return self._tables[key]
 
 
-def _thinned(samples: Samples) -> Samples:
-    """Reduce the rate of samples to what comparisons need."""
-    usual = float(np.median(np.diff(samples.motion.time)))
-    every = max(1, round(1.0 / (_RATE * usual)))
-    if every == 1 or samples.torque_bandwidth is not None:
-        return samples
-    some = slice(None, None, every)
-    return replace(
-        samples,
-        motion=samples.motion.rows(some),
-        torque=samples.torque[some],
-        usable=samples.usable[some],
-        segments=(slice(0, len(samples.torque[some])),),
-        mask=None,
-    )
+def _clearly_better(errors: Array, first: Array, share: float) -> bool:
+    """Return whether errors of segments (k,) are lower than others by share and standard error."""
+    if errors.shape != first.shape or not errors.size:
+        return False
+    if not np.all(np.isfinite(first)):
+        return bool(np.all(np.isfinite(errors)))
+    change = np.log(errors / first)
+    spread = float(change.std(ddof=1) / np.sqrt(len(change))) if len(change) > 1 else np.inf
+    return bool(change.mean() < min(math.log(1.0 - share), -spread))
 
 
 def _sweep(
-    trial: _Trial, now: Settings, questions: Collection[Question]
+    trial: _Trial, now: Settings, questions: Collection[str]
 ) -> tuple[Settings, list[Choice]]:
     """Decide interdependent settings in turn until nothing changes."""
-    asked = [one for one in _SWEPT if one.question in questions]
+    asked = [swept for swept in _SWEPT if swept.question in questions]
     choices: list[Choice] = []
     for _ in range(_MOST_SWEEPS):
         before = now
         choices = []
-        for one in asked:
-            found = trial.decide(one.name, one.vary(now), one.share)
-            now, choices = found.settings, [*choices, found.choice]
+        for swept in asked:
+            decision = trial.decide(swept.name, swept.vary(now))
+            now, choices = decision.settings, [*choices, decision.choice]
         if now.key == before.key:
             break
     return now, choices
@@ -459,30 +611,28 @@ class _Swept(NamedTuple):
     question: Question
     name: str
     vary: Callable[[Settings], list[Settings]]  # settings with each candidate
-    share: float = WORTHWHILE  # required improvement, see `_Trial.decide`
 
 
 _SWEPT: Final = (
+    _Swept(
+        "rows",
+        "rows that are left out",
+        lambda now: [_with(now, left_out=rows) for rows in LEFT_OUT],
+    ),
+    _Swept(
+        "velocity",
+        "velocity",
+        lambda now: [_with(now, velocity=source) for source in VELOCITIES],
+    ),
     _Swept(
         "bandwidth",
         "bandwidth of the motion",
         lambda now: [_with(now, rigid_bandwidth=width) for width in BANDWIDTHS],
     ),
     _Swept(
-        "velocity",
-        "velocity",
-        lambda now: [_with(now, velocity=source) for source in get_args(VelocitySource)],
-    ),
-    _Swept(
         "presliding",
         "presliding displacement",
         lambda now: [_friction(now, presliding=distance) for distance in PRESLIDING],
-    ),
-    _Swept(
-        "rows",
-        "rows that are left out",
-        lambda now: [_with(now, left_out=rows) for rows in LEFT_OUT],
-        share=0.0,
     ),
 )
 
@@ -509,7 +659,7 @@ def _with(settings: Settings, **changes: Any) -> Settings:
 
 def _differences(candidates: Sequence[Settings]) -> tuple[str, ...]:
     """Describe candidates by their differences."""
-    parts = [one.describe() for one in candidates]
+    parts = [each.describe() for each in candidates]
     differ = [len(set(column)) > 1 for column in zip(*parts, strict=True)]
     return tuple(
         ", ".join(word for word, apart in zip(words, differ, strict=True) if apart)

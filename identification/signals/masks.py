@@ -39,7 +39,7 @@ _FALL: Final = 16.0
 # an arm with a balancer fitting long rests doubles the prediction error.
 LONGEST_HALT: Final = 0.25  # s
 
-LeftOut = Literal["rests", "slow", "none"]
+LeftOut = Literal["rests", "halts", "slow", "none"]
 
 EDGE: Final = "beside a gap or an end of the recording"
 SATURATED: Final = "torque or current saturated"
@@ -97,8 +97,10 @@ def mask_rows(
     `bandwidth` (n,) [Hz] and `delay` [s] are of the smoothing; `torque_bandwidth` (n,) [Hz] of a
     low-pass of torque and regressor; `current_limit` (n,) [A] of motors. `left_out` excludes
 
-    - "rests": rows slower than standstill for more than `LONGEST_HALT`, and the two rows at a
-        change of the velocity's sign;
+    - "rests": rows in which no joint moves for more than `LONGEST_HALT`: a joint that stands while
+        another moves holds its load;
+    - "halts": rows of a joint slower than standstill for more than `LONGEST_HALT`, and the two rows
+        at a change of its velocity's sign;
     - "slow": all rows slower than standstill, or near a velocity reversal;
     - "none": no slow rows.
     """
@@ -117,6 +119,9 @@ def mask_rows(
     reversal = near_any_reversal(model, motion, REVERSAL_PERIODS / bandwidth)
     reasons = {EDGE: np.broadcast_to(edge[:, None], shape)}
     if left_out == "rests":
+        rest = long_rests(motion.time, still.all(axis=1, keepdims=True))
+        reasons |= {REST: np.broadcast_to(rest, shape)}
+    elif left_out == "halts":
         at_once = near_any_reversal(model, motion, np.zeros(shape[1]))
         reasons |= {REST: long_rests(motion.time, still), REVERSAL: at_once}
     elif left_out == "slow":

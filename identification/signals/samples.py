@@ -42,7 +42,7 @@ class Preprocessing:
     #: velocity and acceleration from the smoothed position, or from the smoothed measured velocity
     #: if recorded
     velocity: VelocitySource = "position"
-    #: excluded slow rows, see :func:`identification.signals.masks.mask_rows`; by default "rests" if
+    #: excluded slow rows, see :func:`identification.signals.masks.mask_rows`; by default "halts" if
     #: all joints have presliding friction, else "slow"
     left_out: LeftOut | None = None
     #: as in the paper: torque and regressor are smoothed alike. Without it least squares averages
@@ -227,7 +227,7 @@ def prepare(
         current_limit=current_limit,
         torque_bandwidth=torque_bandwidth,
         delay=options.torque_delay,
-        left_out=options.left_out or ("rests" if presliding else "slow"),
+        left_out=options.left_out or ("halts" if presliding else "slow"),
     )
     samples = Samples(
         motion=motion,
