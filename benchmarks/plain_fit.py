@@ -199,7 +199,7 @@ def body_lengths(robot: Any) -> Array:
         if inboard >= 0:
             way = np.linalg.norm(robot.jointPlacements[joint].translation)
             length[inboard] = max(length[inboard], way)
-    return np.maximum(length, _LEAST_LENGTH * length.max())
+    return np.asarray(np.maximum(length, _LEAST_LENGTH * length.max()))
 
 
 def regressor(robot: Any, measured: Measured, cutoff: float) -> Array:
@@ -238,18 +238,19 @@ def solve(table: Array, torque: Array) -> Array:
     """Weighted least squares (14 n,) of minimum norm; a joint's weight is that of its residual."""
     factors = _joint_factors(table, torque)
     least = 1e-9 * float(np.linalg.norm(torque)) or 1.0
-    scale = np.ones(torque.shape[1])
+    scale: Array = np.ones(torque.shape[1])
     for _ in range(_ROUNDS):
         rows = np.vstack([factor / s for factor, s in zip(factors, scale, strict=True)])
-        parameters = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=_RANK)[0]
+        parameters: Array = np.asarray(np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=_RANK)[0])
         scale = np.maximum(_residuals(factors, parameters), least)
-    return np.asarray(parameters)
+    return parameters
 
 
 def solve_friction(bodies: Array, table: Array, torque: Array) -> Array:
     """Least squares (14 n,) over the last four parameters of each joint, the bodies given."""
     n = torque.shape[1]
-    parameters, left = bodies.copy(), torque - table @ bodies
+    parameters: Array = bodies.copy()
+    left = torque - table @ bodies
     for joint in range(n):
         columns = 10 * n + joint + n * np.arange(4)
         parameters[columns] = np.linalg.lstsq(
@@ -264,6 +265,7 @@ def solve_with_prior(
     """Most probable parameters (14 n,); a joint's noise is that of its residual, iterated."""
     factors = _joint_factors(table, torque)
     least = 1e-9 * float(np.linalg.norm(torque)) or 1.0
+    parameters: Array = prior.mean
     noise = np.maximum(torque.std(axis=0), least)
     for _ in range(_ROUNDS):
         weighted = [factor / s for factor, s in zip(factors, noise, strict=True)]
