@@ -47,9 +47,9 @@ import scipy.signal
 from numpy.typing import NDArray
 
 from benchmarks import parser_of, show
+from benchmarks.arms import ARMS, urdf
 from benchmarks.board import suspicious
 from benchmarks.degradations import CAUSES
-from benchmarks.identification import ARMS, urdf
 from benchmarks.joint_log import JointLog
 from benchmarks.plain_fit import robot_from_urdf
 from hil.identify import identify_archives
@@ -246,15 +246,24 @@ class Logged(NamedTuple):
     torque: Array
 
 
-def logged(arm: Arm, seed: int, part: int, duration: float, delay: float, *, white: bool) -> Logged:
-    """Log a motion with noise, the torque a delay [s] late."""
+def logged(
+    arm: Arm,
+    seed: int,
+    part: int,
+    duration: float,
+    delay: float,
+    *,
+    white: bool = False,
+    rate: float = RATE,
+) -> Logged:
+    """Log a motion with noise at a rate [Hz], the torque a delay [s] late."""
     random = np.random.default_rng([seed, 2, part])
     motion = drawn_motion(arm.robot, random, duration)
-    time = np.arange(round(duration * RATE)) / RATE
+    time = np.arange(round(duration * rate)) / rate
     torque = arm.torque(*motion.at(time - delay))
     noise = random.standard_normal(torque.shape)
     if not white:
-        keep = np.exp(-1.0 / (_MEMORY * RATE))
+        keep = np.exp(-1.0 / (_MEMORY * rate))
         drive = np.sqrt(1.0 - keep**2) * random.standard_normal(torque.shape)
         noise = np.sqrt(0.5) * (noise + scipy.signal.lfilter([1.0], [1.0, -keep], drive, axis=0))
     torque += _TORQUE_NOISE * torque.std(axis=0) * noise

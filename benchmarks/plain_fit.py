@@ -11,6 +11,10 @@ Coulomb and viscous friction and an offset for each joint. Every row is fitted.
 - `fit_with_prior`: the most probable parameters of a Gaussian prior about the URDF's, at one
   cut-off. Where the motion determines a parameter, this is `fit`.
 
+Run with ``python -m benchmarks.plain_fit LOG.npz ROBOT.urdf [--share 0.7]`` for `fit` alone, on the
+first part of arrays `time`, `position`, `torque` and perhaps `velocity`; it prints cut-off and
+errors on both parts.
+
 The cut-off of the first two is the one with which the first 70 % of what is fitted predict the rest
 of it best. The latter two have no meaning, or another prior, where the masses of a URDF are
 placeholders (`has_masses`).
@@ -18,8 +22,11 @@ placeholders (`has_masses`).
 
 from __future__ import annotations
 
+import argparse
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -51,6 +58,11 @@ class Measured(NamedTuple):
     position: Array
     velocity: Array | None
     torque: Array
+
+    def rows(self, wanted: slice) -> Measured:
+        """Some of the rows."""
+        velocity = None if self.velocity is None else self.velocity[wanted]
+        return Measured(self.time[wanted], self.position[wanted], velocity, self.torque[wanted])
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,3 +305,28 @@ def _residuals(factors: Sequence[Array], parameters: Array) -> Array:
 def relative_error(torque: Array, predicted: Array) -> float:
     """||tau - tau_hat|| / ||tau|| over all joints and rows."""
     return float(np.linalg.norm(torque - predicted) / np.linalg.norm(torque))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Fit the first part of a log and predict the rest; print a line of JSON."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("log", type=Path)
+    parser.add_argument("urdf", type=Path)
+    parser.add_argument("--share", type=float, default=INNER_SHARE, help="of the rows, fitted")
+    options = parser.parse_args(arguments)
+    with np.load(options.log) as arrays:
+        whole = Measured(
+            arrays["time"], arrays["position"], arrays.get("velocity"), arrays["torque"]
+        )
+    cut = round(options.share * len(whole.time))
+    first, last = whole.rows(slice(0, cut)), whole.rows(slice(cut, None))
+    fitted = fit(robot_from_urdf(options.urdf.read_text(encoding="utf-8")), first)
+    errors = {
+        name: relative_error(part.torque, fitted.predicted_torque(part))
+        for name, part in (("fitted", first), ("predicted", last))
+    }
+    print(json.dumps({"cutoff": fitted.cutoff, **errors}))
+
+
+if __name__ == "__main__":
+    main()

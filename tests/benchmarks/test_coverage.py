@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks import coverage, plain_fit
+from benchmarks.arms import urdf
 from benchmarks.coverage import ARM_TYPES, Run, drawn_arm, drawn_body, drawn_motion, logged
-from benchmarks.identification import urdf
 from hil.importers import IMPORTED_LAW
 from identification.model.robot import RobotModel
 
