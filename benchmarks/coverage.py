@@ -1,16 +1,17 @@
 """Whether 95 % intervals of `hil identify` hold the truth of arms that were simulated without hil.
 
 Run with ``python -m benchmarks.coverage [--seeds N] [--arms NAME ...] [--delays MS ...]
-[--quadratic] [--white] [--json]``. Each run is a log of its own seed, imported and identified with
-default settings; another motion is held out. Motion, dynamics (pinocchio's RNEA), friction and
-noise share no code with what is tested, only the URDF; what the parameters are called and how they
-are grouped is the project's.
+[--quadratic] [--white] [--rate HZ] [--speed SHARE] [--json]``. Each run is a log of its own seed,
+imported and identified with default settings; another motion is held out. Motion, dynamics
+(pinocchio's RNEA), friction and noise share no code with what is tested, only the URDF; what the
+parameters are called and how they are grouped is the project's.
 
 - The arm is not its URDF: masses differ by 10 to 20 %, centres and inertias alike, by a congruence
   of the pseudo-inertia, which keeps a body physically consistent. Its rotors are in no URDF.
 - Friction is Coulomb, viscous and an offset, the law that an import assumes. ``--quadratic`` adds a
   term with the speed squared, and states all four in the archive.
 - The motion is a random Fourier series within the URDF's limits that starts and ends at rest.
+  ``--speed`` is the share of the largest speeds that it may use.
 - Positions have 1e-5 rad of noise. The torque has 1.4 % of its scatter, half of its power white and
   half with a memory of 50 ms; ``--white`` all white. It is logged a delay late, the same for all
   joints.
@@ -61,7 +62,6 @@ from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
 
-RATE: Final = 250.0  # Hz
 FITTED_TIME: Final = 30.0  # s
 HELD_OUT_TIME: Final = 12.0  # s
 DELAYS: Final = (0.0, 1.3, 4.0, 10.0)  # ms
@@ -70,7 +70,6 @@ QUADRATIC_LAW: Final = FrictionLaw(third="quadratic", offset=True)
 
 _BASE_FREQUENCY: Final = 0.1  # Hz
 _HARMONICS: Final = 10
-_SPEED_SHARE: Final = 0.7  # of the URDF's largest speeds
 _ROOM_SHARE: Final = 0.6  # of the way from the middle of a range to its end
 _MOST_ROOM: Final = 2.0  # rad
 _ACCELERATION: Final = 4.0  # 1/s, largest acceleration over largest speed
@@ -83,6 +82,25 @@ _SHAPE_SCATTER: Final = 0.05  # of the pseudo-inertia's congruence, each entry
 _MASS_SCATTER: Final = 0.12  # of the logarithm of a body's density
 _FRICTION_SCATTER: Final = 0.2  # of each coefficient
 _PROJECT_ORDER: Final = (4, 5, 7, 6, 8, 9, 1, 2, 3, 0)  # of pinocchio's ten parameters of a body
+
+
+class Conditions(NamedTuple):
+    """What all runs of a study have in common.
+
+    Attributes:
+        quadratic: whether friction has a term with the speed squared, stated in the archive.
+        white: whether the noise of the torque has no memory.
+        rate: of the log [Hz].
+        speed: share of the URDF's largest speeds that motions may use.
+    """
+
+    quadratic: bool = False
+    white: bool = False
+    rate: float = 250.0
+    speed: float = 0.7
+
+
+DEFAULTS: Final = Conditions()
 
 
 class Friction(NamedTuple):
@@ -222,8 +240,10 @@ class Motion:
         return value, slope, 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x) * way**2
 
 
-def drawn_motion(robot: Any, random: np.random.Generator, duration: float) -> Motion:
-    """Draw a motion within the URDF's limits of position and speed."""
+def drawn_motion(
+    robot: Any, random: np.random.Generator, duration: float, speed_share: float
+) -> Motion:
+    """Draw a motion within the URDF's limits of position and a share of those of speed."""
     n = robot.nv
     harmonic = np.arange(1.0, _HARMONICS + 1.0)[:, None]
     cosine, sine = random.standard_normal((2, _HARMONICS, n)) / harmonic
@@ -232,7 +252,7 @@ def drawn_motion(robot: Any, random: np.random.Generator, duration: float) -> Mo
     room = np.minimum(_ROOM_SHARE * room, _MOST_ROOM)
     series = Motion(np.zeros(n), cosine, sine, duration)
     largest = [np.abs(values).max(axis=0) for values in series.at(np.arange(0.0, duration, 0.01))]
-    speed = _SPEED_SHARE * robot.velocityLimit
+    speed = speed_share * robot.velocityLimit
     limits = room, speed, _ACCELERATION * speed
     scale = np.min([limit / most for limit, most in zip(limits, largest, strict=True)], axis=0)
     return Motion(centre, scale * cosine, scale * sine, duration)
@@ -247,23 +267,16 @@ class Logged(NamedTuple):
 
 
 def logged(
-    arm: Arm,
-    seed: int,
-    part: int,
-    duration: float,
-    delay: float,
-    *,
-    white: bool = False,
-    rate: float = RATE,
+    arm: Arm, seed: int, part: int, duration: float, delay: float, conditions: Conditions
 ) -> Logged:
-    """Log a motion with noise at a rate [Hz], the torque a delay [s] late."""
+    """Log a motion with noise, the torque a delay [s] late."""
     random = np.random.default_rng([seed, 2, part])
-    motion = drawn_motion(arm.robot, random, duration)
-    time = np.arange(round(duration * rate)) / rate
+    motion = drawn_motion(arm.robot, random, duration, conditions.speed)
+    time = np.arange(round(duration * conditions.rate)) / conditions.rate
     torque = arm.torque(*motion.at(time - delay))
     noise = random.standard_normal(torque.shape)
-    if not white:
-        keep = np.exp(-1.0 / (_MEMORY * rate))
+    if not conditions.white:
+        keep = np.exp(-1.0 / (_MEMORY * conditions.rate))
         drive = np.sqrt(1.0 - keep**2) * random.standard_normal(torque.shape)
         noise = np.sqrt(0.5) * (noise + scipy.signal.lfilter([1.0], [1.0, -keep], drive, axis=0))
     torque += _TORQUE_NOISE * torque.std(axis=0) * noise
@@ -320,16 +333,16 @@ class Run(NamedTuple):
     seconds: float
 
 
-def run(name: str, delay: float, seed: int, *, quadratic: bool = False, white: bool = False) -> Run:
+def run(name: str, delay: float, seed: int, conditions: Conditions = DEFAULTS) -> Run:
     """Simulate an arm, log it a delay [s] late, import the log and identify it."""
     kind = ARM_TYPES[name]
-    arm = drawn_arm(kind, seed, quadratic=quadratic)
-    law = QUADRATIC_LAW if quadratic else IMPORTED_LAW
+    arm = drawn_arm(kind, seed, quadratic=conditions.quadratic)
+    law = QUADRATIC_LAW if conditions.quadratic else IMPORTED_LAW
     with tempfile.TemporaryDirectory() as scratch:
         robot = Robot.from_urdf(urdf(kind.urdf), friction=law, locked=kind.locked)
         archives = []
         for part, duration in enumerate((FITTED_TIME, HELD_OUT_TIME)):
-            log = logged(arm, seed, part, duration, delay, white=white)
+            log = logged(arm, seed, part, duration, delay, conditions)
             joint_log = JointLog(
                 robot, log.time, log.position, None, log.torque, kind.rated_payload
             )
@@ -436,15 +449,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--delays", nargs="+", type=float, default=DELAYS, metavar="MS")
     parser.add_argument("--quadratic", action="store_true", help="true, and stated in the archive")
     parser.add_argument("--white", action="store_true", help="no coloured noise of the torque")
+    parser.add_argument("--rate", type=float, default=DEFAULTS.rate, metavar="HZ")
+    parser.add_argument("--speed", type=float, default=DEFAULTS.speed, metavar="SHARE")
     options = parser.parse_args(arguments)
+    conditions = Conditions(options.quadratic, options.white, options.rate, options.speed)
     runs: dict[str, list[Run]] = {}
     for name in options.arms:
         for delay in options.delays:
             cell = f"{name}, {delay:g} ms"
             for seed in range(options.first_seed, options.first_seed + options.seeds):
-                found = run(
-                    name, 1e-3 * delay, seed, quadratic=options.quadratic, white=options.white
-                )
+                found = run(name, 1e-3 * delay, seed, conditions)
                 runs.setdefault(cell, []).append(found)
                 print(
                     f"{cell}, seed {seed}: {found.seconds:.1f} s of processor",
@@ -459,8 +473,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     result = {
         "cells": {cell: figures(cell_runs) for cell, cell_runs in runs.items()},
         "all": every,
-        "quadratic": options.quadratic,
-        "white": options.white,
+        **conditions._asdict(),
     }
     show(result, only_json=True)
 

@@ -7,10 +7,19 @@ import pytest
 
 from benchmarks import coverage, plain_fit
 from benchmarks.arms import urdf
-from benchmarks.coverage import ARM_TYPES, Run, drawn_arm, drawn_body, drawn_motion, logged
+from benchmarks.coverage import (
+    ARM_TYPES,
+    Conditions,
+    Run,
+    drawn_arm,
+    drawn_body,
+    drawn_motion,
+    logged,
+)
 from hil.importers import IMPORTED_LAW
 from identification.model.robot import RobotModel
 
+SPEED = DEFAULTS.speed
 ARMS = [pytest.param(name, id=name) for name in ARM_TYPES]
 
 
@@ -26,7 +35,7 @@ class TestArm:
         model = RobotModel.from_urdf(text, locked=kind.locked, friction=law)
         truth = coverage.true_values(arm, model)
         assert list(truth) == list(model.parameter_names)
-        motion = drawn_motion(arm.robot, np.random.default_rng(2), 10.0)
+        motion = drawn_motion(arm.robot, np.random.default_rng(2), 10.0, SPEED)
         states = motion.at(np.arange(1.0, 9.0, 0.05))
         fast = np.abs(states[1]).min(axis=1) > 0.01  # dry friction is that of the law there
         states = tuple(values[fast] for values in states)
@@ -55,11 +64,11 @@ class TestMotion:
     def test_it_is_within_limits_and_at_rest_at_both_ends(self, name: str) -> None:
         robot = drawn_arm(ARM_TYPES[name], 1).robot
         for seed in range(5):
-            motion = drawn_motion(robot, np.random.default_rng(seed), 12.0)
+            motion = drawn_motion(robot, np.random.default_rng(seed), 12.0, SPEED)
             position, velocity, _ = motion.at(np.arange(-0.1, 12.1, 0.004))
             assert np.all(position >= robot.lowerPositionLimit)
             assert np.all(position <= robot.upperPositionLimit)
-            assert np.all(np.abs(velocity) <= robot.velocityLimit)
+            assert np.all(np.abs(velocity) <= SPEED * robot.velocityLimit + 1e-3)
             assert np.all(velocity[[0, 1, -2, -1]] == 0.0)
             # Every joint uses a good share of what it may.
             assert np.all(np.abs(velocity).max(axis=0) > 0.15 * robot.velocityLimit)
@@ -67,7 +76,7 @@ class TestMotion:
     def test_velocity_and_acceleration_are_derivatives(self) -> None:
         """In both ramps and between them, by central differences over 20 us."""
         robot = drawn_arm(ARM_TYPES["panda"], 1).robot
-        motion = drawn_motion(robot, np.random.default_rng(3), 12.0)
+        motion = drawn_motion(robot, np.random.default_rng(3), 12.0, SPEED)
         time, step = np.array([0.3, 0.7, 2.0, 5.5, 8.1, 11.2, 11.9]), 1e-5
         before, now, after = (motion.at(time + shift) for shift in (-step, 0.0, step))
         for order in (0, 1):
@@ -79,11 +88,11 @@ class TestLog:
     def test_the_torque_is_late_and_has_the_stated_noise(self) -> None:
         """Without noise it is RNEA of the motion a delay earlier; the noise keeps its memory."""
         arm = drawn_arm(ARM_TYPES["panda"], 1)
-        late = logged(arm, 5, 0, 20.0, 0.004, white=False)
+        late = logged(arm, 5, 0, 20.0, 0.004, DEFAULTS)
         # At 250 Hz the delay is a row.
-        prompt = logged(arm, 5, 0, 20.0, 0.0, white=False)
+        prompt = logged(arm, 5, 0, 20.0, 0.0, DEFAULTS)
         noise_free = arm.torque(
-            *drawn_motion(arm.robot, np.random.default_rng([5, 2, 0]), 20.0).at(prompt.time)
+            *drawn_motion(arm.robot, np.random.default_rng([5, 2, 0]), 20.0, SPEED).at(prompt.time)
         )
         noise = prompt.torque - noise_free
         assert noise.std(axis=0) == pytest.approx(0.014 * noise_free.std(axis=0), rel=0.15)
@@ -133,7 +142,7 @@ def test_a_run_is_read_from_the_results(monkeypatch: pytest.MonkeyPatch) -> None
     """All parameters of the arm are counted; the error is that of the noise of the torque."""
     monkeypatch.setattr(coverage, "FITTED_TIME", 10.0)
     monkeypatch.setattr(coverage, "HELD_OUT_TIME", 5.0)
-    found = coverage.run("ns16", 0.0, 1, white=True)
+    found = coverage.run("ns16", 0.0, 1, Conditions(white=True))
     n_base, n_friction = 40, 18
     counted = len(found.inertial) + len(found.friction) + found.undetermined
     assert counted + found.dropped >= n_base + n_friction
