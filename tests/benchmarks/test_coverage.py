@@ -9,6 +9,7 @@ from benchmarks import coverage, plain_fit
 from benchmarks.arms import urdf
 from benchmarks.coverage import (
     ARM_TYPES,
+    DEFAULTS,
     Conditions,
     Run,
     drawn_arm,
