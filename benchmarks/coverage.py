@@ -16,10 +16,10 @@ parameters are called and how they are grouped is the project's.
   half with a memory of 50 ms; ``--white`` all white. It is logged a delay late, the same for all
   joints.
 
-Figures per arm and delay:
+Figures per arm and delay, and of all; a seed is the same arm, motion and noise at every delay:
 
 - ``inertial``, ``friction``: share of 95 % intervals that hold the true value, over all determined
-  parameters and runs, with two standard errors over the runs. ``undetermined``: parameters without
+  parameters and runs, with two standard errors over the draws. ``undetermined``: parameters without
   an interval. ``dropped``: coefficients of true friction that the model does not have. ``width``:
   median half width of an inertial interval over the true value.
 - ``delay_near``: runs whose applied delay is within 0.3 ms of the truth on every joint;
@@ -380,9 +380,10 @@ def compared(results: Results, truth: Mapping[str, float], delay: float, seconds
             width.append(half / abs(value))
     delays = results.delays
     applied = np.zeros(len(results.joint_names)) if delays is None else np.array(delays.applied)
-    half_widths = [] if delays is None else [one for one in delays.interval if one is not None]
+    half_widths = [] if delays is None else [half for half in delays.interval if half is not None]
     justified = {"delay"} if delay > 0.0 else set()
-    names = [one.check for one in suspicious(results) if one.check in CAUSES - justified]
+    checks = [finding.check for finding in suspicious(results)]
+    blamed = [check for check in checks if check in CAUSES - justified]
     return Run(
         inertial=inertial,
         friction=friction,
@@ -391,7 +392,7 @@ def compared(results: Results, truth: Mapping[str, float], delay: float, seconds
         width=width,
         delay_error=(applied - delay).tolist(),
         delay_half=half_widths,
-        blamed=list(dict.fromkeys(names)),
+        blamed=list(dict.fromkeys(blamed)),
         good=results.verdict.good,
         inside=None if results.calibration is None else results.calibration.inside,
         error=results.validation[0].all_rows_relative_error,
@@ -399,16 +400,17 @@ def compared(results: Results, truth: Mapping[str, float], delay: float, seconds
     )
 
 
-def figures(runs: Sequence[Run]) -> dict[str, Any]:
-    """Figures of some runs; see the module."""
+def figures(draws: Sequence[Sequence[Run]]) -> dict[str, Any]:
+    """Figures of the runs of some draws, each one arm, motion and noise; see the module."""
+    runs = [run for draw in draws for run in draw]
     near = [all(abs(error) <= NEAR for error in run.delay_error) for run in runs]
     bias = np.mean([error for run in runs for error in run.delay_error])
     halves = [half for run in runs for half in run.delay_half]
     inside = [run.inside for run in runs if run.inside is not None]
     return {
         "runs": len(runs),
-        **_coverage("inertial", [run.inertial for run in runs]),
-        **_coverage("friction", [run.friction for run in runs]),
+        **_coverage("inertial", [[run.inertial for run in draw] for draw in draws]),
+        **_coverage("friction", [[run.friction for run in draw] for draw in draws]),
         "undetermined": sum(run.undetermined for run in runs),
         "dropped": sum(run.dropped for run in runs),
         "width": _rounded(np.median([share for run in runs for share in run.width])),
@@ -423,17 +425,17 @@ def figures(runs: Sequence[Run]) -> dict[str, Any]:
     }
 
 
-def _coverage(name: str, by_run: Sequence[Sequence[bool]]) -> dict[str, float | None]:
-    """Share of all, and two standard errors of the mean of the runs' shares."""
-    held = [value for values in by_run for value in values]
-    shares = [np.mean(values) for values in by_run if values]
+def _coverage(name: str, intervals: Sequence[Sequence[Sequence[bool]]]) -> dict[str, float | None]:
+    """Share of all intervals by draw and run, and two standard errors over the draws."""
+    by_draw = [[held for run in draw for held in run] for draw in intervals]
+    held = [value for values in by_draw for value in values]
+    shares = [np.mean(values) for values in by_draw if values]
     if not shares:
         return {name: None, f"{name}_unsure": None}
-    unsure = 2.0 * np.std(shares, ddof=1) / np.sqrt(len(shares)) if len(shares) > 1 else np.nan
-    return {
-        name: _rounded(np.mean(held)),
-        f"{name}_unsure": None if np.isnan(unsure) else _rounded(unsure),
-    }
+    unsure = None
+    if len(shares) > 1:
+        unsure = _rounded(2.0 * np.std(shares, ddof=1) / np.sqrt(len(shares)))
+    return {name: _rounded(np.mean(held)), f"{name}_unsure": unsure}
 
 
 def _rounded(number: float | np.floating[Any]) -> float:
@@ -453,29 +455,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--speed", type=float, default=DEFAULTS.speed, metavar="SHARE")
     options = parser.parse_args(arguments)
     conditions = Conditions(options.quadratic, options.white, options.rate, options.speed)
-    runs: dict[str, list[Run]] = {}
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    cells: dict[str, dict[str, Any]] = {}
+    draws: dict[tuple[str, int], list[Run]] = {}
     for name in options.arms:
         for delay in options.delays:
             cell = f"{name}, {delay:g} ms"
-            for seed in range(options.first_seed, options.first_seed + options.seeds):
-                found = run(name, 1e-3 * delay, seed, conditions)
-                runs.setdefault(cell, []).append(found)
-                print(
-                    f"{cell}, seed {seed}: {found.seconds:.1f} s of processor",
-                    file=sys.stderr,
-                    flush=True,
-                )
+            runs = []
+            for seed in seeds:
+                outcome = run(name, 1e-3 * delay, seed, conditions)
+                runs.append([outcome])
+                draws.setdefault((name, seed), []).append(outcome)
+                seconds = f"{cell}, seed {seed}: {outcome.seconds:.1f} s of processor"
+                print(seconds, file=sys.stderr, flush=True)
+            cells[cell] = figures(runs)
             if not options.json:
-                print(_line(cell, figures(runs[cell])), flush=True)
-    every = figures([run for cell_runs in runs.values() for run in cell_runs])
+                print(_line(cell, cells[cell]), flush=True)
+    every = figures(list(draws.values()))
     if not options.json:
         print(_line("all", every))
-    result = {
-        "cells": {cell: figures(cell_runs) for cell, cell_runs in runs.items()},
-        "all": every,
-        **conditions._asdict(),
-    }
-    show(result, only_json=True)
+    show({"cells": cells, "all": every, **conditions._asdict()}, only_json=True)
 
 
 def _line(cell: str, row: Mapping[str, Any]) -> str:

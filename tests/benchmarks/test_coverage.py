@@ -126,7 +126,7 @@ class TestFigures:
         late = CLEAN._replace(
             inertial=[True] * 20, delay_error=[4e-4, 0.0], blamed=["friction"], good=False
         )
-        found = coverage.figures([CLEAN, late])
+        found = coverage.figures([[CLEAN], [late]])
         assert found["inertial"] == pytest.approx(39 / 40)
         assert found["inertial_unsure"] == pytest.approx(0.05)  # 2 x 0.0354 / sqrt(2)
         assert found["friction"] == 1.0
@@ -135,8 +135,13 @@ class TestFigures:
         assert found["false_causes"] == {"friction": 1}
         assert (found["good"], found["inside"], found["seconds"]) == (1, 0.9, 10.0)
 
+    def test_runs_of_one_draw_are_one_sample(self) -> None:
+        """Of the same noise at two delays nothing can be said about other noise."""
+        assert coverage.figures([[CLEAN, CLEAN]])["inertial"] == pytest.approx(0.95)
+        assert coverage.figures([[CLEAN, CLEAN]])["inertial_unsure"] is None
+
     def test_the_standard_error_of_a_single_run_is_not_known(self) -> None:
-        assert coverage.figures([CLEAN])["inertial_unsure"] is None
+        assert coverage.figures([[CLEAN]])["inertial_unsure"] is None
 
 
 def test_a_run_is_read_from_the_results(monkeypatch: pytest.MonkeyPatch) -> None:
