@@ -6,9 +6,13 @@ With ``--short`` the first and the last 40 % of each log are fitted and its rest
 
 Errors are ||tau - tau_hat|| / ||tau|| over all joints and every row of what is predicted, of the
 torque as it was recorded. *hil* imports a recording and identifies from the archive as `hil
-identify` does with default settings; `plain` is `benchmarks.plain_fit` on the same rows. A ratio
-below 1 is better than that. *Inside* is the share of hil's held-out means of torque inside their
-95 % intervals.
+identify` does with default settings; `plain` is `benchmarks.plain_fit` on the same rows, *plain +
+prior* the same with a Gaussian prior about the URDF's bodies, *nominal* the URDF's model as it is
+and *nominal + friction* that with rotor inertia, friction and offset fitted; the last two are
+missing where the URDF has no masses. A ratio below 1 is better than `plain`. *Inside* is the share
+of hil's held-out means of torque inside their 95 % intervals. A summary follows the rows: the
+geometric mean of the ratios, the worst, and which rows are above 1.03 of `plain` or above *nominal
++ friction*.
 
 With ``--degraded``, the first held-out split of each robot and of the simulated cell is repeated
 with copies of the logs, each with one fault (`benchmarks.degradations`): the error, that of the
@@ -20,7 +24,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -41,6 +45,15 @@ from identification.validation.finding import Finding
 
 DATA: Final = Path(__file__).resolve().parents[2] / "shared" / "data"
 SIMULATED: Final = "simulated"
+ABOVE_PLAIN: Final = 1.03  # ratio from which a row counts as worse than the ordinary fit
+RIVALS: Final[Mapping[str, Callable[[Any, plain_fit.Measured], plain_fit.PlainFit]]] = {
+    "plain": plain_fit.fit,
+    "plain + prior": plain_fit.fit_with_prior,
+    "nominal": lambda robot, _: plain_fit.nominal(robot),
+    "nominal + friction": plain_fit.fit_friction,
+}
+"""Columns of the board beside hil's."""
+NEED_MASSES: Final = ("nominal", "nominal + friction")
 _RATED_PAYLOAD: Final = 16.0  # kg, of the NS 16
 _VALIDATION_SEED: Final = 1_000_000  # noise of its own
 
@@ -107,9 +120,12 @@ def identified_parts(parts: Parts, folder: Path) -> Identified:
         return identified(fitted, [predicted])
 
 
-def fit_errors(parts: Parts) -> tuple[float, list[float]]:
-    """Errors of the ordinary fit over all joints, and by joint."""
-    fitted = plain_fit.fit(parts.fitted.pinocchio_model(), parts.fitted.measured)
+def rival_errors(name: str, parts: Parts) -> tuple[float, list[float]] | None:
+    """Errors of a rival over all joints, and by joint; None if it needs masses that are unknown."""
+    robot = parts.fitted.pinocchio_model()
+    if name in NEED_MASSES and not plain_fit.has_masses(robot):
+        return None
+    fitted = RIVALS[name](robot, parts.fitted.measured)
     torque, predicted = parts.predicted.torque, fitted.predicted_torque(parts.predicted.measured)
     joints = [
         plain_fit.relative_error(torque[:, joint], predicted[:, joint])
@@ -118,16 +134,26 @@ def fit_errors(parts: Parts) -> tuple[float, list[float]]:
     return plain_fit.relative_error(torque, predicted), joints
 
 
+def fit_errors(parts: Parts) -> tuple[float, list[float]]:
+    """Errors of the ordinary fit over all joints, and by joint."""
+    errors = rival_errors("plain", parts)
+    assert errors is not None
+    return errors
+
+
 def row(name: str, split: Split, archives: Mapping[str, Path], logs: Mapping[str, JointLog]) -> Row:
-    """Both errors on one split of logs, which the archives hold, and the seconds that each took.
+    """All errors on one split of logs, which the archives hold, and the seconds that two took.
 
     `inside` is None in sample; `white_inside`: of the intervals that white residuals would have.
+    Seconds are of the processor.
     """
     parts = cut(split, logs)
-    start = time.perf_counter()
+    start = time.process_time()
     ours = identified_split(split, archives, parts)
-    middle = time.perf_counter()
+    middle = time.process_time()
     fit, fit_joints = fit_errors(parts)
+    seconds = {"hil": middle - start, "plain": time.process_time() - middle}
+    others = {rival: rival_errors(rival, parts) for rival in RIVALS if rival != "plain"}
     calibration = ours.results.calibration
     return {
         "data": name,
@@ -135,9 +161,10 @@ def row(name: str, split: Split, archives: Mapping[str, Path], logs: Mapping[str
         "hil": ours.error,
         "plain": fit,
         "ratio": ours.error / fit,
+        **{rival: None if errors is None else errors[0] for rival, errors in others.items()},
         "hil_joints": ours.joints,
         "plain_joints": fit_joints,
-        "seconds": {"hil": middle - start, "plain": time.perf_counter() - middle},
+        "seconds": seconds,
         "inside": None if calibration is None else calibration.inside,
         "white_inside": None if calibration is None else calibration.white_inside,
     }
@@ -259,9 +286,40 @@ def summary(rows: Sequence[Row], degraded: Sequence[Row]) -> dict[str, Any]:
         ratios = np.array([one["ratio"] for one in rows])
         mean = float(np.exp(np.log(ratios).mean()))
         found |= {"worst_ratio": float(ratios.max()), "mean_ratio": mean}
+        found["worst_row"] = row_name(rows[int(ratios.argmax())])
+        found["above_plain"] = [row_name(one) for one in rows if one["ratio"] > ABOVE_PLAIN]
+        found["above_nominal_friction"] = [
+            row_name(one)
+            for one in rows
+            if one["nominal + friction"] is not None and one["hil"] > one["nominal + friction"]
+        ]
     if degraded:
         found |= {"degraded": list(degraded), "right": sum(one["right"] for one in degraded)}
     return found
+
+
+def row_name(row: Row) -> str:
+    """Robot and split of a row."""
+    return f"{row['data']}, {row['split']}"
+
+
+def summary_lines(figures: Mapping[str, Any]) -> Iterator[str]:
+    """Lines to print below the rows, of what `summary` found."""
+    if figures["rows"]:
+        yield (
+            f"hil / plain: geometric mean {figures['mean_ratio']:.3f}, worst"
+            f" {figures['worst_ratio']:.3f} ({figures['worst_row']})"
+        )
+        for title, key in (
+            (f"above {ABOVE_PLAIN:g} of plain", "above_plain"),
+            ("above nominal + friction", "above_nominal_friction"),
+        ):
+            names = figures[key]
+            yield f"{title}: {len(names)} of {len(figures['rows'])} rows" + "".join(
+                f"; {name}" for name in names
+            )
+    if "right" in figures:
+        yield f"right verdicts: {figures['right']} of {len(figures['degraded'])}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -287,13 +345,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
             degraded.append(one)
             if not options.json:
                 print(_line(one), flush=True)
-    show(summary(rows, degraded), only_json=True)
+    figures = summary(rows, degraded)
+    if not options.json:
+        print("\n".join(summary_lines(figures)))
+    show(figures, only_json=True)
 
 
 def _line(row: Row) -> str:
     """Return names, errors and remarks of a row."""
     shown = [f"{row['data']:11} {row.get('split') or row['case']:30}"]
-    errors = [key for key in ("hil", "plain", "undegraded") if row.get(key) is not None]
+    errors = [key for key in ("hil", *RIVALS, "undegraded") if row.get(key) is not None]
     shown += [f"{key} {row[key]:.2%}" for key in errors]
     shown += [f"{key} {row[key]:.2f}" for key in ("ratio", "inside") if row.get(key) is not None]
     if "right" in row:

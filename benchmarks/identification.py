@@ -1,8 +1,8 @@
 """Time of an identification, from samples to parameters with covariance, against figaroh's.
 
-Run with ``python -m benchmarks.identification [--json] [--figaroh PYTHON]``: 16 000 samples of the
-NS 16, 6 joints. Processor time of one thread; repetitions alternate between all that is compared,
-and medians are printed, with smallest and largest.
+Run with ``python -m benchmarks.identification [--json] [--figaroh PYTHON] [--only PART ...]``:
+16 000 samples of the NS 16, 6 joints. Processor time of one thread; repetitions alternate between
+all that is compared, and medians are printed, with smallest and largest.
 
 - ``fit_ms``: regressor, block factor, weighted least squares (eq. 4) and cluster-robust covariance
   of 58 parameters: 40 base, and viscous, Coulomb and offset friction. ``large_fit_ms``: the same
@@ -18,6 +18,11 @@ and medians are printed, with smallest and largest.
   ``torque_difference``: the two fits' predicted torque, as a share of its RMS.
 - ``base_ms``: a model from URDF text, that is chain, base parameters and regressor plan.
 - ``consistent_ms``: the physically consistent estimate on the factor of the fit.
+- ``whole_1000_hz_s``, ``whole_250_hz_s``: all of `hil identify` of 30 s of six axes, report
+  included, in a fresh process; ``..._plain_s``: `benchmarks.plain_fit` on the same log, likewise;
+  ``..._ratio_to_plain``: the first over the second.
+- ``memory_1_min_mb`` and so on: largest memory of `hil identify` of as many minutes of six axes at
+  1 kHz, in a fresh process, and its processor time.
 
 figaroh is no dependency of this project. ``--install-figaroh`` puts it into an environment of its
 own, `build/figaroh`, which is used where it is there; another interpreter that has it can be named.
@@ -41,7 +46,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from benchmarks import parser_of, show, timed
+from benchmarks import parser_of, show, timed, whole_run
+from benchmarks.arms import ARMS, urdf
 from benchmarks.regressor import SAMPLES, sine_motion
 from identification import Motion, RobotModel
 from identification.estimators.consistent import consistent_estimate
@@ -73,12 +79,7 @@ WRIST: Final = Coupling(
     ])
 )  # fmt: skip
 """Joint 4 turns motors 5 and 6 along, joint 5 motor 6."""
-ARMS: Final[dict[str, str | Path]] = {
-    "ns16": URDF_PATH,
-    "ur10": "ur_description/urdf/ur10_robot.urdf",
-    "panda": "panda_description/urdf/panda.urdf",
-}
-"""Arms whose base parameters are found; those of example-robot-data by their path in it."""
+PARTS: Final = ("fits", "models", "whole", "memory")
 _POSITION_NOISE: Final = 1e-6  # rad
 _TORQUE_NOISE: Final = 1.0  # N·m
 
@@ -242,16 +243,6 @@ def time_models(repetitions: int) -> dict[str, float | int]:
     return result
 
 
-def urdf(where: str | Path) -> Path:
-    """A file of ours, or one of the package example-robot-data."""
-    if isinstance(where, Path):
-        return where
-    for file in importlib.metadata.files("example-robot-data") or ():
-        if str(file).endswith(f"robots/{where}"):
-            return Path(str(file.locate()))
-    raise SystemExit(f"{where} is not in the package example-robot-data; is it installed?")
-
-
 def installed(python: Path | None, *, install: bool) -> Path | None:
     """The interpreter that has figaroh: the one named, or that of an environment of its own."""
     own = ENVIRONMENT / "bin" / "python"
@@ -272,14 +263,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--repetitions", type=int, default=9)
     parser.add_argument("--figaroh", type=Path, metavar="PYTHON", help="interpreter that has it")
     parser.add_argument("--install-figaroh", action="store_true", help="into build/figaroh")
+    parser.add_argument(
+        "--only", nargs="+", choices=PARTS, default=PARTS, metavar="PART", help=", ".join(PARTS)
+    )
     options = parser.parse_args(arguments)
 
     python = installed(options.figaroh, install=options.install_figaroh)
-    if python is None:
-        print("figaroh is not installed; add --install-figaroh to compare", file=sys.stderr)
-    result: dict[str, Any] = {
-        **time_fits(python, options.repetitions),
-        **time_models(options.repetitions),
+    result: dict[str, Any] = {}
+    if "fits" in options.only:
+        if python is None:
+            print("figaroh is not installed; add --install-figaroh to compare", file=sys.stderr)
+        result |= time_fits(python, options.repetitions)
+    if "models" in options.only:
+        result |= time_models(options.repetitions)
+    if "whole" in options.only:
+        result |= whole_run.times()
+    if "memory" in options.only:
+        result |= whole_run.memory()
+    result |= {
         "samples": SAMPLES,
         "repetitions": options.repetitions,
         "clock": "processor time, BLAS of one thread; medians",

@@ -13,7 +13,7 @@ robot left out would be larger than that of the present values.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 from unittest.mock import patch
@@ -66,12 +66,14 @@ def chosen_without(robots: Mapping[str, Mapping[tuple[str, str], float]], defaul
     return found
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table, and the line of JSON if asked for."""
     parser = parser_of(__doc__)
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--only", nargs="+", default=known(), help="some of the recordings")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
+    if len(set(options.only)) < 2:
+        parser.error("--only needs at least two recordings: each is judged by all others")
     robots = {name: ratios(name, options.data) for name in options.only}
     mean = {PRESENT: _geometric([one[PRESENT, ""] for one in robots.values()])}
     table = {default: chosen_without(robots, default) for default in ALTERNATIVES}

@@ -75,7 +75,7 @@ class TestIdentification:
     @pytest.fixture(scope="class")
     @classmethod
     def figures(cls) -> dict:
-        return run("identification", "--repetitions", "1")
+        return run("identification", "--repetitions", "1", "--only", "fits", "models")
 
     def test_it_times_the_sizes_that_it_states(self, figures: dict) -> None:
         assert figures["samples"] == 16_000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -97,6 +98,10 @@ class TestRow:
             squares = np.square(joints) @ np.square(np.linalg.norm(torque, axis=0))
             assert error == pytest.approx(np.sqrt(squares) / np.linalg.norm(torque))
         assert found["ratio"] == found["hil"] / found["plain"]
+        # The URDF has neither friction nor rotors, and its bodies are the true ones.
+        assert found["nominal"] > 3.0 * floor
+        assert 0.9 * floor < found["nominal + friction"] < 2.0 * floor
+        assert 0.9 * floor < found["plain + prior"] < 2.0 * floor
         assert (found["inside"] is None) == split.in_sample
         assert found["inside"] is None or found["inside"] > 0.9
 
@@ -104,12 +109,33 @@ class TestRow:
         split = Split(fitted="one", predicted="other")
         rows = [board.row("arm", split, archives, logs)] * 2
         found = json.loads(json.dumps(board.summary(rows, [])))
-        assert found.keys() == {"rows", "worst_ratio", "mean_ratio"}
+        assert found.keys() == {
+            "rows", "worst_ratio", "mean_ratio", "worst_row", "above_plain",
+            "above_nominal_friction",
+        }  # fmt: skip
         assert found["rows"][0].keys() == {
-            "data", "split", "hil", "plain", "ratio", "hil_joints", "plain_joints", "seconds",
-            "inside", "white_inside",
+            "data", "split", "hil", "plain", "ratio", "plain + prior", "nominal",
+            "nominal + friction", "hil_joints", "plain_joints", "seconds", "inside", "white_inside",
         }  # fmt: skip
         assert found["worst_ratio"] == pytest.approx(found["mean_ratio"])
+
+    def test_the_summary_names_the_rows_that_lost(self) -> None:
+        """A ratio of 1.03 is not above it; a row without masses is not above their model."""
+
+        def row(split: str, hil: float, nominal_friction: float | None) -> board.Row:
+            ratios = {"plain": 0.1, "ratio": hil / 0.1, "nominal + friction": nominal_friction}
+            return {"data": "arm", "split": split, "hil": hil, **ratios}
+
+        rows = [row("near", 0.103, 0.2), row("far", 0.104, 0.1), row("bare", 0.05, None)]
+        figures = board.summary(rows, [])
+        assert figures["above_plain"] == ["arm, far"]
+        assert figures["above_nominal_friction"] == ["arm, far"]
+        assert figures["mean_ratio"] == pytest.approx((1.03 * 1.04 * 0.5) ** (1 / 3))
+        assert "\n".join(board.summary_lines(figures)).splitlines() == [
+            "hil / plain: geometric mean 0.812, worst 1.040 (arm, far)",
+            "above 1.03 of plain: 1 of 3 rows; arm, far",
+            "above nominal + friction: 1 of 3 rows; arm, far",
+        ]
 
     def test_the_fields_of_a_degraded_one(
         self, logs: Logs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -206,6 +232,56 @@ class TestPlainFit:
         for measured in (one, other):
             predicted = fitted.predicted_torque(measured)
             assert plain_fit.relative_error(measured.torque, predicted) < 1e-8
+
+    def test_friction_of_a_nominal_model_is_found_exactly(self) -> None:
+        fitted = plain_fit.fit_friction(ROBOT, of_the_regressor(5.0, 1))
+        assert fitted.parameters == pytest.approx(planted(), abs=1e-8)
+
+    def test_a_prior_hardly_moves_what_a_motion_determines(self) -> None:
+        """Prediction moves by less than the noise of the fitted torque, and less if rows count."""
+        fitted_part, other = (of_the_regressor(12.0, seed) for seed in (1, 2))
+        noise = 0.3 * np.random.default_rng(3).standard_normal(fitted_part.torque.shape)
+        fitted_part = fitted_part._replace(torque=fitted_part.torque + noise)
+        free = plain_fit.fit(ROBOT, fitted_part)
+        assert free.cutoff == 12.0
+        moved = []
+        for share in (0.1, 1.0):
+            held = plain_fit.fit_with_prior(ROBOT, fitted_part, 12.0, share)
+            difference = held.predicted_torque(other) - free.predicted_torque(other)
+            moved.append(np.sqrt(np.mean(difference**2)))
+        assert moved[1] < 0.5 * moved[0] < moved[0] < 0.3
+
+    def test_a_prior_keeps_what_a_motion_does_not_determine(self) -> None:
+        """The second joint stands: its rotor and its viscous friction stay at their mean, zero."""
+        measured = of_the_regressor(plain_fit.PRIOR_CUTOFF, 1)
+        position = measured.position * [1.0, 0.0]
+        found = plain_fit.fit_with_prior(ROBOT, measured._replace(position=position))
+        rotor, viscous = found.parameters[[21, 25]]
+        assert abs(rotor) < 1e-6
+        assert abs(viscous) < 1e-6
+
+    def test_the_prior_of_a_body(self) -> None:
+        """Shares of the mass, times the way to the next joint and its square."""
+        prior = plain_fit.body_prior(ROBOT, two_joint_log(1).measured)
+        mass, length = ROBOT.inertias[1].mass, np.linalg.norm(ROBOT.jointPlacements[2].translation)
+        assert prior.mean[:20] == pytest.approx(planted()[:20])
+        assert prior.deviation[:10] == pytest.approx(
+            0.3 * mass * length ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])
+        )
+
+    def test_placeholders_are_no_masses(self) -> None:
+        """All bodies of one kilogram, one of them fixed to another; or none at all."""
+        bodies = re.compile(r'<mass value="[^"]*"')
+        for mass in ("1.0", "0.0"):
+            urdf = bodies.sub(f'<mass value="{mass}"', URDF.read_text())
+            robot = plain_fit.robot_from_urdf(urdf)
+            assert not plain_fit.has_masses(robot)
+            prior = plain_fit.body_prior(robot, two_joint_log(1).measured)
+            assert not prior.mean.any()
+            assert prior.deviation[0] == plain_fit.UNKNOWN_MASS
+            with pytest.raises(ValueError, match="placeholders"):
+                plain_fit.fit_friction(robot, two_joint_log(1).measured)
+        assert plain_fit.has_masses(ROBOT)
 
     def test_gravity_and_locked_joints_are_those_that_are_named(self) -> None:
         locked = plain_fit.robot_from_urdf(URDF.read_text(), (0.0, 9.81, 0.0), {"elbow": 0.5})

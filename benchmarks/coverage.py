@@ -1,0 +1,496 @@
+"""Whether 95 % intervals of `hil identify` hold the truth of arms that were simulated without hil.
+
+Run with ``python -m benchmarks.coverage [--seeds N] [--arms NAME ...] [--delays MS ...]
+[--quadratic] [--white] [--rate HZ] [--speed SHARE] [--json]``. Each run is a log of its own seed,
+imported and identified with default settings; another motion is held out. Motion, dynamics
+(pinocchio's RNEA), friction and noise share no code with what is tested, only the URDF; what the
+parameters are called and how they are grouped is the project's.
+
+- The arm is not its URDF: masses differ by 10 to 20 %, centres and inertias alike, by a congruence
+  of the pseudo-inertia, which keeps a body physically consistent. Its rotors are in no URDF.
+- Friction is Coulomb, viscous and an offset, the law that an import assumes. ``--quadratic`` adds a
+  term with the speed squared, and states all four in the archive.
+- The motion is a random Fourier series within the URDF's limits that starts and ends at rest.
+  ``--speed`` is the share of the largest speeds that it may use.
+- Positions have 1e-5 rad of noise. The torque has 1.4 % of its scatter, half of its power white and
+  half with a memory of 50 ms; ``--white`` all white. It is logged a delay late, the same for all
+  joints.
+
+Figures per arm and delay, and of all; a seed is the same arm, motion and noise at every delay:
+
+- ``inertial``, ``friction``: share of 95 % intervals that hold the true value, over all determined
+  parameters and runs, with two standard errors over the draws. ``undetermined``: parameters without
+  an interval. ``dropped``: coefficients of true friction that the model does not have. ``width``:
+  median half width of an inertial interval over the true value.
+- ``delay_near``: runs whose applied delay is within 0.3 ms of the truth on every joint;
+  ``delay_bias_ms``: mean of applied less true; ``delay_half_ms``: median half width of its interval
+  where a run states one.
+- ``false_causes``: runs whose verdict blames something, other than a delay that is there, by the
+  name of the finding. ``good``: runs whose verdict is good.
+- ``inside``: share of held-out means of torque inside their intervals (`calibration` in
+  `results.json`). ``error``: of held-out torque, all rows. ``seconds``: of the processor, mean.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+import scipy.signal
+from numpy.typing import NDArray
+
+from benchmarks import parser_of, show
+from benchmarks.arms import ARMS, urdf
+from benchmarks.board import suspicious
+from benchmarks.degradations import CAUSES
+from benchmarks.joint_log import JointLog
+from benchmarks.plain_fit import robot_from_urdf
+from hil.identify import identify_archives
+from hil.importers import IMPORTED_LAW, Robot
+from hil.progress import Silent
+from hil.results import Results
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+
+Array = NDArray[np.float64]
+
+FITTED_TIME: Final = 30.0  # s
+HELD_OUT_TIME: Final = 12.0  # s
+DELAYS: Final = (0.0, 1.3, 4.0, 10.0)  # ms
+NEAR: Final = 0.3e-3  # s
+QUADRATIC_LAW: Final = FrictionLaw(third="quadratic", offset=True)
+
+_BASE_FREQUENCY: Final = 0.1  # Hz
+_HARMONICS: Final = 10
+_ROOM_SHARE: Final = 0.6  # of the way from the middle of a range to its end
+_MOST_ROOM: Final = 2.0  # rad
+_ACCELERATION: Final = 4.0  # 1/s, largest acceleration over largest speed
+_RAMP: Final = 1.0  # s, from rest to the series and back
+_POSITION_NOISE: Final = 1e-5  # rad
+_TORQUE_NOISE: Final = 0.014  # of the scatter of each joint's torque
+_MEMORY: Final = 0.05  # s, of the coloured half of the torque noise
+_DRY_SPEED: Final = 1e-3  # rad/s, below which dry friction is not full
+_SHAPE_SCATTER: Final = 0.05  # of the pseudo-inertia's congruence, each entry
+_MASS_SCATTER: Final = 0.12  # of the logarithm of a body's density
+_FRICTION_SCATTER: Final = 0.2  # of each coefficient
+_PROJECT_ORDER: Final = (4, 5, 7, 6, 8, 9, 1, 2, 3, 0)  # of pinocchio's ten parameters of a body
+
+
+class Conditions(NamedTuple):
+    """What all runs of a study have in common.
+
+    Attributes:
+        quadratic: whether friction has a term with the speed squared, stated in the archive.
+        white: whether the noise of the torque has no memory.
+        rate: of the log [Hz].
+        speed: share of the URDF's largest speeds that motions may use.
+    """
+
+    quadratic: bool = False
+    white: bool = False
+    rate: float = 250.0
+    speed: float = 0.7
+
+
+DEFAULTS: Final = Conditions()
+
+
+class Friction(NamedTuple):
+    """Coefficients (n,) of Coulomb [N·m], viscous, quadratic friction and an offset."""
+
+    coulomb: Array
+    viscous: Array
+    quadratic: Array
+    offset: Array
+
+    def torque(self, velocity: Array) -> Array:
+        """Torque (m, n) at speeds (m, n)."""
+        dry = self.coulomb * np.tanh(velocity / _DRY_SPEED)
+        fluid = self.viscous * velocity + self.quadratic * np.abs(velocity) * velocity
+        return np.asarray(dry + fluid + self.offset)
+
+
+@dataclass(frozen=True, eq=False)
+class ArmType:
+    """An arm and the sizes of what its URDF does not have.
+
+    Attributes:
+        locked: positions of joints of the URDF that do not belong to the arm.
+        rotor: inertias (n,) at the joints [kg·m²].
+        coulomb: (n,) [N·m].
+        viscous: (n,) [N·m·s/rad].
+        rated_payload: [kg].
+    """
+
+    urdf: str | Path
+    rotor: tuple[float, ...]
+    coulomb: tuple[float, ...]
+    viscous: tuple[float, ...]
+    rated_payload: float
+    locked: Mapping[str, float] = field(default_factory=dict)
+
+
+ARM_TYPES: Final[Mapping[str, ArmType]] = {
+    "ns16": ArmType(
+        urdf=ARMS["ns16"],
+        rotor=(7.6, 24.6, 10.5, 0.25, 0.30, 0.12),
+        coulomb=(68.0, 108.0, 50.0, 9.2, 8.9, 5.1),
+        viscous=(41.0, 63.0, 39.0, 3.3, 8.2, 4.5),
+        rated_payload=16.0,
+    ),
+    "panda": ArmType(
+        urdf=ARMS["panda"],
+        rotor=(0.6, 0.6, 0.5, 0.5, 0.2, 0.2, 0.2),
+        coulomb=(0.8, 0.9, 0.7, 0.8, 0.6, 0.4, 0.5),
+        viscous=(1.2, 1.4, 1.0, 1.1, 0.6, 0.5, 0.4),
+        rated_payload=3.0,
+        locked={"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0},
+    ),
+}
+"""A heavy geared arm, whose wrist has more friction than inertia, and a light one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """One drawn arm: bodies and rotors (as armature) in pinocchio's model, and friction."""
+
+    robot: Any
+    friction: Friction
+
+    def torque(self, position: Array, velocity: Array, acceleration: Array) -> Array:
+        """Torque (m, n) of the joints, friction included."""
+        data = self.robot.createData()
+        states = zip(position, velocity, acceleration, strict=True)
+        rigid = np.array([pin.rnea(self.robot, data, *state) for state in states])
+        return rigid + self.friction.torque(velocity)
+
+
+def drawn_arm(kind: ArmType, seed: int, *, quadratic: bool = False) -> Arm:
+    """Draw an arm near its URDF."""
+    random = np.random.default_rng([seed, 1])
+    robot = robot_from_urdf(urdf(kind.urdf).read_text(encoding="utf-8"), locked=kind.locked)
+    for joint in range(1, robot.njoints):
+        robot.inertias[joint] = drawn_body(robot.inertias[joint], random)
+
+    def near(values: Sequence[float]) -> Array:
+        scatter = 1.0 + _FRICTION_SCATTER * random.uniform(-1.0, 1.0, len(values))
+        return np.asarray(scatter * np.array(values))
+
+    robot.armature = near(kind.rotor)
+    coulomb, viscous = near(kind.coulomb), near(kind.viscous)
+    offset = 0.2 * coulomb * random.uniform(-1.0, 1.0, len(coulomb))
+    # At full speed it is as large as a third of the viscous term.
+    share = near([1.0 / 3.0] * len(coulomb)) if quadratic else np.zeros(len(coulomb))
+    return Arm(robot, Friction(coulomb, viscous, share * viscous / robot.velocityLimit, offset))
+
+
+def drawn_body(body: Any, random: np.random.Generator) -> Any:
+    """A physically consistent body near one: its mass distribution sheared, and denser or lighter.
+
+    In units of the body's own size, so that its centre moves by a share of that.
+    """
+    pseudo = body.toPseudoInertia()
+    matrix = np.block([[pseudo.sigma, pseudo.h[:, None]], [pseudo.h[None, :], pseudo.mass]])
+    size = np.sqrt(np.trace(pseudo.sigma) / pseudo.mass)
+    unit = np.diag([size, size, size, 1.0])
+    shear = np.eye(4) + _SHAPE_SCATTER * random.standard_normal((4, 4))
+    shear = unit @ shear @ np.linalg.inv(unit)
+    moved = np.exp(_MASS_SCATTER * random.standard_normal()) * shear @ matrix @ shear.T
+    return pin.Inertia.FromPseudoInertia(
+        pin.PseudoInertia(moved[3, 3], moved[:3, 3], moved[:3, :3])
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A Fourier series (k harmonics of n joints) between two ramps from and to rest."""
+
+    centre: Array  # (n,)
+    cosine: Array  # (k, n)
+    sine: Array  # (k, n)
+    duration: float  # s
+
+    def at(self, time: Array) -> tuple[Array, Array, Array]:
+        """Position, velocity and acceleration (m, n); at rest before and after the motion."""
+        rate = 2.0 * np.pi * _BASE_FREQUENCY * np.arange(1, len(self.cosine) + 1)
+        angle = time[:, None] * rate
+        c, s = np.cos(angle), np.sin(angle)
+        wave = c @ self.cosine + s @ self.sine
+        slope = (c * rate) @ self.sine - (s * rate) @ self.cosine
+        bend = -(c * rate**2) @ self.cosine - (s * rate**2) @ self.sine
+        w, dw, ddw = (column[:, None] for column in self._ramp(time))
+        position = self.centre + w * wave
+        velocity = w * slope + dw * wave
+        return position, velocity, w * bend + 2.0 * dw * slope + ddw * wave
+
+    def _ramp(self, time: Array) -> tuple[Array, Array, Array]:
+        """Quintic from 0 to 1, and back at the end, with two derivatives (m,)."""
+        x = np.clip(np.minimum(time, self.duration - time) / _RAMP, 0.0, 1.0)
+        way = np.where(time < 0.5 * self.duration, 1.0, -1.0) / _RAMP
+        value = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+        slope = 30.0 * x**2 * (1.0 - x) ** 2 * way
+        return value, slope, 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x) * way**2
+
+
+def drawn_motion(
+    robot: Any, random: np.random.Generator, duration: float, speed_share: float
+) -> Motion:
+    """Draw a motion within the URDF's limits of position and a share of those of speed."""
+    n = robot.nv
+    harmonic = np.arange(1.0, _HARMONICS + 1.0)[:, None]
+    cosine, sine = random.standard_normal((2, _HARMONICS, n)) / harmonic
+    centre = 0.5 * (robot.lowerPositionLimit + robot.upperPositionLimit)
+    room = 0.5 * (robot.upperPositionLimit - robot.lowerPositionLimit)
+    room = np.minimum(_ROOM_SHARE * room, _MOST_ROOM)
+    series = Motion(np.zeros(n), cosine, sine, duration)
+    largest = [np.abs(values).max(axis=0) for values in series.at(np.arange(0.0, duration, 0.01))]
+    speed = speed_share * robot.velocityLimit
+    limits = room, speed, _ACCELERATION * speed
+    scale = np.min([limit / most for limit, most in zip(limits, largest, strict=True)], axis=0)
+    return Motion(centre, scale * cosine, scale * sine, duration)
+
+
+class Logged(NamedTuple):
+    """What a logger has written: m rows of n joints."""
+
+    time: Array
+    position: Array
+    torque: Array
+
+
+def logged(
+    arm: Arm, seed: int, part: int, duration: float, delay: float, conditions: Conditions
+) -> Logged:
+    """Log a motion with noise, the torque a delay [s] late."""
+    random = np.random.default_rng([seed, 2, part])
+    motion = drawn_motion(arm.robot, random, duration, conditions.speed)
+    time = np.arange(round(duration * conditions.rate)) / conditions.rate
+    torque = arm.torque(*motion.at(time - delay))
+    noise = random.standard_normal(torque.shape)
+    if not conditions.white:
+        keep = np.exp(-1.0 / (_MEMORY * conditions.rate))
+        drive = np.sqrt(1.0 - keep**2) * random.standard_normal(torque.shape)
+        noise = np.sqrt(0.5) * (noise + scipy.signal.lfilter([1.0], [1.0, -keep], drive, axis=0))
+    torque += _TORQUE_NOISE * torque.std(axis=0) * noise
+    position = motion.at(time)[0]
+    return Logged(time, position + _POSITION_NOISE * random.standard_normal(torque.shape), torque)
+
+
+def true_values(arm: Arm, model: RobotModel) -> dict[str, float]:
+    """Base parameters and friction coefficients of an arm by the project's names for them."""
+    bodies = np.array([body.toDynamicParameters() for body in arm.robot.inertias[1:]])
+    standard = np.zeros(model.layout.size)
+    standard[model.layout.links] = bodies[:, _PROJECT_ORDER]
+    standard[model.layout.rotors] = arm.robot.armature
+    values = dict(
+        zip(model.parameter_names, (model.base.grouping @ standard).tolist(), strict=False)
+    )
+    symbols = {"f0": "coulomb", "f1": "viscous", "f2": "quadratic", "fo": "offset"}
+    for symbol, name in symbols.items():
+        for joint, coefficient in enumerate(getattr(arm.friction, name).tolist(), 1):
+            if symbol != "f2" or arm.friction.quadratic.any():
+                values[f"{symbol}_{joint}"] = coefficient
+    return values
+
+
+class Run(NamedTuple):
+    """What became of one log.
+
+    Attributes:
+        inertial: whether each determined base parameter is in its interval.
+        friction: likewise of the friction coefficients.
+        undetermined: number of parameters without an interval.
+        dropped: number of true friction coefficients that the model does not have.
+        width: half widths of inertial intervals over the true values.
+        delay_error: applied less true delay of each joint [s].
+        delay_half: half width of its 95 % interval, where it is stated [s].
+        blamed: names of findings that blame something which is not there.
+        good: whether the verdict is.
+        inside: share of held-out means inside their intervals.
+        error: of held-out torque.
+        seconds: of the processor.
+    """
+
+    inertial: list[bool]
+    friction: list[bool]
+    undetermined: int
+    dropped: int
+    width: list[float]
+    delay_error: list[float]
+    delay_half: list[float]
+    blamed: list[str]
+    good: bool
+    inside: float | None
+    error: float
+    seconds: float
+
+
+def run(name: str, delay: float, seed: int, conditions: Conditions = DEFAULTS) -> Run:
+    """Simulate an arm, log it a delay [s] late, import the log and identify it."""
+    kind = ARM_TYPES[name]
+    arm = drawn_arm(kind, seed, quadratic=conditions.quadratic)
+    law = QUADRATIC_LAW if conditions.quadratic else IMPORTED_LAW
+    with tempfile.TemporaryDirectory() as scratch:
+        robot = Robot.from_urdf(urdf(kind.urdf), friction=law, locked=kind.locked)
+        archives = []
+        for part, duration in enumerate((FITTED_TIME, HELD_OUT_TIME)):
+            log = logged(arm, seed, part, duration, delay, conditions)
+            joint_log = JointLog(
+                robot, log.time, log.position, None, log.torque, kind.rated_payload
+            )
+            archives.append(joint_log.imported(Path(scratch) / f"{part}.mcap"))
+        start = time.process_time()
+        results = identify_archives(archives[:1], Silent(), predict=archives[1:]).results
+        seconds = time.process_time() - start
+    model = RobotModel.from_urdf(robot.urdf, locked=kind.locked, friction=law)
+    return compared(results, true_values(arm, model), delay, seconds)
+
+
+def compared(results: Results, truth: Mapping[str, float], delay: float, seconds: float) -> Run:
+    """Compare results with the truth: parameters by name, and the delay [s].
+
+    A coefficient that the truth does not have is zero. The interval is zero wide where a parameter
+    was fixed at zero, and does not hold another value.
+
+    Raises:
+        KeyError: the results have another base parameter.
+    """
+    inertial: list[bool] = []
+    friction: list[bool] = []
+    width: list[float] = []
+    undetermined = 0
+    for index, parameter in enumerate(results.parameters):
+        if parameter.undetermined or not np.isfinite(parameter.std):
+            undetermined += 1
+            continue
+        is_inertial = index < results.n_base
+        value = truth[parameter.name] if is_inertial else truth.get(parameter.name, 0.0)
+        half = results.uncertainty.interval_factor * parameter.std
+        held = bool(abs(parameter.estimate - value) <= half)
+        (inertial if is_inertial else friction).append(held)
+        if is_inertial:
+            width.append(half / abs(value))
+    delays = results.delays
+    applied = np.zeros(len(results.joint_names)) if delays is None else np.array(delays.applied)
+    half_widths = [] if delays is None else [half for half in delays.interval if half is not None]
+    justified = {"delay"} if delay > 0.0 else set()
+    checks = [finding.check for finding in suspicious(results)]
+    blamed = [check for check in checks if check in CAUSES - justified]
+    return Run(
+        inertial=inertial,
+        friction=friction,
+        undetermined=undetermined,
+        dropped=len(truth.keys() - {parameter.name for parameter in results.parameters}),
+        width=width,
+        delay_error=(applied - delay).tolist(),
+        delay_half=half_widths,
+        blamed=list(dict.fromkeys(blamed)),
+        good=results.verdict.good,
+        inside=None if results.calibration is None else results.calibration.inside,
+        error=results.validation[0].all_rows_relative_error,
+        seconds=seconds,
+    )
+
+
+def figures(draws: Sequence[Sequence[Run]]) -> dict[str, Any]:
+    """Figures of the runs of some draws, each one arm, motion and noise; see the module."""
+    runs = [run for draw in draws for run in draw]
+    near = [all(abs(error) <= NEAR for error in run.delay_error) for run in runs]
+    bias = np.mean([error for run in runs for error in run.delay_error])
+    halves = [half for run in runs for half in run.delay_half]
+    inside = [run.inside for run in runs if run.inside is not None]
+    return {
+        "runs": len(runs),
+        **_coverage("inertial", [[run.inertial for run in draw] for draw in draws]),
+        **_coverage("friction", [[run.friction for run in draw] for draw in draws]),
+        "undetermined": sum(run.undetermined for run in runs),
+        "dropped": sum(run.dropped for run in runs),
+        "width": _rounded(np.median([share for run in runs for share in run.width])),
+        "delay_near": sum(near),
+        "delay_bias_ms": _rounded(1e3 * bias),
+        "delay_half_ms": _rounded(1e3 * np.median(halves)) if halves else None,
+        "false_causes": dict(Counter(name for run in runs for name in run.blamed)),
+        "good": sum(run.good for run in runs),
+        "inside": _rounded(np.mean(inside)) if inside else None,
+        "error": _rounded(np.mean([run.error for run in runs])),
+        "seconds": _rounded(np.mean([run.seconds for run in runs])),
+    }
+
+
+def _coverage(name: str, intervals: Sequence[Sequence[Sequence[bool]]]) -> dict[str, float | None]:
+    """Share of all intervals by draw and run, and two standard errors over the draws."""
+    by_draw = [[held for run in draw for held in run] for draw in intervals]
+    held = [value for values in by_draw for value in values]
+    shares = [np.mean(values) for values in by_draw if values]
+    if not shares:
+        return {name: None, f"{name}_unsure": None}
+    unsure = None
+    if len(shares) > 1:
+        unsure = _rounded(2.0 * np.std(shares, ddof=1) / np.sqrt(len(shares)))
+    return {name: _rounded(np.mean(held)), f"{name}_unsure": unsure}
+
+
+def _rounded(number: float | np.floating[Any]) -> float:
+    return float(f"{number:.4g}")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Simulate and identify, print a line per arm and delay, then the line of JSON."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--seeds", type=int, default=3, help="runs per arm and delay")
+    parser.add_argument("--first-seed", type=int, default=1)
+    parser.add_argument("--arms", nargs="+", choices=list(ARM_TYPES), default=list(ARM_TYPES))
+    parser.add_argument("--delays", nargs="+", type=float, default=DELAYS, metavar="MS")
+    parser.add_argument("--quadratic", action="store_true", help="true, and stated in the archive")
+    parser.add_argument("--white", action="store_true", help="no coloured noise of the torque")
+    parser.add_argument("--rate", type=float, default=DEFAULTS.rate, metavar="HZ")
+    parser.add_argument("--speed", type=float, default=DEFAULTS.speed, metavar="SHARE")
+    options = parser.parse_args(arguments)
+    conditions = Conditions(options.quadratic, options.white, options.rate, options.speed)
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    cells: dict[str, dict[str, Any]] = {}
+    draws: dict[tuple[str, int], list[Run]] = {}
+    for name in options.arms:
+        for delay in options.delays:
+            cell = f"{name}, {delay:g} ms"
+            runs = []
+            for seed in seeds:
+                outcome = run(name, 1e-3 * delay, seed, conditions)
+                runs.append([outcome])
+                draws.setdefault((name, seed), []).append(outcome)
+                seconds = f"{cell}, seed {seed}: {outcome.seconds:.1f} s of processor"
+                print(seconds, file=sys.stderr, flush=True)
+            cells[cell] = figures(runs)
+            if not options.json:
+                print(_line(cell, cells[cell]), flush=True)
+    every = figures(list(draws.values()))
+    if not options.json:
+        print(_line("all", every))
+    show({"cells": cells, "all": every, **conditions._asdict()}, only_json=True)
+
+
+def _line(cell: str, row: Mapping[str, Any]) -> str:
+    """Return the figures of some runs as a line."""
+    shown = [f"{cell:14}"]
+    for name in ("inertial", "friction"):
+        share, unsure = row[name], row[f"{name}_unsure"]
+        within = "" if unsure is None else f" ± {unsure:.1%}"
+        shown.append(f"{name} " + ("-" if share is None else f"{share:.1%}{within}"))
+    shown += [f"{name} {row[name]}" for name in ("undetermined", "dropped")]
+    shown.append(f"delay near {row['delay_near']} of {row['runs']}, bias {row['delay_bias_ms']} ms")
+    shown.append(f"false causes {row['false_causes'] or 'none'}")
+    shown.append(f"good {row['good']}")
+    shown += [f"{name} {row[name]}" for name in ("width", "inside", "error", "seconds")]
+    return "  ".join(shown)
+
+
+if __name__ == "__main__":
+    main()

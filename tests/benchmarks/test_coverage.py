@@ -1,0 +1,157 @@
+"""The study of coverage: its arms, motions and logs are what it says, and so are its figures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks import coverage, plain_fit
+from benchmarks.arms import urdf
+from benchmarks.coverage import (
+    ARM_TYPES,
+    DEFAULTS,
+    Conditions,
+    Run,
+    drawn_arm,
+    drawn_body,
+    drawn_motion,
+    logged,
+)
+from hil.importers import IMPORTED_LAW
+from identification.model.robot import RobotModel
+
+SPEED = DEFAULTS.speed
+ARMS = [pytest.param(name, id=name) for name in ARM_TYPES]
+
+
+class TestArm:
+    @pytest.mark.parametrize("name", ARMS)
+    @pytest.mark.parametrize("quadratic", [False, True])
+    def test_its_true_values_make_its_torque(self, name: str, quadratic: bool) -> None:
+        """By the project's model: names, grouping and order of parameters are understood."""
+        kind = ARM_TYPES[name]
+        arm = drawn_arm(kind, 1, quadratic=quadratic)
+        law = coverage.QUADRATIC_LAW if quadratic else IMPORTED_LAW
+        text = urdf(kind.urdf).read_text(encoding="utf-8")
+        model = RobotModel.from_urdf(text, locked=kind.locked, friction=law)
+        truth = coverage.true_values(arm, model)
+        assert list(truth) == list(model.parameter_names)
+        motion = drawn_motion(arm.robot, np.random.default_rng(2), 10.0, SPEED)
+        states = motion.at(np.arange(1.0, 9.0, 0.05))
+        fast = np.abs(states[1]).min(axis=1) > 0.01  # dry friction is that of the law there
+        states = tuple(values[fast] for values in states)
+        torque = arm.torque(*states)
+        modelled = model.torque(np.array(list(truth.values())), *states)
+        assert plain_fit.relative_error(torque, modelled) < 1e-9
+
+    def test_bodies_are_consistent_and_ten_to_twenty_percent_off(self) -> None:
+        body = plain_fit.robot_from_urdf(urdf(ARM_TYPES["ns16"].urdf).read_text()).inertias[3]
+        drawn = [drawn_body(body, np.random.default_rng(seed)) for seed in range(300)]
+        assert min(np.linalg.eigvalsh(d.toPseudoInertia().toMatrix()).min() for d in drawn) > 0.0
+        scatter = np.std([np.log(d.mass / body.mass) for d in drawn])
+        assert 0.1 < scatter < 0.2
+        traces = [np.log(np.trace(d.inertia) / np.trace(body.inertia)) for d in drawn]
+        assert 0.1 < np.std(traces) < 0.2
+
+    def test_a_seed_is_one_arm(self) -> None:
+        one, same, other = (drawn_arm(ARM_TYPES["panda"], seed) for seed in (1, 1, 2))
+        masses = [[body.mass for body in arm.robot.inertias] for arm in (one, same, other)]
+        assert masses[0] == masses[1] != masses[2]
+        assert np.array_equal(one.friction.offset, same.friction.offset)
+
+
+class TestMotion:
+    @pytest.mark.parametrize("name", ARMS)
+    def test_it_is_within_limits_and_at_rest_at_both_ends(self, name: str) -> None:
+        robot = drawn_arm(ARM_TYPES[name], 1).robot
+        for seed in range(5):
+            motion = drawn_motion(robot, np.random.default_rng(seed), 12.0, SPEED)
+            position, velocity, _ = motion.at(np.arange(-0.1, 12.1, 0.004))
+            assert np.all(position >= robot.lowerPositionLimit)
+            assert np.all(position <= robot.upperPositionLimit)
+            assert np.all(np.abs(velocity) <= SPEED * robot.velocityLimit + 1e-3)
+            assert np.all(velocity[[0, 1, -2, -1]] == 0.0)
+            # Every joint uses a good share of what it may.
+            assert np.all(np.abs(velocity).max(axis=0) > 0.15 * robot.velocityLimit)
+
+    def test_velocity_and_acceleration_are_derivatives(self) -> None:
+        """In both ramps and between them, by central differences over 20 us."""
+        robot = drawn_arm(ARM_TYPES["panda"], 1).robot
+        motion = drawn_motion(robot, np.random.default_rng(3), 12.0, SPEED)
+        time, step = np.array([0.3, 0.7, 2.0, 5.5, 8.1, 11.2, 11.9]), 1e-5
+        before, now, after = (motion.at(time + shift) for shift in (-step, 0.0, step))
+        for order in (0, 1):
+            difference = (after[order] - before[order]) / (2.0 * step)
+            assert difference == pytest.approx(now[order + 1], abs=1e-6)
+
+
+class TestLog:
+    def test_the_torque_is_late_and_has_the_stated_noise(self) -> None:
+        """Without noise it is RNEA of the motion a delay earlier; the noise keeps its memory."""
+        arm = drawn_arm(ARM_TYPES["panda"], 1)
+        late = logged(arm, 5, 0, 20.0, 0.004, DEFAULTS)
+        # At 250 Hz the delay is a row.
+        prompt = logged(arm, 5, 0, 20.0, 0.0, DEFAULTS)
+        noise_free = arm.torque(
+            *drawn_motion(arm.robot, np.random.default_rng([5, 2, 0]), 20.0, SPEED).at(prompt.time)
+        )
+        noise = prompt.torque - noise_free
+        assert noise.std(axis=0) == pytest.approx(0.014 * noise_free.std(axis=0), rel=0.15)
+        moved = late.torque[1:] - noise[1:] - noise_free[:-1]
+        assert np.abs(moved).max() < 1e-3 * np.abs(noise_free).max()
+        # Of half the power: exp(-4 ms / 50 ms) of it a row later.
+        neighbours = np.mean(noise[1:] * noise[:-1]) / np.mean(noise**2)
+        assert neighbours == pytest.approx(0.5 * np.exp(-0.08), abs=0.08)
+        assert (prompt.position - late.position == 0.0).all()
+
+
+CLEAN = Run(
+    inertial=[True] * 19 + [False],
+    friction=[True, True],
+    undetermined=0,
+    dropped=0,
+    width=[0.1, 0.3],
+    delay_error=[0.0, 0.0],
+    delay_half=[1e-4],
+    blamed=[],
+    good=True,
+    inside=0.9,
+    error=0.02,
+    seconds=10.0,
+)
+
+
+class TestFigures:
+    def test_they_are_shares_of_all_intervals_and_runs(self) -> None:
+        late = CLEAN._replace(
+            inertial=[True] * 20, delay_error=[4e-4, 0.0], blamed=["friction"], good=False
+        )
+        found = coverage.figures([[CLEAN], [late]])
+        assert found["inertial"] == pytest.approx(39 / 40)
+        assert found["inertial_unsure"] == pytest.approx(0.05)  # 2 x 0.0354 / sqrt(2)
+        assert found["friction"] == 1.0
+        assert found["delay_near"] == 1  # a run with a late axis is not near
+        assert found["delay_bias_ms"] == pytest.approx(0.1)
+        assert found["false_causes"] == {"friction": 1}
+        assert (found["good"], found["inside"], found["seconds"]) == (1, 0.9, 10.0)
+
+    def test_runs_of_one_draw_are_one_sample(self) -> None:
+        """Of the same noise at two delays nothing can be said about other noise."""
+        assert coverage.figures([[CLEAN, CLEAN]])["inertial"] == pytest.approx(0.95)
+        assert coverage.figures([[CLEAN, CLEAN]])["inertial_unsure"] is None
+
+    def test_the_standard_error_of_a_single_run_is_not_known(self) -> None:
+        assert coverage.figures([[CLEAN]])["inertial_unsure"] is None
+
+
+def test_a_run_is_read_from_the_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All parameters of the arm are counted; the error is that of the noise of the torque."""
+    monkeypatch.setattr(coverage, "FITTED_TIME", 10.0)
+    monkeypatch.setattr(coverage, "HELD_OUT_TIME", 5.0)
+    found = coverage.run("ns16", 0.0, 1, Conditions(white=True))
+    n_base, n_friction = 40, 18
+    counted = len(found.inertial) + len(found.friction) + found.undetermined
+    assert counted + found.dropped >= n_base + n_friction
+    assert len(found.delay_error) == 6
+    assert 0.005 < found.error < 0.05
+    assert found.seconds > 0.0
