@@ -5,6 +5,7 @@ import pytest
 
 from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.load_friction import CONVERGED, fit_with_load
+from identification.excitation.criteria import Objective
 from identification.factor.factor import Factor
 from identification.model.coupling import Coupling
 from identification.model.elements import TorqueRipple, TorsionSpring
@@ -131,6 +132,16 @@ class TestSamples:
         loaded = samples.with_load(LOADED, VALUES)
         gram, same = (Factor.of(MODEL, one).gram for one in (samples, loaded))
         np.testing.assert_array_equal(gram, same)
+
+
+class TestPlannedMotions:
+    def test_they_excite_the_shares_by_the_load_of_the_description(self):
+        motion = a_motion()
+        gram = Objective(LOADED).information(motion)
+        columns = LOADED.regressor(*motion[1:]).dense(LOADED.n_parameters)
+        expected = np.einsum("mjp,mjq->pq", columns, columns)
+        np.testing.assert_allclose(gram, expected, rtol=1e-9, atol=1e-9)
+        assert np.isfinite([*Objective(LOADED).measures(motion).values()]).all()
 
 
 class TestFixedPoint:
