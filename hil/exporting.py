@@ -18,6 +18,7 @@ from hil.identify import Identification
 from hil.identify.cell_context import torque_limits
 from hil.outcome import provenance_of
 from identification.estimators.consistent import ConsistentEstimate
+from identification.export.friction import median_load
 from identification.export.simulators import (
     FORMATS,
     STATES,
@@ -28,6 +29,7 @@ from identification.export.simulators import (
     compare,
 )
 from identification.model.motion import Motion
+from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]
 FormatName = Literal["mjcf", "urdf"]
@@ -89,15 +91,20 @@ def consistent_of(found: Identification) -> ConsistentEstimate:
     return found.consistency.consistent
 
 
-def arm_of(cell: Cell, consistent: ConsistentEstimate) -> Arm:
-    """Return the identified arm with the limits of its cell, or of its URDF."""
+def arm_of(cell: Cell, consistent: ConsistentEstimate, fitted: Sequence[Samples]) -> Arm:
+    """Return the identified arm with the limits of its cell, or of its URDF.
+
+    Friction that grows with the load is that of the fitted motion.
+    """
     described, efforts = urdf_limits(cell.urdf, cell.joint_names), cell.torque_limit
     if efforts is None:
         found = torque_limits(cell)
         efforts = described.effort if found is None else np.nan_to_num(found, nan=np.inf)
     limits = described if cell.file.limits is None else cell.joint_limits
     ranges = Ranges(limits.lower, limits.upper, limits.velocity, efforts)
-    return Arm(cell.urdf, cell.model, consistent.standard, consistent.estimate.values, ranges)
+    model, values = cell.model, consistent.estimate.values
+    load = median_load(model, values, fitted)
+    return Arm(cell.urdf, model, consistent.standard, values, ranges, load)
 
 
 def export_model(found: Identification, output: Path, to: FormatName) -> Exported:
@@ -107,7 +114,8 @@ def export_model(found: Identification, output: Path, to: FormatName) -> Exporte
         InputError: there are no physically consistent parameters.
         IdentificationError: the arm cannot be written, or reads back with other parameters.
     """
-    form, arm, motion = FORMATS[to], arm_of(found.cell, consistent_of(found)), _motion(found)
+    arm = arm_of(found.cell, consistent_of(found), found.prepared.fitted)
+    form, motion = FORMATS[to], _motion(found)
     pooled = found.estimate.pooled
     unknown = ", ".join(pooled.undetermined)
     remarks = (

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.errors import InputError
@@ -21,8 +22,11 @@ from hil.report import ReportSeries, report_bytes
 from hil.results import ExportResult, Results
 from identification import Estimate, IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
+from identification.export.friction import median_load
 from identification.export.parameters import parameters_csv, parameters_json
 from identification.export.urdf import write_urdf
+
+Array = NDArray[np.float64]
 
 RESULTS, REPORT, SERIES = "results.json", "report.html", "report_series.npz"
 _LARGEST: Final = 1 << 30
@@ -38,6 +42,7 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
         consistency if isinstance(consistency, str) else consistency.consistent,
         essential=None if isinstance(essential, str) else essential.estimate.names,
         provenance=provenance_of(found.results, found.paths),
+        load=median_load(found.cell.model, found.estimate.pooled.values, found.prepared.fitted),
     )
     results = found.results.model_copy(update={"exports": exports.result})
     files = {
@@ -122,8 +127,11 @@ def exports_of(
     *,
     essential: Collection[str] | None = None,
     provenance: Mapping[str, str] | None = None,
+    load: Array | None = None,
 ) -> Exports:
     """Return the exports of an identified model; `provenance` see :func:`provenance_of`.
+
+    `load` as in :func:`write_urdf`.
 
     The URDF needs a physically consistent estimate (else `consistent` is the
     reason why there is none). IdentificationError: the estimate is of another model.
@@ -146,7 +154,7 @@ def exports_of(
         withheld[URDF] = f"there are no physically consistent parameters: {consistent}"
     else:
         try:
-            contents[URDF] = _urdf(cell, estimate, possible, origin)
+            contents[URDF] = _urdf(cell, estimate, possible, origin, load)
         except IdentificationError as error:
             withheld[URDF] = str(error)
     return Exports({**contents, **dict.fromkeys(withheld)}, withheld)
@@ -165,7 +173,11 @@ def provenance_of(results: Results, archives: Sequence[Path]) -> dict[str, str]:
 
 
 def _urdf(
-    cell: Cell, estimate: Estimate, consistent: ConsistentEstimate, origin: Mapping[str, str]
+    cell: Cell,
+    estimate: Estimate,
+    consistent: ConsistentEstimate,
+    origin: Mapping[str, str],
+    load: Array | None,
 ) -> str:
     """Return the user's URDF with the consistent parameters and a comment."""
     model = cell.model
@@ -177,4 +189,4 @@ def _urdf(
     if undetermined := ", ".join(estimate.undetermined):
         lines.append(f"Nominal values, not determined by the data: {undetermined}.")
     lines += [f"{key}: {value}" for key, value in origin.items()]
-    return write_urdf(cell.urdf, model, consistent.standard, friction, remarks=lines)
+    return write_urdf(cell.urdf, model, consistent.standard, friction, lines, load)

@@ -153,6 +153,7 @@ class JointFrictionTable(Table):
     stribeck: NonNegative = field("speed in rad/s of a Stribeck term, 0 for none", 0.0)
     tanh: NonNegative = field("speed vt in rad/s of f0 tanh(qd / vt), 0 for f0 sgn(qd)", 0.0)
     asymmetric: Choice = field("true or false: Coulomb and viscous friction by direction", False)
+    load: Choice = field("true or false: fl sgn(qd) times the size of the gear's torque", False)
     standstill: NonNegative = field(
         "speed in rad/s (m/s) below which a joint counts as at rest", 0.02
     )

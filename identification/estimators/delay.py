@@ -329,16 +329,17 @@ class _Reader:
     def at(self, shift: float) -> Samples:
         """Return the bins with the motion of an earlier time, by a shift."""
         time, usable = self.binned.motion.time, self.binned.usable.copy()
-        fields = [field for field in self.samples.motion[1:] if field is not None]
-        moved = [np.zeros((len(time), field.shape[1])) for field in fields]
+        fields = {k: v for k, v in self.samples.motion._asdict().items() if v is not None}
+        del fields["time"]
+        moved = {name: np.zeros((len(time), field.shape[1])) for name, field in fields.items()}
         for raw, b in self.parts:
             inside, at = self.samples.motion.time[raw], time[b] - shift
-            for field, target in zip(fields, moved, strict=True):
-                target[b] = read_at(inside, field[raw], at)
+            for name, field in fields.items():
+                moved[name][b] = read_at(inside, field[raw], at)
             place, clear = np.interp(at, time[b], np.arange(len(at))), self.clear[b]
             near = clear[np.floor(place).astype(int)] & clear[np.ceil(place).astype(int)]
             usable[b] &= near & ((at >= inside[0]) & (at <= inside[-1]))[:, None]
-        result = replace(self.binned, motion=Motion(time, *moved), usable=usable)
+        result = replace(self.binned, motion=Motion(time, **moved), usable=usable)
         return replace(result, torque=result.torque - result.known_torque(self.model))
 
     def profile(self, shifts: Array) -> tuple[Array, Array]:

@@ -280,7 +280,7 @@ class Objective:
             acceleration=motion.acceleration,
         )
         sums = [np.zeros((len(used), len(used))) for used in model.plan.columns]
-        for _, rows in model.plan.chunks(*states):
+        for _, rows in model.chunks(*states):
             for joint, block in enumerate(rows):
                 sums[joint] += block @ block.T
         total = np.zeros((model.n_parameters, model.n_parameters))

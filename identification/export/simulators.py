@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 from xml.etree import ElementTree
 
@@ -12,9 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
+from identification.export.friction import equivalent_coulomb, load_remarks
 from identification.export.urdf import WriteBackError, as_text, comment_text, rnea, write_urdf
 from identification.model.elements import TorsionSpring
-from identification.model.friction import COULOMB, CUBIC, QUADRATIC, TANH, VISCOUS, FrictionTerm
+from identification.model.friction import (
+    COULOMB,
+    CUBIC,
+    LOAD,
+    QUADRATIC,
+    TANH,
+    VISCOUS,
+    FrictionTerm,
+)
 from identification.model.kinematics import pinocchio_model
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import Body, body
@@ -61,11 +70,23 @@ class Arm:
     standard: Array  # consistent standard parameters (s,)
     values: Array  # the corresponding parameters (p,) of the model
     ranges: Ranges  # limits of its joints
+    # torque of each gear (n,) [N·m, N] at which friction that grows with it is written, see
+    # :func:`identification.export.friction.median_load`; None: zero
+    load: Array | None = field(default=None)
+
+    @property
+    def written_load(self) -> Array:
+        """The `load` (n,), zero if None."""
+        return np.zeros(self.model.n_joints) if self.load is None else self.load
 
     @property
     def friction(self) -> tuple[dict[str, float], ...]:
-        """Coefficients by symbol of each joint, then of each coupled motor."""
-        return self.model.friction.table(self.values[self.model.friction_part])
+        """Coefficients by symbol of each joint, then of each coupled motor.
+
+        Coulomb friction contains that of the `load`.
+        """
+        coefficients = self.values[self.model.friction_part]
+        return equivalent_coulomb(self.model, coefficients, self.written_load)
 
     @property
     def bodies(self) -> tuple[Body, ...]:
@@ -112,7 +133,7 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     model, ranges, rotors = arm.model, arm.ranges, arm.rotors
     coupled = np.array((rotors != np.diag(np.diag(rotors))).any(axis=1))
     root = Node("mujoco", model=name)
-    _comment(root, remarks)
+    _comment(root, [*remarks, *load_remarks(model, arm.written_load)])
     _add(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     _add(root, "option", gravity=as_text(model.gravity), timestep=as_text(_TIMESTEP),
          integrator="implicitfast")  # fmt: skip
@@ -164,7 +185,7 @@ def urdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     """Return the URDF with the arm's bodies and friction; see `write_urdf`."""
     del name
     friction = arm.values[arm.model.friction_part]
-    return write_urdf(arm.urdf, arm.model, arm.standard, friction, remarks)
+    return write_urdf(arm.urdf, arm.model, arm.standard, friction, remarks, arm.load)
 
 
 class Format(NamedTuple):
@@ -211,7 +232,7 @@ def compare(text: str, form: Format, arm: Arm, motion: Motion) -> Comparison:
     if form.read is _mujoco_torque:
         dry = _mujoco_torque(text, arm, motion, friction=True) - _supported(form, arm, motion)
         left[_REVERSALS] = _rms(dry - _dry(arm, motion))
-    whole = arm.model.torque(arm.values, *motion[1:]) + arm.model.load_torque(*motion[1:4])
+    whole = arm.model.torque(arm.values, *motion[1:5]) + arm.model.load_torque(*motion[1:4])
     return Comparison(difference, _rms(whole), {k: v for k, v in left.items() if v.any()})
 
 
@@ -229,6 +250,7 @@ def random_states(arm: Arm, count: int = STATES) -> Motion:
     )
 
 
+_BEYOND: Final = "beyond that at the load for which it is written"
 _REVERSALS: Final = "dry friction between the two directions (velocity reversals, standstill)"
 
 
@@ -239,7 +261,10 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[tuple[str, Array,
     for kind in model.friction.kinds:
         if kind not in _DRY or kind not in form.friction:
             of_kind = [one.term.label == kind.label and not one.motor for one in terms]
-            yield kind.description, _friction(arm, motion, of_kind), kind in form.friction
+            torque, description = _friction(arm, motion, of_kind), kind.description
+            if kind.of_load:
+                torque, description = torque - _at_load(arm, motion), f"{description}, {_BEYOND}"
+            yield description, torque, kind in form.friction
     diagonal = np.diag(np.diag(arm.rotors))
     motors = [one.motor and not (form.drives and one.term.label in _DRY_LABELS) for one in terms]
     yield "rotor inertias", qdd @ diagonal, form.drives
@@ -265,7 +290,7 @@ def _left_out(form: Format, arm: Arm, motion: Motion) -> dict[str, Array]:
             left[name] = left.get(name, 0.0) + torque
     left[_REVERSALS] = _dry(arm, motion) - _dry(arm, motion, jumps=True)
     base = np.where(np.arange(model.n_parameters) < model.base.rank, arm.values, 0.0)
-    whole = model.torque(base, *motion[1:])
+    whole = model.torque(base, *motion[1:5])
     rounded = whole - _rigid(arm, motion) - motion.acceleration @ arm.rotors
     if np.abs(rounded).max() > AGREES * np.abs(whole).max():
         left["effect of rounded angles of the URDF on the base parameters"] = rounded
@@ -285,18 +310,28 @@ def _rigid(arm: Arm, motion: Motion) -> Array:
     return plan.torque(arm.standard[model.layout.links].reshape(-1), *motion[1:4])
 
 
-def _friction(arm: Arm, motion: Motion, chosen: Sequence[bool]) -> Array:
-    """Return the torque (m, n) of some friction terms."""
-    values, part = np.zeros(arm.model.n_parameters), arm.model.friction_part
+def _friction(arm: Arm, motion: Motion, chosen: Sequence[bool], load: Array | None = None) -> Array:
+    """Return the torque (m, n) of some friction terms, at a load (m, n), by default the arm's."""
+    model = arm.model
+    if load is None and model.friction.has_load:
+        load = model.gear_torque(arm.values, *motion[1:4])
+    values, part = np.zeros(model.n_parameters), model.friction_part
     values[part] = np.where(chosen, arm.values[part], 0.0)
-    return arm.model.torque(values, *motion[1:])
+    return model.torque(values, *motion[1:5], load)
+
+
+def _at_load(arm: Arm, motion: Motion) -> Array:
+    """Return the torque (m, n) of load-dependent friction at the load for which it is written."""
+    shares = [one.term.label == LOAD.label for one in arm.model.friction.terms]
+    return _friction(arm, motion, shares, np.tile(arm.written_load, (motion.n_samples, 1)))
 
 
 def _dry(arm: Arm, motion: Motion, *, jumps: bool = False) -> Array:
     """Return the torque (m, n) of dry friction of the model, or with a jump at zero speed."""
     if not jumps:
         terms = arm.model.friction.terms
-        return _friction(arm, motion, [one.term.label in _DRY_LABELS for one in terms])
+        dry = _friction(arm, motion, [one.term.label in _DRY_LABELS for one in terms])
+        return dry + _at_load(arm, motion) if arm.model.friction.has_load else dry
     friction, n = arm.model.friction, arm.model.n_joints
     f0 = np.array([row.get("f0", 0.0) for row in arm.friction])
     shares = friction.motor_speeds()

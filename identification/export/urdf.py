@@ -18,6 +18,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
+from identification.export.friction import equivalent_coulomb, load_remarks
 from identification.model.friction import TERMS
 from identification.model.kinematics import (
     FROM_PINOCCHIO,
@@ -66,9 +67,12 @@ def write_urdf(
     standard: Array,
     friction: Array | None = None,
     remarks: Sequence[str] = (),
+    load: Array | None = None,
 ) -> str:
     """Return the URDF text of a model with standard parameters (s,), and friction (k,) if given.
 
+    Friction that grows with the load is written as Coulomb friction at a `load` (n,) of the gears
+    [N·m or N], such as :func:`median_load`, by default zero; a remark says so.
     A coefficient of NaN leaves its attribute unchanged, None all of ``<dynamics>``; `remarks` are
     lines of a comment before the robot. The inverse dynamics of the text are compared with the
     regressor before it is returned.
@@ -83,7 +87,9 @@ def write_urdf(
     inertial = standard[model.layout.links]
     terms: list[dict[str, float]] = [{} for _ in model.joint_names]
     if friction is not None:
-        terms = [*model.friction.table(friction)][: model.n_joints]
+        load = np.zeros(model.n_joints) if load is None else load
+        terms = [*equivalent_coulomb(model, friction, load)][: model.n_joints]
+        remarks = (*remarks, *load_remarks(model, load))
     dynamics = [
         {
             attribute: values[symbol]

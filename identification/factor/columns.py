@@ -38,7 +38,8 @@ def instrument_factor(
 ) -> Factor:
     """Reduce a recording to blocks of [Z | W | y].
 
-    Rows count if the noise-free instrument, known where `usable` (m, n), moves as well.
+    Rows count if the noise-free instrument, known where `usable` (m, n), moves as well. Its load of
+    the gears is that of the samples.
     """
     rows = samples.usable & model.moving(instrument.velocity)
     if usable is not None:
@@ -46,6 +47,7 @@ def instrument_factor(
     columns = tuple(np.append(own, own + model.n_parameters) for own in model.plan.columns)
     measured = augmented_rows(model, replace(samples, usable=rows))
     # The same rows, with the same torque low-pass.
+    instrument = instrument._replace(load=samples.motion.load)
     planned = augmented_rows(model, replace(samples, motion=instrument, usable=rows))
     index = fine_blocks(samples)
     both = (
@@ -122,7 +124,9 @@ def standard_factor(model: RobotModel, recordings: Sequence[Samples]) -> Factor:
         every = max(1, len(samples.torque) // _MOST_ROWS)
         filtered = samples.torque_bandwidth is not None
         part = slice(None, None, 1 if filtered else every)  # filters need all rows
-        found = [plan.evaluate(*(one[part] for one in samples.motion[1:4])) for plan in plans]
+        motion = samples.motion.rows(part)
+        load = model.gear_load(*motion[1:4], motion.load)
+        found = [plan.evaluate(*motion[1:4], load=load) for plan in plans]
         for joint in range(n):
             usable = samples.usable[::every, joint]
             table = np.zeros((len(usable), 4 * s + 1))

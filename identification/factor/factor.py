@@ -651,7 +651,8 @@ def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
     )
     chunks: Iterable[tuple[slice, list[Array]]]
     if samples.torque_bandwidth is None:
-        chunks = model.plan.chunks(q, qd, qdd, samples.motion.direction, response=torque)
+        direction, load = samples.motion.direction, samples.motion.load
+        chunks = model.chunks(q, qd, qdd, direction, load, response=torque)
     else:
         chunks = _filtered(model, samples)
     for part, blocks in chunks:

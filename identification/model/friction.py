@@ -1,15 +1,22 @@
 r"""Friction of joints, linear in its coefficients: terms, law of a joint, friction of an arm.
 
 .. math:: \tau_f = f_0\,\mathrm{sgn}(v) + f_1 v + f_d |v| + f_2\,\mathrm{sgn}(v)\,v^2
-                   + f_s\,\mathrm{sgn}(v)\,e^{-(v/v_s)^2} + f_o
+                   + f_s\,\mathrm{sgn}(v)\,e^{-(v/v_s)^2} + f_l\,\mathrm{sgn}(v)\,|\tau_g| + f_o
 
-with the joint's speed v. Each summand is a :class:`FrictionTerm` in :data:`TERMS`. At a velocity
-reversal dry friction changes elastically over a displacement of some 1e-4 rad (presliding). Dahl
-(1968) describes it by a state z in place of sgn(v),
+with the joint's speed v and the torque :math:`\tau_g` that its gear transmits. Each summand is a
+:class:`FrictionTerm` in :data:`TERMS`. At a velocity reversal dry friction changes elastically over
+a displacement of some 1e-4 rad (presliding). Dahl (1968) describes it by a state z in place of
+sgn(v),
 
 .. math:: z \leftarrow s + (z - s)\,e^{-|dq| / d}, \qquad s = \mathrm{sgn}(dq)
 
 so that the torque remains linear in the coefficients for a fixed distance d.
+
+Friction of gears grows with their load (Bittencourt and Gunnarsson, Static friction in a robot
+joint, 2012; Wolf et al., Extending a dynamic friction model with nonlinear viscous and thermal
+dependency, 2018). The transmitted torque depends on the inertial parameters, so the torque is
+linear in the coefficients for a given load only, that of a previous estimate
+(:mod:`identification.estimators.load_friction`).
 
 The paper has three coefficients per joint (after its eq. 1); the third term is quadratic in its
 authors' later software, and cubic elsewhere.
@@ -52,6 +59,7 @@ class FrictionTerm:
     speed_symbol: str = ""  # of `speed`; empty for a column without it
     urdf: str = ""  # attribute of `<dynamics>` for the coefficient, if any
     of_motor: bool = False  # whether coupled motors have this term too
+    of_load: bool = False  # whether the column is multiplied by the transmitted torque's size
     is_friction: bool = True  # False if it may be the zero error of a sensor
     # whether the coefficient must be non-negative for friction to dissipate energy; with a `pair`
     # (symbol, matrix) this is required of g, (coefficient of symbol, this one) = matrix @ g
@@ -74,12 +82,20 @@ class FrictionTerm:
             case speed:
                 return replace(self, speed=speed)
 
-    def column(self, v: Array, s: Array) -> Array:
-        """Return the column (...) at speeds and directions of dry friction (...)."""
-        return self.value(v, s, self.speed)
+    def column(self, v: Array, s: Array, load: Array | None = None) -> Array:
+        """Return the column (...) at speeds, directions of dry friction and transmitted torques.
+
+        Without a transmitted torque the column of a term that depends on it is zero.
+        """
+        column = self.value(v, s, self.speed)
+        if not self.of_load:
+            return column
+        return np.zeros_like(column) if load is None else np.asarray(column * np.abs(load))
 
     def unit(self, *, revolute: bool) -> str:
         """Return the unit of the coefficient of a revolute or prismatic joint."""
+        if self.of_load:
+            return "1"
         if self.power == 0:
             return "N·m" if revolute else "N"
         power = _EXPONENT[self.power]
@@ -161,6 +177,16 @@ STRIBECK: Final = FrictionTerm(
     not_negative=True,
     pair=("f0", ((1.0, 0.0), (-1.0, 1.0))),
 )
+# Motors that turn several joints have no such term: it acts in the joint, with the joint's torque.
+LOAD: Final = FrictionTerm(
+    symbol="fl",
+    option="load",
+    label="load",
+    description="friction that grows with the transmitted torque, a share fl of it",
+    value=lambda v, s, _: s,
+    of_load=True,
+    not_negative=True,
+)
 OFFSET: Final = FrictionTerm(
     symbol="fo",
     option="offset",
@@ -170,7 +196,7 @@ OFFSET: Final = FrictionTerm(
     selected=lambda law: law.offset or (law.asymmetric and law.coulomb),
     is_friction=False,
 )
-TERMS: Final = (COULOMB, TANH, VISCOUS, ASYMMETRIC, QUADRATIC, CUBIC, STRIBECK, OFFSET)
+TERMS: Final = (COULOMB, TANH, VISCOUS, ASYMMETRIC, QUADRATIC, CUBIC, STRIBECK, LOAD, OFFSET)
 """All terms in the order of the parameters."""
 _SYMBOLS: Final = tuple(dict.fromkeys(kind.symbol for kind in TERMS))
 
@@ -196,6 +222,8 @@ class FrictionLaw:
     #: friction depends on the direction: a term ``fd |v|``, and an offset fo, so that Coulomb
     #: friction is f0 + fo and f0 - fo; the zero error of a sensor cannot be distinguished from fo
     asymmetric: bool = False
+    #: ``fl sgn(v) |load|``: dry friction grows by a share fl of the torque that the gear transmits
+    load: bool = False
     #: rows slower than standstill: "exclude": not fitted, see :meth:`moving`; "linear": fitted
     #: with v / standstill in place of sgn(v)
     zone: Zone = "exclude"
@@ -266,9 +294,12 @@ class FrictionLaw:
         state = presliding_state(np.insert(path, 0, start), self.presliding)[1:]
         return np.delete(state, turning + 1 + np.arange(len(turning)))
 
-    def columns(self, velocity: Array, direction: Array) -> Array:
-        """Return the columns of the k coefficients (k, ...) at speeds and directions (...)."""
-        rows = [term.column(velocity, direction) for term in self.terms]
+    def columns(self, velocity: Array, direction: Array, load: Array | None = None) -> Array:
+        """Return the columns of the k coefficients (k, ...) at speeds and directions (...).
+
+        `load` is the transmitted torque (...) [N·m, N], see :meth:`FrictionTerm.column`.
+        """
+        rows = [term.column(velocity, direction, load) for term in self.terms]
         return np.reshape(rows, (len(rows), *np.shape(velocity)))
 
     def moving(self, velocity: Array) -> NDArray[np.bool_]:
@@ -376,6 +407,11 @@ class JointFriction:
         """Terms that any joint has, in order."""
         return tuple(kind for kind in TERMS if any(kind.of(law) for law in self.laws))
 
+    @cached_property
+    def has_load(self) -> bool:
+        """Whether the friction of a joint depends on the torque that its gear transmits."""
+        return any(law.load for law in self.laws)
+
     @property
     def standstill(self) -> Array:
         """Speed of each joint (n,) [rad/s or m/s] below which it counts as at rest."""
@@ -451,8 +487,8 @@ class Dissipation(NamedTuple):
 def dissipation(friction: JointFriction) -> Dissipation:
     """Return the conditions for friction to dissipate energy.
 
-    f0, f0 + fs (value at rest of a Stribeck term), f1, or f1 + fd and f1 - fd are not negative. The
-    third term and the offset, which may be a sensor's, can have any sign.
+    f0, f0 + fs (value at rest of a Stribeck term), f1, or f1 + fd and f1 - fd, and fl are not
+    negative. The third term and the offset, which may be a sensor's, can have any sign.
     """
     place = {(t.motor, t.owner, t.symbol): k for k, t in enumerate(friction.terms)}
     combine = np.eye(len(place))

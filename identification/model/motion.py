@@ -19,6 +19,9 @@ class Motion(NamedTuple):
     acceleration: Array  #: qdd, shape (m, n)
     #: of dry friction (:meth:`JointFriction.direction`), shape (m, n + k); None: sign of velocity
     direction: Array | None = None
+    #: torque that the gears transmit [N·m, N], shape (m, n), see :meth:`RobotModel.gear_torque`;
+    #: None: unknown. Of load-dependent friction only
+    load: Array | None = None
 
     def rows(self, which: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Motion:
         """Return the motion at some of the instants."""

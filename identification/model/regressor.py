@@ -179,14 +179,17 @@ class RegressorPlan:
         qd: Array,
         qdd: Array,
         direction: Array | None = None,
+        load: Array | None = None,
         *,
         response: Array | None = None,
     ) -> Iterator[tuple[slice, list[Array]]]:
         """Yield the regressor in chunks of samples: (slice of samples, rows of each joint).
 
         `direction` of dry friction (m, n + k) is that of joints and coupled motors, by default the
-        sign of their speeds. The rows of joint j have shape (c_j, k) for k samples, one more with
-        `response` (m, n) as the last. They are views that are valid until the next chunk.
+        sign of their speeds. `load` (m, n) is the torque that the gears transmit; without it the
+        columns of load-dependent friction are zero. The rows of joint j have shape (c_j, k) for k
+        samples, one more with `response` (m, n) as the last. They are views that are valid until
+        the next chunk.
         """
         m, n = q.shape
         rows = self.rows
@@ -196,8 +199,8 @@ class RegressorPlan:
             for start in range(0, m, work.size):
                 part = slice(start, min(start + work.size, m))
                 k = part.stop - start
-                given = None if direction is None else direction[part]
-                work.update(q[part], qd[part], qdd[part], given)
+                given = (None if array is None else array[part] for array in (direction, load))
+                work.update(q[part], qd[part], qdd[part], *given)
                 if response is not None:
                     for joint in range(n):
                         work.rows[joint, self.response_row(joint), :k] = response[part, joint]
@@ -219,23 +222,34 @@ class RegressorPlan:
                 self._spare = [*self._spare, work][-_SPARE:]
 
     def evaluate(
-        self, q: Array, qd: Array, qdd: Array, direction: Array | None = None
+        self,
+        q: Array,
+        qd: Array,
+        qdd: Array,
+        direction: Array | None = None,
+        load: Array | None = None,
     ) -> Regressor:
-        """Return the whole regressor for motion arrays (m, n); `direction` as in :meth:`chunks`."""
+        """Return the whole regressor for motion arrays (m, n), see :meth:`chunks`."""
         m = q.shape[0]
         full = [np.empty((len(columns), m)) for columns in self.columns]
-        for part, rows in self.chunks(q, qd, qdd, direction):
+        for part, rows in self.chunks(q, qd, qdd, direction, load):
             for target, block in zip(full, rows, strict=True):
                 target[:, part] = block
         return Regressor(tuple(block.T for block in full), self.columns)
 
     def torque(
-        self, values: Array, q: Array, qd: Array, qdd: Array, direction: Array | None = None
+        self,
+        values: Array,
+        q: Array,
+        qd: Array,
+        qdd: Array,
+        direction: Array | None = None,
+        load: Array | None = None,
     ) -> Array:
-        """Return the torques (m, n) of parameters (p,) for motion arrays (m, n)."""
+        """Return the torques (m, n) of parameters (p,) for motion arrays, see :meth:`chunks`."""
         torque = np.empty(q.shape)
         weights = [values[columns] for columns in self.columns]
-        for part, rows in self.chunks(q, qd, qdd, direction):
+        for part, rows in self.chunks(q, qd, qdd, direction, load):
             for joint, block in enumerate(rows):
                 torque[part, joint] = weights[joint] @ block
         return torque
@@ -290,6 +304,7 @@ class _Workspace:
         self._motion = LinkMotion(plan.chain, plan.gravity, size)
         motors = 0 if plan.friction is None else len(plan.friction.motors)
         self._direction = np.zeros((n + motors, size))
+        self._load = np.zeros((n, size))
         self._primitives = np.empty((n, N_PRIMITIVES, size))
         self._friction = self._friction_parts()
         self._drives = self._drive_parts()
@@ -329,17 +344,23 @@ class _Workspace:
             )
         )
 
-    def _friction_parts(self) -> list[tuple[FrictionLaw, Array, Array, Array]]:
-        """Return laws with views of speeds, directions and target rows."""
+    def _friction_parts(self) -> list[tuple[FrictionLaw, Array, Array, Array, Array]]:
+        """Return laws with views of speeds, directions, transmitted torques and target rows."""
         velocity = self._motion.velocity
         direction = self._direction[: len(velocity)]
         if self._joint_friction is None:
             return []
         if (one := self._joint_friction.one_law) is not None:
             rows = self.rows[:, self._drive_rows[0].friction]
-            return [(one, velocity, direction, rows.transpose(1, 0, 2))]
+            return [(one, velocity, direction, self._load, rows.transpose(1, 0, 2))]
         return [
-            (law, velocity[j], direction[j], self.rows[j, self._drive_rows[j].friction])
+            (
+                law,
+                velocity[j],
+                direction[j],
+                self._load[j],
+                self.rows[j, self._drive_rows[j].friction],
+            )
             for j, law in enumerate(self._joint_friction.laws)
         ]
 
@@ -397,7 +418,14 @@ class _Workspace:
         ):
             friction.laws[motor].sign(share @ velocity, out=out)
 
-    def update(self, q: Array, qd: Array, qdd: Array, direction: Array | None = None) -> None:
+    def update(
+        self,
+        q: Array,
+        qd: Array,
+        qdd: Array,
+        direction: Array | None = None,
+        load: Array | None = None,
+    ) -> None:
         """Compute all columns for k <= size samples (k, n); the others are undefined."""
         motion = self._motion
         motion.update(q, qd, qdd)
@@ -410,8 +438,10 @@ class _Workspace:
                 c.target[c.joints] = np.einsum("jrt,crt->jct", c.twists, c.wrenches)
         if self._joint_friction is not None:
             self._write_direction(self._joint_friction, direction, len(q))
-        for law, velocity, sign, target in self._friction:
-            target[...] = law.columns(velocity, sign)
+            if self._joint_friction.has_load:
+                self._load[:, : len(q)] = 0.0 if load is None else load.T
+        for law, velocity, sign, transmitted, target in self._friction:
+            target[...] = law.columns(velocity, sign, transmitted)
         for source, target in self._drives:
             np.copyto(target, source)
         for element, target in self._elements:

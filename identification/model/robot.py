@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from identification.errors import ModelError, ShapeError
 from identification.model.base_parameters import TOLERANCE, BaseParameters, select_base, share_left
 from identification.model.coupling import Coupling
-from identification.model.elements import Element, ElementError, JointElements
+from identification.model.elements import Element, ElementError, JointElements, TorqueRipple
 from identification.model.friction import OFFSET, FrictionLaw, JointFriction
 from identification.model.kinematics import Chain, chain_from_urdf
 from identification.model.payload import Load, Payload
@@ -271,17 +271,42 @@ class RobotModel:
         return values
 
     def regressor(
-        self, q: Array, qd: Array, qdd: Array, direction: Array | None = None
+        self,
+        q: Array,
+        qd: Array,
+        qdd: Array,
+        direction: Array | None = None,
+        load: Array | None = None,
     ) -> Regressor:
         """Return W for m samples of motion, each array (m, n).
 
-        `direction` (m, n + k) of dry friction as in :attr:`Motion.direction`.
+        `direction` (m, n + k) of dry friction and `load` (m, n) as in :class:`Motion`; a load of
+        None is that of :meth:`gear_load`.
 
         Raises:
             ShapeError: an array has another shape.
         """
         q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
-        return self.plan.evaluate(q, qd, qdd, direction)
+        return self.plan.evaluate(q, qd, qdd, direction, self.gear_load(q, qd, qdd, load))
+
+    def chunks(
+        self,
+        q: Array,
+        qd: Array,
+        qdd: Array,
+        direction: Array | None = None,
+        load: Array | None = None,
+        *,
+        response: Array | None = None,
+    ) -> Iterator[tuple[slice, list[Array]]]:
+        """Yield W in chunks, see :meth:`RegressorPlan.chunks`; `load` as in :meth:`regressor`.
+
+        Raises:
+            ShapeError: an array has another shape.
+        """
+        q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
+        load = self.gear_load(q, qd, qdd, load)
+        return self.plan.chunks(q, qd, qdd, direction, load, response=response)
 
     def torque(
         self,
@@ -290,19 +315,63 @@ class RobotModel:
         qd: Array,
         qdd: Array,
         direction: Array | None = None,
+        load: Array | None = None,
     ) -> Array:
         """Return the joint torques [N·m, N] of parameter values (p,), shape (m, n).
 
-        Without :meth:`load_torque`; `direction` as in :meth:`regressor`.
+        Without :meth:`load_torque`; `direction` and `load` as in :class:`Motion`, a load of None is
+        that of the values.
 
         Raises:
             ShapeError: an array has another shape.
         """
+        values = self._checked(values)
+        q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
+        if self.friction.has_load and load is None:
+            load = self.gear_torque(values, q, qd, qdd)
+        return self.plan.torque(values, q, qd, qdd, direction, load)
+
+    def gear_torque(self, values: Array, q: Array, qd: Array, qdd: Array) -> Array:
+        """Return the torque [N·m, N] that the gears transmit, of parameters (p,), shape (m, n).
+
+        That of the bodies, the payload, springs and balancers; without friction, offsets, torque
+        ripple and the inertia of rotors, as far as this is separate from that of the bodies.
+
+        Raises:
+            ShapeError: an array has another shape.
+        """
+        transmitted = np.where(self._transmitted, self._checked(values), 0.0)
+        q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
+        return self.plan.torque(transmitted, q, qd, qdd) + self.load_torque(q, qd, qdd)
+
+    def gear_load(self, q: Array, qd: Array, qdd: Array, load: Array | None = None) -> Array | None:
+        """Return the transmitted torque (m, n) of load-dependent friction, None without it.
+
+        A given `load`, else that of the URDF's bodies and of nominal springs and balancers.
+        """
+        if not self.friction.has_load or load is not None:
+            return load
+        values = np.zeros(self.n_parameters)
+        values[: self.base.rank] = self.base.grouping @ self.nominal
+        values[self.element_part] = self.elements.nominal
+        return self.gear_torque(values, q, qd, qdd)
+
+    def _checked(self, values: Array) -> Array:
         values = np.asarray(values, dtype=np.float64)
         if values.shape != (self.n_parameters,):
             raise ShapeError("values", values.shape, f"({self.n_parameters},)")
-        q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
-        return self.plan.torque(values, q, qd, qdd, direction)
+        return values
+
+    @property
+    def _transmitted(self) -> NDArray[np.bool_]:
+        """Which parameters (p,) have a torque that the gears transmit."""
+        drives = [*self.layout.rotors, *self.layout.couplings]
+        transmitted = np.zeros(self.n_parameters, dtype=np.bool_)
+        transmitted[: self.base.rank] = ~np.isin(self.base.pivots, drives)
+        for placed in self.elements.identified:
+            is_ripple = isinstance(placed.element, TorqueRipple)
+            transmitted[self.element_part][placed.part] = not is_ripple
+        return transmitted
 
     @property
     def has_load(self) -> bool:

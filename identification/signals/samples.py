@@ -113,6 +113,23 @@ class Samples:
             direction = model.friction.direction(*self.motion[:3])
         return replace(self, motion=self.motion._replace(direction=direction))
 
+    def with_load(self, model: RobotModel, values: Array) -> Samples:
+        """Return samples with the torque that the gears transmit, of parameters (p,)."""
+        return self.with_given_load(model.gear_torque(values, *self.whole.motion[1:4]))
+
+    def with_given_load(self, load: Array | None) -> Samples:
+        """Return samples with a transmitted torque [N·m, N] of all rows of their recording."""
+        if self.parent is not None:
+            parent, part = self.parent
+            parent = parent.with_given_load(load)
+            return replace(self, motion=parent.motion.rows(part), parent=(parent, part))
+        return replace(self, motion=self.motion._replace(load=load))
+
+    @property
+    def whole(self) -> Samples:
+        """The samples of the recording that these are part of."""
+        return self if self.parent is None else self.parent[0].whole
+
     def as_measured(self, joint: int, columns: Array) -> Array:
         """Filter columns (m, c) of a joint's row by the torque's low-pass."""
         if self.torque_bandwidth is None:
@@ -131,12 +148,23 @@ class Samples:
             tuple(self.as_measured(joint, block) for joint, block in enumerate(blocks)), columns
         )
 
-    def predicted_torque(self, model: RobotModel, values: Array) -> Array:
-        """Return the torque (m, n) of parameters (p,), filtered by the torque's low-pass."""
+    def predicted_torque(
+        self, model: RobotModel, values: Array, chosen: NDArray[np.bool_] | None = None
+    ) -> Array:
+        """Return the torque (m, n) of parameters (p,), filtered by the torque's low-pass.
+
+        Friction has the load of these values, not of the motion. With `chosen` (p,) only the part
+        of some parameters, whose friction has the load of all.
+        """
         if self.parent is not None:
             samples, part = self.parent
-            return samples.predicted_torque(model, values)[part]
-        return self._filtered(model.torque(values, *self.motion[1:]))
+            return samples.predicted_torque(model, values, chosen)[part]
+        load = None
+        if model.friction.has_load:
+            load = model.gear_torque(values, *self.motion[1:4])
+        if chosen is not None:
+            values = np.where(chosen, values, 0.0)
+        return self._filtered(model.torque(values, *self.motion[1:5], load))
 
     def known_torque(self, model: RobotModel) -> Array:
         """Return the torque (m, n) of known payload and elements, filtered likewise."""

@@ -421,7 +421,9 @@ def _corrected(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
         order[list(fault.joints)] = fault.joints[::-1]
     motion, torque, usable = samples.motion, samples.torque, samples.usable
     if fault.kind in _OF_MOTION:
+        load = None if motion.load is None else motion.load[:, order]
         motion = Motion(motion.time, *(part[:, order] * sign for part in motion[1:4]))
+        motion = motion._replace(load=load)
         usable = usable[:, order]
     if fault.kind != "position order":
         torque = torque[:, order] * sign

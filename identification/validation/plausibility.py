@@ -103,9 +103,9 @@ def _wrong_signs(
             )
             yield words, top != 0.0
     alone = {  # names of single parameters
-        k: f"friction {term.name} of motor {term.owner + 1}"
+        k: f"friction {term.name} of {'motor' if term.motor else 'joint'} {term.owner + 1}"
         for k, term in enumerate(model.friction.terms, start=first)
-        if term.motor
+        if term.motor or term.term.of_load
     }
     for k, (name, row) in enumerate(zip(model.base.names, model.base.grouping, strict=True)):
         if np.count_nonzero(row) <= 1 and _NEVER_NEGATIVE.fullmatch(name):

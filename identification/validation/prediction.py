@@ -123,7 +123,7 @@ def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: fl
     factor within `FRICTION_CHANGE`.
     """
     error = residual(model, values, samples, bandwidth)
-    friction = samples.predicted_torque(model, np.where(model.friction_columns, values, 0.0))
+    friction = samples.predicted_torque(model, values, model.friction_columns)
     friction = _usable_part(samples, friction, bandwidth)
     usable = samples.usable
     power = (friction**2 * usable).sum(axis=0)

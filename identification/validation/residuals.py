@@ -337,10 +337,10 @@ def check_residuals(
     torque = np.array([(np.where(run.usable, run.torque, 0.0) ** 2).sum(axis=0) for run in runs])
     rows = np.maximum(sum(np.count_nonzero(run.usable, axis=0) for run in runs), 1)
     repeated = fitted if same_motion else 1
-    heat, drift = np.where(model.friction_columns, values, 0.0), []
+    drift = []
     pieces = -(-_PIECES // fitted)
     for run, own in zip(training, left, strict=False):
-        friction = run.predicted_torque(model, heat)
+        friction = run.predicted_torque(model, values, model.friction_columns)
         tables = np.where(run.usable, [friction * own, friction**2], 0.0)
         edges = np.linspace(0, len(own), pieces + 1).astype(np.intp)[:-1]
         drift.append(np.add.reduceat(tables, edges, axis=1))

@@ -29,6 +29,7 @@ from hil.results import SCHEMA_VERSION, Results
 from hil.simulation import planted_values
 from identification.errors import IdentificationError
 from identification.estimators.consistent import Shrinkage, SolverError
+from identification.model.friction import FrictionLaw
 from sim_fixtures.ns16 import URDF_PATH
 
 from .simulated_logs import archive_of, simulate
@@ -361,6 +362,11 @@ def test_a_stribeck_speed_below_the_recorded_ones_is_refused(campaign):
     options = Options(friction={"stribeck": 1e-4}, estimator="wls", standstill="rests")
     with pytest.raises(InputError, match=r"stribeck.*slower than twice .* larger speed"):
         prepare_sources(gather_sources(paths(campaign), 0.7), options, Silent())
+
+
+def test_a_friction_law_may_grow_with_the_load():
+    law = FrictionLaw.from_table(friction_from("coulomb,viscous,load"))
+    assert law.symbols == ("f0", "f1", "fl")
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from identification.errors import ModelError, ShapeError
 from identification.estimators.consistent import consistent_estimate
 from identification.excitation.collision import CollisionChecker, Workspace
 from identification.excitation.errors import CollisionModelError
+from identification.export.friction import friction_curve, median_load
 from identification.export.parameters import parameters_csv, parameters_json
 from identification.export.simulators import (
     AGREES,
@@ -28,7 +29,7 @@ from identification.export.simulators import (
     mjcf,
     random_states,
 )
-from identification.export.urdf import NotConsistentError, WriteBackError, write_urdf
+from identification.export.urdf import NotConsistentError, WriteBackError, not_in_urdf, write_urdf
 from identification.factor.factor import Factor, estimate
 from identification.model.coupling import Coupling
 from identification.model.elements import Anchors, GasCylinder, TorqueRipple, TorsionSpring
@@ -41,7 +42,7 @@ from identification.model.urdf_text import LONGEST, MOST_LINKS, refusal, urdf_tr
 from identification.signals.smoothing import LowPassShape, low_passed, noiseless_above
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import random_urdf, robot_text, some_bodies
-from tests.identification.two_link import URDF
+from tests.identification.two_link import URDF, as_samples, four_sines
 from tests.identification.two_link import URDF as TWO_LINK
 
 INERTIAL = (
@@ -654,6 +655,81 @@ class TestTexts:
         where = {"mjcf": "frictionloss", "urdf": "friction"}[form]
         found = [float(one.get(where, 0)) for one in root.iter() if where in one.attrib]
         assert found == f0
+
+
+class TestLoadFriction:
+    """Friction that grows with the load becomes Coulomb friction at one load."""
+
+    LOAD = np.array([400.0, 300.0, 100.0, 20.0, 10.0, 5.0])
+
+    @FORMS
+    def test_coulomb_friction_is_that_at_the_load(self, form):
+        arm = replace(an_arm(urdf_text(), friction=FrictionLaw(load=True)), load=self.LOAD)
+        model = arm.model
+        table = model.friction.table(arm.values[model.friction_part])
+        expected = [
+            row["f0"] + row["fl"] * load for row, load in zip(table, self.LOAD, strict=True)
+        ]
+        text = FORMATS[form].write(arm, "arm", ["a remark"])
+        where = {"mjcf": "frictionloss", "urdf": "friction"}[form]
+        root = ElementTree.fromstring(text)
+        found = [float(one.get(where)) for one in root.iter() if where in one.attrib]
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+        assert "Coulomb friction is that at a load of joint_1 400 N·m, joint_2 300 N·m" in text
+
+    @FORMS
+    def test_what_is_left_out_is_the_friction_beyond_that_load(self, form):
+        arm = replace(an_arm(urdf_text(), friction=FrictionLaw(load=True)), load=self.LOAD)
+        motion, model = random_states(arm, 60), arm.model
+        found = compared(form, arm, samples=60)
+        beyond = [torque for name, torque in found.left_out.items() if "grows" in name]
+        shares = np.array(
+            [row["fl"] for row in model.friction.table(arm.values[model.friction_part])]
+        )
+        sizes = np.abs(model.gear_torque(arm.values, *motion[1:4]))
+        expected = np.sqrt(np.mean((shares * (sizes - self.LOAD)) ** 2, axis=0))
+        np.testing.assert_allclose(beyond, [expected], rtol=1e-6)
+        assert found.difference < AGREES
+
+    def test_a_joint_that_did_not_move_has_the_friction_of_its_description(self):
+        arm = an_arm(urdf_text(), friction=FrictionLaw(load=True))
+        friction = arm.values[arm.model.friction_part]
+        names = arm.model.parameter_names[arm.model.friction_part]
+        friction = np.where([name.endswith("_6") for name in names], np.nan, friction)
+        text = write_urdf(arm.urdf, arm.model, arm.standard, friction, load=self.LOAD)
+        joints = {one.get("name"): one for one in ElementTree.fromstring(text).iter("joint")}
+        before = {one.get("name"): one for one in ElementTree.fromstring(arm.urdf).iter("joint")}
+        last, described = (one["joint_6"].find("dynamics") for one in (joints, before))
+        assert (None if last is None else last.attrib) == (
+            None if described is None else described.attrib
+        )
+
+    def test_the_curve_has_the_friction_of_a_load(self):
+        arm = an_arm(urdf_text(), friction=FrictionLaw(load=True))
+        row = arm.model.friction.table(arm.values[arm.model.friction_part])[1]
+        plain, loaded = (
+            friction_curve(arm.model, arm.values, 1, -1.0, 1.0, load) for load in (0.0, 300.0)
+        )
+        added = row["fl"] * 300.0 * np.sign(plain.speed)
+        np.testing.assert_allclose(loaded.torque - plain.torque, added, rtol=1e-9)
+
+    def test_the_median_load_is_that_of_usable_rows(self):
+        model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(load=True))
+        motion = four_sines(np.arange(0.0, 2.0, 0.01))
+        values = np.arange(1.0, model.n_parameters + 1.0)
+        sizes = np.abs(model.gear_torque(values, *motion[1:4]))
+        usable = np.zeros(sizes.shape, dtype=bool)
+        usable[50:, 0] = True  # the other joint never moves
+        run = as_samples(model, motion, sizes, usable=usable)
+        expected = [np.median(sizes[50:, 0]), np.median(sizes[:, 1])]
+        np.testing.assert_allclose(median_load(model, values, [run]), expected)
+
+    def test_parameters_list_the_shares(self):
+        model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(load=True))
+        assert not_in_urdf(model)[-2:] == (
+            "a term f2 with the speed squared",
+            "friction that grows with the transmitted torque, a share fl of it",
+        )
 
 
 class TestNoise:
