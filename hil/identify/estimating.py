@@ -33,6 +33,7 @@ from identification.estimators.least_squares import (
     estimate_repetitions,
     fit_least_squares,
 )
+from identification.estimators.load_friction import fit_with_load
 from identification.estimators.losses import Huber, Loss, Tukey
 from identification.estimators.prior import (
     BODY_SHARE,
@@ -87,6 +88,37 @@ class Estimation:
     posterior: PosteriorEstimate  #: estimate with the prior; the result of "auto" and "prior"
     refit: Refit  #: parameters by the estimator from a factor, to predict parts of the fitted rows
     warnings: tuple[str, ...]
+
+
+def with_transmitted_load(prepared: Prepared) -> Prepared:
+    """Return samples that carry the torque that the gears transmit, for friction that grows with it.
+
+    Of the posterior, as a fixed point; unchanged without such friction.
+    """
+    cell = prepared.sources.cell
+    model = cell.model
+    if not model.friction.has_load:
+        return prepared
+
+    def fit(samples: Sequence[Samples]) -> Estimate:
+        total = total_factor(model, samples)
+        return Posterior.of(cell, total, "auto", prepared.settings.strength).fit(total).estimate
+
+    loaded = fit_with_load(model, prepared.fitted, fit)
+    values = loaded.result.values
+    training = tuple(samples.with_load(model, values) for samples in prepared.training)
+    held_out = training
+    if not prepared.sources.in_sample:
+        held_out = tuple(samples.with_load(model, values) for samples in prepared.held_out)
+    notes = prepared.notes
+    if not loaded.converged:
+        notes += (
+            f"the friction that grows with load still changed the torque by {loaded.change:.1%} in"
+            f" pass {loaded.passes}",
+        )
+    return replace(
+        prepared, fitted=loaded.samples, training=training, held_out=held_out, notes=notes
+    )
 
 
 def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> Estimation:

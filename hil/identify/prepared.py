@@ -319,7 +319,11 @@ def _chosen(
     if "presliding" in questions:
         friction |= {"presliding": law.presliding}
     if "friction" in questions:
-        friction |= {"third": law.third or "none", "stribeck": law.stribeck or 0.0}
+        friction |= {
+            "third": law.third or "none",
+            "stribeck": law.stribeck or 0.0,
+            "load": law.load,
+        }
     if "ripple" in questions and best.ripple:
         friction |= {"ripple": [*best.ripple]}
     return replace(

@@ -32,7 +32,7 @@ from identification.excitation import (
     coupling_index_max,
     information,
 )
-from identification.export.friction import friction_curve, friction_torque
+from identification.export.friction import friction_curve, friction_torque, median_load
 from identification.factor.factor import joint_weights
 from identification.model.elements import TorqueRipple
 from identification.selection.essential import Elimination, choose_essential
@@ -52,7 +52,7 @@ from planner import FourierSeries
 from sim_fixtures.ns16 import TABLE2, URDF_PATH
 
 from .cell_context import cell_context_of, nominal_of
-from .estimating import Estimation, estimate_with
+from .estimating import Estimation, estimate_with, with_transmitted_load
 from .options import ESTIMATORS, Options
 from .prepared import Prepared, executed_rows, moving_rows, prepare_sources
 from .sources import Sources, gather_sources
@@ -171,7 +171,7 @@ def identify_archives(
         InputError: the archives cannot be used, not together, or not by the chosen estimator.
     """
     sources = gather_sources(paths, options.split, predict, in_sample=options.in_sample)
-    prepared = prepare_sources(sources, options, reporter)
+    prepared = with_transmitted_load(prepare_sources(sources, options, reporter))
     estimation = estimate_with(prepared, options, reporter)
     sources, result, cell = prepared.sources, estimation.result, prepared.sources.cell
     warned = [*sources.warnings, *warnings, *estimation.warnings]
@@ -249,8 +249,11 @@ def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSerie
     predicted = example.predicted_torque(model, values)
     speed, torque = _friction_data(model, values, fitted)
     slowest, fastest = (end(speed, axis=0, initial=0.0) for end in (np.nanmin, np.nanmax))
+    load = median_load(model, values, fitted)
     curves = [
-        friction_curve(model, values, joint, float(slowest[joint]), float(fastest[joint]))
+        friction_curve(
+            model, values, joint, float(slowest[joint]), float(fastest[joint]), float(load[joint])
+        )
         for joint in range(model.n_joints)
     ]
     return ReportSeries(

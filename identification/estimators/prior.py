@@ -66,6 +66,9 @@ _SETTLED: Final = 1e-3  # relative change of the noise
 # Of the scatter of its torque, that a term of friction alone makes. Coulomb and viscous friction
 # together are the torque of a light wrist, and a fifth of that of a heavy arm.
 _FRICTION_SHARE: Final = 0.5
+LOAD_SHARE: Final = 0.1
+"""Deviation of the share of the transmitted torque that becomes friction: strain-wave gears lose
+some 2 to 15 % (Bittencourt and Gunnarsson 2012)."""
 _FEWEST_ROWS: Final = 2  # per parameter, to estimate the noise
 _INERTIA, _MOMENT, _MASS = slice(0, 6), slice(6, 9), 9
 
@@ -325,6 +328,9 @@ def body_prior(
     combinations[b:, layout.size :] = np.eye(len(others))
     mean, std = np.zeros(len(names)), np.zeros(len(names))
     std[layout.size :] = _torque_over_columns(model, factor)[b:]
+    for k, term in enumerate(model.friction.terms, layout.size):
+        if term.term.of_load:
+            std[k] = LOAD_SHARE
     reason = _placeholder(model, factor)
     length = body_lengths(model)
     masses = np.full(model.n_joints, _UNKNOWN_MASS)

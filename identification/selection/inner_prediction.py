@@ -58,6 +58,7 @@ IF_LONG: Final[frozenset[str]] = frozenset({"bandwidth", "presliding", "strength
 one costs much on another motion."""
 LOW_PASS: Final = "low-pass of the torque"
 DELAY: Final = "delay of the torque"
+LOAD: Final = "friction that grows with load"
 STRENGTH: Final = "strength of the prior"
 CONSISTENT: Final = "physical consistency"
 """Names of decisions."""
@@ -93,6 +94,8 @@ _MEANINGLESS: Final = 1.0
 _FAST: Final = 0.85
 # Smallest friction within the range of speeds, as a share of Coulomb friction.
 _LEAST_FRICTION: Final = 0.5
+# Share of load that becomes friction in a worm gear; a larger one is another effect.
+_LARGEST_SHARE: Final = 0.5
 _SHOWN: Final = 0.1  # share of the torque's scatter from which on friction is judged
 _SPEEDS: Final = 20  # points of that test
 _MOST_SWEEPS: Final = 2
@@ -316,8 +319,9 @@ def choose_settings(
     if "low-pass" in asked:
         now, choices = _compare_low_passes(trial, first, now, choices, asked, low_passes)
     if "friction" in asked:
-        decision = _friction_terms(trial, now)
-        now, choices = decision.settings, [*choices, decision.choice]
+        for decide in (_friction_terms, _load_friction):
+            decision = decide(trial, now)
+            now, choices = decision.settings, [*choices, decision.choice]
     if "ripple" in asked:
         rippled = [replace(now, model=now.model.with_elements(elements)) for elements in ripples]
         decision = trial.decide("torque ripple", [now, *rippled])
@@ -351,6 +355,17 @@ def _friction_terms(trial: _Trial, now: Settings) -> _Decision:
         for k, each in enumerate(candidates)
     ]
     return trial.decide("friction at speed", candidates, TERM_WORTHWHILE, possible=possible)
+
+
+def _load_friction(trial: _Trial, now: Settings) -> _Decision:
+    """Choose whether dry friction grows with the transmitted torque, as in strain-wave gears.
+
+    A stated term comes first. Shares that no gear has are refused.
+    """
+    law = now.model.friction.laws[0]
+    candidates = [_friction(now, load=load) for load in (law.load, not law.load)]
+    possible = [True, law.load or trial.has_load_shares(candidates[1])]
+    return trial.decide(LOAD, candidates, TERM_WORTHWHILE, possible=possible)
 
 
 def _compare_delays(
@@ -560,13 +575,41 @@ class _Trial:
                 return False
         return True
 
+    def has_load_shares(self, settings: Settings) -> bool:
+        """Return whether the fitted shares of load that become friction are those of gears.
+
+        Weighted by the torque of their joints: that of a joint with hardly any torque is open.
+        """
+        reduced = self._reduced(settings)
+        values = self._estimator(settings, reduced.prior)(reduced.folds.fitted)
+        power = reduced.folds.fitted.gram[:, -1, -1]
+        terms = settings.model.friction.terms
+        shares = [
+            (value, power[term.owner])
+            for value, term in zip(values[settings.model.friction_part], terms, strict=True)
+            if term.term.of_load
+        ]
+        share, weight = np.array(shares).T
+        return bool(0.0 < np.average(share, weights=weight) < _LARGEST_SHARE)
+
     def samples(self, settings: Settings) -> list[Samples]:
-        """Return the samples of settings, with their friction's direction."""
+        """Return the samples of settings, with direction of friction and transmitted torque.
+
+        The load is that of the estimate without friction that depends on it.
+        """
         if settings.preprocessing not in self._samples:
             samples = self._ready(settings.model, settings.preprocessing)
             self._samples[settings.preprocessing] = [*samples]
-        samples = self._samples[settings.preprocessing]
-        return [each.with_friction_direction(settings.model) for each in samples]
+        samples = [
+            each.with_friction_direction(settings.model)
+            for each in self._samples[settings.preprocessing]
+        ]
+        if not settings.model.friction.has_load:
+            return samples
+        without = _friction(settings, load=False)
+        reduced = self._reduced(without)
+        values = self._estimator(without, reduced.prior)(reduced.folds.fitted)
+        return [each.with_load(without.model, values) for each in samples]
 
     def _reduced(self, settings: Settings) -> _Reduced:
         key = settings.factor_key
