@@ -8,6 +8,8 @@ import io
 import json
 import math
 import re
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -28,7 +30,7 @@ from hil.report import (
     page,
     report_bytes,
 )
-from hil.report.drawing import thinned
+from hil.report.drawing import round_ticks, single, thinned
 from hil.report.rendering import environment
 from hil.results import Results
 from identification.excitation import CRITERIA, METHODS
@@ -552,3 +554,25 @@ class TestNumbers:
     )
     def test_are_rounded_where_uncertainty_begins(self, value, std, text):
         assert numbers.beside(value, std) == text
+
+
+class TestDrawing:
+    @given(st.floats(-1e9, 1e9), st.floats(1e-6, 1e9), st.integers(2, 8))
+    def test_ticks_are_round_in_the_range_and_read_back(self, low, span, most):
+        high = low + max(span, 1e-6 * abs(low))
+        ticks, texts = round_ticks(low, high, most)
+        assert 1 <= len(ticks) <= most + 1
+        assert len(set(texts)) == len(texts)
+        assert all(low - 1e-6 * span <= tick <= high + 1e-6 * span for tick in ticks)
+        read = [float(text.replace("−", "-")) for text in texts]
+        np.testing.assert_allclose(read, ticks, rtol=1e-9, atol=1e-7 * span)
+
+    def test_a_line_is_interrupted_at_nan(self):
+        axes = single(170.0, "torque", "time")
+        axes.line(np.arange(5.0), np.array([0.0, 1.0, np.nan, 1.0, 0.0]), "black", 1.0)
+        (line,) = re.findall(r'd="([^"]*)" style="fill:none;stroke:black', axes.svg("c"))
+        assert (line.count("M"), line.count("L")) == (2, 2)
+
+    def test_of_a_report_loads_no_plotting_library(self):
+        code = "import sys, hil.report, hil.outcome; sys.exit('matplotlib' in sys.modules)"
+        assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
