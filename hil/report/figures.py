@@ -117,7 +117,12 @@ def joints_of(results: Results) -> list[Joint]:
         return [Joint(j, one.joint, one.unit, "") for j, one in enumerate(results.judgement.joints)]
     errors = zip(example.relative_error, example.all_rows_joint_errors, strict=True)
     return [
-        Joint(j, one.joint, one.unit, f"error {percent(moving)} %, all rows {percent(every)} %")
+        Joint(
+            j,
+            one.joint,
+            one.unit,
+            f"error in motion {percent(moving)} %, whole recording {percent(every)} %",
+        )
         for j, (one, (moving, every)) in enumerate(
             zip(results.judgement.joints, errors, strict=True)
         )

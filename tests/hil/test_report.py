@@ -419,12 +419,13 @@ class TestPage:
 
     def test_has_errors_of_unseen_and_fitted_motion(self, html):
         head = Page(html[: html.index("<main>")])
-        median, worst, fitted = (list(row.values()) for row in head.table("All rows [%]"))
-        assert fitted == ["fitted", "2.10", "4.30"]
-        assert median[2] == "5.00" == worst[2]
-        assert float(worst[1]) >= float(median[1]) > 0.0
+        median, worst, fitted = (list(row.values()) for row in head.table("Whole recording [%]"))
+        assert fitted == ["fitted", "4.30", "2.10"]
+        assert median[1] == "5.00" == worst[1]
+        assert float(worst[2]) >= float(median[2]) > 0.0
         assert "median of 12 runs" in median[0]
         assert Page(html).text.count("includes standstill and reversals") == 1
+        assert "whole recording" in Page(html).text and "in motion" in Page(html).text
 
     def test_shows_steps_of_the_campaign_if_known(self, whole):
         for words in ("Execution", "6 of 6 criteria passed", "Accepted by ada", "2 late"):
@@ -461,6 +462,19 @@ class TestParameters:
         rows = rendered(make_results(parameters=parameters)).table("Estimate")
         remarks = [row["Remark"].replace("\xa0", " ") for row in rows]
         assert remarks[: len(cases)] == [remark for *_, remark in cases]
+
+    def test_show_the_share_of_the_data_beside_that_of_the_prior(self):
+        parameters = [p.model_dump() for p in make_results().parameters]
+        parameters[0] |= {"prior_std": 1.0, "prior_ratio": 0.5}
+        parameters[1] |= {"prior_std": math.inf, "prior_ratio": 0.0}
+        html = render(make_results(parameters=parameters))
+        assert (
+            'aria-label="75 % from the data, 25 % from the prior"><span style="width:75%">' in html
+        )
+        assert html.count('class="share"') == len(parameters) - 1
+        for parameter in parameters:
+            parameter |= {"prior_std": None, "prior_ratio": None}
+        assert 'class="share"' not in render(make_results(parameters=parameters))
 
     def test_have_a_matrix_of_correlation_from_white_to_black(self, results):
         svg = figures.correlation_matrix(results).svg
