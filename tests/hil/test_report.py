@@ -427,6 +427,18 @@ class TestPage:
         assert Page(html).text.count("includes standstill and reversals") == 1
         assert "whole recording" in Page(html).text and "in motion" in Page(html).text
 
+    def test_groups_warnings_outside_the_box_of_the_verdict(self):
+        judgement = _judgement() | {"findings": [
+            {"check": "resolution", "level": "doubtful", "words": "few digits"}]}  # fmt: skip
+        verdict = {"good": True, "line": "Good.", "reasons": [],
+                   "warnings": ["few digits", "friction drifts"]}  # fmt: skip
+        html = render(make_results(judgement=judgement, verdict=verdict))
+        section = html[html.index('<section class="warnings"') :].split("</section>")[0]
+        assert Page(section).text == (
+            "2 warnings About the model and its prediction friction drifts"
+            " About the recording few digits"
+        )
+
     def test_shows_steps_of_the_campaign_if_known(self, whole):
         for words in ("Execution", "6 of 6 criteria passed", "Accepted by ada", "2 late"):
             assert words in whole.text
