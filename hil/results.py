@@ -242,6 +242,14 @@ class ParameterResult(Frozen):
         return self.name if self.table2_id is None else f"{self.table2_id} {self.name}"
 
     @property
+    def data_share(self) -> float | None:
+        """Share of the information that comes from the data, 0 to 1; None without a prior."""
+        bounded = self.prior_std is not None and math.isfinite(self.prior_std)
+        if not bounded or self.prior_ratio is None or not math.isfinite(self.prior_ratio):
+            return None
+        return 1.0 - min(self.prior_ratio, 1.0) ** 2
+
+    @property
     def relative_std(self) -> float:
         """Std / |estimate|."""
         return self.std / abs(self.estimate) if self.estimate else math.inf

@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 from hil import results
 from hil.archive import ArchiveHeader
 from hil.campaign.folder import CampaignFolder
-from hil.campaign.status import conduct_of
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.progress import Reporter
 from hil.reading import path_exists
 from hil.report import ReportSeries
-from hil.simulation import planted_values
 from hil.version import software
 from identification import Factor, IdentificationError, RobotModel, estimate
 from identification.estimators.covariance import with_block_covariance
@@ -152,6 +150,8 @@ def identify_campaign(
         name=root.resolve().name,
         warnings=folder.damaged(),
     )
+    from hil.campaign.status import conduct_of  # only a campaign needs what executes it
+
     conduct = conduct_of(folder)
     return replace(found, results=found.results.model_copy(update={"conduct": conduct}))
 
@@ -434,6 +434,8 @@ def true_values(cell: Cell, header: ArchiveHeader) -> Array | None:
         return np.array([planted.get(name, np.nan) for name in model.parameter_names])
     if cell.file.simulation is None:
         return None
+    from hil.simulation import planted_values  # only for a simulated arm
+
     values = planted_values(cell)
     for one in model.elements.identified:
         if isinstance(one.element, TorqueRipple):

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
-from hil.report.drawing import drawing
+import matplotlib as mpl
 
 INK, MUTED, RULE = "#1a1a1a", "#666666", "#dddddd"
 LIMIT = "#b3261e"
@@ -29,6 +33,16 @@ _STYLE = {
 }
 
 
-def page() -> AbstractContextManager[None]:
-    """Draw with these settings, one thread at a time."""
-    return drawing(_STYLE)
+_settings = threading.RLock()
+
+
+@contextmanager
+def page() -> Iterator[None]:
+    """Draw with fixed settings of matplotlib, one thread at a time (settings are global)."""
+    with _settings, warnings.catch_warnings(), mpl.rc_context():
+        # A name may have glyphs that are missing in DejaVu.
+        warnings.filterwarnings("ignore", message=r"Glyph \d+")
+        mpl.rcdefaults()
+        settings: Any = {"svg.fonttype": "none", "svg.hashsalt": "hil", "text.parse_math": False}
+        mpl.rcParams.update(settings | _STYLE)
+        yield

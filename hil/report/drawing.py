@@ -1,65 +1,41 @@
-"""Panels of the pages: matplotlib figures as SVG, in the font and colours of the style sheet."""
+"""Panels of the pages as SVG, in the font and colours of the style sheet.
+
+A report has some forty plots of lines, dots and bands. A general plotting library takes a tenth of
+a second for each, and half a second to load; these are written as text directly.
+"""
 
 from __future__ import annotations
 
+import base64
 import io
-import re
-import threading
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any, Final, Literal, NamedTuple
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Final, Literal, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 from markupsafe import Markup, escape
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Figures have placeholder colours, which become variables of the style sheet (light, dark, print).
-CSS_VARIABLES: Final = {
-    f"#0102{k:02x}": f"var(--{name})"
-    for k, name in enumerate(("ink", "muted", "grid", "band", "first", "second", "wide"))
-}
-INK, MUTED, GRID, BAND, FIRST, SECOND, WIDE = CSS_VARIABLES
-"""`WIDE` is a light colour for a broad line below another one."""
+INK, MUTED, GRID, BAND, FIRST, SECOND, WIDE = (
+    f"var(--{name})" for name in ("ink", "muted", "grid", "band", "first", "second", "wide")
+)
+"""Variables of the style sheet (light, dark, print); `WIDE` is a light colour for a broad line
+below another one."""
 
 TICK_SIZE, TEXT_SIZE = 10.5, 11.0
-DASHED: Final = (0, (4, 3))
 _WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 370.0, 46.0, 10.0, 20.0, 40.0  # of a panel, px
 _GAP: Final = 24.0  # between plots above each other, px
+_TICK, _PAD, _THIN = 3.0, 6.5, 0.8  # length and distance of text, width of thin lines, px
+_FOOT: Final = 32.0  # from the axis down to the base line of its quantity, px
+_MARGIN: Final = 0.05  # free on both sides of the values, as a share of their range
 _LABEL_LENGTH: Final = 28
 _FEWEST_FOR_A_BOX: Final = 5  # values
-_PAGE: Final = {
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": MUTED,
-    "axes.axisbelow": True,
-    "axes.titlelocation": "left",
-    "axes.titlesize": TEXT_SIZE,
-    "axes.titlecolor": MUTED,
-    "axes.titlepad": 5.0,
-    "axes.labelsize": TEXT_SIZE,
-    "axes.labelcolor": MUTED,
-    "axes.labelpad": 3.0,
-    "grid.color": GRID,
-    "lines.solid_joinstyle": "round",
-    "savefig.transparent": True,
-    **{
-        f"{axis}tick.{name}": value
-        for axis in "xy"
-        for name, value in (
-            ("color", MUTED), ("labelcolor", INK), ("labelsize", TICK_SIZE), ("major.size", 3.0),
-        )
-    },
-}  # fmt: skip
-_settings = threading.RLock()
+_BINS: Final = 400  # of a line over time, which has up to two points in each
+_STEPS: Final = (1.0, 2.0, 5.0, 10.0)  # of round ticks, times a power of ten
+_MOST_DIGITS: Final = 1e6  # Ticks from here on have an exponent
 
 
 class Caption(NamedTuple):
@@ -80,18 +56,6 @@ class Panel:
     svg: Markup
 
 
-@contextmanager
-def drawing(style: Mapping[str, Any] = _PAGE) -> Iterator[None]:
-    """Draw with fixed settings of matplotlib, one thread at a time (settings are global)."""
-    with _settings, warnings.catch_warnings(), mpl.rc_context():
-        # Text is shown in the fonts of the page; glyphs missing in DejaVu do not matter.
-        warnings.filterwarnings("ignore", message=r"Glyph \d+")
-        mpl.rcdefaults()
-        settings: Any = {"svg.fonttype": "none", "svg.hashsalt": "hil", "text.parse_math": False}
-        mpl.rcParams.update(settings | dict(style))
-        yield
-
-
 def one_line(text: str) -> str:
     """Replace unprintable characters by blanks."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
@@ -103,74 +67,195 @@ def label(text: str) -> str:
     return line if len(line) <= _LABEL_LENGTH else line[: _LABEL_LENGTH - 1] + "…"
 
 
-def to_panel(figure: Figure, caption: Caption) -> Panel:
-    """Return a figure as SVG for inclusion in a page."""
-    out = io.StringIO()
-    metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-    figure.savefig(out, format="svg", metadata=metadata)
-    svg = out.getvalue().partition("<svg")[2].partition(">")[2]
-    svg = re.sub(r"<style.*?</style>|<metadata>.*?</metadata>", "", svg, flags=re.S)
-    svg = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{caption.key}-", svg).replace("xlink:", "")
-    svg = re.sub(r" font-family: [^;\"]*;?", "", svg)
-    svg = re.sub(r"(?<=\.\d\d)\d+", "", svg)
-    for placeholder, variable in CSS_VARIABLES.items():
-        svg = svg.replace(placeholder, variable)
-    width, height = figure.get_size_inches() * 72.0
-    note = f"; {caption.note}" if caption.note else ""
-    alt = escape(one_line(f"{caption.title}: {caption.what}{note}."))
-    size = f'viewBox="0 0 {width:g} {height:g}" style="max-width: {1.3 * width:.0f}px"'
-    head = f'<svg {size} role="img" aria-label="{alt}">'
-    return Panel(caption.title, caption.note, Markup(head + svg))
-
-
-@contextmanager
-def panel(
-    panels: list[Panel],
-    height: float,
-    caption: Caption,
-    heading: str = "",
-    foot: str = "",
-    *,
-    left: float = _LEFT,
-    right: float = _RIGHT,
-    bottom: float = _BOTTOM,
-    top: float = _TOP,
-    width: float = _WIDTH,
-) -> Iterator[Axes]:
-    """Yield axes, and append the drawing to `panels`; size and margins in px.
-
-    `heading` is the quantity and unit of the vertical axis, `foot` those of the horizontal one.
-    """
-    with drawing():
-        figure = Figure(figsize=(width / 72.0, height / 72.0))
-        figure.subplots_adjust(
-            left / width, bottom / height, 1.0 - right / width, 1.0 - top / height
-        )
-        axes = figure.subplots()
-        axes.set_title(heading)
-        axes.set_xlabel(foot)
-        yield axes
-        panels.append(to_panel(figure, caption))
-
-
-def ruled(
-    axes: Axes, axis: Literal["x", "y", "both"], *, x_ticks: int = 5, y_ticks: int = 4
-) -> None:
-    """Draw a light grid at few, round ticks."""
-    axes.grid(True, axis=axis)
-    axes.xaxis.set_major_locator(MaxNLocator(x_ticks, steps=[1, 2, 5, 10]))
-    axes.yaxis.set_major_locator(MaxNLocator(y_ticks, steps=[1, 2, 5, 10]))
-
-
 def thinned(time: Array, values: Array, bins: int = 500) -> tuple[Array, Array]:
-    """Return minimum and maximum of each of `bins` equal intervals, (m,) -> (<= 2 bins,)."""
+    """Return minimum and maximum of each of `bins` equal intervals, (m,) -> (<= 2 bins + 2,)."""
     if time.size <= 2 * bins:
         return time, values
     edges = np.linspace(0, time.size, bins + 1).astype(np.intp)
-    parts = [(start, values[start:end]) for start, end in pairwise(edges)]
-    ends = [start + end(part) for start, part in parts for end in (np.argmin, np.argmax)]
-    chosen = np.unique([0, *ends, time.size - 1])
+    starts, ends = edges[:-1, None], edges[1:, None]
+    # Rows of equal length: the last sample of an interval is repeated.
+    rows = np.minimum(starts + np.arange(int(np.max(ends - starts))), ends - 1)
+    parts, starts = values[rows], edges[:-1]
+    extremes = [starts + parts.argmin(axis=1), starts + parts.argmax(axis=1)]
+    chosen = np.unique(np.concatenate([[0, time.size - 1], *extremes]))
     return time[chosen], values[chosen]
+
+
+def round_ticks(low: float, high: float, most: int) -> tuple[list[float], list[str]]:
+    """Return the round values from `low` to `high`, at most `most` intervals, with their texts."""
+    size = (high - low) / most
+    decade = 10.0 ** math.floor(math.log10(size))
+    step = next((s for s in _STEPS if s * decade >= size * (1.0 - 1e-9)), _STEPS[-1]) * decade
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    ticks = [k * step for k in range(first, last + 1)]
+    place = math.floor(math.log10(step) + 1e-9)
+    if max(abs(low), abs(high)) < _MOST_DIGITS and place >= -6:
+        texts = [f"{tick:.{max(0, -place)}f}" for tick in ticks]
+    else:
+        digits = [math.floor(math.log10(abs(tick))) - place if tick else 0 for tick in ticks]
+        texts = [f"{tick:.{max(0, d)}e}" for tick, d in zip(ticks, digits, strict=True)]
+    return ticks, [text.replace("-", "−") for text in texts]
+
+
+def padded(values: Array) -> tuple[float, float]:
+    """Return the range of the finite values with a margin; it is never empty."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return 0.0, 1.0
+    low, high = float(finite.min()), float(finite.max())
+    # Neighbouring floats have no ticks between them.
+    if not high - low > 1e-9 * max(abs(low), abs(high)):
+        room = 0.05 * abs(low) or 1.0
+        return low - room, high + room
+    room = _MARGIN * (high - low)
+    return low - room, high + room
+
+
+@dataclass
+class Axes:
+    """One plot of a panel: shapes are collected in units of the data, and written at the end."""
+
+    left: float  #: edge in the panel [px]
+    top: float
+    width: float
+    height: float
+    heading: str = ""  #: quantity and unit of the vertical axis
+    foot: str = ""  #: those of the horizontal one
+    x_limits: tuple[float, float] | None = None  #: the range of the values with a margin if None
+    y_limits: tuple[float, float] | None = None
+    x_ticks: int = 5  #: at most so many intervals; none if 0
+    y_ticks: int = 4
+    x_labelled: bool = True
+    x_names: Sequence[tuple[float, str]] = ()  #: names at places instead of round ticks
+    grid: Literal["both", "y"] = "both"
+    _shapes: list[tuple[str, Array, Array, str]] = field(default_factory=list)
+
+    def line(
+        self, x: Array, y: Array, colour: str, width: float, *, dashed: bool = False, ends: str = ""
+    ) -> None:
+        """Draw a line through points (m,), interrupted at NaN."""
+        dash = ";stroke-dasharray:4 3" if dashed else ";stroke-linecap:square"
+        style = f"fill:none;stroke:{colour};stroke-width:{width:g}{ends or dash}"
+        self._shapes.append(("line", np.asarray(x), np.asarray(y), style))
+
+    def segments(self, x: Array, y: Array, colour: str, width: float) -> None:
+        """Draw lines that are not connected, (m, 2) each."""
+        apart = np.full((len(x), 1), np.nan)
+        across, up = np.hstack([x, apart]).ravel(), np.hstack([y, apart]).ravel()
+        self.line(across, up, colour, width, ends=";stroke-linecap:butt")
+
+    def dots(self, x: Array, y: Array, colour: str, size: float, *, opacity: float = 1.0) -> None:
+        """Draw dots at points (m,), of a diameter in px."""
+        style = f"fill:none;stroke:{colour};stroke-width:{size:g};stroke-linecap:round"
+        style += f";stroke-opacity:{opacity:g}" if opacity < 1.0 else ""
+        self._shapes.append(("dots", np.asarray(x), np.asarray(y), style))
+
+    def bands(self, x: Array, y: Array, colour: str, outline: str = "") -> None:
+        """Fill rectangles, (m, 2) each; infinite ends are those of the plot."""
+        style = f"fill:{colour}" + (f";stroke:{outline};stroke-width:1" if outline else "")
+        self._shapes.append(("bands", np.asarray(x), np.asarray(y), style))
+
+    def svg(self, clip: str) -> str:
+        """Return the plot; `clip` is the id of its clipping path."""
+        drawn = [shape for shape in self._shapes if shape[0] != "bands" or "stroke" in shape[3]]
+        low, high = self.x_limits or padded(_joined(shape[1] for shape in drawn))
+        bottom, top = self.y_limits or padded(_joined(shape[2] for shape in drawn))
+        right, foot = self.left + self.width, self.top + self.height
+
+        def across(x: Array) -> Array:
+            share = (np.asarray(x, np.float64) - low) / (high - low)
+            return np.asarray(self.left + self.width * np.clip(share, -3.0, 4.0))
+
+        def up(y: Array) -> Array:
+            share = (np.asarray(y, np.float64) - bottom) / (top - bottom)
+            return np.asarray(foot - self.height * np.clip(share, -3.0, 4.0))
+
+        names = self.x_names or list(zip(*round_ticks(low, high, self.x_ticks), strict=True))
+        x_at = across(np.array([place for place, _ in names])).tolist()
+        ticks, texts = round_ticks(bottom, top, self.y_ticks)
+        y_at = up(np.array(ticks)).tolist()
+        rules = [f"M{self.left:g} {y:.1f}H{right:g}" for y in y_at]
+        rules += [f"M{x:.1f} {self.top:g}V{foot:g}" for x in x_at if self.grid == "both"]
+        frame = [f"M{self.left:g} {self.top:g}V{foot:g}H{right:g}"]
+        frame += [f"M{self.left:g} {y:.1f}h{-_TICK:g}" for y in y_at]
+        frame += [f"M{x:.1f} {foot:g}v{_TICK:g}" for x in x_at if not self.x_names]
+        area = f'x="{self.left:g}" y="{self.top:g}" width="{self.width:g}" height="{self.height:g}"'
+        thin = f"fill:none;stroke-width:{_THIN:g};stroke:"
+        parts = [f'<clipPath id="{clip}"><rect {area}/></clipPath><g clip-path="url(#{clip})">']
+        shapes = [_path(kind, across(x), up(y), style) for kind, x, y, style in self._shapes]
+        below = [kind == "bands" and "stroke" not in style for kind, *_, style in self._shapes]
+        parts += [shape for shape, first in zip(shapes, below, strict=True) if first]
+        parts.append(f'<path d="{"".join(rules)}" style="{thin}{GRID}"/>')
+        parts += [shape for shape, first in zip(shapes, below, strict=True) if not first]
+        parts.append(f'</g><path d="{"".join(frame)}" style="{thin}{MUTED}"/>')
+        parts += [
+            _text(text, self.left - _PAD, y + 0.38 * TICK_SIZE, INK, TICK_SIZE, "end")
+            for y, text in zip(y_at, texts, strict=True)
+        ]
+        if self.x_labelled:
+            parts += [
+                _text(line, x, foot + _PAD + (k + 0.76) * 1.2 * TICK_SIZE, INK, TICK_SIZE, "middle")
+                for x, (_, text) in zip(x_at, names, strict=True)
+                for k, line in enumerate(text.split("\n"))
+            ]
+        parts.append(_text(self.heading, self.left, self.top - 5.0, MUTED, TEXT_SIZE, "start"))
+        middle = self.left + 0.5 * self.width
+        parts.append(_text(self.foot, middle, foot + _FOOT, MUTED, TEXT_SIZE, "middle"))
+        return "".join(parts)
+
+
+def _joined(arrays: Iterable[Array]) -> Array:
+    return np.concatenate([np.empty(0), *(np.asarray(a, np.float64).ravel() for a in arrays)])
+
+
+def _path(kind: str, x: Array, y: Array, style: str) -> str:
+    """Return a shape with its points in px."""
+    if kind == "bands":
+        corners = zip(x.tolist(), y.tolist(), strict=True)
+        d = "".join(
+            f"M{left:.1f} {foot:.1f}H{right:.1f}V{top:.1f}H{left:.1f}z"
+            for (left, right), (foot, top) in corners
+        )
+        return f'<path d="{d}" style="{style}"/>'
+    there = np.isfinite(x) & np.isfinite(y)
+    points = list(map("{:.1f} {:.1f}".format, x[there].tolist(), y[there].tolist()))
+    if kind == "dots":
+        d = "".join(f"M{point}h0" for point in points)
+    else:
+        # A line starts anew behind a gap.
+        starts = there & np.concatenate([[True], ~there])[:-1]
+        first = starts[there].tolist()
+        d = "".join(("M" if start else "L") + p for start, p in zip(first, points, strict=True))
+    return f'<path d="{d}" style="{style}"/>'
+
+
+def _text(text: str, x: float, y: float, colour: str, size: float, anchor: str) -> str:
+    if not text:
+        return ""
+    style = f"font-size:{size:g}px;text-anchor:{anchor};fill:{colour}"
+    return f'<text x="{x:.1f}" y="{y:.1f}" style="{style}">{escape(one_line(text))}</text>'
+
+
+def to_panel(width: float, height: float, content: str, caption: Caption) -> Panel:
+    """Return SVG content of a size in px as a panel with its text alternative."""
+    note = f"; {caption.note}" if caption.note else ""
+    alt = escape(one_line(f"{caption.title}: {caption.what}{note}."))
+    size = f'viewBox="0 0 {width:g} {height:g}" style="max-width: {1.3 * width:.0f}px"'
+    svg = f'<svg {size} role="img" aria-label="{alt}">{content}</svg>'
+    return Panel(caption.title, caption.note, Markup(svg))
+
+
+def panel(plots: Sequence[Axes], caption: Caption, width: float = _WIDTH) -> Panel:
+    """Return plots as one panel; its height is that of the lowest plot and the text below it."""
+    height = max(axes.top + axes.height for axes in plots) + _BOTTOM
+    content = "".join(axes.svg(f"{caption.key}-{k}") for k, axes in enumerate(plots))
+    return to_panel(width, height, content, caption)
+
+
+def single(height: float, heading: str, foot: str, *, x_ticks: int = 5) -> Axes:
+    """Return the axes of a panel with one plot; height in px, margins included."""
+    inner = height - _TOP - _BOTTOM
+    return Axes(_LEFT, _TOP, _WIDTH - _LEFT - _RIGHT, inner, heading, foot, x_ticks=x_ticks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,33 +283,24 @@ class Plot:
 
 def time_panel(time: Array, plots: Sequence[Plot], caption: Caption) -> Panel:
     """Draw plots over the same time (m,) [s], one above the other."""
-    inner = [plot.height for plot in plots]
-    height = _TOP + sum(inner) + _GAP * (len(plots) - 1) + _BOTTOM
-    with drawing():
-        figure = Figure(figsize=(_WIDTH / 72.0, height / 72.0))
-        rows = figure.subplots(
-            len(plots), 1, sharex=True, squeeze=False, height_ratios=inner,
-            gridspec_kw={
-                "left": _LEFT / _WIDTH, "right": 1.0 - _RIGHT / _WIDTH, "top": 1.0 - _TOP / height,
-                "bottom": _BOTTOM / height, "hspace": _GAP / float(np.mean(inner)),
-            },
-        )[:, 0]  # fmt: skip
-        for axes, plot in zip(rows, plots, strict=True):
-            for interval in plot.shaded:
-                axes.axvspan(*interval, color=BAND, linewidth=0.0, zorder=0.5)
-            for trace in plot.traces:
-                line = DASHED if trace.dashed else "-"
-                axes.plot(
-                    *thinned(time, trace.values), color=trace.colour, linewidth=trace.width,
-                    linestyle=line,
-                )  # fmt: skip
-            if plot.reach is not None:
-                axes.set_ylim(-plot.reach, plot.reach)
-            axes.set_title(plot.heading)
-            ruled(axes, "both", x_ticks=6)
-        rows[-1].set_xlabel("time [s]")
-        rows[-1].set_xlim(float(time[0]), max(float(time[-1]), float(time[0]) + 1e-9))
-        return to_panel(figure, caption)
+    span = float(time[0]), max(float(time[-1]), float(time[0]) + 1e-9)
+    drawn, top = list[Axes](), _TOP
+    for k, plot in enumerate(plots):
+        last = k == len(plots) - 1
+        axes = Axes(
+            _LEFT, top, _WIDTH - _LEFT - _RIGHT, plot.height, plot.heading,
+            "time [s]" if last else "", x_limits=span, x_ticks=6, x_labelled=last,
+            y_limits=None if plot.reach is None else (-plot.reach, plot.reach),
+        )  # fmt: skip
+        if plot.shaded:
+            infinite = np.full((len(plot.shaded), 1), np.inf)
+            axes.bands(np.array(plot.shaded), np.hstack([-infinite, infinite]), BAND)
+        for trace in plot.traces:
+            points = thinned(time, trace.values, _BINS)
+            axes.line(*points, trace.colour, trace.width, dashed=trace.dashed)
+        drawn.append(axes)
+        top += plot.height + _GAP
+    return panel(drawn, caption)
 
 
 def box_panel(
@@ -234,32 +310,35 @@ def box_panel(
     heading: str,
     labels: Sequence[str],
 ) -> Panel:
-    """Draw columns of values (m,) as dots with a box."""
-    lines = 1 + max(label.count("\n") for label in labels)
-    panels, grey = list[Panel](), {"color": MUTED}
+    """Draw columns of values (m,) as dots with a box: quartiles, median, 1.5 box heights."""
+    lines = 1 + max(text.count("\n") for text in labels)
     width, bottom = 110.0 + 40.0 * len(columns), 12.0 + 13.0 * lines
-    with panel(panels, 206.0 + bottom, caption, heading, width=width, bottom=bottom) as axes:
-        for k, (values, colour) in enumerate(zip(columns, colours, strict=True), 1):
-            if values.size >= _FEWEST_FOR_A_BOX:
-                axes.boxplot(
-                    [values], positions=[k], widths=0.6, patch_artist=True, showfliers=False,
-                    boxprops={"facecolor": BAND, "edgecolor": MUTED}, whiskerprops=grey,
-                    capprops=grey, medianprops={"color": INK, "linewidth": 2.2},
-                )  # fmt: skip
-            # Horizontal offsets by the golden ratio separate neighbouring values.
-            rank = np.argsort(np.argsort(values, kind="stable"), kind="stable")
-            side = k + 0.34 * ((rank * 0.6180339887498949) % 1.0 - 0.5)
-            axes.scatter(side, values, s=14.0, color=colour, alpha=0.85, linewidths=0.0, zorder=3)
-        ruled(axes, "y", y_ticks=5)
-        axes.set_xticks(range(1, len(columns) + 1), labels)
-        axes.set_xlim(0.4, len(columns) + 0.6)
-        axes.tick_params(axis="x", length=0.0)
-        # A scale that shows every value and does not exaggerate small changes.
-        every = np.concatenate(columns)
-        middle = float(np.median(every))
-        low, high = min(float(every.min()), 0.9 * middle), max(float(every.max()), 1.1 * middle)
-        axes.set_ylim(max(0.0, low - 0.06 * (high - low)), high + 0.06 * (high - low) or 1.0)
-    return panels[0]
+    # A scale that shows every value and does not exaggerate small changes.
+    every = np.concatenate(columns)
+    middle = float(np.median(every))
+    low, high = min(float(every.min()), 0.9 * middle), max(float(every.max()), 1.1 * middle)
+    limits = max(0.0, low - 0.06 * (high - low)), high + 0.06 * (high - low) or 1.0
+    axes = Axes(
+        _LEFT, _TOP, width - _LEFT - _RIGHT, 206.0 - _TOP, heading, y_limits=limits, y_ticks=5,
+        x_limits=(0.4, len(columns) + 0.6), x_names=list(enumerate(labels, 1)), grid="y",
+    )  # fmt: skip
+    for k, (values, colour) in enumerate(zip(columns, colours, strict=True), 1):
+        if values.size >= _FEWEST_FOR_A_BOX:
+            first, median, third = np.percentile(values, (25.0, 50.0, 75.0)).tolist()
+            reach = 1.5 * (third - first)
+            inside = values[(values >= first - reach) & (values <= third + reach)]
+            ends = min(float(inside.min()), first), max(float(inside.max()), third)
+            axes.bands(np.array([[k - 0.3, k + 0.3]]), np.array([[first, third]]), BAND, MUTED)
+            whiskers = [[k, k], [k, k], [k - 0.15, k + 0.15], [k - 0.15, k + 0.15]]
+            levels = [[ends[0], first], [third, ends[1]], [ends[0]] * 2, [ends[1]] * 2]
+            axes.segments(np.array(whiskers), np.array(levels), MUTED, 1.0)
+            axes.segments(np.array([[k - 0.3, k + 0.3]]), np.array([[median] * 2]), INK, 2.2)
+        # Horizontal offsets by the golden ratio separate neighbouring values.
+        rank = np.argsort(np.argsort(values, kind="stable"), kind="stable")
+        side = k + 0.34 * ((rank * 0.6180339887498949) % 1.0 - 0.5)
+        axes.dots(np.asarray(side, np.float64), values, colour, 4.0, opacity=0.85)
+    content = axes.svg(f"{caption.key}-0")
+    return to_panel(width, 206.0 + bottom, content, caption)
 
 
 _LABELS: Final = 84.0  # px
@@ -269,21 +348,29 @@ _SMALLEST_CELL, _LARGEST_CELL = 11.0, 26.0  # px
 
 def matrix_panel(matrix: Array, labels: Sequence[str], key: str, title: str) -> Panel:
     """Draw |ρ| of a normalised matrix (n, n), 0 white, 1 black, one label for each row."""
+    from PIL import Image  # only pages with a matrix need it
+
     n, matrix = len(labels), np.abs(matrix)
-    names = [label(text) for text in labels]
     note = f"{int(np.sum(np.triu(matrix, 1) > 0.9))} of {n * (n - 1) // 2} pairs above 0.9"
     what = f"absolute correlation between {n} base parameters, white for 0 and black for 1"
     cell = min(max(_SIDE / n, _SMALLEST_CELL), _LARGEST_CELL)
     side, size = n * cell, min(TICK_SIZE, 0.76 * cell)
-    panels, caption = list[Panel](), Caption(key, title, note, what)
-    with panel(
-        panels, _LABELS + side + 6.0, caption, left=_LABELS, top=_LABELS, right=6.0, bottom=6.0,
-        width=_LABELS + side + 6.0,
-    ) as axes:  # fmt: skip
-        axes.imshow(matrix, cmap="gray_r", vmin=0.0, vmax=1.0, interpolation="none", aspect="auto")
-        axes.xaxis.tick_top()
-        axes.set_xticks(range(n), names, rotation=90, fontsize=size)
-        axes.set_yticks(range(n), names, fontsize=size)
-        axes.tick_params(length=0.0, pad=4.0)
-        axes.spines[:].set_visible(True)
-    return panels[0]
+    grey = np.round(255.0 * (1.0 - np.clip(np.nan_to_num(matrix), 0.0, 1.0))).astype(np.uint8)
+    png = io.BytesIO()
+    Image.fromarray(np.repeat(grey[:, :, None], 3, axis=2)).save(png, "png")
+    data = base64.b64encode(png.getvalue()).decode("ascii")
+    area = f'x="{_LABELS:g}" y="{_LABELS:g}" width="{side:g}" height="{side:g}"'
+    parts = [
+        f'<image {area} preserveAspectRatio="none" style="image-rendering:pixelated"'
+        f' href="data:image/png;base64,{data}"/>',
+        f'<rect {area} style="fill:none;stroke:{MUTED};stroke-width:{_THIN:g}"/>',
+    ]
+    for k, text in enumerate(labels):
+        at, name = _LABELS + (k + 0.5) * cell + 0.36 * size, label(text)
+        parts.append(_text(name, _LABELS - 4.0, at, INK, size, "end"))
+        upward = _text(name, 0.0, 0.0, INK, size, "start")
+        parts.append(
+            f'<g transform="translate({at:.1f} {_LABELS - 4.0:g}) rotate(-90)">{upward}</g>'
+        )
+    whole = _LABELS + side + 6.0
+    return to_panel(whole, whole, "".join(parts), Caption(key, title, note, what))

@@ -21,8 +21,9 @@ from hil.report.drawing import (
     Plot,
     Trace,
     matrix_panel,
+    padded,
     panel,
-    ruled,
+    single,
     time_panel,
 )
 from hil.report.numbers import fixed, percent, significant
@@ -116,7 +117,12 @@ def joints_of(results: Results) -> list[Joint]:
         return [Joint(j, one.joint, one.unit, "") for j, one in enumerate(results.judgement.joints)]
     errors = zip(example.relative_error, example.all_rows_joint_errors, strict=True)
     return [
-        Joint(j, one.joint, one.unit, f"error {percent(moving)} %, all rows {percent(every)} %")
+        Joint(
+            j,
+            one.joint,
+            one.unit,
+            f"error in motion {percent(moving)} %, whole recording {percent(every)} %",
+        )
         for j, (one, (moving, every)) in enumerate(
             zip(results.judgement.joints, errors, strict=True)
         )
@@ -181,16 +187,18 @@ def friction_panels(series: ReportSeries, joints: Sequence[Joint]) -> list[Panel
         ends = " to ".join(significant(float(end)) for end in law[[0, -1]])
         caption = Caption(f"k{j}", name, f"{ends} {unit}", "friction over velocity")
         foot = f"speed [{joints[j].angle}/s]"
-        with panel(panels, 210.0, caption, f"friction [{unit}]", foot) as axes:
-            axes.axhline(0.0, color=MUTED, linewidth=0.8)
-            axes.axvline(0.0, color=MUTED, linewidth=0.8)
-            axes.plot(series.friction_speed[there, j], torque, ".", color=WIDE, markersize=2.2)
-            axes.plot(speed, law, color=SECOND, linewidth=1.8)
-            shown = np.percentile(torque, _SHOWN) if torque.size else []
-            values = np.concatenate([shown, law, [0.0]])
-            room = 0.08 * float(np.ptp(values)) or 1.0
-            axes.set_ylim(float(values.min()) - room, float(values.max()) + room)
-            ruled(axes, "both")
+        axes = single(210.0, f"friction [{unit}]", foot)
+        endless = np.array([-np.inf, np.inf])
+        shown = np.percentile(torque, _SHOWN) if torque.size else np.empty(0)
+        values = np.concatenate([shown, law, [0.0]])
+        room = 0.08 * float(np.ptp(values)) or 1.0
+        axes.y_limits = float(values.min()) - room, float(values.max()) + room
+        speeds = np.concatenate([series.friction_speed[there, j], speed])
+        axes.x_limits = padded(speeds)
+        axes.segments(np.array([endless, [0.0, 0.0]]), np.array([[0.0, 0.0], endless]), MUTED, 0.8)
+        axes.dots(series.friction_speed[there, j], torque, WIDE, 2.2)
+        axes.line(speed, law, SECOND, 1.8)
+        panels.append(panel([axes], caption))
     return panels
 
 
@@ -211,15 +219,18 @@ def residual_panels(results: Results) -> dict[str, list[Panel]]:
             note = f"RMS error {significant(joint.rms)} {joint.unit}"
             caption = Caption(f"{what[0]}{j}", joint.joint, note, f"mean residual over {what}")
             heading, foot = f"mean residual [{joint.unit}]", f"{what} [{angle}{per}]"
-            with panel(panels, 170.0, caption, heading, foot) as axes:
-                axes.axhspan(-joint.rms, joint.rms, color=BAND, linewidth=0.0)
-                axes.axhline(0.0, color=MUTED, linewidth=0.9)
-                # NaN interrupts the line at empty bins.
-                axes.errorbar(
-                    profile.centre, mean, yerr=_INTERVAL * std, color=FIRST, marker="o",
-                    markersize=4.5, linewidth=1.2, capsize=2.5,
-                )  # fmt: skip
-                ruled(axes, "both", x_ticks=6)
+            axes = single(170.0, heading, foot, x_ticks=6)
+            centre, endless = np.array(profile.centre, np.float64), np.array([-np.inf, np.inf])
+            axes.bands(endless[None], np.array([[-joint.rms, joint.rms]]), BAND)
+            reach = np.where(np.isfinite(std), _INTERVAL * std, 0.0)
+            ends = np.stack([mean - reach, mean + reach], axis=1)
+            axes.y_limits = padded(np.concatenate([ends.ravel(), [0.0, -joint.rms, joint.rms]]))
+            axes.x_limits = padded(centre[np.isfinite(mean)])
+            axes.segments(endless[None], np.zeros((1, 2)), MUTED, 0.9)
+            axes.segments(np.stack([centre, centre], axis=1), ends, FIRST, 1.2)
+            axes.line(centre, mean, FIRST, 1.2)
+            axes.dots(centre, mean, FIRST, 4.5)
+            panels.append(panel([axes], caption))
     return found
 
 

@@ -16,6 +16,14 @@ from identification.selection.inner_prediction import Choice
 _MOST_CANDIDATES: Final = 6
 """Candidates shown of one choice: the first, and the best of the others."""
 
+_OF_MODEL: Final = "About the model and its prediction"
+_OF_RECORDING: Final = "About the recording"
+_RECORDING_CHECKS: Final = frozenset(
+    {"torque bandwidth", "resolution", "whiteness", "saturation", "excitation", "delay",
+     "systematic error"}
+)  # fmt: skip
+"""Checks whose findings describe how it was recorded."""
+
 
 def report_bytes(results: Results, series: ReportSeries) -> bytes:
     """Return the report as one HTML file; the same input gives the same bytes.
@@ -32,6 +40,8 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
         "shown_candidates": shown_candidates,
         "has_truth": any(p.truth is not None for p in results.parameters),
         "has_ids": any(p.table2_id is not None for p in results.parameters),
+        "has_prior": any(p.data_share is not None for p in results.parameters),
+        "warnings": grouped_warnings(results),
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
         "by_name": {parameter.name: parameter for parameter in results.parameters},
         "outside_mark": outside_mark,
@@ -47,6 +57,16 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
         **figures.residual_panels(results),
     }
     return page_bytes(environment().get_template("report.html.j2").render(**context))
+
+
+def grouped_warnings(results: Results) -> dict[str, list[str]]:
+    """Return the warnings of the verdict by what they are about, the most consequential first."""
+    checks = {finding.words: finding.check for finding in results.judgement.findings}
+    groups: dict[str, list[str]] = {title: [] for title in (_OF_MODEL, _OF_RECORDING)}
+    for warning in results.verdict.warnings:
+        title = _OF_RECORDING if checks.get(warning) in _RECORDING_CHECKS else _OF_MODEL
+        groups[title].append(warning)
+    return groups if results.verdict.warnings else {}
 
 
 def every_row_errors(results: Results) -> list[float]:

@@ -156,10 +156,10 @@ def _trajectories(condition: ConditionResult, joint_names: list[str]) -> list[dr
             for one in condition.methods
         ]
         caption = drawing.Caption(f"x{j}", name, "; ".join(spans), "position in each excitation")
-        with drawing.panel(panels, 170.0, caption, "position [rad]", "time [s]") as axes:
-            for one, colour in zip(condition.methods, COLOURS, strict=True):
-                axes.plot(one.time, one.position[j], color=colour, linewidth=1.3)
-            drawing.ruled(axes, "both", x_ticks=6)
+        axes = drawing.single(170.0, "position [rad]", "time [s]", x_ticks=6)
+        for one, colour in zip(condition.methods, COLOURS, strict=True):
+            axes.line(np.array(one.time), np.array(one.position[j]), colour, 1.3)
+        panels.append(drawing.panel([axes], caption))
     return panels
 
 

@@ -8,6 +8,8 @@ import io
 import json
 import math
 import re
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -28,7 +30,7 @@ from hil.report import (
     page,
     report_bytes,
 )
-from hil.report.drawing import thinned
+from hil.report.drawing import round_ticks, single, thinned
 from hil.report.rendering import environment
 from hil.results import Results
 from identification.excitation import CRITERIA, METHODS
@@ -417,12 +419,25 @@ class TestPage:
 
     def test_has_errors_of_unseen_and_fitted_motion(self, html):
         head = Page(html[: html.index("<main>")])
-        median, worst, fitted = (list(row.values()) for row in head.table("All rows [%]"))
-        assert fitted == ["fitted", "2.10", "4.30"]
-        assert median[2] == "5.00" == worst[2]
-        assert float(worst[1]) >= float(median[1]) > 0.0
+        median, worst, fitted = (list(row.values()) for row in head.table("Whole recording [%]"))
+        assert fitted == ["fitted", "4.30", "2.10"]
+        assert median[1] == "5.00" == worst[1]
+        assert float(worst[2]) >= float(median[2]) > 0.0
         assert "median of 12 runs" in median[0]
         assert Page(html).text.count("includes standstill and reversals") == 1
+        assert "whole recording" in Page(html).text and "in motion" in Page(html).text
+
+    def test_groups_warnings_outside_the_box_of_the_verdict(self):
+        judgement = _judgement() | {"findings": [
+            {"check": "resolution", "level": "doubtful", "words": "few digits"}]}  # fmt: skip
+        verdict = {"good": True, "line": "Good.", "reasons": [],
+                   "warnings": ["few digits", "friction drifts"]}  # fmt: skip
+        html = render(make_results(judgement=judgement, verdict=verdict))
+        section = html[html.index('<section class="warnings"') :].split("</section>")[0]
+        assert Page(section).text == (
+            "2 warnings About the model and its prediction friction drifts"
+            " About the recording few digits"
+        )
 
     def test_shows_steps_of_the_campaign_if_known(self, whole):
         for words in ("Execution", "6 of 6 criteria passed", "Accepted by ada", "2 late"):
@@ -459,6 +474,19 @@ class TestParameters:
         rows = rendered(make_results(parameters=parameters)).table("Estimate")
         remarks = [row["Remark"].replace("\xa0", " ") for row in rows]
         assert remarks[: len(cases)] == [remark for *_, remark in cases]
+
+    def test_show_the_share_of_the_data_beside_that_of_the_prior(self):
+        parameters = [p.model_dump() for p in make_results().parameters]
+        parameters[0] |= {"prior_std": 1.0, "prior_ratio": 0.5}
+        parameters[1] |= {"prior_std": math.inf, "prior_ratio": 0.0}
+        html = render(make_results(parameters=parameters))
+        assert (
+            'aria-label="75 % from the data, 25 % from the prior"><span style="width:75%">' in html
+        )
+        assert html.count('class="share"') == len(parameters) - 1
+        for parameter in parameters:
+            parameter |= {"prior_std": None, "prior_ratio": None}
+        assert 'class="share"' not in render(make_results(parameters=parameters))
 
     def test_have_a_matrix_of_correlation_from_white_to_black(self, results):
         svg = figures.correlation_matrix(results).svg
@@ -552,3 +580,25 @@ class TestNumbers:
     )
     def test_are_rounded_where_uncertainty_begins(self, value, std, text):
         assert numbers.beside(value, std) == text
+
+
+class TestDrawing:
+    @given(st.floats(-1e9, 1e9), st.floats(1e-6, 1e9), st.integers(2, 8))
+    def test_ticks_are_round_in_the_range_and_read_back(self, low, span, most):
+        high = low + max(span, 1e-6 * abs(low))
+        ticks, texts = round_ticks(low, high, most)
+        assert 1 <= len(ticks) <= most + 1
+        assert len(set(texts)) == len(texts)
+        assert all(low - 1e-6 * span <= tick <= high + 1e-6 * span for tick in ticks)
+        read = [float(text.replace("−", "-")) for text in texts]
+        np.testing.assert_allclose(read, ticks, rtol=1e-9, atol=1e-7 * span)
+
+    def test_a_line_is_interrupted_at_nan(self):
+        axes = single(170.0, "torque", "time")
+        axes.line(np.arange(5.0), np.array([0.0, 1.0, np.nan, 1.0, 0.0]), "black", 1.0)
+        (line,) = re.findall(r'd="([^"]*)" style="fill:none;stroke:black', axes.svg("c"))
+        assert (line.count("M"), line.count("L")) == (2, 2)
+
+    def test_of_a_report_loads_no_plotting_library(self):
+        code = "import sys, hil.report, hil.outcome; sys.exit('matplotlib' in sys.modules)"
+        assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
