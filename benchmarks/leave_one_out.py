@@ -29,10 +29,13 @@ ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
     "WORTHWHILE": (0.0, 0.03),
     "TERM_WORTHWHILE": (0.0, 0.05),
     "LOW_PASS_WORTHWHILE": (0.02, 0.10),
-    "LEFT_OUT": (("rests", "slow"),),
-    "BANDWIDTHS": ((20.0, 5.0, 7.0, 10.0, 14.0, 40.0),),
+    "LEFT_OUT": (("halts", "rests", "slow"),),
+    "BANDWIDTHS": ((10.0, 7.0, 14.0, 20.0, 40.0), (20.0, 7.0, 10.0, 14.0, 40.0)),
+    "VELOCITIES": (("position", "measured"),),
     "PRESLIDING": ((1e-5, 1e-6, 3e-5, 1e-4, 3e-4, 1e-3),),
-    "FOLDS": (3, 8),
+    "STRENGTHS": ((0.25, 1.0, 4.0), (4.0, 1.0, 0.25)),
+    "FOLDS": (5,),
+    "SHORT": (0.0, 30.0),
 }
 """Other values of each default; of a sequence, the first is the one that others have to beat."""
 PRESENT: Final = "present values"

@@ -43,10 +43,17 @@ from hil.recordings import open_recording
 from identification.estimators.consistent import consistent_estimate
 from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.losses import Huber, Tukey
-from identification.estimators.prior import fit_with_prior, nominal_prior
+from identification.estimators.prior import body_prior, fit_posterior
 from identification.estimators.robust import robust_estimate
 from identification.estimators.torque_channel import possible_low_passes
-from identification.factor.factor import Estimate, Factor, NormalEquations, joint_weights, solve
+from identification.factor.factor import (
+    Estimate,
+    Factor,
+    NormalEquations,
+    joint_weights,
+    solve,
+    total_factor,
+)
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
@@ -149,14 +156,17 @@ def _values(fit: Callable[[RobotModel, Sequence[Samples]], Estimate]) -> Estimat
     return lambda model, samples: fit(model, [samples]).values
 
 
+def _posterior(model: RobotModel, runs: Sequence[Samples]) -> Estimate:
+    factor = total_factor(model, runs)
+    return fit_posterior(model, factor, body_prior(model, factor).gaussian).estimate
+
+
 ESTIMATORS: Final[dict[str, Estimator]] = {
     "ols": _values(lambda model, runs: fit_least_squares(model, runs, "ordinary")),
     "wls": _values(fit_least_squares),
     "huber": _values(lambda model, runs: robust_estimate(model, runs, Huber()).estimate),
     "tukey": _values(lambda model, runs: robust_estimate(model, runs, Tukey()).estimate),
-    "prior": _values(
-        lambda model, runs: fit_with_prior(model, runs, nominal_prior(model)).estimate
-    ),
+    "posterior": _values(_posterior),
     "consistent": _consistent,
 }
 

@@ -40,8 +40,8 @@ class Identifying:
         typer.Option(
             metavar="TERMS|auto",
             help=f"Friction law in place of the archive's: terms of {FRICTION_TERMS}, separated "
-            "by commas. auto: the archive's, extended by the terms that predict better near "
-            "reversals (for imported recordings also at speed).",
+            "by commas. auto: the archive's, extended by the terms that predict clearly better "
+            "near reversals (for imported recordings also at speed and under load).",
         ),
     ] = "auto"
     delay: DelayOption = None
@@ -49,8 +49,8 @@ class Identifying:
         str,
         typer.Option(
             metavar="HZ|auto",
-            help="Largest bandwidth of the position smoothing. auto: the value that predicts "
-            "parts of the fitted recordings best from the rest.",
+            help="Largest bandwidth of the position smoothing. auto: 14 Hz, unless another value "
+            "predicts parts of a long recording clearly better.",
         ),
     ] = "auto"
     velocity: Annotated[
@@ -58,12 +58,12 @@ class Identifying:
         typer.Option(help="Source of the velocity: smoothed positions, or as measured."),
     ] = "auto"
     standstill: Annotated[
-        Literal["auto", "rests", "slow", "none"],
+        Literal["auto", "rests", "halts", "slow", "none"],
         typer.Option(
-            help="Rows excluded from the fit. rests: rests longer than 0.25 s, and the two rows "
-            "at each change of sign of a velocity. slow: all rows below the standstill speed or "
-            "near a velocity reversal. auto: slow, or rests if it predicts parts of the fitted "
-            "recordings better."
+            help="Rows excluded from the fit. rests: rests of the whole arm longer than 0.25 s. "
+            "halts: those of each joint. slow: all rows below the standstill speed or near a "
+            "velocity reversal. auto: rests, unless another predicts parts of the fitted "
+            "recordings clearly better."
         ),
     ] = "auto"
     torque_bandwidth: Annotated[

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,6 +44,7 @@ from identification.estimators.prior import (
     fit_posterior,
     posterior_values,
 )
+from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.factor.columns import instrument_factor
 from identification.factor.factor import (
     QR_CONDITION,
@@ -54,13 +54,12 @@ from identification.factor.factor import (
     no_rows_message,
     total_factor,
 )
+from identification.selection.inner_prediction import Strength
 from identification.signals.samples import Samples
 from identification.validation.calibration import Refit
 from identification.validation.finding import joined
 
 from .options import Estimator, Options
-from identification.selection.inner_prediction import Strength
-
 from .prepared import Prepared, known_parameters, samples_of
 
 # Hz. A narrower smoother removes part of the motion from the regressor, a bias that instruments
@@ -85,15 +84,17 @@ class Estimation:
     estimator: Estimator
     result: RepeatedEstimate  #: pooled and per repetition
     held_out: tuple[Factor, ...]  #: one per held-out recording
-    posterior: PosteriorEstimate  #: estimate with the prior; the result of "auto" and "prior"
+    posterior: Posterior  #: prior of the arm, and its strength
+    #: estimate with that prior, which is the result of "auto" and "prior"
+    with_prior: PosteriorEstimate
     refit: Refit  #: parameters by the estimator from a factor, to predict parts of the fitted rows
     warnings: tuple[str, ...]
 
 
 def with_transmitted_load(prepared: Prepared) -> Prepared:
-    """Return samples that carry the torque that the gears transmit, for friction that grows with it.
+    """Return samples that carry the torque that the gears transmit.
 
-    Of the posterior, as a fixed point; unchanged without such friction.
+    Of the posterior, as a fixed point; unchanged without friction that grows with it.
     """
     cell = prepared.sources.cell
     model = cell.model
@@ -174,7 +175,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
             " parameters poorly (solved by QR)"
         )
     refit = refit_of(model, name, posterior)
-    return Estimation(name, result, held_out, beside, refit, tuple(warnings))
+    return Estimation(name, result, held_out, posterior, beside, refit, tuple(warnings))
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,10 +208,18 @@ class Posterior:
         """Information of the prior as it counts beside that of all rows (p, p)."""
         return self.design_effect * self.prior.gaussian.information
 
+    def free(self, factor: Factor, share: float = 1.0) -> PosteriorEstimate:
+        """Fit a factor that is this share of the rows, whatever bodies the parameters need."""
+        effect = share * self.design_effect
+        return fit_posterior(self.model, factor, self.prior.gaussian, effect)
+
+    def weights(self, factor: Factor) -> Array:
+        """Return the weights of the joints (n,): inverse variances of their residuals."""
+        return posterior_values(factor, self.prior.gaussian, self.design_effect)[1]
+
     def fit(self, factor: Factor, share: float = 1.0) -> PosteriorEstimate:
         """Fit a factor that is this share of the rows, with the prior counting as for all."""
-        effect = share * self.design_effect
-        result = fit_posterior(self.model, factor, self.prior.gaussian, effect)
+        result = self.free(factor, share)
         if not self.consistent:
             return result
         values = self.values(factor, share)

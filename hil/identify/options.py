@@ -53,8 +53,8 @@ class Options:
     velocity: VelocitySource | Literal["auto"] = "auto"
     #: entries of `[robot.friction]` that replace the cell's
     friction: Mapping[str, Any] | Literal["auto"] = "auto"
-    #: rows excluded for low speed: long "rests", all "slow" rows and those near a reversal, or
-    #: "none"; None depends on the friction law
+    #: rows excluded for low speed: long "rests" of the arm, long "halts" of each joint, all "slow"
+    #: rows and those near a reversal, or "none"; None depends on the friction law
     standstill: LeftOut | Literal["auto"] | None = "auto"
     in_sample: bool = False  #: fit all recordings and hold out none
 

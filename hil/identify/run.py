@@ -20,8 +20,7 @@ from hil.progress import Reporter
 from hil.reading import path_exists
 from hil.report import ReportSeries
 from hil.version import software
-from identification import Factor, IdentificationError, RobotModel, estimate
-from identification.estimators.covariance import with_block_covariance
+from identification import Factor, IdentificationError, RobotModel
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.excitation import (
     Criteria,
@@ -31,7 +30,6 @@ from identification.excitation import (
     information,
 )
 from identification.export.friction import friction_curve, friction_torque, median_load
-from identification.factor.factor import joint_weights
 from identification.model.elements import TorqueRipple
 from identification.selection.essential import Elimination, choose_essential
 from identification.signals.samples import Samples
@@ -89,12 +87,19 @@ class Identification:
         return self.estimation.result
 
 
-def consistency_of(model: RobotModel, training: Factor, held_out: Factor) -> ConsistencyCheck | str:
-    """Compare the consistent with the unconstrained estimate, or return why that failed."""
+def consistency_of(estimation: Estimation, held_out: Factor) -> ConsistencyCheck | str:
+    """Compare the posteriors with and without possible bodies, or return why that failed."""
+    posterior, training = estimation.posterior, estimation.result.factor
     try:
-        weights = joint_weights(training)
-        free = with_block_covariance(estimate(model, training, weights), training, weights)
-        return check_consistency(model, training, held_out, free, weights=weights)
+        return check_consistency(
+            posterior.model,
+            training,
+            held_out,
+            posterior.free(training).estimate,
+            weights=posterior.weights(training),
+            prior=posterior.prior,
+            design_effect=posterior.design_effect,
+        )
     except IdentificationError as error:
         return str(error)
 
@@ -177,7 +182,7 @@ def identify_archives(
     warned = [*sources.warnings, *warnings, *estimation.warnings]
     with reporter.task("validating", 3) as task:
         unseen = sum(estimation.held_out, Factor.zero(cell.model))
-        consistency = consistency_of(cell.model, result.factor, unseen)
+        consistency = consistency_of(estimation, unseen)
         impossible: list[str] = []
         if isinstance(consistency, str):
             warned.append(f"no physically consistent parameters were found: {consistency}")
@@ -323,7 +328,6 @@ def summarise(
     excitation, gram = _excitation(prepared)
     simulated = sources.header.only_simulated
     truth = true_values(cell, sources.header) if simulated else None
-    posterior = estimation.posterior
     return results.Results(
         name=name,
         cell=cell.name,
@@ -338,7 +342,7 @@ def summarise(
             words=pooled.method
             if estimation.estimator == "auto"
             else ESTIMATORS[estimation.estimator],
-            prior=posterior.words,
+            prior=estimation.with_prior.words,
             condition=pooled.condition,
             grouping=model.base.explanation(),
         ),
@@ -495,7 +499,7 @@ def _planned(sources: Sources) -> Excitation | None:
 def _parameters(
     cell: Cell, estimation: Estimation, truth: Array | None
 ) -> list[results.ParameterResult]:
-    model, estimate, posterior = cell.model, estimation.result, estimation.posterior
+    model, estimate, posterior = cell.model, estimation.result, estimation.with_prior
     pooled, many = estimate.pooled, len(estimate.repetitions) > 1
     # Rows 29 and 31 of the paper's Table 2 have the other sign.
     ids = {row.pivot or row.parameter: row.id for row in TABLE2}

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from identification.distributions import student_limit
 from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
-from identification.estimators.prior import NOMINAL_SHARE
+from identification.estimators.prior import NOMINAL_SHARE, BodyPrior
 from identification.factor.factor import Estimate, Factor
 from identification.model.friction import COULOMB
 from identification.model.pseudo_inertia import pseudo_inertia, reference_bodies
@@ -203,15 +203,20 @@ def check_consistency(
     unconstrained: Estimate,
     *,
     weights: Array | None = None,
+    prior: BodyPrior | None = None,
+    design_effect: float = 1.0,
 ) -> ConsistencyCheck:
     """Compare the physically consistent estimate with an unconstrained one.
 
-    Weights (n,) are by default the inverse residual variances of an ordinary fit.
+    Weights (n,) are by default the inverse residual variances of an ordinary fit; prior and
+    `design_effect` as for :func:`identification.estimators.consistent.consistent_estimate`.
 
     Raises:
         IdentificationError: see :func:`identification.estimators.consistent.consistent_estimate`.
     """
-    found = consistent_estimate(model, training, unconstrained, weights=weights)
+    found = consistent_estimate(
+        model, training, unconstrained, weights=weights, prior=prior, design_effect=design_effect
+    )
     values, free = found.estimate.values, unconstrained.values
     shift, links = np.abs(found.shift), model.layout.links
     rise = held_out.relative_errors(values) - held_out.relative_errors(free)
