@@ -142,12 +142,13 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         task.advance(1, name)
         total = total_factor(model, fitted)
         posterior = Posterior.of(cell, total, name, prepared.settings.strength)
+        posterior, unsolved = posterior.solvable(total)
         if name == "iv":
             result, warnings = _instrumental(model, prepared, fitted)
         elif name in _LOSSES:
             result, warnings = _robust(model, fitted, name)
         elif name in _OF_PRIOR:
-            result, warnings = _posterior(model, fitted, posterior)
+            result, warnings = _posterior(model, fitted, posterior), unsolved
         else:
             result, warnings = _by_factor(model, fitted, name)
         if prepared.sources.same_motion:
@@ -191,12 +192,13 @@ class Posterior:
     def of(cls, cell: Cell, factor: Factor, name: Estimator, strength: Strength) -> Posterior:
         """Return the posterior of an estimator; all but "auto" have the strength of the residuals.
 
-        The estimator "prior" takes the uncertainty that `[nominal]` states.
+        The bodies are as uncertain as `[nominal]` states; the estimator "prior" trusts them to
+        `NOMINAL_SHARE` if it states nothing.
         """
         table = cell.file.nominal
-        share = BODY_SHARE
-        if name == "prior":
-            share = NOMINAL_SHARE if table is None else table.uncertainty or NOMINAL_SHARE
+        share = NOMINAL_SHARE if name == "prior" else BODY_SHARE
+        if table is not None and "uncertainty" in table.model_fields_set:
+            share = table.uncertainty or share
         prior = body_prior(cell.model, factor, share, known_parameters(cell))
         if name != "auto":
             strength = Strength()
@@ -233,10 +235,15 @@ class Posterior:
         values, weights = posterior_values(factor, self.prior.gaussian, effect)
         if not self.consistent:
             return values
+        return consistent_values(self.model, factor, weights, values, self.prior, effect)
+
+    def solvable(self, factor: Factor) -> tuple[Posterior, list[str]]:
+        """Return the posterior without the restriction to possible bodies if that fails, and why."""
         try:
-            return consistent_values(self.model, factor, weights, values, self.prior, effect)
-        except SolverError:
-            return values
+            self.values(factor)
+        except SolverError as error:
+            return replace(self, consistent=False), [f"all bodies were allowed because {error}"]
+        return self, []
 
 
 # Estimators
@@ -274,16 +281,15 @@ _OF_PRIOR: Final = ("auto", "prior")
 
 def _posterior(
     model: RobotModel, fitted: Sequence[Samples], posterior: Posterior
-) -> tuple[RepeatedEstimate, list[str]]:
+) -> RepeatedEstimate:
     share = 1.0 / len(fitted)
-    result = estimate_repetitions(
+    return estimate_repetitions(
         model,
         fitted,
         lambda _, factor: posterior.fit(factor).estimate,
         # The prior counts for a part as for the whole, so that the scatter is that of the noise.
         each=lambda _, factor: posterior.fit(factor, share).estimate,
     )
-    return result, []
 
 
 def _by_factor(

@@ -28,8 +28,9 @@ from hil.progress import Silent
 from hil.results import SCHEMA_VERSION, Results
 from hil.simulation import planted_values
 from identification.errors import IdentificationError
-from identification.estimators.consistent import Shrinkage, SolverError
+from identification.estimators.consistent import SolverError
 from identification.model.friction import FrictionLaw
+from identification.selection.inner_prediction import Strength
 from sim_fixtures.ns16 import URDF_PATH
 
 from .simulated_logs import archive_of, simulate
@@ -330,7 +331,7 @@ class TestEstimators:
     def test_refit_of_all_rows_is_the_estimate(self, name, estimations):
         """So that the calibration is that of the estimator; others need the samples."""
         found = estimations[name]
-        values = found.posterior.estimate.values if name == "prior" else found.result.pooled.values
+        values = found.with_prior.estimate.values if name == "prior" else found.result.pooled.values
         difference = found.refit(found.result.factor) - values
         assert torque_share(difference, found.result.factor) < 1e-4
 
@@ -344,17 +345,18 @@ class TestEstimators:
         with pytest.raises(InputError, match=r"--estimator iv.*no commanded positions.*use --est"):
             estimate_with(without, Options(estimator="iv"), Silent())
 
-    def test_without_a_consistent_solution_are_least_squares(
-        self, prepared, estimations, monkeypatch
-    ):
+    def test_without_a_consistent_solution_any_bodies_are_allowed(self, prepared, monkeypatch):
         """The reason is a warning."""
+        free = replace(prepared.settings, strength=Strength(consistent=False))
+        expected = estimate_with(replace(prepared, settings=free), Options(), Silent())
         failing = raiser(SolverError("no solution was found"))
-        monkeypatch.setattr("hil.identify.estimating.consistent_estimate", failing)
-        settings = replace(prepared.settings, shrinkage=Shrinkage(0.1))
-        found = estimate_with(replace(prepared, settings=settings), Options(), Silent())
-        expected = estimations["wls"].result.pooled.values
-        np.testing.assert_array_equal(found.result.pooled.values, expected)
-        assert any("least squares is reported" in one for one in found.warnings)
+        monkeypatch.setattr("hil.identify.estimating.consistent_values", failing)
+        restricted = replace(prepared.settings, strength=Strength(consistent=True))
+        estimation = estimate_with(replace(prepared, settings=restricted), Options(), Silent())
+        np.testing.assert_array_equal(
+            estimation.result.pooled.values, expected.result.pooled.values
+        )
+        assert any("no solution was found" in warning for warning in estimation.warnings)
 
 
 def test_a_stribeck_speed_below_the_recorded_ones_is_refused(campaign):
