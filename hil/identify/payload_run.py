@@ -395,10 +395,12 @@ def _require_agreement(
     loaded = next(run.loaded for run in runs if run.name == second.name)
     if not loaded:
         mass, low, high = second.mass
+        heavier, lighter = (second, first) if mass > 0.0 else (first, second)
+        low, high = (low, high) if mass > 0.0 else (-high, -low)
         raise InputError(
             None,
-            f"the bare recordings contradict each other: {second.name} carries {mass:.3g} kg"
-            f" ({low:.3g} to {high:.3g} kg) more than {first.name}",
+            f"the bare recordings contradict each other: {heavier.name} carries"
+            f" {abs(mass):.3g} kg ({low:.3g} to {high:.3g} kg) more than {lighter.name}",
             remedy="give bare recordings with one tool, or none, on the flange",
         )
     words = []
