@@ -177,7 +177,7 @@ class PayloadFound:
                 " between the recordings; record the same motion bare and loaded, on a warm arm."
             )
         if self.mounting is not None:
-            lines.append(f"The mounting is in doubt: {self.mounting}. No controller settings.")
+            lines.append(f"The mounting is doubtful: {self.mounting}. No controller settings.")
         return lines
 
     @property
@@ -193,7 +193,7 @@ class PayloadFound:
     def controllers(self) -> dict[str, str]:
         """Commands that set the payload, by controller; units and frames as in its manual.
 
-        What is not determined has a comment in place of its command. Empty if the mounting is in
+        What is not determined has a comment in place of its command. Empty if the mounting is doubtful
         doubt.
         """
         if self.mounting is not None:
