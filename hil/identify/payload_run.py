@@ -62,7 +62,7 @@ class PayloadFound:
     bare: tuple[str, ...]  #: names of the archives without payload
     loaded: tuple[str, ...]  #: names of the archives with payload
     scale: TorqueScale  #: how well the torques are known
-    mounting: str | None  #: why the stated direction of gravity is in doubt, with a remedy
+    mounting: str | None  #: why the stated direction of gravity is unlikely, with a remedy
     #: as typed: archives or folders without and with payload
     typed: tuple[tuple[Path, ...], tuple[Path, ...]]
     with_currents: bool  #: whether all archives hold motor currents
@@ -193,8 +193,7 @@ class PayloadFound:
     def controllers(self) -> dict[str, str]:
         """Commands that set the payload, by controller; units and frames as in its manual.
 
-        What is not determined has a comment in place of its command. Empty if the mounting is doubtful
-        doubt.
+        What is not determined has a comment instead of its command. Empty if the mounting is wrong.
         """
         if self.mounting is not None:
             return {}
@@ -326,7 +325,7 @@ def find_payload(
             travel = np.max([np.abs(one.position).max(axis=0) for one in recordings], axis=0)
             _require_within_reach(estimate, reach(cell.model, frame, travel), frame)
         task.advance(1)
-        mounting = mounting_in_doubt(cell.model, prepared.fitted)
+        mounting = doubtful_mounting(cell.model, prepared.fitted)
         task.advance(1)
     warnings = (*prepared.sources.warnings, *found[True].warnings)
     if estimate.body is None:
@@ -352,7 +351,7 @@ def find_payload(
     )
 
 
-def mounting_in_doubt(model: RobotModel, bare: Sequence[Samples]) -> str | None:
+def doubtful_mounting(model: RobotModel, bare: Sequence[Samples]) -> str | None:
     """Return why another direction of gravity is likely, from the bare recordings; else None.
 
     The check of :mod:`identification.validation`: fitted to the beginning of each recording, the
