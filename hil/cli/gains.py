@@ -113,10 +113,7 @@ def _as_toml(found: GainsFound, assumed: str | None) -> str:
         else f"    nan,  # {one['name']}: not determined; {one['not_determined']}"
         for one in _motors(found)
     ]
-    spread = [
-        "nan" if one["not_determined"] else f"{one['std'] / abs(one['torque_constant']):.2g}"
-        for one in _motors(found)
-    ]
+    spread = [f"{share:.2g}" for share in found.gains.relative_std]
     return "\n".join(
         [
             *([f"# {assumed}"] if assumed else []),

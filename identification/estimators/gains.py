@@ -65,6 +65,11 @@ class Gains:
         """Which gains the data determine (n,)."""
         return np.isfinite(self.values)
 
+    @property
+    def relative_std(self) -> Array:
+        """Standard deviations relative to the gains (n,), NaN if undetermined."""
+        return np.asarray(self.std / np.abs(self.values))
+
 
 def identify_gains(model: RobotModel, factors: Sequence[Factor]) -> Gains:
     """Estimate gains of motors (n,), from recordings with a known payload and with another or none.
