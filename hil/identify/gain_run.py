@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.cell import Cell
@@ -17,6 +18,7 @@ from identification.estimators.gains import MOST_BLOCKS, Gains, identify_gains
 from identification.factor.columns import gain_factor
 from identification.factor.factor import FINE_BLOCK, Factor
 from identification.model.payload import Payload
+from identification.model.robot import RobotModel
 from identification.signals.recording import RecordingError
 
 from .options import FIXED
@@ -87,13 +89,26 @@ def find_gains(
             task.advance(1, path.name)
     assert first is not None, "the command line asks for an archive"
     _require_load(loads.values())
+    recorded = list(zip(sources, cells, lags, carried, strict=True))
+    factors = _reduced(recorded, model, turns, reporter)
+    gains = identify_gains(model, factors)
+    return GainsFound(gains, loads, not np.array_equal(turns, np.eye(len(turns))))
+
+
+def _reduced(
+    recorded: Sequence[tuple[Source, Cell, Settings, Payload | None]],
+    model: RobotModel,
+    turns: NDArray[np.float64],
+    reporter: Reporter,
+) -> list[Factor]:
+    """Return the factor of each recording, in equal blocks of time."""
     # Repetitions of a motion begin together: errors of the model repeat at equal times.
-    together, _ = aligned(tuple(sources))
+    together, _ = aligned(tuple(source for source, *_ in recorded))
     longest = max(one.recording.time[-1] - one.recording.time[0] for one in together)
     block = max(FINE_BLOCK, float(longest) / MOST_BLOCKS)
     factors: list[Factor] = []
     with reporter.task("reducing recordings", len(together)) as task:
-        for source, cell, settings, load in zip(together, cells, lags, carried, strict=True):
+        for source, (_, cell, settings, load) in zip(together, recorded, strict=True):
             try:
                 samples = samples_of(source, cell, settings, model)
             except RecordingError as error:
@@ -104,8 +119,7 @@ def find_gains(
                 gain_factor(model, samples, current, payload=load, transmission=turns, block=block)
             )
             task.advance(1, source.name)
-    gains = identify_gains(model, factors)
-    return GainsFound(gains, loads, not np.array_equal(turns, np.eye(len(turns))))
+    return factors
 
 
 def _require_load(loads: Iterable[Payload | None]) -> None:

@@ -59,7 +59,7 @@ class TestWhichCounts:
             found = torque_scale(cell, [recording()], simulated=simulated)
             assert found.std.tolist() == [0.01, 0.02]
 
-    def test_the_column_map_comes_before_the_cell_and_the_worst_recording_counts(self) -> None:
+    def test_the_column_map_comes_before_the_cell(self) -> None:
         mapped = [
             recording({"torque_uncertainty": text}) for text in ("[0.004, 0.1]", "[0.005, 0]")
         ]

@@ -128,7 +128,7 @@ class TestPayload:
         ]
         return identify_payload(MODEL, runs, std)
 
-    def test_intervals_contain_the_truth_under_wrong_torque_constants(self):
+    def test_intervals_cover_under_wrong_torque_constants(self):
         """Of 60 draws at 95 % fewer than 52 inside have a probability of 0.5 %."""
         figures = {"mass": 4.0, "cx": 0.2, "cz": 0.1, "Iyy": 0.03}
         places = [NAMES.index(name) for name in figures]
