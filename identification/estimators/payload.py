@@ -183,10 +183,7 @@ def identify_payload(
     six, halves = to_centre @ found.values, found.factor * found.std(to_centre)
     lower, upper = _off_centre(mass, (intervals[1:4, 1] - intervals[1:4, 0]) / 2.0)
     intervals[4:] = np.column_stack([six - halves - lower, six + halves + upper])
-    # Beyond rounding: no body has a negative moment of inertia.
-    rounding = _ROUNDING * mass * (1.0 + float(centre @ centre))
-    negative = np.zeros(_BODY, dtype=np.bool_)
-    negative[_DIAGONAL] = intervals[_DIAGONAL, 1] < -rounding
+    negative = _impossible(intervals, _ROUNDING * mass * (1.0 + float(centre @ centre)))
     if negative.any():  # nor is a tensor with such an entry that of a body
         intervals[4:] = [-np.inf, np.inf]
     intervals[_DIAGONAL] = np.maximum(intervals[_DIAGONAL], 0.0)
@@ -207,6 +204,13 @@ def identify_payload(
         impossible=tuple(np.array(NAMES)[negative].tolist()),
         method=found.words,
     )
+
+
+def _impossible(intervals: Array, rounding: float) -> NDArray[np.bool_]:
+    """Return which figures (10,) are moments of inertia that are negative beyond rounding."""
+    negative = np.zeros(_BODY, dtype=np.bool_)
+    negative[_DIAGONAL] = intervals[_DIAGONAL, 1] < -rounding
+    return negative
 
 
 @dataclass(frozen=True)
