@@ -8,6 +8,7 @@ noise that is half white and half correlated over 50 ms. The friction of every j
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Final
 
@@ -22,7 +23,7 @@ from identification.model.friction import FrictionLaw
 from identification.model.pseudo_inertia import Body
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
-from identification.signals.samples import prepare
+from identification.signals.samples import Samples, prepare
 from sim_fixtures.ns16 import urdf_text
 
 Array = NDArray[np.float64]
@@ -101,11 +102,35 @@ def runs_of(
         pace: of the motion.
     """
     loads = (None, load_of(seed)) if loads is None else loads
+    recordings = recordings_of(seed, model.joint_names, loads, drift=drift, pace=pace)
+    return [
+        Run.of(f"run {k}", model, samples_of(recording, model), None, loaded=load is not None)
+        for k, (recording, load) in enumerate(zip(recordings, loads, strict=True), 1)
+    ]
+
+
+def samples_of(recording: Recording, model: RobotModel) -> Samples:
+    """A recording, smoothed with the known noise of its positions."""
+    return prepare(recording, model, noise_variance=np.full(6, _POSITION_NOISE**2))
+
+
+def recordings_of(
+    seed: int,
+    joint_names: tuple[str, ...],
+    loads: tuple[Body | None, ...],
+    *,
+    drift: float = DRIFT,
+    pace: float = 1.0,
+    duration: float = _DURATION,
+    other_motions: bool = False,
+) -> Iterator[Recording]:
+    """Recordings of one motion, or of a motion each, with the loads; see :func:`runs_of`."""
     rng = np.random.default_rng([seed, 2])
-    time = np.arange(round(_DURATION * _RATE)) / _RATE
+    time = np.arange(round(duration * _RATE)) / _RATE
     q, qd, qdd = _motion(rng, time, pace)
-    runs = []
     for k, load in enumerate(loads):
+        if k and other_motions:
+            q, qd, qdd = _motion(rng, time, pace)
         arm = pin.buildModelFromXML(urdf_text())
         arm.armature = _ROTOR
         if load is not None:
@@ -115,15 +140,12 @@ def runs_of(
         friction = _COULOMB * np.tanh(qd / 1e-3) + _VISCOUS * qd
         torque += (1.0 + drift * rng.standard_normal(6)) * friction
         torque += _NOISE * torque.std(axis=0) * _noise(rng, torque.shape)
-        recording = Recording(
+        yield Recording(
             time=time,
             position=q + _POSITION_NOISE * rng.standard_normal(q.shape),
-            joint_names=model.joint_names,
+            joint_names=joint_names,
             torque=torque,
         )
-        samples = prepare(recording, model, noise_variance=np.full(6, _POSITION_NOISE**2))
-        runs.append(Run.of(f"run {k + 1}", model, samples, None, loaded=load is not None))
-    return runs
 
 
 def coverage(seeds: range, most_pairs: int = 1) -> Coverage:

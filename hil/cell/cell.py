@@ -464,6 +464,7 @@ def _check(cell: Cell) -> None:
         )
         raise cell.error(tables[0], None, problem, remedy)
     _check_lengths(cell)
+    _check_uncertainty(cell)
     # Errors of derived objects are reported on loading.
     with_drives = file.drive_train is not None
     placed = file.limits is not None and (with_drives or file.limits.frame == "urdf")
@@ -509,6 +510,19 @@ def _check_lengths(cell: Cell) -> None:
                 problem = f"has {len(value)} entries but the URDF has {n_joints} joints"
                 remedy = f"give one entry for each of {names}{' or none' * (0 in allowed)}"
                 raise cell.error(field, value, problem, remedy)
+
+
+def _check_uncertainty(cell: Cell) -> None:
+    """Check that the uncertainty of torques is stated once, with an entry for each joint."""
+    stated, drives = cell.file.robot.torque_uncertainty, cell.file.drive_train
+    field = "robot.torque_uncertainty"
+    if stated is not None and drives is not None and drives.torque_uncertainty is not None:
+        problem = "is stated in [drive_train], too"
+        raise cell.error(field, stated, problem, "remove it from [robot]")
+    if isinstance(stated, list) and len(stated) != cell.model.n_joints:
+        problem = f"has {len(stated)} entries but the URDF has {cell.model.n_joints} joints"
+        remedy = f"give a number for all joints, or one for each of {', '.join(cell.joint_names)}"
+        raise cell.error(field, stated, problem, remedy)
 
 
 def _check_postures(cell: Cell) -> None:

@@ -248,6 +248,14 @@ ElementTable = Annotated[
 ]
 
 
+Share = Annotated[Number, Field(ge=0, lt=1)]
+TorqueUncertainty = Share | Annotated[list[Share], Field(min_length=1)]
+_UNCERTAINTY: Final = (
+    "relative standard deviation from 0 to 1, one for all joints or a list of one per joint, such "
+    "as 0.03 for 3 %"
+)
+
+
 class RobotTable(Table):
     """`[robot]`: settings of the model built from the URDF."""
 
@@ -260,6 +268,9 @@ class RobotTable(Table):
     )
     friction: FrictionTable = field("a table of the friction law", FrictionTable())
     payload: PayloadTable | None = field("a table of the known payload", None)
+    torque_uncertainty: TorqueUncertainty | None = field(
+        f"of the scale of imported torques: {_UNCERTAINTY}", None
+    )
     coupling: CouplingTable | None = field("a table of coupled motors", None)
     elements: list[ElementTable] = field(
         f"tables [[robot.elements]], each with a kind: {ELEMENT_KINDS}", []
@@ -335,6 +346,9 @@ class DriveTrainTable(Table):
     )
     joint_offset_deg: Vector = field("controller angle at URDF angle 0, in degrees, one per joint")
     torque_constant: PositiveVector = field("N·m/A at the motor, all above 0")
+    torque_uncertainty: TorqueUncertainty | None = field(
+        f"of the torque constants: {_UNCERTAINTY}", None
+    )
     current_limit: PositiveVector = field("A at the motor, one per joint")
     following_error: PositiveVector = field("threshold in motor revolutions")
     encoder_counts_per_revolution: Whole = field("encoder counts per motor turn", gt=0)

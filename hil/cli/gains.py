@@ -22,7 +22,7 @@ def gains(
     archives: Annotated[list[Path], typer.Argument(metavar="ARCHIVE...")],
     loaded: list[Path] | None = None,
     mass: float | None = None,
-    centre: str = "0,0,0",
+    centre: str | None = None,
     inertia: str = "0,0,0,0,0,0",
     frame: str | None = None,
     delay: Annotated[str, typer.Option(metavar="SECONDS")] = "stated",
@@ -31,15 +31,18 @@ def gains(
 ) -> None:
     """Estimate the torque constant of each motor from recordings with and without a known payload.
 
-    Prints TOML for a cell file or a column map, with 95 % intervals. Motors whose constant the data
-    do not determine are listed with the value nan, which cell and map refuse: exit status 5.
+    Prints TOML for a cell file ([drive_train]) or a column map ([drive]), with 95 % intervals, and
+    the relative standard deviation of each constant, which `hil payload` uses. Motors whose
+    constant the data do not determine are listed with the value nan, which cell and map refuse:
+    exit status 5.
 
     Options:
         archives: Archives (*.mcap) with motor currents, or folders of them. Those whose cell has a
             [robot.payload] were recorded with it, the others without payload.
         loaded: Archive or folder recorded with the payload of --mass (repeatable).
         mass: Mass of that payload, kg.
-        centre: Its centre of mass in the frame, x,y,z in m.
+        centre: Its centre of mass in the frame, x,y,z in m. Default: the origin of the frame, and
+            the output says so: the constants are wrong if it is elsewhere.
         inertia: Its inertia tensor about the centre of mass, xx,xy,xz,yy,yz,zz in kg·m² in the axes
             of the frame.
         frame: URDF link of that frame. Default: the link of the last joint.
@@ -51,16 +54,17 @@ def gains(
         raise InputError(twice.pop(), "is listed twice", remedy="give it with or without load")
     if mass is not None and not loaded:
         raise _refusal("--mass", "has no recording with this payload", "add --loaded")
-    payload = _payload(mass, centre, inertia, frame) if loaded else None
+    payload = _payload(mass, centre or "0,0,0", inertia, frame) if loaded else None
     carried = {path: payload for path in full if payload is not None}
     lag = delay_from(delay)
     if lag == "auto":
         raise _refusal("--delay", "cannot be estimated from currents", "give seconds")
     found = find_gains(bare, carried, make_reporter(quiet=quiet or json), delay=lag)
+    assumed = None if centre or not loaded else assumption(frame)
     if json:
-        print_json(as_dict(found))
+        print_json(as_dict(found) | {"assumed": assumed})
     else:
-        typer.echo(_as_toml(found))
+        typer.echo(_as_toml(found, assumed))
     if not found.gains.determined.all():
         raise typer.Exit(NOT_GOOD)
 
@@ -91,8 +95,17 @@ def _numbers(text: str, count: int, field: str) -> list[float]:
     return values
 
 
-def _as_toml(found: GainsFound) -> str:
-    """Format the constants as TOML; one that is not determined is nan."""
+def assumption(frame: str | None) -> str:
+    """Return what is assumed of a load whose centre of mass was not given."""
+    place = f"the frame {frame}" if frame else "the frame of the last joint's link"
+    return (
+        f"the load's centre of mass is assumed at the origin of {place}; if it is elsewhere, give"
+        " --centre x,y,z"
+    )
+
+
+def _as_toml(found: GainsFound, assumed: str | None) -> str:
+    """Format constants and their uncertainty as TOML; what is not determined is nan."""
     side = "motor side" if found.motor_side else "joint side, gears included"
     lines = [
         f"    {one['torque_constant']:.6g},  # {one['name']} ± {one['half_interval']:.2g}"
@@ -100,7 +113,17 @@ def _as_toml(found: GainsFound) -> str:
         else f"    nan,  # {one['name']}: not determined; {one['not_determined']}"
         for one in _motors(found)
     ]
-    return "\n".join([f"# N·m/A ({side}), 95 % intervals", "torque_constant = [", *lines, "]"])
+    spread = [f"{share:.2g}" for share in found.gains.relative_std]
+    return "\n".join(
+        [
+            *([f"# {assumed}"] if assumed else []),
+            f"# N·m/A ({side}), 95 % intervals",
+            "torque_constant = [",
+            *lines,
+            "]",
+            f"torque_uncertainty = [{', '.join(spread)}]  # relative standard deviations",
+        ]
+    )
 
 
 def _motors(found: GainsFound) -> list[dict[str, Any]]:

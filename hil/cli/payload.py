@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json as json_module
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -30,7 +30,8 @@ def payload(
 
     Fits the difference between recordings without and with the payload, on one model of the arm.
     Prints the values in the form that COMAU, UR and Franka controllers expect. Exit status 5 if a
-    value of --check lies outside its interval.
+    value of --check lies outside its interval, or if another mounting of the arm explains the bare
+    recordings much better.
 
     Options:
         bare: Archives (*.mcap) recorded without the payload, or campaign folders.
@@ -45,28 +46,31 @@ def payload(
     options = Options(estimator="wls", delay=delay_from(delay))
     found = find_payload(bare, loaded or [], reporter, frame=frame, options=options)
     outside = found.outside(wanted)
-    text = json_module.dumps(
-        found.as_json() | {"checked": wanted, "outside": outside}, indent=1, ensure_ascii=False
-    )
+    remedies = found.remedy(wanted) if outside else []
+    fields = found.as_json() | {"checked": wanted, "outside": outside, "next_steps": remedies}
+    text = json_module.dumps(fields, indent=1, ensure_ascii=False)
     lines = payload_lines(found, wanted, outside)
     typer.echo(text if json else "\n".join(lines))
-    if outside:
+    if outside or found.mounting is not None:
         raise typer.Exit(NOT_GOOD)
 
 
 def payload_lines(
-    found: PayloadFound, wanted: Collection[str] = (), outside: Sequence[str] = ()
+    found: PayloadFound, wanted: Mapping[str, float] | None = None, outside: Sequence[str] = ()
 ) -> list[str]:
     """Format the result and its comparison with known values."""
     lines = [*found.sentences, ""]
     lines += [
-        f"{name:5} {value:10.5g}  {low:10.5g} to {high:<10.5g} {unit}"
+        f"{name:5} {'not determined':>10}"
+        if value is None
+        else f"{name:5} {value:10.5g}  {low:10.5g} to {high:<10.5g} {unit}"
         for name, value, low, high, unit in found.table
     ]
     for controller, typed in found.controllers.items():
         lines += ["", f"{controller}:", typed]
     lines += ["", *(f"warning: {warning}" for warning in found.warnings)]
     lines += [f"check: {sentence}" for sentence in outside]
+    lines += [f"next: {sentence}" for sentence in (found.remedy(wanted or {}) if outside else [])]
     if wanted and not outside:
         lines.append(f"check: {', '.join(wanted)} inside the 95 % interval")
     return lines

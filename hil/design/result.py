@@ -79,7 +79,10 @@ def fingerprint(cell: Cell) -> dict[str, str]:
     }
     for name in ("robot", "drive_train", "nominal", "workspace"):
         table = getattr(file, name)
-        parts[name] = None if table is None else table.model_dump(mode="json")
+        # How well torque constants are known affects no motion.
+        parts[name] = (
+            None if table is None else table.model_dump(mode="json", exclude={"torque_uncertainty"})
+        )
     return {name: json_digest(part)[:_DIGITS] for name, part in parts.items()}
 
 

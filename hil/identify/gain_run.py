@@ -8,20 +8,22 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
-from identification.estimators.gains import Gains, identify_gains
+from identification.estimators.gains import MOST_BLOCKS, Gains, identify_gains
 from identification.factor.columns import gain_factor
-from identification.factor.factor import Factor, joined
+from identification.factor.factor import FINE_BLOCK, Factor
 from identification.model.payload import Payload
+from identification.model.robot import RobotModel
 from identification.signals.recording import RecordingError
 
 from .options import FIXED
-from .prepared import motor_from_joint, samples_of, stated_settings
-from .sources import cell_of, source_of
+from .prepared import Settings, motor_from_joint, samples_of, stated_settings
+from .sources import Source, aligned, cell_of, source_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +51,10 @@ def find_gains(
         InputError: an archive cannot be used, or not with the others; no archive has a payload.
         IdentificationError: no usable row.
     """
-    factors: list[Factor] = []
+    carried: list[Payload | None] = []
+    sources: list[Source] = []
+    cells: list[Cell] = []
+    lags: list[Settings] = []
     loads: dict[str, Payload | None] = {}
     first: Cell | None = None
     names = [path.name for path in (*archives, *loaded)]
@@ -75,19 +80,46 @@ def find_gains(
                 raise ArchiveError(path, problem, remedy=remedy)
             # A recorded torque may have been computed with other gains.
             without = replace(source.recording, torque=np.zeros_like(current))
-            settings = stated_settings(cell, replace(FIXED, delay=delay))
-            try:
-                samples = samples_of(replace(source, recording=without), cell, settings, model)
-            except RecordingError as error:
-                raise ArchiveError(path, str(error), remedy="leave it out") from error
             load = loaded.get(path, cell.model.payload)
             loads[path.name if names.count(path.name) == 1 else str(path)] = load
-            factors.append(gain_factor(model, samples, current, payload=load, transmission=turns))
+            carried.append(load)
+            lags.append(stated_settings(cell, replace(FIXED, delay=delay)))
+            sources.append(replace(source, recording=without))
+            cells.append(cell)
             task.advance(1, path.name)
     assert first is not None, "the command line asks for an archive"
     _require_load(loads.values())
-    gains = identify_gains(joined(factors), model.joint_names)
+    recorded = list(zip(sources, cells, lags, carried, strict=True))
+    factors = _reduced(recorded, model, turns, reporter)
+    gains = identify_gains(model, factors)
     return GainsFound(gains, loads, not np.array_equal(turns, np.eye(len(turns))))
+
+
+def _reduced(
+    recorded: Sequence[tuple[Source, Cell, Settings, Payload | None]],
+    model: RobotModel,
+    turns: NDArray[np.float64],
+    reporter: Reporter,
+) -> list[Factor]:
+    """Return the factor of each recording, in equal blocks of time."""
+    # Repetitions of a motion begin together: errors of the model repeat at equal times.
+    together, _ = aligned(tuple(source for source, *_ in recorded))
+    longest = max(one.recording.time[-1] - one.recording.time[0] for one in together)
+    block = max(FINE_BLOCK, float(longest) / MOST_BLOCKS)
+    factors: list[Factor] = []
+    with reporter.task("reducing recordings", len(together)) as task:
+        for source, (_, cell, settings, load) in zip(together, recorded, strict=True):
+            try:
+                samples = samples_of(source, cell, settings, model)
+            except RecordingError as error:
+                raise ArchiveError(source.path, str(error), remedy="leave it out") from error
+            current = source.recording.motor_current
+            assert current is not None, "checked above"
+            factors.append(
+                gain_factor(model, samples, current, payload=load, transmission=turns, block=block)
+            )
+            task.advance(1, source.name)
+    return factors
 
 
 def _require_load(loads: Iterable[Payload | None]) -> None:

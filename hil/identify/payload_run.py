@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,19 +17,37 @@ from identification.estimators.payload import (
     NAMES,
     PayloadEstimate,
     Run,
+    contradiction,
     figures_of,
     identify_payload,
+    reach,
 )
+from identification.factor.columns import standard_factor
 from identification.model.pseudo_inertia import Body
 from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.validation.evidence import find_gravity
+from identification.validation.finding import Thresholds
 
 from .options import Options
 from .prepared import prepare_sources, samples_of
-from .sources import aligned, archives_in, arm_differences, gather_sources, refuse_duplicates
+from .sources import (
+    Source,
+    aligned,
+    archives_in,
+    arm_differences,
+    gather_sources,
+    refuse_duplicates,
+)
+from .torque_scale import TorqueScale, torque_scale
 
 Array = NDArray[np.float64]
 
 _FLANGES: Final = ("tool0", "flange")  # flange frames of controllers, by their ROS-Industrial names
+NOT_DETERMINED: Final = "not determined: enter the maker's, or record faster motion"
+_LEAST_DISTANCE: Final = 0.5  # m, of a hand tool on an arm that is shorter itself
+_FITTED: Final = 0.7  # of each bare recording, when the direction of gravity is tried
+_MOST_RECORDINGS: Final = 3  # enough to determine gravity
 _UNITS: Final = dict(zip(NAMES, ["kg", *["m"] * 3, *["kg·m²"] * 6], strict=True))
 
 
@@ -42,6 +61,11 @@ class PayloadFound:
     gravity: float  #: magnitude [m/s²]
     bare: tuple[str, ...]  #: names of the archives without payload
     loaded: tuple[str, ...]  #: names of the archives with payload
+    scale: TorqueScale  #: how well the torques are known
+    mounting: str | None  #: why the stated direction of gravity is unlikely, with a remedy
+    #: as typed: archives or folders without and with payload
+    typed: tuple[tuple[Path, ...], tuple[Path, ...]]
+    with_currents: bool  #: whether all archives hold motor currents
     warnings: tuple[str, ...]
 
     @property
@@ -76,55 +100,138 @@ class PayloadFound:
                 )
         return found
 
+    def remedy(self, expected: Mapping[str, float]) -> list[str]:
+        """Return what to do if an expected value is outside its interval."""
+        mass = expected.get("mass")
+        if mass is None:
+            return [
+                "check the torque constants with a known load: repeat with --check mass=KG, which"
+                " prints the command for it"
+            ]
+        ratio = mass / self.body.mass
+        lines = [
+            f"the torques are too large by a factor of {1.0 / ratio:.3f} if the load weighs"
+            f" {mass:g} kg; they come from the torque constants or sensors"
+        ]
+        if not self.with_currents:
+            lines.append(
+                "the archives hold torques without motor currents: check unit and scale of"
+                f" [torque] in the column map (scale = {ratio:.4f} times the present one)"
+            )
+            return lines
+        lines.append(f"estimate the torque constants from the known load: {self._gains(expected)}")
+        return lines
+
+    def _gains(self, expected: Mapping[str, float]) -> str:
+        """Return the command that estimates torque constants from these recordings."""
+        bare, loaded = self.typed
+        # The same factor is in mass and inertia, and not in the centre.
+        ratio = expected["mass"] / self.body.mass
+        factors = [ratio, 1.0, 1.0, 1.0, *[ratio] * 6]
+        figures = {
+            name: expected.get(name, float(factor * value))
+            for name, factor, value in zip(NAMES, factors, self.figures, strict=True)
+        }
+        centre = ",".join(f"{figures[name]:.4f}" for name in NAMES[1:4])
+        words = ["hil", "gains", *map(str, bare)]
+        for path in loaded:
+            words += ["--loaded", str(path)]
+        words += ["--mass", f"{figures['mass']:g}", f"--centre={centre}", "--frame", self.frame]
+        if self.determines(*NAMES[4:]):
+            order = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
+            tensor = ",".join(f"{figures[name]:.5f}" for name in order)
+            words.append(f"--inertia={tensor}")
+        return shlex.join(words)
+
+    def determines(self, *names: str) -> bool:
+        """Return whether all figures are determined."""
+        return not set(names) & set(self.estimate.undetermined)
+
     @property
     def sentences(self) -> list[str]:
         """Summary for the operator."""
         body, estimate, torque = self.body, self.estimate, self.wrist_torque
         low, high = estimate.intervals[0]
-        centre = ", ".join(f"{1e3 * part:.1f}" for part in body.centre)
+        centre = ", ".join(
+            f"{1e3 * part:.1f}" if self.determines(name) else "?"
+            for name, part in zip(NAMES[1:4], body.centre, strict=True)
+        )
         lines = [
             f"The payload weighs {body.mass:.4g} kg (95 %: {low:.4g} to"
             f" {high:.4g} kg), its centre of mass is at {centre} mm in the frame {self.frame};"
             f" its weight loads the flange with up to {torque[0]:.3g} N·m"
-            f" ({torque[1]:.3g} to {torque[2]:.3g})."
+            f" ({torque[1]:.3g} to {torque[2]:.3g}).",
+            f"The intervals are computed {self.scale.message}.",
         ]
-        if estimate.undetermined:
+        ambiguous = [
+            name
+            for name in estimate.undetermined
+            if not estimate.impossible or name not in NAMES[4:]
+        ]
+        if ambiguous:
+            lines.append(f"{', '.join(ambiguous)} {NOT_DETERMINED}.")
+        if estimate.impossible:
             lines.append(
-                f"The motion does not determine {', '.join(estimate.undetermined)}: set to zero"
-                " where the other figures allow it."
+                f"The estimate of {', '.join(estimate.impossible)} is negative, which no body has:"
+                " the inertia is not determined. Friction or delay of the torques may differ"
+                " between the recordings; record the same motion bare and loaded, on a warm arm."
             )
+        if self.mounting is not None:
+            lines.append(f"The mounting is doubtful: {self.mounting}. No controller settings.")
         return lines
 
     @property
-    def table(self) -> list[tuple[str, float, float, float, str]]:
-        """Rows of name, value, interval and unit."""
+    def table(self) -> list[tuple[str, float | None, float, float, str]]:
+        """Rows of name, value (None: not determined), interval and unit."""
         rows = zip(NAMES, self.figures.tolist(), self.estimate.intervals.tolist(), strict=True)
-        return [(name, value, low, high, _UNITS[name]) for name, value, (low, high) in rows]
+        return [
+            (name, value if self.determines(name) else None, low, high, _UNITS[name])
+            for name, value, (low, high) in rows
+        ]
 
     @property
     def controllers(self) -> dict[str, str]:
-        """Commands that set the payload, by controller; units and frames as in its manual."""
+        """Commands that set the payload, by controller; units and frames as in its manual.
+
+        What is not determined has a comment instead of its command. Empty if the mounting is wrong.
+        """
+        if self.mounting is not None:
+            return {}
         mass, centre = f"{self.body.mass:.3f}", self.body.centre
         millimetres = ", ".join(f"{1e3 * part:.2f}" for part in centre)
         metres = ", ".join(f"{part:.5f}" for part in centre)
         xx, xy, xz, yy, yz, zz = (f"{part:.5f}" for part in self.figures[4:])
         six, nine = (xx, yy, zz, xy, xz, yz), (xx, xy, xz, xy, yy, yz, xz, yz, zz)
-        comau = [
-            f"$TOOL_MASS := {mass}",
-            f"$TOOL_CNTR := POS({millimetres}, 0, 0, 0, '')",
-            *(f"$TOOL_INERTIA[{k}] := {figure}" for k, figure in enumerate(six, 1)),
-        ]
-        return {
-            "COMAU": "\n".join(comau),
-            "UR": f"set_target_payload({mass}, [{metres}], [{', '.join(six)}])",
-            "Franka": f"robot.setLoad({mass}, {{{metres}}}, {{{', '.join(nine)}}});",
-        }
+        with_centre, with_inertia = self.determines(*NAMES[1:4]), self.determines(*NAMES[4:])
+        comau = [f"$TOOL_MASS := {mass}"]
+        comau.append(
+            f"$TOOL_CNTR := POS({millimetres}, 0, 0, 0, '')"
+            if with_centre
+            else f"-- $TOOL_CNTR {NOT_DETERMINED}"
+        )
+        if with_inertia:
+            comau += [f"$TOOL_INERTIA[{k}] := {figure}" for k, figure in enumerate(six, 1)]
+        else:
+            comau.append(f"-- $TOOL_INERTIA {NOT_DETERMINED}")
+        if not with_centre:
+            robot, franka = f"# centre of mass {NOT_DETERMINED}", f"// centre {NOT_DETERMINED}"
+        elif not with_inertia:
+            robot = f"set_target_payload({mass}, [{metres}])\n# inertia {NOT_DETERMINED}"
+            franka = (
+                f"// inertia {NOT_DETERMINED}:\n"
+                f"// robot.setLoad({mass}, {{{metres}}}, {{Ixx, Ixy, Ixz, Ixy, Iyy, Iyz, Ixz, Iyz,"
+                " Izz});"
+            )
+        else:
+            robot = f"set_target_payload({mass}, [{metres}], [{', '.join(six)}])"
+            franka = f"robot.setLoad({mass}, {{{metres}}}, {{{', '.join(nine)}}});"
+        return {"COMAU": "\n".join(comau), "UR": robot, "Franka": franka}
 
     def as_json(self) -> dict[str, Any]:
-        """Return all values as JSON data; infinite ends of intervals are null."""
+        """Return all values as JSON data; infinite ends and undetermined values are null."""
         torque, estimate = self.wrist_torque, self.estimate
 
-        def figure(value: float, low: float, high: float, unit: str) -> dict[str, Any]:
+        def figure(value: float | None, low: float, high: float, unit: str) -> dict[str, Any]:
             interval = [end if np.isfinite(end) else None for end in (low, high)]
             return {"value": value, "interval": interval, "unit": unit}
 
@@ -135,6 +242,13 @@ class PayloadFound:
             },
             "wrist_torque": figure(*torque, "N·m"),
             "undetermined": list(estimate.undetermined),
+            "impossible": list(estimate.impossible),
+            "torque_uncertainty": {
+                "std": self.scale.std.tolist(),
+                "of": self.scale.of,
+                "source": self.scale.source,
+            },
+            "mounting": self.mounting,
             "least_squares": estimate.parameters.tolist(),
             "method": estimate.method,
             "controllers": self.controllers,
@@ -200,8 +314,18 @@ def find_payload(
             samples = samples_of(source, cell, settings)
             runs.append(Run.of(source.name, cell.model, samples, frame, loaded=True))
             task.advance(1, source.name)
-    with reporter.task("weighing", 1) as task:
-        estimate = identify_payload(cell.model, runs)
+    simulated = all(side.header.only_simulated for side in found.values())
+    recordings = [source.recording for source in training]
+    scale = torque_scale(cell, recordings, simulated=simulated)
+    with reporter.task("weighing", 3) as task:
+        estimate = identify_payload(cell.model, runs, scale.std)
+        task.advance(1)
+        if estimate.body is not None:
+            _require_agreement(cell.model, runs, estimate, frame, sides, training)
+            travel = np.max([np.abs(one.position).max(axis=0) for one in recordings], axis=0)
+            _require_within_reach(estimate, reach(cell.model, frame, travel), frame)
+        task.advance(1)
+        mounting = doubtful_mounting(cell.model, prepared.fitted)
         task.advance(1)
     warnings = (*prepared.sources.warnings, *found[True].warnings)
     if estimate.body is None:
@@ -219,7 +343,104 @@ def find_payload(
         gravity=float(np.linalg.norm(cell.model.gravity)),
         bare=tuple(source.name for source in first),
         loaded=tuple(source.name for source in last),
+        scale=scale,
+        mounting=mounting,
+        typed=(tuple(bare), tuple(loaded)),
+        with_currents=all(one.motor_current is not None for one in recordings),
         warnings=tuple(dict.fromkeys(warnings)),
+    )
+
+
+def doubtful_mounting(model: RobotModel, bare: Sequence[Samples]) -> str | None:
+    """Return why another direction of gravity is likely, from the bare recordings; else None.
+
+    The check of :mod:`identification.validation`: fitted to the beginning of each recording, the
+    best direction predicts the rest much better than the stated one.
+    """
+    first, last = [], []
+    for samples in bare[:_MOST_RECORDINGS]:
+        count = len(samples.torque)
+        cut = round(_FITTED * count)
+        first.append(samples.between(0, cut))
+        last.append(samples.between(cut, count))
+    found = find_gravity(model, standard_factor(model, first), standard_factor(model, last))
+    limits, angle = Thresholds(), float(np.degrees(found.angle))
+    if not (found.ratio < limits.gravity and angle > limits.gravity_angle):
+        return None
+    declared, best = (
+        ", ".join(f"{part:.2f}" for part in vector) for vector in (found.declared, found.best)
+    )
+    return (
+        f"with gravity ({best}) m/s² in base axes, {angle:.0f}° from the declared ({declared})"
+        f" m/s², the bare recordings are predicted with {np.sqrt(found.ratio):.2f} times the error;"
+        " set gravity of [robot] in the cell file to the mounting of the arm and import the"
+        " recordings with that cell; if it is right, check the zero positions of the joints"
+    )
+
+
+def _require_agreement(
+    model: RobotModel,
+    runs: Sequence[Run],
+    estimate: PayloadEstimate,
+    frame: str,
+    sides: Mapping[bool, Sequence[Path]],
+    training: Sequence[Source],
+) -> None:
+    """Raise InputError if two recordings carried different bodies."""
+    found = contradiction(model, runs, estimate)
+    if found is None:
+        return
+    first, second = found
+    loaded = next(run.loaded for run in runs if run.name == second.name)
+    if not loaded:
+        mass, low, high = second.mass
+        heavier, lighter = (second, first) if mass > 0.0 else (first, second)
+        low, high = (low, high) if mass > 0.0 else (-high, -low)
+        raise InputError(
+            None,
+            f"the bare recordings contradict each other: {heavier.name} carries"
+            f" {abs(mass):.3g} kg ({low:.3g} to {high:.3g} kg) more than {lighter.name}",
+            remedy="give bare recordings with one tool, or none, on the flange",
+        )
+    words = []
+    for weighing in found:
+        mass, low, high = weighing.mass
+        centre = ", ".join(
+            f"{1e3 * part:.0f}" if np.isfinite(part) else "?" for part in weighing.centre
+        )
+        words.append(
+            f"{weighing.name} weighs {mass:.4g} kg ({low:.4g} to {high:.4g} kg) with its centre at"
+            f" ({centre}) mm in {frame}"
+        )
+    other = next(source.path for source in training if source.name == second.name)
+    command = ["hil", "payload", *map(str, sides[False]), "--loaded", str(other)]
+    raise InputError(
+        None,
+        f"the loaded recordings contradict each other: {words[0]}, {words[1]}",
+        field="--loaded",
+        remedy="a load that was turned, moved or changed is another payload; weigh each by itself:"
+        f" {shlex.join(command)}",
+    )
+
+
+def _require_within_reach(estimate: PayloadEstimate, length: float, frame: str) -> None:
+    """Raise InputError if the centre of mass is further from the flange than the arm is long.
+
+    A load's moment about the base is then at least twice that of the same mass at the flange, which
+    no maker's rating allows.
+    """
+    value, low, high = (part / estimate.parameters[9] for part in estimate.moment)
+    if value <= max(length, _LEAST_DISTANCE):
+        return
+    mass = estimate.parameters[9]
+    raise InputError(
+        None,
+        f"the estimated body ({mass:.3g} kg) cannot hang on this arm: its centre of mass would be"
+        f" {value:.2g} m ({low:.2g} to {high:.2g} m) from {frame}, and the arm is"
+        f" {length:.2g} m long",
+        field="--loaded",
+        remedy="record the same motion bare and loaded, with the wrist in many poses; check that"
+        " torques of all joints have the right sign and unit, and that only the payload differs",
     )
 
 

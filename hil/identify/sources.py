@@ -80,10 +80,18 @@ def cell_of(archive: Archive) -> Cell:
 
 
 def arm_differences(one: Cell, other: Cell) -> list[str]:
-    """Return the parts in which two cells describe different arms, payloads aside."""
+    """Return the parts in which two cells describe different arms.
+
+    Payloads and how well torques are known aside.
+    """
+    unstated = {"torque_uncertainty": None}
     parts = (
-        {"robot.urdf": cell.urdf, "[robot]": cell.without_payload().file.robot}
-        | {"[drive_train]": cell.file.drive_train}
+        {
+            "robot.urdf": cell.urdf,
+            "[robot]": cell.without_payload().file.robot.model_copy(update=unstated),
+            "[drive_train]": cell.file.drive_train
+            and cell.file.drive_train.model_copy(update=unstated),
+        }
         for cell in (one, other)
     )
     first, second = parts

@@ -42,6 +42,7 @@ Column = Annotated[int, Field(ge=0)] | str
 _Number = Annotated[int, Field(ge=1)]
 _DOCUMENTATION = "the column map in docs/archive-format.md"
 _ONE_OR_EACH = "a number, or a list of one per joint"
+_Share = Annotated[FiniteFloat, Field(ge=0.0, lt=1.0)]
 _PerJoint = Annotated[Vector | None, Field(description="a list of numbers, one per joint")]
 
 
@@ -106,6 +107,8 @@ class Drive(_Table):
         joint_offset: angle of the URDF where the recorded angle is zero [rad].
         torque_constant: N·m/A on the motor side; converts motor currents to torques where the log
             has no torque.
+        torque_uncertainty: relative standard deviation of the torque constants, or of the scale of
+            recorded torques, one for all joints or one each; by default that of the robot's cell.
     """
 
     gear_ratio: _PerJoint = None
@@ -118,6 +121,11 @@ class Drive(_Table):
     )
     joint_offset: _PerJoint = None
     torque_constant: _PerJoint = None
+    torque_uncertainty: _Share | Annotated[tuple[_Share, ...], Field(min_length=1)] | None = Field(
+        default=None,
+        description="relative standard deviation from 0 to 1, such as 0.03 for 3 %: "
+        f"{_ONE_OR_EACH}",
+    )
 
     @property
     def geared(self) -> bool:

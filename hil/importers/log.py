@@ -63,6 +63,9 @@ def import_log(
         metadata["motor_from_joint"] = json.dumps(matrix.tolist())
         if coupled and np.any(matrix != np.diag(np.diag(matrix))):
             robot = robot.with_coupling(matrix)
+    if (uncertainty := columns.drive.torque_uncertainty) is not None:
+        each = np.broadcast_to(uncertainty, len(log.joints))[log.order]
+        metadata["torque_uncertainty"] = json.dumps(each.tolist())
     with np.errstate(over="ignore", invalid="ignore"):
         joint_side = _joint_side(values, columns, log)
     return write_imported(
@@ -268,6 +271,8 @@ class _Log:
         for name in ("gear_ratio", "joint_offset", "torque_constant", "motor_from_joint"):
             if (values := getattr(drive, name)) is not None:
                 self._check_count(values, f"drive.{name}")
+        if isinstance(drive.torque_uncertainty, tuple):
+            self._check_count(drive.torque_uncertainty, "drive.torque_uncertainty")
         for row in drive.motor_from_joint or ():
             self._check_count(row, "drive.motor_from_joint")
         diagonal = np.diag(drive.gear_ratio or np.ones(n))

@@ -1,35 +1,53 @@
 r"""Current-to-torque gains of all drives, from a payload of known torque.
 
 Weighted least squares of the measured currents on one
-:func:`identification.factor.columns.gain_factor` (after Gautier and Briot 2014),
+:func:`identification.factor.columns.gain_factor` for each recording k (after Gautier and Briot
+2014),
 
-.. math:: i_m = \kappa_m \bigl(W_m \pi + t_m\bigr) + e_m, \qquad \kappa_m = 1 / K_m
+.. math:: i_m = \kappa_m \bigl(W_m \pi + \varphi_{km} f_m + \delta_{km} + t_m\bigr) + e_m, \qquad
+          \kappa_m = 1 / K_m, \quad f_m = W_{m,f} \pi_f
 
-bilinear and solved by Gauss-Newton; least squares of :math:`K_m i_m - W_m \pi = t_m` would bias
-gains towards zero by current noise.
+solved by Gauss-Newton; least squares of :math:`K_m i_m - W_m \pi = t_m` would bias gains towards
+zero by current noise. Friction scale and offset of a motor may differ between recordings, with the
+priors of :mod:`identification.estimators.payload`: without them a gear that warmed by some percent
+between two recordings counts as torque of the payload. The covariance is cluster-robust by time of
+the motion.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.estimators.covariance import cluster_covariance
-from identification.factor.factor import Factor, NormalEquations, Solution, solve
+from identification.estimators.covariance import Clustered, cluster_covariance
+from identification.estimators.payload import DRIFT, OFFSET, STRETCH
+from identification.factor.factor import (
+    FINE_BLOCK,
+    Factor,
+    NormalEquations,
+    Solution,
+    merged,
+    solve,
+)
+from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
 
 WORST_RELATIVE_STD: Final = 0.05  # tolerance of a maker's torque constant
+MOST_BLOCKS: Final = 400
+"""Blocks of time that the longest recording is reduced to."""
 _NO_LOAD: Final = 1e-9  # relative length of the payload's column that is rounding
 _ITERATIONS: Final = 50
 _VANISHING: Final = 1e-100
 _LEAST_NOISE: Final = 1e-6  # rounding of the Gram matrix, as a share of the current
 _CONVERGED: Final = 1e-9
+_MOST_VALUES: Final = 2e7  # of the information matrices of all blocks
+_FEWEST_BLOCKS: Final = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,31 +65,43 @@ class Gains:
         """Which gains the data determine (n,)."""
         return np.isfinite(self.values)
 
+    @property
+    def relative_std(self) -> Array:
+        """Standard deviations relative to the gains (n,), NaN if undetermined."""
+        return np.asarray(self.std / np.abs(self.values))
 
-def identify_gains(factor: Factor, motor_names: Sequence[str]) -> Gains:
-    """Estimate gains of motors (n,), from blocks with a known payload and with another or none.
+
+def identify_gains(model: RobotModel, factors: Sequence[Factor]) -> Gains:
+    """Estimate gains of motors (n,), from recordings with a known payload and with another or none.
+
+    `factors` are their :func:`identification.factor.columns.gain_factor`, with equal blocks.
 
     Raises:
         IdentificationError: no usable row, or no recording with a payload.
     """
-    grams = np.stack(factor.matrices, axis=1)
-    total, rows = grams.sum(axis=0), factor.samples
-    p = factor.n_parameters - 1
+    runs = [np.stack(factor.matrices, axis=1) for factor in factors]
+    totals = np.stack([run.sum(axis=0) for run in runs])
+    rows = np.sum([factor.samples for factor in factors], axis=0)
+    p = model.n_parameters
     if not rows.any():
         raise IdentificationError("no usable sample to identify gains from")
+    total = totals.sum(axis=0)
     if not total[:, p, p].any():
         raise IdentificationError(
             "no recording has a known payload, so gains and parameters have no scale"
         )
+    layout = _Layout(p, model.n_joints, len(runs), model.friction_columns)
     noise, inverses = _motor_by_motor(total, rows)
-    unknowns, solution = _gauss_newton(total, noise, inverses)
-    clustered = cluster_covariance(*_linearised(grams, unknowns, noise)[:2], solution)
-    std = np.sqrt(np.diag(clustered.covariance)[p:])
-    reasons = _reasons(total, rows, unknowns[p:], solution.determined[p:], std)
+    unknowns, _ = _gauss_newton(layout, totals, noise, inverses)
+    level = _offset_variance(layout, totals, unknowns, rows)
+    unknowns, solution, clustered = _with_covariance(layout, runs, totals, noise, unknowns, level)
+    std = np.sqrt(np.diag(clustered.covariance)[layout.gains])
+    inverse = unknowns[layout.gains]
+    reasons = _reasons(total, rows, inverse, solution.determined[layout.gains], std)
     known = np.array([reason is None for reason in reasons])
-    gains = 1.0 / np.where(known, unknowns[p:], 1.0)
+    gains = 1.0 / np.where(known, inverse, 1.0)
     return Gains(
-        motor_names=tuple(motor_names),
+        motor_names=model.joint_names,
         values=np.where(known, gains, np.nan),
         # From the inverses, to first order.
         std=np.where(known, std * gains**2, np.inf),
@@ -80,11 +110,43 @@ def identify_gains(factor: Factor, motor_names: Sequence[str]) -> Gains:
     )
 
 
+class _Layout(NamedTuple):
+    """Places of the unknowns: parameters, inverse gains, and by run offsets and friction scales."""
+
+    p: int
+    n: int
+    runs: int
+    friction: NDArray[np.bool_]  # which parameters are friction (p,)
+
+    @property
+    def size(self) -> int:
+        return self.p + self.n + 2 * self.runs * self.n
+
+    @property
+    def gains(self) -> slice:
+        return slice(self.p, self.p + self.n)
+
+    @property
+    def drifts(self) -> NDArray[np.intp]:
+        """Offsets and friction scales (2, runs, n)."""
+        first = self.p + self.n
+        return np.arange(first, self.size, dtype=np.intp).reshape(2, self.runs, self.n)
+
+    def prior(self, offset_variance: Array) -> Array:
+        """Return the information on each unknown, by the variance of offsets (n,)."""
+        prior = np.zeros(self.size)
+        prior[self.drifts[0]] = np.divide(
+            1.0, offset_variance, out=np.zeros(self.n), where=offset_variance > 0.0
+        )
+        prior[self.drifts[1]] = 1.0 / DRIFT**2
+        return prior
+
+
 def _reasons(
     total: Array, rows: NDArray[np.intp], found: Array, determined: NDArray[np.bool_], std: Array
 ) -> tuple[str | None, ...]:
     """Return why each motor's gain is undetermined or None, from inverse and std (n,)."""
-    p = total.shape[1] - 2
+    p = total.shape[1] - 3
     size = np.abs(found)
     relative = np.divide(std, size, out=np.full_like(size, np.inf), where=size > _VANISHING)
     # Whether the payload's torque on a motor exceeds rounding.
@@ -109,30 +171,62 @@ def _reasons(
 
 def _motor_by_motor(total: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
     """Return current noise (n,) and inverse gain (n,), estimated separately per motor."""
-    n, p = len(total), total.shape[1] - 2
+    n, p = len(total), total.shape[1] - 3
     noise, inverses = np.full((2, n), np.nan)
+    unknown = np.arange(p + 1)
     for m in np.flatnonzero(rows):
-        gram = total[m]
-        own = solve(NormalEquations(gram[:-1, :-1], gram[:-1, -1], gram[-1, -1], int(rows[m])))
-        squares = gram[-1, -1] - own.values @ gram[:-1, -1]
-        freedom = max(rows[m] - len(gram) + 1, 1)
-        noise[m] = np.sqrt(max(squares, _LEAST_NOISE**2 * gram[-1, -1]) / freedom)
+        gram, current = total[m][np.ix_(unknown, unknown)], total[m][unknown, -1]
+        own = solve(NormalEquations(gram, current))
+        squares = total[m][-1, -1] - own.values @ current
+        freedom = max(rows[m] - len(unknown), 1)
+        noise[m] = np.sqrt(max(squares, _LEAST_NOISE**2 * total[m][-1, -1]) / freedom)
         if own.determined[p] and own.values[p] > 0.0:
             inverses[m] = own.values[p]
     known = np.isfinite(inverses)
     return noise, np.where(known, inverses, np.median(inverses[known]) if known.any() else 1.0)
 
 
-def _gauss_newton(total: Array, noise: Array, inverses: Array) -> tuple[Array, Solution]:
-    """Return parameters and inverse gains (p + n,) from a start (n,), and the last problem."""
-    p = total.shape[1] - 2
+def _offset_variance(
+    layout: _Layout, totals: Array, unknowns: Array, rows: NDArray[np.intp]
+) -> Array:
+    """Return the prior variance of offsets (n,), by the mean square of each motor's friction."""
+    friction = np.where(layout.friction, unknowns[: layout.p], 0.0)
+    gram = totals.sum(axis=0)[:, : layout.p, : layout.p]
+    squares = np.einsum("i,mij,j->m", friction, gram, friction)
+    return np.asarray(OFFSET**2 * squares / np.maximum(rows, 1))
+
+
+def _gauss_newton(
+    layout: _Layout, totals: Array, noise: Array, start: Array, prior: Array | None = None
+) -> tuple[Array, Solution]:
+    """Return the unknowns and the last problem, from inverse gains (n,) or all unknowns.
+
+    Without a prior all recordings have one friction and no further offset.
+    """
+    if prior is None:
+        free = np.arange(layout.p + layout.n)
+        prior = np.zeros(layout.size)
+    else:
+        free = np.arange(layout.size)
+    unknowns = np.zeros(layout.size)
+    if len(start) == layout.size:
+        unknowns[:] = start
+    else:
+        unknowns[layout.gains] = start
 
     def problem(unknowns: Array) -> tuple[NormalEquations, float]:
-        information, scores, squares = _linearised(total[None], unknowns, noise)
-        return NormalEquations(information[0], scores[0]), float(squares[0])
+        information, scores, squares = 0.0, 0.0, 0.0
+        for k, total in enumerate(totals):
+            own = _linearised(layout, k, total[None], unknowns, noise)
+            information, scores = information + own[0][0], scores + own[1][0]
+            squares += float(own[2][0])
+        equations = NormalEquations(
+            np.asarray(information + np.diag(prior)), np.asarray(scores - prior * unknowns)
+        )
+        return equations, squares + float(unknowns @ (prior * unknowns))
 
-    unknowns = np.concatenate([np.zeros(p), inverses])
-    unknowns[:p] = solve(problem(unknowns)[0].part(np.arange(p))).values
+    if len(start) != layout.size:
+        unknowns[: layout.p] = solve(problem(unknowns)[0].part(np.arange(layout.p))).values
     # Steps are halved if the sum of squares increases.
     damping, cost = 1.0, np.inf
     best, step = unknowns, np.zeros_like(unknowns)
@@ -144,29 +238,67 @@ def _gauss_newton(total: Array, noise: Array, inverses: Array) -> tuple[Array, S
             if damping < 1e-3:
                 break
             continue
-        step = solve(equations).values
+        part = equations.part(free)
+        step = np.zeros_like(unknowns)
+        step[free] = solve(part).values
         best, cost, damping = unknowns, squares, 1.0
         unknowns = best + step
-        if step @ equations.A @ step < _CONVERGED:
+        if step[free] @ part.A @ step[free] < _CONVERGED:
             break
     return best, solve(problem(best)[0])
 
 
-def _linearised(gram: Array, unknowns: Array, noise: Array) -> tuple[Array, Array, Array]:
+def _with_covariance(
+    layout: _Layout,
+    runs: Sequence[Array],
+    totals: Array,
+    noise: Array,
+    unknowns: Array,
+    offset_variance: Array,
+) -> tuple[Array, Solution, Clustered]:
+    """Return unknowns with drifts, the last problem, and the covariance."""
+    length = -(-max(map(len, runs)) // max(_FEWEST_BLOCKS, int(_MOST_VALUES / layout.size**2)))
+    blocks = [merged(run, length) for run in runs]
+    prior = layout.prior(offset_variance)
+    # The prior is not scaled; the data are, by the design effect of coloured noise.
+    effect = 1.0
+    for _ in range(2):
+        spread = noise * np.sqrt(effect)
+        unknowns, solution = _gauss_newton(layout, totals, spread, unknowns, prior)
+        count = max(map(len, blocks))
+        information = np.zeros((count, layout.size, layout.size))
+        scores = np.zeros((count, layout.size))
+        for k, run in enumerate(blocks):
+            own = _linearised(layout, k, run, unknowns, spread)
+            information[: len(run)] += own[0]
+            scores[: len(run)] += own[1]
+        duration = length * FINE_BLOCK  # for the description only
+        clustered = cluster_covariance(information, scores, solution, prior, duration, STRETCH)
+        effect *= max(1.0, clustered.design_effect)
+    return unknowns, solution, clustered
+
+
+def _linearised(
+    layout: _Layout, run: int, gram: Array, unknowns: Array, noise: Array
+) -> tuple[Array, Array, Array]:
     """Return information (B, k, k), scores (B, k) and weighted squares (B,) of the currents."""
-    blocks, n, width, _ = gram.shape
-    p = width - 2
-    information, scores = np.zeros((blocks, p + n, p + n)), np.zeros((blocks, p + n))
-    squares = np.zeros(blocks)
+    blocks, _, width, _ = gram.shape
+    p, (offsets, scales) = layout.p, layout.drifts[:, run]
+    information = np.zeros((blocks, layout.size, layout.size))
+    scores, squares = np.zeros((blocks, layout.size)), np.zeros(blocks)
+    friction = np.where(layout.friction, unknowns[:p], 0.0)
     for m in np.flatnonzero(noise > 0.0):
-        inverse = unknowns[p + m]
-        torque = np.concatenate([unknowns[:p], [1.0, 0.0]])  # of [W | t | i]
-        slope = np.zeros((width, p + 1))
-        slope[:p, :p] = inverse * np.eye(p)
+        inverse, scale = unknowns[p + m], unknowns[scales[m]]
+        # Of the columns [W | t | 1 | i].
+        torque = np.concatenate([unknowns[:p] + scale * friction, [1.0, unknowns[offsets[m]], 0.0]])
+        slope = np.zeros((width, p + 3))
+        slope[:p, :p] = inverse * np.diag(1.0 + scale * layout.friction)
         slope[:, p] = torque
+        slope[p + 1, p + 1] = inverse
+        slope[:p, p + 2] = inverse * friction
         residual = -inverse * torque
         residual[-1] = 1.0
-        place = np.append(np.arange(p), p + m)
+        place = np.append(np.arange(p), [p + m, offsets[m], scales[m]])
         own = gram[:, m] / noise[m] ** 2
         information[:, place[:, None], place] += slope.T @ own @ slope
         scores[:, place] += own @ residual @ slope

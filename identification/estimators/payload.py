@@ -8,13 +8,14 @@ offset and friction scale of every joint:
           f = W_f \hat\pi_f
 
 The friction f is that of the previous iteration, with weak priors (:data:`DRIFT`) on the drifts.
-The covariance is cluster-robust by time of the motion.
+The covariance is cluster-robust by time of the motion, and contains the uncertainty of the torque
+scale (:mod:`identification.estimators.torque_scale`) if that is given.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.covariance import Clustered, cluster_covariance
+from identification.estimators.torque_scale import scale_covariance
 from identification.factor.factor import (
     FINE_BLOCK,
     Factor,
@@ -47,7 +49,8 @@ Array = NDArray[np.float64]
 
 DRIFT: Final = 0.1
 """Prior standard deviation of the relative change of friction between recordings."""
-_OFFSET: Final = 1.0  # prior standard deviation of offset changes, as a share of the friction
+OFFSET: Final = 1.0
+"""Prior standard deviation of offset changes, as a share of the friction."""
 _BODY: Final = len(LINK_SYMBOLS)
 _INERTIA: Final = np.arange(6)
 _DIAGONAL: Final = [4, 7, 9]  # of a tensor, among `NAMES`
@@ -55,11 +58,18 @@ _ROUNDS: Final = 4  # iterations of weights and friction
 _MOST_BLOCKS: Final = 500
 # Longer blocks: with noise correlated over 50 ms nominal 95 % intervals cover 93 and 95 %,
 # otherwise 90 and 93 %.
-_STRETCH: Final = 2
+STRETCH: Final = 2
 _LEAST_NOISE: Final = 1e-6  # rounding of the Gram matrix, as a share of the torque
 _PARTICIPATION: Final = 1e-3
 _ROUNDING: Final = 1e-9
 _DENSITY: Final = 1000.0  # kg/m³; a ball of it is the least inertia worth determining
+
+CONTRADICTION_SIGMAS: Final = 5.0
+SAME_MASS: Final = 0.1
+"""Share of the mass by which two weighings may differ: pairs of recordings of a real arm differ by
+2 %, and friction by `DRIFT`."""
+SAME_CENTRE: Final = 0.2
+"""The same of a first moment, as a share of mass times distance, or times the radius of a ball."""
 
 NAMES: Final = ("mass", "cx", "cy", "cz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 """Figures of a body: mass, centre of mass, inertia tensor about it."""
@@ -130,17 +140,24 @@ class PayloadEstimate:
     # mass times distance of centre from the frame's origin [kg m], and interval
     moment: tuple[float, float, float]
     undetermined: tuple[str, ...]  # figures of the body that are set to zero
+    # of those, moments of inertia whose 95 % interval lies below zero: no body has them
+    impossible: tuple[str, ...]
     method: str  # description of the covariance
 
 
-def identify_payload(model: RobotModel, runs: Sequence[Run]) -> PayloadEstimate:
+def identify_payload(
+    model: RobotModel, runs: Sequence[Run], scale_std: Array | None = None
+) -> PayloadEstimate:
     """Estimate the body that the loaded recordings carry and the bare ones do not.
+
+    `scale_std` is the relative standard deviation of each joint's torque scale (n,), by default
+    zero: it is common to all recordings.
 
     Raises:
         PayloadError: undetermined mass, or negative mass.
         IdentificationError: no usable row.
     """
-    found = _body_estimate(model, runs)
+    found = _body_estimate(model, runs, scale_std)
     mass, low, high = found.mass
     if not np.isfinite(high):
         raise PayloadError(
@@ -150,14 +167,14 @@ def identify_payload(model: RobotModel, runs: Sequence[Run]) -> PayloadEstimate:
     if high < 0.0:
         raise PayloadError(
             f"the bare recordings carry {-mass:.3g} kg more than the loaded ones; check whether"
-            " they are interchanged"
+            " they are interchanged, and the sign of the torques"
         )
     intervals = np.tile([-np.inf, np.inf], (_BODY, 1))
     intervals[0] = max(0.0, low), high
     if low <= 0.0:
         undetermined = NAMES[1:]
         return PayloadEstimate(
-            found.values, None, intervals, found.moment, undetermined, found.words
+            found.values, None, intervals, found.moment, undetermined, (), found.words
         )
     intervals[1:4] = found.centre_intervals
     open_ended = np.isinf(intervals[:, 1])
@@ -166,8 +183,11 @@ def identify_payload(model: RobotModel, runs: Sequence[Run]) -> PayloadEstimate:
     six, halves = to_centre @ found.values, found.factor * found.std(to_centre)
     lower, upper = _off_centre(mass, (intervals[1:4, 1] - intervals[1:4, 0]) / 2.0)
     intervals[4:] = np.column_stack([six - halves - lower, six + halves + upper])
+    negative = _impossible(intervals, _ROUNDING * mass * (1.0 + float(centre @ centre)))
+    if negative.any():  # nor is a tensor with such an entry that of a body
+        intervals[4:] = [-np.inf, np.inf]
     intervals[_DIAGONAL] = np.maximum(intervals[_DIAGONAL], 0.0)
-    radius = (3.0 * mass / (4.0 * np.pi * _DENSITY)) ** (1.0 / 3.0)
+    radius = ball_radius(mass)
     width = (intervals[4:, 1] - intervals[4:, 0]) / 2.0
     zero = (intervals[4:, 0] <= 0.0) & (intervals[4:, 1] >= 0.0)
     open_ended[4:] = np.isinf(width) | (zero & (width > 0.4 * mass * radius**2))
@@ -181,8 +201,92 @@ def identify_payload(model: RobotModel, runs: Sequence[Run]) -> PayloadEstimate:
         ),
         moment=found.moment,
         undetermined=tuple(np.array(NAMES)[open_ended].tolist()),
+        impossible=tuple(np.array(NAMES)[negative].tolist()),
         method=found.words,
     )
+
+
+def _impossible(intervals: Array, rounding: float) -> NDArray[np.bool_]:
+    """Return which figures (10,) are moments of inertia that are negative beyond rounding."""
+    negative = np.zeros(_BODY, dtype=np.bool_)
+    negative[_DIAGONAL] = intervals[_DIAGONAL, 1] < -rounding
+    return negative
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """Body of one recording by itself, where it is determined."""
+
+    name: str  # of the recording
+    mass: tuple[float, float, float]  # value and 95 % interval [kg]
+    centre: Array  # of mass in the frame (3,) [m], NaN where undetermined
+
+
+def contradiction(
+    model: RobotModel, runs: Sequence[Run], estimate: PayloadEstimate
+) -> tuple[Weighing, Weighing] | None:
+    """Return two loaded, or two bare recordings that carry different bodies; None if all agree.
+
+    Each loaded recording is weighed by itself against all bare ones, each bare one against the
+    first. Bodies differ if a difference of mass or first moments is above
+    `CONTRADICTION_SIGMAS` standard deviations and above the shares of what was weighed that
+    friction and model errors explain (`SAME_MASS`, `SAME_CENTRE`). The torque scale is the same in
+    all recordings.
+    """
+    bare, loaded = ([run for run in runs if run.loaded == kind] for kind in (False, True))
+    mass = float(estimate.parameters[9])
+    size = max(estimate.moment[0], mass * ball_radius(mass))
+    limits = np.array([SAME_CENTRE * size] * 3 + [SAME_MASS * mass])
+    if len(loaded) > 1:
+        single = [_body_estimate(model, [*bare, run]) for run in loaded]
+        for one, run in zip(single[1:], loaded[1:], strict=True):
+            if _differs(single[0], one, limits):
+                return _weighing(loaded[0].name, single[0]), _weighing(run.name, one)
+    for run in bare[1:]:
+        found = _body_estimate(model, [bare[0], replace(run, loaded=True)])
+        if _differs(None, found, limits):
+            nothing = Weighing(bare[0].name, (0.0, 0.0, 0.0), np.full(3, np.nan))
+            return nothing, _weighing(run.name, found)
+    return None
+
+
+def _differs(first: _BodyEstimate | None, second: _BodyEstimate, limits: Array) -> bool:
+    """Return whether first moments and mass (4,) differ, beyond chance and limits; None is zero."""
+    rows = np.eye(_BODY)[6:]
+    change, variance = rows @ second.values, second.std(rows) ** 2
+    if first is not None:
+        change = change - rows @ first.values
+        variance = variance + first.std(rows) ** 2
+    # Infinite variances are never exceeded.
+    beyond = np.abs(change) > np.maximum(limits, CONTRADICTION_SIGMAS * np.sqrt(variance))
+    return bool(beyond.any())
+
+
+def _weighing(name: str, found: _BodyEstimate) -> Weighing:
+    known = np.isfinite(found.std(np.eye(_BODY)[6:]))
+    centre = found.values[6:9] / found.values[9] if found.values[9] != 0.0 else np.full(3, np.nan)
+    return Weighing(name, found.mass, np.where(known[:3], centre, np.nan))
+
+
+def reach(model: RobotModel, frame: str | None, travel: Array) -> float:
+    """Return how far a frame can be from the first joint's axis [m].
+
+    The sum of the chain's lengths; `travel` (n,) is the largest displacement of each joint from
+    zero [rad or m], of which that of prismatic joints counts.
+
+    Raises:
+        ModelError: the description has no such frame, or it is fixed to the base.
+    """
+    joint, _, translation = model.chain.frame(frame)
+    path = list(model.chain.ancestors(joint))
+    lengths = np.linalg.norm(model.chain.translation[path[1:]], axis=1)
+    slides = np.where(model.chain.revolute, 0.0, travel)[path]
+    return float(lengths.sum() + slides.sum() + np.linalg.norm(translation))
+
+
+def ball_radius(mass: float) -> float:
+    """Return the radius of a ball with the density of water [m]."""
+    return float((3.0 * mass / (4.0 * np.pi * _DENSITY)) ** (1.0 / 3.0))
 
 
 def mass_difference(model: RobotModel, runs: Sequence[Run]) -> tuple[float, float, float]:
@@ -222,6 +326,7 @@ class _Fit(NamedTuple):
     root: Array  # of the inverse information, determined part (r, k)
     scale: Array  # length of each column (r,)
     covariance: Array  # (r, r)
+    sensitivity: Array  # change per relative change of each joint's torques (r, n)
     clustered: Clustered
 
     @property
@@ -274,7 +379,7 @@ def _fit(model: RobotModel, runs: Sequence[Run], shape: Array) -> _Fit:
             at = np.flatnonzero(np.isin(places, drifts[:, 1, joint]))
             squares[joint] += gram[:, at, at].sum()
         noise = np.divide(1.0, weights, out=np.zeros(n), where=weights > 0.0)
-        level = _OFFSET**2 * np.maximum(squares / np.maximum(rows, 1), noise)
+        level = OFFSET**2 * np.maximum(squares / np.maximum(rows, 1), noise)
         prior = np.zeros(width)
         prior[drifts[:, 0]] = np.divide(1.0, level, out=np.zeros(n), where=level > 0.0)
         prior[drifts[:, 1]] = 1.0 / DRIFT**2
@@ -301,22 +406,27 @@ def _fit(model: RobotModel, runs: Sequence[Run], shape: Array) -> _Fit:
     # The prior is not scaled; the data are, by the design effect of coloured noise.
     effect = 1.0
     for _ in range(2):
-        prior = prior_of(problem, weights / effect)
-        blocks = blocks_of(problem, weights / effect)
+        scaled = weights / effect
+        prior = prior_of(problem, scaled)
+        blocks = blocks_of(problem, scaled)
         equations = equations_of(blocks.sum(axis=0), prior)
         solution = solve(equations)
         scores = blocks[:, :-1] @ np.append(-solution.values, 1.0)
         clustered = cluster_covariance(
-            blocks[:, :-1, :-1], scores, solution, prior, length * FINE_BLOCK, _STRETCH
+            blocks[:, :-1, :-1], scores, solution, prior, length * FINE_BLOCK, STRETCH
         )
         effect *= max(1.0, clustered.design_effect)
     scale = np.sqrt(np.diag(equations.A))
     basis = solution.root * np.where(scale > 0.0, scale, 1.0)[:, None]
+    pulls = np.zeros((width, n))
+    for joint, gram, places in problem:
+        pulls[places[:-1], joint] += scaled[joint] * gram.sum(axis=0)[:-1, -1]
     return _Fit(
         values=solution.values[part],
         root=basis[part] / np.linalg.norm(basis, axis=0),
         scale=scale[part],
         covariance=clustered.covariance[np.ix_(part, part)],
+        sensitivity=solution.root[part] @ (solution.root.T @ pulls),
         clustered=clustered,
     )
 
@@ -385,18 +495,23 @@ class _BodyEstimate(NamedTuple):
         return np.column_stack([(b - root) / a, (b + root) / a])
 
 
-def _body_estimate(model: RobotModel, runs: Sequence[Run]) -> _BodyEstimate:
+def _body_estimate(
+    model: RobotModel, runs: Sequence[Run], scale_std: Array | None = None
+) -> _BodyEstimate:
     """Estimate the body of the loaded runs, of least norm where undetermined."""
     fit, determined = _fit(model, runs, np.eye(_BODY)), np.eye(_BODY)
     found = fit.determined
     if len(found) < _BODY:
         determined = found
         fit = _fit(model, runs, np.asarray(np.linalg.pinv(determined)))
+    std, factor = np.zeros(model.n_joints), fit.clustered.interval_factor
+    if scale_std is not None:
+        std = scale_std
     return _BodyEstimate(
         values=np.linalg.pinv(determined) @ fit.values,
         determined=determined,
-        spread=fit.covariance,
-        factor=fit.clustered.interval_factor,
+        spread=fit.covariance + scale_covariance(fit.sensitivity, std, factor),
+        factor=factor,
         words=fit.clustered.words,
     )
 

@@ -1,6 +1,6 @@
 """Factors of other columns than those of the regressor W.
 
-Instrumental variables use [Z | W | y], gains [W | t | i], a search for the direction of gravity
+Instrumental variables use [Z | W | y], gains [W | t | 1 | i], a search for the direction of gravity
 [W0 | Wx | Wy | Wz | y].
 """
 
@@ -28,7 +28,6 @@ from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]
 
-_MOST_BLOCKS: Final = 400  # of one recording, for gains
 _MOST_ROWS: Final = 1000  # of one recording, in standard parameters
 _PARTS: Final = ("W0", "Wx", "Wy", "Wz")
 
@@ -71,11 +70,13 @@ def gain_factor(
     *,
     payload: Payload | None = None,
     transmission: Array | None = None,
+    block: float = FINE_BLOCK,
 ) -> Factor:
-    """Reduce a recording to blocks of [W | t | i], one Gram matrix for each motor.
+    """Reduce a recording to blocks of [W | t | 1 | i], one Gram matrix for each motor.
 
     A motor's current (m, n) [A] counts if the rows of all its joints do; t is the payload torque.
-    `transmission`: motor angles per joint angle (n, n); identity: gains include gear ratios.
+    `transmission`: motor angles per joint angle (n, n); identity: gains include gear ratios. Blocks
+    of `block` seconds count from the origin of the motion.
     """
     n, p, m = model.n_joints, model.n_parameters, len(samples.motion.time)
     turns = np.eye(n) if transmission is None else np.asarray(transmission, dtype=np.float64)
@@ -83,19 +84,20 @@ def gain_factor(
     load = model.elements.known(samples.motion.position)
     if payload is not None:
         load = load + Load(model.chain, model.gravity, payload).torque(*samples.motion[1:4])
-    time = samples.motion.time - samples.motion.time[0]
-    index = np.floor(time / max(FINE_BLOCK, time[-1] / _MOST_BLOCKS) + 1e-9).astype(np.intp)
-    usable, tables = np.zeros((m, n), dtype=np.bool_), np.zeros((n, p + 2, m))
+    since = samples.motion.time - samples.origin
+    index = np.maximum(np.floor(since / block + 1e-9).astype(np.intp), 0)
+    usable, tables = np.zeros((m, n), dtype=np.bool_), np.zeros((n, p + 3, m))
     for motor, share in enumerate(np.linalg.inv(turns).T):
         acting = np.flatnonzero(share).tolist()
         usable[:, motor] = samples.usable[:, acting].all(axis=1)
         for joint in acting:
             tables[motor, columns[joint]] += share[joint] * blocks[joint].T
             tables[motor, p] += share[joint] * samples.as_measured(joint, load[:, [joint]])[:, 0]
-        tables[motor, p + 1] = motor_current[:, motor]
+        tables[motor, p + 1] = 1.0
+        tables[motor, p + 2] = motor_current[:, motor]
         tables[motor][:, ~usable[:, motor]] = 0.0
-    names = (*model.parameter_names, "torque of the payload")
-    every = (np.arange(p + 1),) * n
+    names = (*model.parameter_names, "torque of the payload", "offset")
+    every = (np.arange(p + 2),) * n
     return Factor.of_rows([(index, tables)], count_by_block(index, usable), every, names)
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.gains import coverage as gain_coverage
 from benchmarks.identification_study import Covered, coverage, recorded, study
 from benchmarks.payload import coverage as payload_coverage
 from benchmarks.real_data import ESTIMATORS, Case, error, load_case, splits_of
@@ -104,6 +106,25 @@ class TestPayload:
         assert found.within_one_percent >= within
         for figure, share in {**found.covered, "moment": found.moment_covered}.items():
             assert 0.90 <= share <= 0.99, figure
+
+
+class TestGains:
+    """Torque constants from a known load, friction drifting by 4 % between the recordings."""
+
+    @pytest.mark.parametrize("how", [{}, {"duration": 8.0}, {"drift": 0.0, "other_motions": True}])
+    def test_intervals_of_a_few_pairs_hold_the_truth(self, how: dict[str, Any]) -> None:
+        """Of 72 with 95 %, fewer than 61 inside come once in 500 times."""
+        found = gain_coverage(range(1000, 1012), **how)
+        assert found.determined > 0.95
+        assert found.covered >= 61 / 72
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize(
+        "how", [{}, {"duration": 8.0}, {"drift": 0.0}, {"other_motions": True}]
+    )
+    def test_of_200_pairs_intervals_hold_93_to_98_percent(self, how: dict[str, Any]) -> None:
+        found = gain_coverage(range(200), **how)
+        assert 0.93 <= found.covered <= 0.98
 
 
 @pytest.fixture(scope="module")

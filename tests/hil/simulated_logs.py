@@ -63,6 +63,7 @@ def simulate(
     noise: float = 1.0,
     pace: float = 1.0,
     load: pin.Inertia | None = None,
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
 ) -> Simulated:
     """A motion of sines within the joint limits, torques by recursive Newton-Euler and friction.
 
@@ -71,6 +72,7 @@ def simulate(
     path = urdf_path(name)
     model = pin.buildModelFromUrdf(str(path))
     model = pin.buildReducedModel(model, [model.getJointId(j) for j in locked], pin.neutral(model))
+    model.gravity.linear = np.array(gravity)
     n, rng = model.nv, np.random.default_rng(seed)
     amplitude = rng.uniform(0.1, 0.3, (5, n)) / np.arange(1, 6)[:, None] ** 0.5
     hertz = 0.08 + 0.13 * np.arange(5)[:, None] + rng.uniform(0.0, 0.04, (5, n))

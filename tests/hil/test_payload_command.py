@@ -127,6 +127,8 @@ def test_the_same_recording_and_another_arm_are_named(folder: Path, tmp_path: Pa
 
 
 CONSTANTS = np.array([0.12, 0.12, 0.1, 0.08, 0.05, 0.04])  # N·m/A, motor side
+TYPE = np.array([12.0, 12.0, 10.0, 5.0, 5.0, 5.0])  # N·m/A, joint side
+WALL = (0.0, -9.81, 0.0)
 RATIO = np.array([100.0, 100.0, -100.0, 60.0, 60.0, -60.0])
 
 
@@ -156,6 +158,154 @@ def currents(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The constants of another type: 9 % too large."""
+    folder = tmp_path_factory.mktemp("wrong")
+    time = np.arange(0.0, 12.0, 8e-3)
+    for seed, (name, mass) in enumerate({"empty": 0.0, "full": MASS}.items(), 1):
+        load = None if mass == 0.0 else pin.Inertia(mass, CENTRE, TENSOR)
+        made = simulate("ur5_robot.urdf", time, seed=seed, load=load)
+        for kind, drive in (
+            ("assumed", {}),
+            ("stated", {"torque_uncertainty": 0.1}),
+            ("exact", {"torque_uncertainty": [0.0] * 6}),
+        ):
+            columns = {
+                "time": {"column": "t"},
+                "position": {"columns": "q"},
+                "motor_current": {"columns": "i"},
+                "drive": {"torque_constant": tuple(1.09 * TYPE), **drive},
+            }
+            arrays = {"t": time, "q": made.position, "i": made.torque / TYPE}
+            archive_of(folder / f"{name}_{kind}.mcap", made.urdf, columns, LAW, **arrays)
+    return folder
+
+
+class TestTorqueScale:
+    """Imported torques have a scale of a data sheet unless the map or the cell states another."""
+
+    def weighed(self, folder: Path, kind: str) -> dict[str, Any]:
+        status, text = run(folder, f"empty_{kind}.mcap", "--loaded", f"full_{kind}.mcap", "--json")
+        assert status == 0
+        found: dict[str, Any] = json.loads(text)
+        return found
+
+    def test_the_interval_says_what_it_assumes(self, wrong: Path) -> None:
+        found = self.weighed(wrong, "assumed")
+        assert found["torque_uncertainty"]["std"] == [0.03] * 6
+        low, high = found["figures"]["mass"]["interval"]
+        # Two joints of independent scale bear the weight, so that it is known to 2 to 3 %.
+        assert 0.05 < (high - low) / found["figures"]["mass"]["value"] < 0.13
+        text = run(wrong, "empty_assumed.mcap", "--loaded", "full_assumed.mcap")[1]
+        assert "assuming torque constants to 3 %" in text
+
+    def test_a_stated_uncertainty_replaces_it(self, wrong: Path) -> None:
+        stated, exact = (self.weighed(wrong, kind)["figures"] for kind in ("stated", "exact"))
+        low, high = stated["mass"]["interval"]
+        assert low < MASS < high
+        low, high = exact["mass"]["interval"]
+        assert (high - low) / exact["mass"]["value"] < 0.02
+
+    def test_a_failed_check_prints_a_command_that_works(self, wrong: Path) -> None:
+        """The command is typed, and finds the constants."""
+        status, text = run(
+            wrong, "empty_assumed.mcap", "--loaded", "full_assumed.mcap", "--check", "mass=4"
+        )
+        assert status == 5
+        (line,) = [line for line in text.splitlines() if "hil gains" in line]
+        program, *words = shlex.split(line[line.index("hil gains") :])
+        assert program == "hil"
+        result = CliRunner().invoke(app, [*words, "--quiet"])
+        assert result.exit_code == 0, result.output
+        table = tomllib.loads(result.output)
+        assert table["torque_constant"] == pytest.approx(TYPE, rel=0.03)
+        assert np.all(np.array(table["torque_uncertainty"]) < 0.02)
+        Drive(**table)
+
+    def test_torques_without_currents_get_the_scale_to_correct(self, folder: Path) -> None:
+        status, text = run(folder, "empty.mcap", "--loaded", "full.mcap", "--check", "mass=5")
+        assert status == 5
+        assert "hil gains" not in text
+        assert "scale of [torque] in the column map" in text
+
+
+class TestRefused:
+    def test_loads_mounted_differently_are_both_named(self, folder: Path, tmp_path: Path) -> None:
+        """Turned by 180°, their mean centre is on the axis."""
+        time = np.arange(0.0, 12.0, 8e-3)
+        load = pin.Inertia(MASS, CENTRE * [-1.0, -1.0, 1.0], TENSOR)
+        turned = archived(
+            tmp_path / "turned.mcap", simulate("ur5_robot.urdf", time, seed=3, load=load)
+        )
+        bare, full = folder / "empty.mcap", folder / "full.mcap"
+        with pytest.raises(InputError, match=r"contradict.*full\.mcap.*turned\.mcap.*mm") as error:
+            find_payload([bare], [full, turned], Silent())
+        command = shlex.split(str(error.value.remedy).split("itself: ")[1])
+        assert command[:2] == ["hil", "payload"]
+        assert CliRunner().invoke(app, command[1:]).exit_code == 0
+
+    def test_equal_loads_are_no_contradiction(self, folder: Path, tmp_path: Path) -> None:
+        again = record(tmp_path, "again.mcap", MASS, 4)
+        found = find_payload([folder / "empty.mcap"], [folder / "full.mcap", again], Silent())
+        assert found.body.mass == pytest.approx(MASS, rel=0.01)
+
+    def test_a_bare_recording_with_a_tool_is_named(self, folder: Path, tmp_path: Path) -> None:
+        tool = record(tmp_path, "tool.mcap", 1.5, 5)
+        with pytest.raises(
+            InputError, match=r"bare recordings contradict.*tool\.mcap carries 1\.(49|50?) kg"
+        ):
+            find_payload([folder / "empty.mcap", tool], [folder / "full.mcap"], Silent())
+
+    def test_a_body_beyond_the_arm_s_reach_is_refused(self, tmp_path: Path) -> None:
+        """3 m behind a flange of an arm of 0.9 m."""
+        bare = record(tmp_path, "empty.mcap", 0.0, 1)
+        time = np.arange(0.0, 12.0, 8e-3)
+        far = pin.Inertia(0.5, np.array([0.0, 0.0, 3.0]), TENSOR)
+        full = archived(tmp_path / "full.mcap", simulate("ur5_robot.urdf", time, seed=2, load=far))
+        with pytest.raises(InputError, match=r"cannot hang on this arm.* 3\.\d m .* m long"):
+            find_payload([bare], [full], Silent())
+
+
+class TestMounting:
+    def test_an_arm_on_the_wall_gets_no_settings(self, tmp_path: Path) -> None:
+        time = np.arange(0.0, 12.0, 8e-3)
+        for seed, (name, load) in enumerate(
+            {"empty": None, "full": pin.Inertia(MASS, CENTRE, TENSOR)}.items(), 1
+        ):
+            made = simulate("ur5_robot.urdf", time, seed=seed, load=load, gravity=WALL)
+            archived(tmp_path / f"{name}.mcap", made)
+        status, text = run(tmp_path, "empty.mcap", "--loaded", "full.mcap", "--json")
+        found = json.loads(text)
+        assert status == 5
+        assert "set gravity of [robot]" in found["mounting"]
+        assert found["controllers"] == {}
+
+    def test_a_right_one_is_not_doubted(self, printed: dict[str, object]) -> None:
+        assert printed["mounting"] is None
+
+
+def test_an_inertia_that_is_not_determined_is_not_typed_in(tmp_path: Path) -> None:
+    """In slow motion only the weight acts; a zero would be taken for a value."""
+    time = np.arange(0.0, 60.0, 2e-2)
+    load = pin.Inertia(MASS, CENTRE, TENSOR)
+    for seed, (name, body) in enumerate({"empty": None, "full": load}.items(), 1):
+        slow = simulate("ur5_robot.urdf", time, seed=seed, pace=0.1, load=body)
+        noise = 0.1 * np.random.default_rng(seed).standard_normal(slow.torque.shape)  # N·m
+        archived(tmp_path / f"{name}.mcap", replace(slow, torque=slow.torque + noise))
+    status, text = run(tmp_path, "empty.mcap", "--loaded", "full.mcap", "--json")
+    found = json.loads(text)
+    assert status == 0
+    assert found["figures"]["Ixx"]["value"] is None
+    for typed in found["controllers"].values():
+        commands_only = [
+            line for line in typed.splitlines() if not line.startswith(("#", "//", "--"))
+        ]
+        assert not any("INERTIA" in line or "0.00000" in line for line in commands_only)
+        assert "not determined: enter the maker's, or record faster motion" in typed
+    assert "set_target_payload(" in found["controllers"]["UR"]
+
+
 def gains(folder: Path, *arguments: str) -> dict[str, Any]:
     found: dict[str, Any] = json.loads(run(folder, *arguments, "--json", command="gains")[1])
     return found
@@ -174,6 +324,13 @@ def test_the_constants_lie_in_their_intervals(currents: Path) -> None:
             assert error < 2.0 * motor["half_interval"] + 0.005 * truth
             assert motor["half_interval"] < 0.1 * truth
     assert known >= 5
+
+
+def test_a_load_without_centre_is_assumed_at_the_flange_and_said(currents: Path) -> None:
+    assert gains(currents, "empty.mcap", *BOTH)["assumed"] is None
+    assert "--centre" in gains(currents, "empty.mcap", *BOTH[:4])["assumed"]
+    text = run(currents, "empty.mcap", *BOTH[:4], "--quiet", command="gains")[1]
+    assert "the load's centre of mass is assumed at the origin" in text
 
 
 def test_the_output_is_an_entry_of_the_column_map(currents: Path) -> None:

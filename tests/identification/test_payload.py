@@ -10,7 +10,6 @@ from identification.errors import IdentificationError, ModelError
 from identification.estimators.gains import identify_gains
 from identification.estimators.payload import NAMES, PayloadError, Run, identify_payload
 from identification.factor.columns import gain_factor
-from identification.factor.factor import joined
 from identification.model.friction import FrictionLaw
 from identification.model.payload import Load, Payload
 from identification.model.pseudo_inertia import inertial_parameters, margin
@@ -240,7 +239,7 @@ def load_torque(model, payload, motion):
     return Load(model.chain, model.gravity, payload).torque(*motion[1:4])
 
 
-def factor_of(
+def factors_of(
     noise=CURRENT_NOISE, *, seed=0, model=MODEL, values=None, gains=PLANTED, load=KNOWN, **more
 ):
     """Reduce a recording without payload and one with it; noise is on the currents."""
@@ -255,18 +254,18 @@ def factor_of(
         motor = joint if turns is None else np.linalg.solve(turns.T, joint.T).T
         current = motor / gains + noise * rng.standard_normal(joint.shape)
         factors.append(gain_factor(model, samples, current, payload=payload, transmission=turns))
-    return joined(factors)
+    return factors
 
 
-def gains_of(factor, model=MODEL):
-    return identify_gains(factor, model.joint_names)
+def gains_of(factors, model=MODEL):
+    return identify_gains(model, factors)
 
 
 def lifted(payload):
     """Return gains of an arm that lifts along gravity and turns about it."""
     model = RobotModel.from_urdf(LIFT_AND_TURN, friction=FrictionLaw(third=None))
     values = values_of(model, [20.0, 3.0, 15.0, 1.0], (2.0, 0.05))
-    return gains_of(factor_of(model=model, values=values, load=payload), model)
+    return gains_of(factors_of(model=model, values=values, load=payload), model)
 
 
 # Motors' angles per joint angle with a coupled wrist, as the NS 16 has it.
@@ -280,7 +279,7 @@ NS16_LOAD = Payload(16.0, (0.10, 0.05, 0.25), (0.1, 0.0, 0.0, 0.1, 0.0, 0.05))
 def ns16(motion=None):
     """Return gains of the coupled NS 16."""
     model = RobotModel.from_urdf(urdf_text(), friction=FrictionLaw(third=None))
-    factor = factor_of(
+    factors = factors_of(
         np.full(6, 0.05),
         model=model,
         values=ns16_values(model),
@@ -289,16 +288,16 @@ def ns16(motion=None):
         motion=motion,
         turns=TURNS,
     )
-    return gains_of(factor, model)
+    return gains_of(factors, model)
 
 
 class TestGains:
     def test_without_noise_the_true_gains_are_found(self):
-        assert gains_of(factor_of(np.zeros(2))).values == pytest.approx(PLANTED, rel=1e-6)
+        assert gains_of(factors_of(np.zeros(2))).values == pytest.approx(PLANTED, rel=1e-6)
 
     def test_95_percent_intervals_cover_without_bias(self):
         """Unlike least squares of the equation linear in gains and parameters."""
-        draws = [gains_of(factor_of(seed=seed)) for seed in range(100)]
+        draws = [gains_of(factors_of(seed=seed)) for seed in range(100)]
         values = np.array([one.values for one in draws])
         half = np.array([one.interval_factor * one.std for one in draws])
         # Fewer than 89 of 100 have a probability of 0.5 %.
@@ -334,4 +333,4 @@ class TestGains:
 
     def test_missing_payload_raises(self):
         with pytest.raises(IdentificationError, match="no recording has a known payload"):
-            gains_of(factor_of(load=None))
+            gains_of(factors_of(load=None))
