@@ -221,8 +221,8 @@ class ConsistencyCheck:
     # messages on impossible parameters of the unconstrained estimate, by rise of the joint's error
     bounds: tuple[str, ...]
     judged_on: str = "held-out"  # "held-out" or "in-sample"
-    # joints whose link would need an impossible body although gravity loads them
-    overloaded: tuple[str, ...] = ()
+    # the joint that gravity loads, if the rise of the error is mostly its own; else empty
+    overloaded: str = ""
 
     @property
     def cost(self) -> float:
@@ -247,14 +247,14 @@ class ConsistencyCheck:
     def remedy(self) -> str:
         """What to check if no consistent parameters fit.
 
-        A spring or balancer bears the weight on one axis, and a body would have to be impossible to
-        do so; a wrong sign or coupling spoils several.
+        A spring or balancer bears the weight on one axis, which no body can do; a wrong sign or
+        coupling spoils several.
         """
         usual = "check signs, torque constants, coupling and URDF"
-        if len(self.overloaded) != 1:
+        if not self.overloaded:
             return usual
         return (
-            f"describe {ELEMENTS} on {self.overloaded[0]} as [[robot.elements]] of the cell file;"
+            f"describe {ELEMENTS} on {self.overloaded} as [[robot.elements]] of the cell file;"
             f" if it has none, {usual}"
         )
 
@@ -321,11 +321,18 @@ def check_consistency(
             unconstrained.names[k] for k in np.argsort(-shift, kind="stable") if shift[k] > _SIGMAS
         ),
         bounds=tuple(bounds),
-        overloaded=tuple(
-            model.joint_names[joint]
-            for joint in np.flatnonzero((room < _EDGE) & _gravity_loaded(model, training, values))
-        ),
+        overloaded=_overloaded(model, training, held_out, values, free),
     )
+
+
+def _overloaded(
+    model: RobotModel, training: Factor, held_out: Factor, values: Array, free: Array
+) -> str:
+    """Return the joint that gravity loads and that most of the rise of the squared error is of."""
+    rise = np.maximum(held_out.squared_errors(values) - held_out.squared_errors(free), 0.0)
+    joint = int(rise.argmax())
+    alone = rise[joint] > 0.5 * rise.sum() and _gravity_loaded(model, training, free)[joint]
+    return model.joint_names[joint] if alone else ""
 
 
 def _gravity_loaded(model: RobotModel, motion: Factor, values: Array) -> NDArray[np.bool_]:
