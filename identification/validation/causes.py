@@ -56,6 +56,7 @@ _STANDS_OUT: Final = 0.7  # the same, if the joint then is as good as the others
 _SAME_PART: Final = 0.85  # the same, if separate parameters for the part do no better
 _NEAR_NOISE: Final = 2.0  # noise floors; those of coloured noise are underestimated by a third
 _NOISE_OF: Final = 3  # recordings
+_NO_TORQUE: Final = 1e-20  # squared torque of an axis that counts, as a share of the largest
 _NEAR_SEPARATE: Final = 1.1  # error ratio to separate parameters
 _MOST_CAUSES: Final = 4
 # Rows and blocks of all recordings together.
@@ -388,7 +389,7 @@ class _Score(NamedTuple):
 
     def shares(self, squares: Array) -> Array:
         """Return squared errors (n,) as shares of the squared torque, zero without torque."""
-        known = self.torque > 0.0
+        known = self.torque > _NO_TORQUE * self.torque.max(initial=0.0)
         return np.where(known, squares / np.where(known, self.torque, 1.0), 0.0)
 
     def explains(
@@ -399,12 +400,12 @@ class _Score(NamedTuple):
         It is compared with the fit `usual` without this correction, sums of squared noise (n,),
         and the fit with separate parameters for the part, if any.
         """
-        every = np.flatnonzero((usual.fitted > 0.0) & (usual.torque > 0.0))
+        before, after = usual.shares(usual.fitted), self.shares(self.fitted)
+        every = np.flatnonzero(before > 0.0)
         own = np.array(joints, dtype=np.intp) if len(joints) else every
         own = own[np.isin(own, every)]
         if not own.size:
             return False
-        before, after = usual.shares(usual.fitted), self.shares(self.fitted)
         floor = usual.shares(noise)
         if np.all(after[own] <= _NEAR_NOISE**2 * floor[own]):
             return True

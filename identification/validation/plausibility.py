@@ -251,7 +251,7 @@ class ConsistencyCheck:
         coupling spoils several.
         """
         usual = "check signs, torque constants, coupling and URDF"
-        if not self.overloaded:
+        if not (self.overloaded and self.costly):
             return usual
         return (
             f"describe {ELEMENTS} on {self.overloaded} as [[robot.elements]] of the cell file;"

@@ -269,7 +269,8 @@ def _context_facts(evidence: Evidence, limit: Thresholds) -> Facts:
         facts |= {"jumped": joined(where, _JUMPS_SHOWN)}
         facts["jumping"] = joined(list(dict.fromkeys(jump.joint for jump in jumps)))
     if (scale := context.nominal_scale) is not None:
-        if evidence.causes is not None:
+        negated = scale.negated
+        if evidence.causes is not None and not negated:
             # Torques of another joint or with the wrong sign have no nominal size.
             scale = scale.without(j for one in evidence.causes for j in one.fault.joints)
         common, known = scale.common, np.isfinite(scale.scale)
@@ -277,8 +278,8 @@ def _context_facts(evidence: Evidence, limit: Thresholds) -> Facts:
         impossible = abs(np.log(common)) > np.log(_IMPOSSIBLE_SCALE)
         facts |= {"scale": scale.scale, "tolerance": scale.tolerance}
         opposite = off & (scale.scale + scale.tolerance < 0.0) & (np.abs(scale.scale + 1.0) < _NEAR)
-        facts |= {"negated": known & scale.negated, "opposite": opposite & (not scale.negated)}
-        off = off & ~opposite & (not scale.negated)
+        facts |= {"negated": known & negated, "opposite": opposite & (not negated)}
+        off = off & ~opposite & (not negated)
         facts |= {"impossible_scale": off & impossible, "other_scale": off & (not impossible)}
     if (dissipation := evidence.dissipation) is not None:
         positive = scale is not None and bool(np.any(scale.scale - scale.tolerance > 0.0))

@@ -331,17 +331,20 @@ class TestJudgement:
 
     def test_an_axis_of_little_torque_does_not_decide_alone(self):
         """A hundredth of the other's torque, or lost in noise, or small against its limit."""
-        error = an_error(np.array([0.05, 0.6]))
-        assert not judged(held_out=error, training=error).good
-        small = replace(
-            error,
-            squared=error.squared * [1.0, 1e-4],
-            torque_squared=error.torque_squared * [1.0, 1e-4],
-        )
-        verdict = judged(held_out=small, training=small)
-        assert verdict.good and any("two 60% of 0.1 N·m" in one for one in verdict.warnings)
-        assert judged(held_out=error, training=error, noise_floor=np.array([0.1, 3.0])).good
-        assert judged(held_out=error, training=error, torque_limit=np.array([30.0, 3000.0])).good
+
+        def axes(torque, **context):
+            """Two axes with errors of 5 and 60 %; the torque of the second as a share of 10 N·m."""
+            error, power = an_error(np.array([0.05, 0.6])), np.array([1.0, torque**2])
+            error = replace(
+                error, squared=error.squared * power, torque_squared=error.torque_squared * power
+            )
+            return judged(held_out=error, training=error, **context)
+
+        assert not axes(0.03).good
+        assert axes(0.01).good
+        assert any("two 60% of 0.1 N·m" in one for one in axes(0.01).warnings)
+        assert axes(0.03, noise_floor=np.array([0.1, 0.2])).good
+        assert axes(0.03, torque_limit=np.array([30.0, 100.0])).good
 
     def test_a_joint_several_times_worse_than_its_fit_is_not_good(self):
         changes = {"training": an_error(np.array([0.05, 0.015])), "held_out": an_error(0.1)}
@@ -605,7 +608,7 @@ class TestErrorsWithoutCause:
     def test_extreme_torques_raise_no_warning(self):
         """In a block without rows, and with torques near the limits of numbers."""
         one = recorded(1)
-        torque = one.torque * np.where(np.arange(6) == 5, 1e-160, 1.0)
+        torque = one.torque * np.where(np.arange(6) == 5, 1e-150, 1.0)
         usable = one.usable & (np.arange(len(torque)) > 300)[:, None]
         with warnings.catch_warnings():
             warnings.simplefilter("error")
