@@ -8,7 +8,7 @@
 - Steps of a measured position that an arm cannot make, such as lost encoder counts: a departure
   from the steps beside it that later steps do not reverse. Departures common to the other joints
   are errors of the clock and are subtracted first. Samples that the log repeats, or has late, are
-  told apart by where they lie on the path of the motion.
+  recognised by their place on the path of the motion.
 """
 
 from __future__ import annotations

@@ -422,7 +422,7 @@ _CAUSES: Final[dict[Kind, _CauseRow]] = {
         "check torque constant and gear ratio of {joints}; recordings with and without a known"
         " payload determine the constant (`hil gains --loaded`)", offset=1.0),
     "load friction": _CauseRow(
-        "friction law", "friction grows with the load, by {size} of the transmitted torque (median"
+        "friction over load", "friction grows with the load, by {size} of the transmitted torque (median"
         " axis)",
         "the friction law lacks its share of load; predict motions of similar load only, or state a"
         " friction term of the load", scale=1.0),
@@ -534,7 +534,7 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
     _Row("excitation", {"doubtful": "one_way"},
          "{joints} moved in one direction only on the fitted motion: Coulomb friction and offset of"
          " the torque are one column of the regressor there, and only their sum is determined",
-         "record a motion in which {joints} moves both ways"),
+         "record a motion in which {joints} moves in both directions"),
     _Row("excitation", {"good": "rich"},
          "the motion determines every parameter: condition number {condition:.0f} of the regressor"
          " with unit columns"),

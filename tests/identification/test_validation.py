@@ -655,7 +655,7 @@ class TestStepsOfTheLog:
         ],
         ids=["frozen samples", "repeated samples", "rows missing of all joints"],
     )
-    def test_they_are_told_apart(self, one):
+    def test_they_are_separate(self, one):
         found = position_steps(one, "log.mcap")
         assert found.logged and found.jumps == ()
 

@@ -374,7 +374,7 @@ class TestJudgement:
         verdict = judged(one_way=np.array([False, True]))
         (found,) = (one for one in verdict.findings if "one direction" in one.words)
         assert found.level == "doubtful" and found.words.startswith("two moved in one direction")
-        assert found.next_step == "record a motion in which two moves both ways"
+        assert found.next_step == "record a motion in which two moves in both directions"
 
     def test_all_negated_torques_are_one_cause(self):
         """By the nominal model, or by friction that would drive every axis."""
