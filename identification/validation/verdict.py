@@ -422,10 +422,10 @@ _CAUSES: Final[dict[Kind, _CauseRow]] = {
         "check torque constant and gear ratio of {joints}; recordings with and without a known"
         " payload determine the constant (`hil gains --loaded`)", offset=1.0),
     "load friction": _CauseRow(
-        "friction over load", "friction grows with the load, by {size} of the transmitted torque (median"
-        " axis)",
-        "the friction law lacks its share of load; predict motions of similar load only, or state a"
-        " friction term of the load", scale=1.0),
+        "friction over load", "friction grows with the load, by {size} of the transmitted torque"
+        " (median axis)",
+        "predict only motions whose loads are like those of the fitted motion, or fit both: the"
+        " friction law lacks a term of the load"),
     "torque sign": _CauseRow(
         "direction of axes", "the torque of {joints} has probably the wrong sign",
         "check the sign of the torque of {joints} in the column map, or of its torque constant"),
