@@ -28,7 +28,8 @@ _SIGMAS: Final = 3.0  # standard deviations of a significant change
 # Smallest change that is named; a torque constant drifts by some per cent with the temperature of
 # its magnets.
 _LEAST: Final = 0.03
-_GROWN: Final = 2.0  # error on unseen over fitted motion of a joint that may have changed
+# Error on unseen over fitted motion of a joint that may have changed; with the change, it is less.
+_GROWN: Final = 2.0
 # Share of the additional squared error that the change has to explain. Planted changes: at least
 # 0.95; another motion that the fitted one does not cover: below 0.6.
 _EXPLAINED: Final = 0.8
@@ -102,6 +103,8 @@ def find_changes(
             error = unseen.error[joint] - unseen.explained[k, joint]
             left = float(_relative(error, unseen.torque[joint]))
             explains = unseen.relative[joint] ** 2 - left**2 > _EXPLAINED * beyond
+            # A factor near zero removes a prediction that is wrong, and explains nothing.
+            explains &= left < _GROWN * usual[joint]
             size = abs(ratio - 1.0)
             # A factor below zero is no change of one quantity.
             if ratio > 0.0 and explains and size > max(_LEAST, _SIGMAS * deviation):

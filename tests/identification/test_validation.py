@@ -721,6 +721,13 @@ class TestChangesToUnseenMotion:
 
         assert changes_between(as_it_is, waved) == ()
 
+    def test_a_prediction_that_has_failed_is_no_change(self):
+        """Without it the error is less, but not that of the fitted motion."""
+        training, held_out = [arm_with(as_it_is, 1)], [arm_with(as_it_is, 2)]
+        values = estimate_repetitions(MODEL, training).pooled.values
+        held_out = [replace(held_out[0], torque=np.roll(held_out[0].torque, 900, axis=0) / 3.0)]
+        assert find_changes(MODEL, values, training, held_out) == ()
+
     def test_a_torque_of_the_other_sign_is_no_change(self):
         assert changes_between(as_it_is, lambda _, torque: torque * [1.0, -1.0]) == ()
 
