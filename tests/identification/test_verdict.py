@@ -24,6 +24,7 @@ from identification.validation.residuals import (
     HARMONICS,
     BlockMean,
     FrictionDrift,
+    Outliers,
     Ripple,
     check_residuals,
 )
@@ -451,6 +452,12 @@ class TestPatternsOfTheResidual:
         checks = {one.check for one in judged(residuals=clean).findings}
         assert "whiteness" in checks
         assert not {"torque ripple", "friction over time"} & checks
+
+    @pytest.mark.parametrize(("error", "named"), [(0.0004, False), (0.05, True)])
+    def test_an_error_of_zero_has_no_outliers(self, clean, error, named):
+        few = Outliers(np.full(2, 0.001), np.full(2, 0.95), an_error(0.2 * error))
+        verdict = judged(held_out=an_error(error), residuals=replace(clean, outliers=few))
+        assert ("outliers" in {one.check for one in verdict.findings}) == named
 
     @pytest.mark.parametrize(
         ("share", "level"), [(0.0, "good"), (0.9, "information"), (1.1, "doubtful")]
