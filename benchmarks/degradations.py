@@ -46,7 +46,15 @@ EXPECTED: Final = {
     "filtered positions": _named("position bandwidth", silence=True),
 }
 CAUSES: Final = frozenset[str]().union(
-    {"position jumps", "outliers", "gravity", "friction", "scale of the torque"},
+    {
+        "position jumps",
+        "outliers",
+        "gravity",
+        "friction",
+        "friction over load",
+        "scale of the torque",
+        "torque constant",
+    },
     *(expectation.checks for expectation in EXPECTED.values()),
 )
 """Findings that blame something; all others say how large an error is, or where."""

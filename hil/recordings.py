@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hil.archive import Archive, open_archive
 from hil.archive.header import REPLIES_LOST
 from hil.errors import ArchiveError
-from identification.signals.recording import Recording
+from identification.signals.recording import Recording, unwrapped
 
 Array = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def recording_of(archive: Archive) -> Recording:
     """Return the recording of an opened archive, time from zero; ArchiveError without a sample.
 
     Time is counted in cycles of the controller (in samples of an imported recording at a fixed
-    rate), not in times of arrival.
+    rate), not in times of arrival. Angles that wrap are unwrapped.
     """
     columns = archive.columns
     if not archive.n_samples or "position" not in columns:
@@ -75,7 +75,7 @@ def recording_of(archive: Archive) -> Recording:
         provenance[key if key == "outcome" else f"outcome.{key}"] = value
     if archive.missing is not None:
         provenance["missing"] = archive.missing
-    return Recording(
+    recording = Recording(
         time=_time(archive),
         position=columns["position"],
         joint_names=archive.joint_names,
@@ -89,6 +89,7 @@ def recording_of(archive: Archive) -> Recording:
         held_joints=archive.header.held_joints,
         provenance=provenance,
     )
+    return unwrapped(recording)
 
 
 def _time(archive: Archive) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
@@ -14,25 +15,29 @@ from hil.cell.text import urdf_limits
 from identification.estimators.prior import NOMINAL_SHARE
 from identification.estimators.torque_channel import torque_noiseless_above
 from identification.factor.factor import Estimate
+from identification.model.friction import TERMS
 from identification.selection.inner_prediction import LOW_PASS
 from identification.signals.masks import SATURATED
+from identification.signals.recording import UNWRAPPED
 from identification.signals.samples import Samples
 from identification.validation.evidence import CellContext
 from identification.validation.finding import Finding, joined
 from identification.validation.plausibility import (
     InertiaRatio,
+    PositionJump,
     inertia_ratio,
     nominal_scale,
-    position_jumps,
+    position_steps,
 )
 from identification.validation.prediction import PredictionError, pooled_error
 
 from .prepared import Prepared
-from .sources import Source
+from .sources import Source, cell_of
 
 Array = NDArray[np.float64]
 
 _POSTURES = 500
+_FRICTION_AT_SPEED: Final = "friction at speed"  # name of the choice of friction terms
 _TIME_TOLERANCE = 1e-6  # s
 
 
@@ -91,6 +96,7 @@ def _column_at(source: Source, field: str, time: Array) -> Array | None:
 # Position changes below this share of a joint's range are floating-point rounding.
 _ROUNDING: Final = 1e-9
 _STEP_QUANTILE: Final = 0.01  # of the changes between samples: one step of a coarse encoder
+_GRID: Final = 0.05  # distance from a multiple of the step, in steps
 _MAX_ROUNDING: Final = 0.02  # of accelerations, as a share
 _FAST: Final = 2.0  # a low-pass above this multiple of the motion's bandwidth has no effect
 
@@ -101,6 +107,7 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
     recorded = sources.training if sources.in_sample else (*sources.training, *sources.held_out)
     driven = cell.file.drive_train is not None
     saturated, nominal = prepared.masked.get(SATURATED), nominal_of(cell)
+    steps = [position_steps(one.recording, one.name) for one in recorded]
     return CellContext(
         torque_limit=torque_limits(cell),
         saturated=None if saturated is None else saturated / max(prepared.rows, 1),
@@ -115,13 +122,20 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
             rotors_known=nominal.rotors_known,
             share=nominal.share,
         ),
-        jumps=tuple(jump for one in recorded for jump in position_jumps(one.recording, one.name)),
+        jumps=tuple(jump for one in steps for jump in one.jumps),
         controller_inertia=controller_inertia(
             cell, estimate, (*sources.training, *sources.held_out)
         ),
         delays=prepared.delays,
         assumed_delay=prepared.assumed_delay,
-        corrections=(*_clock(prepared), *_torque_channel(prepared), *_resolution(prepared)),
+        corrections=(
+            *_clock(prepared),
+            *_log([jump for one in steps for jump in one.logged]),
+            *_wrapped(recorded),
+            *_torque_channel(prepared),
+            *_resolution(prepared),
+        ),
+        added_friction=_added_friction(prepared),
     )
 
 
@@ -134,6 +148,46 @@ def _clock(prepared: Prepared) -> Iterator[Finding]:
     if retimed:
         text = f"{joined([one.name for one in retimed])}: {'; '.join(retimed[0].clock)}"
         yield _condition("clock", text, "log the controller's time with each sample")
+
+
+def _log(steps: Sequence[PositionJump]) -> Iterator[Finding]:
+    """Yield a finding about samples that the log repeats or has late."""
+    if steps:
+        counts = Counter((step.recording, step.joint) for step in steps)
+        each = joined([f"{joint} {count} in {name}" for (name, joint), count in counts.items()])
+        first = min(steps, key=lambda step: step.time)
+        yield _condition(
+            "clock",
+            f"the log repeats position samples, has them late or lacks rows: {each} (first:"
+            f" {first.joint} after {first.time:.3f} s of {first.recording}); the arm moved on",
+            "log every sample of the controller once, with the controller's time",
+        )
+
+
+def _wrapped(sources: Sequence[Source]) -> Iterator[Finding]:
+    """Yield a finding about angles that were unwrapped."""
+    joints = {one.name: one.recording.provenance.get(UNWRAPPED) for one in sources}
+    each = [f"{names} of {name}" for name, names in joints.items() if names]
+    if each:
+        text = f"angles that wrap at a whole turn were unwrapped: {joined(each)}"
+        yield Finding("wrapped angles", "information", text, "", "condition")
+
+
+def _added_friction(prepared: Prepared) -> tuple[str, ...]:
+    """Return the symbols of friction terms that inner prediction chose and nobody stated."""
+    chosen = prepared.settings.friction
+    if not any(choice.name == _FRICTION_AT_SPEED for choice in prepared.settings.choices):
+        return ()
+    path = prepared.sources.training[0].path
+    stated = cell_of(open_archive(path, fields=("cycle",))).file.robot.friction
+    added = [
+        term.symbol
+        for term in TERMS
+        if (option := term.option) in chosen
+        and chosen[option] not in (None, "none", 0.0, False)
+        and getattr(stated, option) in (None, "none", 0.0, False)
+    ]
+    return tuple(dict.fromkeys(added))
 
 
 def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
@@ -178,11 +232,9 @@ def _resolution(prepared: Prepared) -> Iterator[Finding]:
         recording = source.recording
         interval = float(np.median(np.diff(recording.time)))
         for j, name in enumerate(names):
-            moves = np.abs(np.diff(recording.position[:, j]))
-            moves = moves[moves > _ROUNDING * np.ptp(recording.position[:, j])]
-            if not moves.size:
+            step = grid_step(recording.position[:, j])
+            if step is None:
                 continue
-            step = float(np.quantile(moves, _STEP_QUANTILE))
             width = min(samples.position_bandwidth[j], 0.5 / interval)
             noise = step**2 / 12.0 * 2.0 * interval * (2.0 * np.pi) ** 4 * width**5 / 5.0
             if np.sqrt(noise) > _MAX_ROUNDING * samples.motion.acceleration[:, j].std():
@@ -195,6 +247,18 @@ def _resolution(prepared: Prepared) -> Iterator[Finding]:
             f" {_MAX_ROUNDING:.0%} of the accelerations is rounding error",
             "record positions with more digits, or identify with a lower --bandwidth",
         )
+
+
+def grid_step(position: Array) -> float | None:
+    """Return the step of the grid that the positions (m,) of a joint lie on, None without one."""
+    moves = np.abs(np.diff(position))
+    moves = moves[moves > _ROUNDING * np.ptp(position)]
+    if not moves.size:
+        return None
+    step = float(np.quantile(moves, _STEP_QUANTILE))
+    # Of positions without a grid, a tenth is that near to multiples of any step by chance.
+    off = np.abs(moves / step - np.rint(moves / step))
+    return step if np.mean(off < _GRID) > 0.5 else None
 
 
 class Nominal(NamedTuple):

@@ -19,6 +19,7 @@ from hil.cell.text import UrdfLimits, urdf_limits
 from hil.errors import SourceError
 from identification.model.urdf_text import urdf_tree
 from identification.signals.clock import time_base
+from identification.signals.recording import unwrap
 
 Array = NDArray[np.float64]
 
@@ -74,7 +75,7 @@ def examine(
 
     `locked` are positions [rad or m] of joints that are not in the model, by name.
     """
-    time, position = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9), samples.position
+    time, position = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9), unwrap(samples.position)
     limits = limits_of(urdf, joint_names)
     kinds = {joint.get("name"): joint.get("type") for joint in urdf_tree(urdf).findall("joint")}
     turning = np.array([kinds[name] != "prismatic" for name in joint_names])

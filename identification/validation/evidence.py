@@ -19,18 +19,22 @@ from identification.factor.factor import Estimate, Factor, solve
 from identification.model.regressor import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.signals.smoothing import noiseless_above
 from identification.validation.causes import Cause, find_causes
+from identification.validation.changes import Change, find_changes
 from identification.validation.finding import Finding, Thresholds
 from identification.validation.plausibility import (
+    Dissipation,
     Implausible,
     InertiaRatio,
     NominalScale,
     PositionJump,
+    dissipation_of,
     implausibilities,
 )
 from identification.validation.prediction import (
+    SLOW,
     PredictionError,
+    noise_floor,
     pooled_error,
     prediction_error,
     residual,
@@ -40,14 +44,15 @@ from identification.validation.residuals import ResidualChecks, check_residuals
 
 Array = NDArray[np.float64]
 
-# Hz. The torque of a rigid arm lies below, torque ripple and current noise above.
-SLOW: Final = 10.0
 SIGMAS: Final = 3.0
 _STANDARD: Final = 9.81  # m/s²
 _PASSES: Final = 2
 # Condition beyond which combinations of standard parameters count as undetermined.
 _WORST_CONDITION: Final = 10.0**4.5
 _GROWN: Final = 4.0  # power ratio beyond which a joint's error exceeds that of the fit
+# Share of the rows in the rarer direction of motion below which friction and offset of a joint are
+# one column: with it their correlation is 0.98.
+_OTHER_WAY: Final = 0.01
 _MOST_RECORDINGS: Final = 3  # enough recordings to determine gravity and load
 _PLAUSIBLE: Final = Implausible((), ())
 
@@ -215,6 +220,7 @@ class CellContext:
     jumps: tuple[PositionJump, ...] = ()  # impossible steps of measured positions
     controller_inertia: InertiaRatio | None = None  # its diagonal inertia over the identified one
     corrections: tuple[Finding, ...] = ()  # faults of recordings that were corrected
+    added_friction: tuple[str, ...] = ()  # symbols of friction terms that nobody stated
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,11 +243,16 @@ class Evidence:
     #: torque (n,); None without repetitions
     disagreement: Array | None = None
     causes: tuple[Cause, ...] | None = None  #: faults whose correction reduces errors
+    #: joints whose torque or friction on unseen motion differs from the fitted motion
+    changes: tuple[Change, ...] = ()
+    #: joints that moved in one direction only on the fitted motion (n,); None if not tested
+    one_way: NDArray[np.bool_] | None = None
     gravity: GravityDirection | None = None  #: the direction of gravity that fits best
     load: CarriedLoad | None = None  #: body on the last link in unseen motion only
     #: error of the nominal (CAD) model on the same unseen motion
     nominal: PredictionError | None = None
     implausible: Implausible = _PLAUSIBLE  #: physically impossible signs of the estimate
+    dissipation: Dissipation | None = None  #: friction of each joint at its top speed
     residuals: ResidualChecks | None = None  #: patterns of the residual
     context: CellContext = CellContext()  #: data on the cell
     prismatic: tuple[int, ...] = ()  #: indices of the joints that slide
@@ -288,12 +299,15 @@ def gather(
     standard = standard_factor(model, few), standard_factor(model, unseen_few)
     repeated = same_motion and len(result.repetitions) > 1
     noise = repetition_noise(model, values, training, SLOW) if repeated else None
+    floor = noise_floor(model, values, few, noise)
     evidence = Evidence(
         estimate=result.pooled,
         held_out=error,
         training=pooled_error(prediction_error(model, values, training)),
-        noise_floor=_noise_floor(model, values, few, noise),
-        causes=find_causes(model, training, values, names),
+        noise_floor=floor,
+        causes=find_causes(model, training, values, names, noise=floor),
+        changes=() if in_sample else find_changes(model, values, training, held_out),
+        one_way=_one_way(training),
         gravity=find_gravity(model, *standard),
         load=find_load(model, few, unseen_few, *standard),
         nominal=None
@@ -305,7 +319,9 @@ def gather(
             unseen,
             error.rms,
             speed=np.abs(velocity).max(axis=0),
+            added=context.added_friction,
         ),
+        dissipation=dissipation_of(model, result.pooled, np.abs(velocity).max(axis=0)),
         residuals=check_residuals(
             model,
             values,
@@ -340,22 +356,13 @@ def gather(
     )
 
 
-def _noise_floor(
-    model: RobotModel, values: Array, recordings: Sequence[Samples], repeated: Array | None
-) -> Array | None:
-    """Return the standard deviation of torque noise per joint (n,), NaN without rows."""
-    first = recordings[0]
-    if repeated is None and noiseless_above(first.motion.time, first.torque, first.segments):
-        return None
-    squares, rows = np.zeros((2, model.n_joints))
-    for samples in recordings:
-        fast = residual(model, values, samples) - residual(model, values, samples, SLOW)
-        nyquist = 0.5 / float(np.median(np.diff(samples.motion.time)))
-        share = max(1.0 - SLOW / nyquist, 0.5)  # share of white noise above the bandwidth
-        squares += np.where(samples.usable, fast**2, 0.0).sum(axis=0) / share
-        rows += np.count_nonzero(samples.usable, axis=0)
-    white = squares / np.where(rows > 0.0, rows, np.nan)
-    return np.sqrt(white if repeated is None else white + np.nan_to_num(repeated) ** 2)
+def _one_way(recordings: Sequence[Samples]) -> NDArray[np.bool_]:
+    """Return which joints moved in one direction only (n,)."""
+    velocities = [np.where(run.usable, run.motion.velocity, 0.0) for run in recordings]
+    ways = [[np.count_nonzero(sign * v > 0.0, axis=0) for v in velocities] for sign in (1.0, -1.0)]
+    forwards, backwards = np.array(ways).sum(axis=1)
+    fewer, moved = np.minimum(forwards, backwards), forwards + backwards
+    return np.asarray((moved > 0) & (fewer < _OTHER_WAY * moved))
 
 
 def _disagreement(result: RepeatedEstimate) -> Array:

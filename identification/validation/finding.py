@@ -53,8 +53,14 @@ class Thresholds:
     inconsistency: float = 0.10  #: torque difference of one repetition's estimate to the pooled one
     friction: float = 0.03  #: change of friction to unseen motion that is doubtful
     drift: float = 0.03  #: change of friction during the recordings, as a share of the torque
-    #: error on unseen over error on fitted motion; wrong if also above half of `axis`
+    #: error on unseen over error on fitted motion, as shares of the torque; wrong if also above
+    #: half of `axis`, above a quarter of it if the torque errors themselves have this ratio
     generalisation: float = 2.5
+    #: torque of an axis as a share of that of all axes below which it alone does not decide: an
+    #: eighth of `overall`, so that losing it entirely adds 0.1 points to the error over all axes
+    minor: float = 0.015
+    #: the same as a share of its own limit; sensors resolve some thousandths of their range
+    minor_of_limit: float = 0.005
     nominal: float = 0.005  #: overall error above that of the nominal or controller's model
     rows: int = 100  #: samples of unseen motion in which an axis must have moved
     gravity: float = 0.5  #: squared error on unseen motion with the best gravity over declared

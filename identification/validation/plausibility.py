@@ -7,13 +7,14 @@
   of the controller's to the identified inertia.
 - Steps of a measured position that an arm cannot make, such as lost encoder counts: a departure
   from the steps beside it that later steps do not reverse. Departures common to the other joints
-  are errors of the clock and are subtracted first.
+  are errors of the clock and are subtracted first. Samples that the log repeats, or has late, are
+  recognised by their place on the path of the motion.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -43,6 +44,7 @@ class Implausible(NamedTuple):
 
     impossible: tuple[str, ...]  # wrong signs with a torque above the prediction error
     doubtful: tuple[str, ...]  # wrong signs with a smaller torque
+    added: tuple[str, ...] = ()  # friction that falls by a term that nobody stated
 
 
 def implausibilities(
@@ -52,20 +54,27 @@ def implausibilities(
     error_rms: Array,
     *,
     speed: Array,
+    added: Collection[str] = (),
 ) -> Implausible:
     """Return messages on what is physically impossible in an estimate.
 
     The torque of wrong signs on a `motion` is compared with the error of its prediction (n,);
-    friction is evaluated up to the highest speeds (n,).
+    friction is evaluated up to the highest speeds (n,). Terms of friction of `added` symbols were
+    chosen, not stated: they follow the friction within the fitted speeds and are no reason against
+    a model.
     """
     impossible: list[str] = []
     doubtful: list[str] = []
-    for words, part in _wrong_signs(model, estimate, speed):
+    chosen: list[str] = []
+    for words, part, by_added in _wrong_signs(model, estimate, speed, added):
+        if by_added:
+            chosen.append(words)
+            continue
         own = np.where(part, estimate.values, 0.0)
         squares = np.einsum("i,jik,k->j", own, motion.gram[:, :-1, :-1], own)
         torque = np.sqrt(np.maximum(squares, 0.0) / np.maximum(motion.samples, 1))
         (impossible if np.any(torque > error_rms) else doubtful).append(words)
-    return Implausible(tuple(impossible), tuple(doubtful))
+    return Implausible(tuple(impossible), tuple(doubtful), tuple(chosen))
 
 
 def _is_negative(estimate: Estimate, direction: Array) -> bool:
@@ -79,29 +88,33 @@ def _is_negative(estimate: Estimate, direction: Array) -> bool:
 
 
 def _wrong_signs(
-    model: RobotModel, estimate: Estimate, speed: Array
-) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield messages on wrong signs, with the parameters (p,) that cause them."""
+    model: RobotModel, estimate: Estimate, speed: Array, added: Collection[str] = ()
+) -> Iterator[tuple[str, NDArray[np.bool_], bool]]:
+    """Yield messages on wrong signs, the parameters (p,) that cause them, and if by added terms."""
     values, first, count = estimate.values, model.base.rank, len(estimate.values)
     for joint, (name, law) in enumerate(zip(model.joint_names, model.friction.laws, strict=True)):
         one = speed[joint : joint + 1]
-        top, coulomb = np.zeros((2, count))
+        top, coulomb, stated = np.zeros((3, count))
         for k, (_, term, owner, motor, _) in enumerate(model.friction.terms, start=first):
             if owner == joint and not motor and term.is_friction:
                 top[k] = term.column(one, law.sign(one))[0]
                 coulomb[k] = term == COULOMB
+                stated[k] = term.symbol not in added
         if _is_negative(estimate, coulomb):
             words = (
                 f"Coulomb friction of {name} is negative ({coulomb @ values:.3g}): a torque or a"
                 " direction has the wrong sign"
             )
-            yield words, top != 0.0
+            yield words, top != 0.0, False
         elif _is_negative(estimate, top - 0.5 * coulomb):
+            by_added = not _is_negative(estimate, stated * top - 0.5 * coulomb)
             words = (
                 f"friction of {name} is {top @ values:.3g} at its top speed of {speed[joint]:.3g},"
                 f" less than half of its Coulomb friction {coulomb @ values:.3g}"
             )
-            yield words, top != 0.0
+            if by_added:
+                words += ", by a friction term that was chosen by inner prediction"
+            yield words, top != 0.0, by_added
     alone = {  # names of single parameters
         k: f"friction {term.name} of {'motor' if term.motor else 'joint'} {term.owner + 1}"
         for k, term in enumerate(model.friction.terms, start=first)
@@ -114,7 +127,49 @@ def _wrong_signs(
         direction = np.arange(count) == k
         if _is_negative(estimate, direction.astype(np.float64)):
             figures = f"{values[k]:.3g} ± {estimate.std[k]:.2g} {estimate.units[k]}"
-            yield f"{name} is negative: {figures}", direction
+            yield f"{name} is negative: {figures}", direction, False
+
+
+class Dissipation(NamedTuple):
+    """Friction of n joints at their top speed, negative if it drives the joint."""
+
+    torque: Array  # (n,) [N·m or N]
+    std: Array  # (n,), infinite if undetermined or without friction terms
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Whether the sign of each is significant (n,)."""
+        return np.asarray(np.abs(self.torque) > _SIGMAS * self.std)
+
+    @property
+    def all_driving(self) -> NDArray[np.bool_]:
+        """Joints with known friction (n,) if it drives all of them, most of the arm; else none."""
+        known = self.known
+        most = np.count_nonzero(known) >= max(2, 0.5 * len(known))
+        return known & bool(most and np.all(self.torque[known] < 0.0))
+
+    @property
+    def described(self) -> NDArray[np.object_]:
+        """Torques with their standard deviations as text (n,)."""
+        pairs = zip(self.torque, self.std, strict=True)
+        return np.array([f"{torque:.3g} ± {2.0 * std:.2g}" for torque, std in pairs], dtype=object)
+
+
+def dissipation_of(model: RobotModel, estimate: Estimate, speed: Array) -> Dissipation:
+    """Return the friction of each joint at its highest speed (n,) [rad/s or m/s]."""
+    first, count = model.base.rank, len(estimate.values)
+    torque, std = np.zeros(model.n_joints), np.full(model.n_joints, np.inf)
+    determined = np.isfinite(np.diag(estimate.covariance))
+    covariance = np.where(np.outer(determined, determined), estimate.covariance, 0.0)
+    for joint, law in enumerate(model.friction.laws):
+        top, one = np.zeros(count), speed[joint : joint + 1]
+        for k, (_, term, owner, motor, _) in enumerate(model.friction.terms, start=first):
+            if owner == joint and not motor and term.is_friction:
+                top[k] = term.column(one, law.sign(one))[0]
+        torque[joint] = top @ estimate.values
+        if top.any() and not np.any(top[~determined]):
+            std[joint] = float(np.sqrt(top @ covariance @ top))
+    return Dissipation(torque, std)
 
 
 def inertia_matrices(model: RobotModel, values: Array, position: Array) -> Array:
@@ -144,6 +199,13 @@ _NEGATIVE: Final = {
 }
 
 
+ELEMENTS: Final = "a spring, a balancer or a hydraulic counterweight"
+# Least torque of gravity, over the measured one, of an axis that gravity loads; below, friction and
+# inertia dominate.
+_LOADED: Final = 0.2
+_POSTURES: Final = 50
+
+
 @dataclass(frozen=True, eq=False)
 class ConsistencyCheck:
     """Consistent estimate compared with the unconstrained one on held-out motion."""
@@ -159,6 +221,8 @@ class ConsistencyCheck:
     # messages on impossible parameters of the unconstrained estimate, by rise of the joint's error
     bounds: tuple[str, ...]
     judged_on: str = "held-out"  # "held-out" or "in-sample"
+    # the joint that gravity loads, if the rise of the error is mostly its own; else empty
+    overloaded: str = ""
 
     @property
     def cost(self) -> float:
@@ -178,6 +242,21 @@ class ConsistencyCheck:
     def _beyond(self, overall: float, axis: float) -> bool:
         worse_axis = self.cost > 0.0 and bool(np.any(self.held_out_rise > axis))
         return self.cost > overall or worse_axis
+
+    @property
+    def remedy(self) -> str:
+        """What to check if no consistent parameters fit.
+
+        A spring or balancer bears the weight on one axis, which no body can do; a wrong sign or
+        coupling spoils several.
+        """
+        usual = "check signs, torque constants, coupling and URDF"
+        if not (self.overloaded and self.costly):
+            return usual
+        return (
+            f"describe {ELEMENTS} on {self.overloaded} as [[robot.elements]] of the cell file;"
+            f" if it has none, {usual}"
+        )
 
     @property
     def sentence(self) -> str:
@@ -247,7 +326,28 @@ def check_consistency(
             unconstrained.names[k] for k in np.argsort(-shift, kind="stable") if shift[k] > _SIGMAS
         ),
         bounds=tuple(bounds),
+        overloaded=_overloaded(model, training, held_out, values, free),
     )
+
+
+def _overloaded(
+    model: RobotModel, training: Factor, held_out: Factor, values: Array, free: Array
+) -> str:
+    """Return the joint that gravity loads and that most of the rise of the squared error is of."""
+    rise = np.maximum(held_out.squared_errors(values) - held_out.squared_errors(free), 0.0)
+    joint = int(rise.argmax())
+    alone = rise[joint] > 0.5 * rise.sum() and _gravity_loaded(model, training, free)[joint]
+    return model.joint_names[joint] if alone else ""
+
+
+def _gravity_loaded(model: RobotModel, motion: Factor, values: Array) -> NDArray[np.bool_]:
+    """Return the joints (n,) whose torque is largely weight, by parameters (p,)."""
+    rng = np.random.default_rng(0)
+    position = rng.uniform(-1.0, 1.0, (_POSTURES, model.n_joints))
+    still = np.zeros_like(position)
+    weight = model.torque(np.where(model.friction_columns, 0.0, values), position, still, still)
+    measured = np.sqrt(motion.gram[:, -1, -1] / np.maximum(motion.samples, 1))
+    return np.asarray(np.sqrt(np.mean(weight**2, axis=0)) > _LOADED * measured)
 
 
 _BLOCKS: Final = 20  # parts of the recordings whose scatter gives the standard deviation
@@ -395,6 +495,9 @@ _FASTEST: Final = 150.0  # rad/s² or m/s²
 _BESIDE: Final = 4  # steps to either side
 # Standard deviations by which other joints must move for a missing row to be visible.
 _SHOWS: Final = 5.0
+_MOVES: Final = 3.0  # multiples of the usual departure of a joint that moves
+_OFTEN: Final = 3  # departures by a whole step that an encoder does not repeat by chance
+_ON_PATH: Final = 0.25  # distance from the extrapolated path, as a share of the step
 _WHOLE: Final = 0.15  # tolerance of departures by whole steps of the motion, as a share of a step
 _NORMAL: Final = 1.4826  # standard deviation over median absolute value
 
@@ -409,12 +512,24 @@ class PositionJump:
     size: float  # [rad or m], without the motion
 
 
+class PositionSteps(NamedTuple):
+    """Lasting steps of the measured positions of a recording that the motion does not have."""
+
+    jumps: tuple[PositionJump, ...]  # of a position, by joint and time
+    logged: tuple[PositionJump, ...]  # of the log: samples repeated or late, rows missing
+
+
 def position_jumps(recording: Recording, name: str = "the recording") -> list[PositionJump]:
     """Return lasting steps of the measured positions of a named recording, by joint and time."""
+    return list(position_steps(recording, name).jumps)
+
+
+def position_steps(recording: Recording, name: str = "the recording") -> PositionSteps:
+    """Return lasting steps of the positions of a named recording, apart from those of its log."""
     time, position = recording.time, recording.position
     parts = [part for part in recording.segments() if part.stop - part.start > 2 * _BESIDE + 2]
     if not parts:
-        return []
+        return PositionSteps((), ())
     pieces = [_departures(time[part], position[part]) for part in parts]
     departure, speed, change = map(np.concatenate, zip(*pieces, strict=True))
     steps = np.concatenate([np.diff(time[part]) for part in parts])[:, None]
@@ -427,16 +542,52 @@ def position_jumps(recording: Recording, name: str = "the recording") -> list[Po
     # Missing or repeated rows cause departures by whole steps of the motion.
     one = speed * steps
     count = np.clip(np.rint(departure / np.where(one == 0.0, np.inf, one)), -1.0, GAP_STEPS)
-    whole = np.abs(departure - count * one) < np.maximum(least, _WHOLE * np.abs(one))
+    apart = np.abs(departure - count * one)
+    whole = apart < np.maximum(least, _WHOLE * np.abs(one))
     suspect = (size - 0.5 * change > least) & (shown | ~whole)
-    found = []
+    lasting = np.zeros_like(suspect)
     for joint, k in np.argwhere(suspect.T):
         around = departure[max(0, k - _BESIDE) : k + _BESIDE + 1, joint]
-        if np.abs(around.sum()) > 0.5 * size[k, joint]:  # otherwise the steps beside it reverse it
-            since = float(time[after[k]] - time[0])
-            jump = float(departure[k, joint])
-            found.append(PositionJump(name, recording.joint_names[joint], since, jump))
-    return found
+        # Otherwise the steps beside it reverse it.
+        lasting[k, joint] = np.abs(around.sum()) > 0.5 * size[k, joint]
+    by_whole_steps = (count != 0.0) & (apart < _WHOLE * np.abs(one))
+    often = np.count_nonzero(lasting & by_whole_steps) >= _OFTEN
+    moving = np.abs(one) > _MOVES * spread
+    together = np.count_nonzero(_nearby(lasting) & moving, axis=1)
+    every = (together >= 2) & (together > 0.5 * np.count_nonzero(moving, axis=1))
+    jumps: list[PositionJump] = []
+    logged: list[PositionJump] = []
+    for joint, k in np.argwhere(lasting.T):
+        row, jump = int(after[k]), float(departure[k, joint])
+        found = PositionJump(name, recording.joint_names[joint], float(time[row] - time[0]), jump)
+        by_log = every[k] or (by_whole_steps[k, joint] and often)
+        by_log |= _on_path(time, position[:, joint], row, jump)
+        (logged if by_log else jumps).append(found)
+    return PositionSteps(tuple(jumps), tuple(logged))
+
+
+def _nearby(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return where a row or one beside it is marked (m, n)."""
+    padded = np.pad(marked, ((1, 1), (0, 0)))
+    return np.asarray(padded[:-2] | padded[1:-1] | padded[2:])
+
+
+def _on_path(time: Array, position: Array, row: int, jump: float) -> bool:
+    """Return whether a step to a row of a position (m,) begins or ends a frozen value, on its path.
+
+    A sample that repeats the one before it exactly, while the joint moves, was not measured anew.
+    """
+    if position[row] == position[row - 1]:
+        return True
+    first = row - 1
+    while first > 0 and position[first - 1] == position[first]:
+        first -= 1
+    if first == row - 1 or first < _BESIDE or row + _BESIDE >= len(time):
+        return False
+    before = (position[first] - position[first - _BESIDE]) / (time[first] - time[first - _BESIDE])
+    behind = (position[row + _BESIDE] - position[row]) / (time[row + _BESIDE] - time[row])
+    expected = position[first] + 0.5 * (before + behind) * (time[row] - time[first])
+    return bool(abs(position[row] - expected) < _ON_PATH * abs(jump))
 
 
 def _departures(time: Array, position: Array) -> tuple[Array, Array, Array]:

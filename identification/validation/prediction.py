@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import reduce
 from operator import add
@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.signals.smoothing import low_pass
+from identification.signals.smoothing import low_pass, noiseless_above
 
 Array = NDArray[np.float64]
 
 FRICTION_CHANGE: Final = 0.10
+# Hz. The torque of a rigid arm lies below, torque ripple and current noise above.
+SLOW: Final = 10.0
 FIGURE_BANDWIDTH: Final = 30.0  # Hz, the paper's Fig. 4
 
 
@@ -106,6 +108,31 @@ def _usable_part(samples: Samples, torque: Array, bandwidth: float | None) -> Ar
         if samples.usable[segment].any():
             slow[segment] = low_pass(samples.motion.time[segment], torque[segment], bandwidth)
     return slow
+
+
+def noise_floor(
+    model: RobotModel,
+    values: Array,
+    recordings: Sequence[Samples],
+    repeated: Array | None = None,
+) -> Array | None:
+    """Return the standard deviation of torque noise per joint (n,) [N·m or N], NaN without rows.
+
+    It is that of the residual of parameters (p,) above `SLOW`, as of white noise, and that between
+    repetitions (n,) below, if given; None if the torque has no noise because it was filtered.
+    """
+    first = recordings[0]
+    if repeated is None and noiseless_above(first.motion.time, first.torque, first.segments):
+        return None
+    squares, rows = np.zeros((2, model.n_joints))
+    for samples in recordings:
+        fast = residual(model, values, samples) - residual(model, values, samples, SLOW)
+        nyquist = 0.5 / float(np.median(np.diff(samples.motion.time)))
+        share = max(1.0 - SLOW / nyquist, 0.5)  # share of white noise above the bandwidth
+        squares += np.where(samples.usable, fast**2, 0.0).sum(axis=0) / share
+        rows += np.count_nonzero(samples.usable, axis=0)
+    white = squares / np.where(rows > 0.0, rows, np.nan)
+    return np.sqrt(white if repeated is None else white + np.nan_to_num(repeated) ** 2)
 
 
 class SlowError(NamedTuple):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from identification.validation.causes import Kind
 from identification.validation.evidence import SIGMAS, Evidence
 from identification.validation.finding import Finding, Level, Role, Thresholds, joined
+from identification.validation.plausibility import ELEMENTS
 from identification.validation.prediction import FRICTION_CHANGE
 from identification.validation.residuals import Profile, ResidualChecks, Ripple
 
@@ -27,12 +28,15 @@ _NOT_COVERED: Final = (
 )
 _RICHER: Final = "design a motion for this arm (`hil design`) and record it"
 _WARMER: Final = "warm the arm up by moving it before recording"
+_NEGATE: Final = "set scale = -1 for the torques in the column map, or negate all torque constants"
 _FASTER: Final = "move {joints} faster and further, so that the torque exceeds the noise"
 _INERTIA_OFF: Final = 1.2  # ratio of inertias; data sheets are accurate to 10 %
 # Beyond this ratio the unit is wrong, or motor torques are in place of joint torques (gear ratios
 # are 30 to 200); descriptions in use are closer.
 _IMPOSSIBLE_SCALE: Final = 10.0
 _JUMPS_SHOWN: Final = 3
+_UNEXPLAINED: Final = "unexplained error"  # check
+_NEAR: Final = 0.5  # of -1: scale of a torque of the opposite sign
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,7 @@ def judge(
     findings: list[Finding] = []
     for row in _ROWS:
         findings += row.findings(facts, names) if isinstance(row, _Row) else row(facts, names)
+    findings = _without_explained(findings)
     wrong, doubtful = ([f for f in findings if f.level == one] for one in ("wrong", "doubtful"))
     measure = _measure(names, evidence)
     line = f"The model predicts {tested_on} well: {measure}."
@@ -80,6 +85,12 @@ def judge(
         next_steps=tuple(step for step in steps if step),
         findings=tuple(findings),
     )
+
+
+def _without_explained(findings: Sequence[Finding]) -> list[Finding]:
+    """Leave out that nothing explains the error, if a wrong cause does."""
+    explained = any(one.role == "cause" and one.level == "wrong" for one in findings)
+    return [one for one in findings if not (explained and one.check == _UNEXPLAINED)]
 
 
 def _measure(names: Sequence[str], evidence: Evidence) -> str:
@@ -104,7 +115,11 @@ def _facts(names: tuple[str, ...], evidence: Evidence, limit: Thresholds) -> Fac
     times = relative / np.maximum(training.relative, 1e-12)
     grown, large = times > limit.generalisation, relative > limit.axis
     overall, covered = error.overall > limit.overall, limit.generalisation * training.overall
+    minor = _minor(evidence, limit)
     none, little = explained <= limit.explained, explained < limit.little_explained
+    # Less torque on unseen motion alone raises the share.
+    growth = error.rms / np.maximum(training.rms, 1e-300)
+    far = relative > np.where(growth > limit.generalisation, 0.25, 0.5) * limit.axis
     any_explained = not np.all(np.isnan(explained))
     worst = int(np.nanargmin(explained)) if any_explained else 0
     facts: Facts = {
@@ -118,12 +133,14 @@ def _facts(names: tuple[str, ...], evidence: Evidence, limit: Thresholds) -> Fac
         "rich": not estimate.undetermined and not estimate.condition > limit.condition,
         "overall_covered": overall and not error.overall > covered,
         "overall_grown": overall and error.overall > covered,
-        "large_covered": large & ~grown, "large_grown": large & grown,
-        "none": none, "little": little & ~none,
+        "large_covered": large & ~grown & ~minor, "large_grown": large & grown & ~minor,
+        "large_minor": large & minor, "torque": error.torque_rms,
+        "unit": np.array([_unit(evidence, j) for j in range(len(names))], dtype=np.object_),
+        "none": none & ~minor, "little": little & ~(none & ~minor),
         "much": any_explained and not little.any(),
         "least": explained[worst], "least_explained": names[worst],
-        "grown_far": grown & (relative > 0.5 * limit.axis),
-        "grown_little": grown & ~(relative > 0.5 * limit.axis),
+        "grown_far": grown & far & ~minor, "grown_little": grown & ~(far & ~minor),
+        "one_way": evidence.one_way,
     }  # fmt: skip
     if (share := evidence.disagreement) is not None and not estimate.undetermined:
         # Undetermined parameters vary between repetitions.
@@ -135,7 +152,59 @@ def _facts(names: tuple[str, ...], evidence: Evidence, limit: Thresholds) -> Fac
         facts["multiple"] = error.overall / max(floor, 1e-300)
     facts |= _systematic_facts(names, evidence, limit) | _context_facts(evidence, limit)
     facts |= _cause_facts(evidence, limit)
+    facts |= _change_facts(names, evidence, facts)
     return facts if checks is None else facts | _residual_facts(checks, facts, evidence)
+
+
+def _unit(evidence: Evidence, joint: int) -> str:
+    return "N·m" if evidence.revolute(joint) else "N"
+
+
+def _minor(evidence: Evidence, limit: Thresholds) -> NDArray[np.bool_]:
+    """Return axes whose torque is too small to condemn a model alone (n,).
+
+    It is lost in its noise, or small against that of the other axes or against its own limit.
+    """
+    error = evidence.held_out
+    torque = error.torque_rms
+    slides = np.isin(np.arange(len(torque)), evidence.prismatic)
+    power = np.where(slides[:, None] == slides, torque**2, 0.0).sum(axis=1)
+    minor = torque < limit.minor * np.sqrt(power)
+    if evidence.noise_floor is not None:
+        minor |= np.nan_to_num(evidence.noise_floor) > 0.5 * limit.axis * torque
+    if (most := evidence.context.torque_limit) is not None:
+        minor |= torque < limit.minor_of_limit * np.nan_to_num(most)
+    return np.asarray(minor & (error.rows > 0))
+
+
+def _change_facts(names: tuple[str, ...], evidence: Evidence, known: Facts) -> Facts:
+    """Facts on joints whose torque or friction differs on unseen motion.
+
+    With repetitions friction is compared apart from noise, see :func:`_systematic_facts`.
+    """
+    limit, error = known["limit"], evidence.held_out
+    ratio, std = np.full((2, len(names)), np.nan)
+    gain, friction = np.zeros((2, len(names)), dtype=np.bool_)
+    for one in evidence.changes:
+        (gain if one.kind == "gain" else friction)[one.joint] = True
+        ratio[one.joint], std[one.joint] = one.ratio, 2.0 * one.std
+    # They would be read as changes of single joints, or have spoilt the parameters.
+    contaminated = known.get("carried", False) or known.get("gravity_off", False)
+    contaminated |= any(
+        one.fault.discrete or one.ratio < limit.cause for one in evidence.causes or ()
+    )
+    if contaminated:
+        return {}
+    matters = error.relative > limit.unexplained
+    facts: Facts = {"ratio": ratio, "ratio_half": std}
+    facts |= {"other_gain": gain & matters, "slightly_other_gain": gain & ~matters}
+    if evidence.friction_change is None:
+        change = ratio - 1.0
+        far = friction & matters & (np.abs(change) > FRICTION_CHANGE)
+        facts |= {"change": change, "much_warmer": friction & far.any()}
+        facts |= {"warmer": friction & (not far.any())}
+        facts["friction_axes"] = joined([names[j] for j in np.flatnonzero(friction)])
+    return facts
 
 
 def _systematic_facts(names: tuple[str, ...], evidence: Evidence, limit: Thresholds) -> Facts:
@@ -178,7 +247,8 @@ def _cause_facts(evidence: Evidence, limit: Thresholds) -> Facts:
         # Few samples cause most of the error, and it exceeds its limit with them only.
         found, error_of = checks.outliers, evidence.held_out
         few = (found.power > limit.outlying_power) & (found.share < limit.outliers)
-        few &= found.share > 0.0
+        # An error of rounding has a distribution of its own.
+        few &= (found.share > 0.0) & (np.nan_to_num(error_of.relative) > limit.pattern)
         axis = (error_of.relative > limit.axis) & (found.without.relative <= limit.axis)
         all_axes = error_of.overall > limit.overall >= found.without.overall
         decide = bool(few.any()) and (all_axes or bool(np.any(axis & few)))
@@ -199,16 +269,22 @@ def _context_facts(evidence: Evidence, limit: Thresholds) -> Facts:
         facts |= {"jumped": joined(where, _JUMPS_SHOWN)}
         facts["jumping"] = joined(list(dict.fromkeys(jump.joint for jump in jumps)))
     if (scale := context.nominal_scale) is not None:
-        if evidence.causes is not None:
+        negated = scale.negated
+        if evidence.causes is not None and not negated:
             # Torques of another joint or with the wrong sign have no nominal size.
             scale = scale.without(j for one in evidence.causes for j in one.fault.joints)
         common, known = scale.common, np.isfinite(scale.scale)
         off = known if common != 1.0 else scale.off
         impossible = abs(np.log(common)) > np.log(_IMPOSSIBLE_SCALE)
         facts |= {"scale": scale.scale, "tolerance": scale.tolerance}
-        facts |= {"negated": known & scale.negated}
-        facts["impossible_scale"] = off & impossible & (not scale.negated)
-        facts["other_scale"] = off & (not impossible) & (not scale.negated)
+        opposite = off & (scale.scale + scale.tolerance < 0.0) & (np.abs(scale.scale + 1.0) < _NEAR)
+        facts |= {"negated": known & negated, "opposite": opposite & (not negated)}
+        off = off & ~opposite & (not negated)
+        facts |= {"impossible_scale": off & impossible, "other_scale": off & (not impossible)}
+    if (dissipation := evidence.dissipation) is not None:
+        positive = scale is not None and bool(np.any(scale.scale - scale.tolerance > 0.0))
+        alone = not (positive or np.any(facts.get("negated", False)))
+        facts |= {"driving": dissipation.described, "all_driving": dissipation.all_driving & alone}
     if (inertia := context.controller_inertia) is not None:
         far = np.abs(np.log(inertia.ratio)) > np.log(_INERTIA_OFF)
         known = np.isfinite(inertia.ratio)
@@ -345,6 +421,11 @@ _CAUSES: Final[dict[Kind, _CauseRow]] = {
         "the torque of {joints} is {size} times the value consistent with the other axes",
         "check torque constant and gear ratio of {joints}; recordings with and without a known"
         " payload determine the constant (`hil gains --loaded`)", offset=1.0),
+    "load friction": _CauseRow(
+        "friction over load", "friction grows with the load, by {size} of the transmitted torque"
+        " (median axis)",
+        "predict only motions whose loads are like those of the fitted motion, or fit both: the"
+        " friction law lacks a term of the load"),
     "torque sign": _CauseRow(
         "direction of axes", "the torque of {joints} has probably the wrong sign",
         "check the sign of the torque of {joints} in the column map, or of its torque constant"),
@@ -368,11 +449,19 @@ _CAUSES: Final[dict[Kind, _CauseRow]] = {
 # fmt: on
 
 
+_SIGN_OR_SCALE: Final[tuple[Kind, ...]] = ("torque sign", "axis sign", "gain")
+
+
+def _negated(facts: Facts) -> bool:
+    """Return whether the torques of all joints have the wrong sign, one cause of many signs."""
+    return any(np.any(facts.get(name, False)) for name in ("negated", "all_driving"))
+
+
 def _causes(facts: Facts, names: Sequence[str]) -> Iterator[Finding]:
     """Faults whose correction makes parts of the fitted recordings more predictable."""
     causes = facts["evidence"].causes
     for cause in () if causes is None or facts["outliers_decide"] else causes:
-        if cause.ratio > facts["rival"]:
+        if cause.ratio > facts["rival"] or (cause.fault.kind in _SIGN_OR_SCALE and _negated(facts)):
             continue
         check, words, step, scale, offset = _CAUSES[cause.fault.kind]
         joints, size = [names[j] for j in cause.fault.joints] or ["all axes"], cause.size or 0.0
@@ -391,15 +480,27 @@ def _causes(facts: Facts, names: Sequence[str]) -> Iterator[Finding]:
         yield Finding(check, level, words, step.format(**own), "cause")
 
 
+_BALANCED: Final = (
+    f"describe {ELEMENTS} that carries part of the weight in [[robot.elements]] of the cell file;"
+    " else check the sign of the torque and the direction of each axis"
+)
+
+
 def _physical_signs(facts: Facts, _: Sequence[str]) -> Iterator[Finding]:
     """Parameters with physically impossible signs."""
-    impossible, doubtful = facts["evidence"].implausible
+    impossible, doubtful, added = facts["evidence"].implausible
+    if _negated(facts):
+        impossible, doubtful = (), ()
     step = "check the sign of the torque and the direction of each axis in the column map or cell"
     for words in impossible:
-        yield Finding("physical signs", "wrong", words, step, "symptom")
+        own = _BALANCED if ELEMENTS in words else step
+        yield Finding("physical signs", "wrong", words, own, "symptom")
     step = "use the consistent estimate where the model must be physical (simulation, URDF)"
     for words in doubtful:
         yield Finding("physical signs", "doubtful", words, step)
+    step = "compare with `hil identify --friction coulomb,viscous,offset`"
+    for words in added:
+        yield Finding("friction law", "doubtful", words, step)
 
 
 def _corrections(facts: Facts, _: Sequence[str]) -> Iterator[Finding]:
@@ -430,6 +531,10 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
          "the motion excites the parameters poorly: condition number {condition:.0f} of the"
          " regressor with unit columns, limit {limit.condition:.0f}; predictions are"
          " reliable for similar motions only, single parameters are not", _RICHER),
+    _Row("excitation", {"doubtful": "one_way"},
+         "{joints} moved in one direction only on the fitted motion: Coulomb friction and offset of"
+         " the torque are one column of the regressor there, and only their sum is determined",
+         "record a motion in which {joints} moves in both directions"),
     _Row("excitation", {"good": "rich"},
          "the motion determines every parameter: condition number {condition:.0f} of the regressor"
          " with unit columns"),
@@ -443,11 +548,18 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
          " ({declared}) m/s², {on} is predicted with {gravity_error:.2f} times the error",
          "set gravity of [robot] in the cell file to the mounting of the arm; if it is right,"
          " check the zero positions of the joints", "cause"),
-    _causes,
     _Row("direction of axes", {"wrong": "negated"},
          "all torques have the opposite sign of the nominal inertial torques: ratio <{scale:.2g}>",
-         "set scale = -1 for the torques in the column map, or negate all torque constants",
+         _NEGATE, "cause"),
+    _Row("direction of axes", {"wrong": "all_driving"},
+         "all torques have the opposite sign: friction would drive every axis, <{driving}> at top"
+         " speed",
+         _NEGATE, "cause"),
+    _Row("direction of axes", {"wrong": "opposite"},
+         "the torque has the opposite sign of the nominal inertial torque: ratio <{scale:.2g}>",
+         "check the sign of the torque of {joints} in the column map, or of its torque constant",
          "cause"),
+    _causes,
     _Row("scale of the torque", {"wrong": "impossible_scale", "doubtful": "other_scale"},
          "ratio of measured torque to the torque of the nominal inertias:"
          " <{scale:.3g} ± {tolerance:.2g}>",
@@ -458,6 +570,11 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
          " explains {load.explained:.0%} of the additional error",
          "record both with the same tool and payload, or state the payload of each in its cell"
          " file", "cause"),
+    _Row("sameness", {"wrong": "other_gain", "doubtful": "slightly_other_gain"},
+         "the torque on {on} differs from that of the fitted motion by a factor: <{ratio:.3g} ±"
+         " {ratio_half:.2g}>",
+         "check what changed for {joints} between the recordings: torque constant, unit or scale of"
+         " the torque, drive settings; identify the recordings of each state separately", "cause"),
     _Row("friction", {"wrong": "much_warmer"},
          "friction on {on} differs from the estimate: <{change:+.0%}>, beyond the"
          f" {FRICTION_CHANGE:.0%} that gear temperature causes; this explains the error of"
@@ -479,10 +596,13 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
          "the torque error on {on} exceeds {limit.axis:.0%}: <{relative:.0%}>",
          "check sign, gear ratio and torque constant of {joints}, and whether the torque exceeds"
          " its noise", "symptom"),
+    _Row("error on unseen motion", {"doubtful": "large_minor"},
+         "the torque error on {on} exceeds {limit.axis:.0%} for axes of little torque:"
+         " <{relative:.0%} of {torque:.2g} {unit}>", _FASTER, "symptom"),
     _Row("error on unseen motion", {"wrong": "large_grown"},
          "the torque error on {on} exceeds {limit.axis:.0%}: <{relative:.0%}>", _NOT_COVERED,
          "symptom"),
-    _Row("unexplained error", {"wrong": "unexplained"},
+    _Row(_UNEXPLAINED, {"wrong": "unexplained"},
          "the torque error on {on} is {error.overall:.1%}, {multiple:.1f} times the noise floor of"
          " {floor:.1%}; none of the tested faults explains it (delay, torque constants, signs and"
          " order of joints, payload, changes between recordings)",

@@ -21,6 +21,7 @@ from identification.signals.masks import EDGE, SATURATED, STANDSTILL, RowMask
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples
 from identification.validation.calibration import TorqueMeans, calibrate, inner_errors
+from identification.validation.changes import find_changes
 from identification.validation.evidence import repetition_noise
 from identification.validation.plausibility import (
     Implausible,
@@ -30,6 +31,7 @@ from identification.validation.plausibility import (
     inertia_ratio,
     nominal_scale,
     position_jumps,
+    position_steps,
 )
 from identification.validation.prediction import (
     PredictionError,
@@ -55,6 +57,8 @@ from tests.identification.two_link import (
     a_motion,
     as_samples,
     coloured,
+    four_sines,
+    gaussian,
     one_sine,
     recording,
     simulated,
@@ -465,6 +469,25 @@ class TestSigns:
         assert found.impossible == ()
         assert any("I2m is negative" in words for words in found.doubtful)
 
+    def test_a_term_that_nobody_stated_is_no_reason(self):
+        """It follows friction within the fitted speeds; a stated one is."""
+        model = RobotModel.from_urdf(URDF, friction=FrictionLaw(third="quadratic"))
+        falling = known(parameters(model, f2_1=-3.0), model)
+        motion = one_sine(np.arange(2000) * 2e-3)
+        factor = Factor.from_samples(model, motion, np.zeros((2000, 2)))
+        speed = np.abs(motion.velocity).max(axis=0)
+
+        def found(*added):
+            return implausibilities(
+                model, falling, factor, np.full(2, 0.1), speed=speed, added=added
+            )
+
+        (words,) = found().impossible
+        assert "less than half of its Coulomb friction" in words
+        assert found("f2").impossible == found("f2").doubtful == ()
+        (words,) = found("f2").added
+        assert "chosen by inner prediction" in words
+
     def test_negative_friction_of_a_coupled_motor_is_named(self):
         coupling = Coupling(np.array([[1.0, 0.0], [0.5, 1.0]]), inertia=False)
         coupled = RobotModel.from_urdf(URDF, friction=MODEL.friction.laws[0], coupling=coupling)
@@ -527,6 +550,19 @@ class TestConsistencyCheck:
         assert found.impossible and "shoulder" in found.sentence
         assert found.sentence.startswith("no physically consistent parameters fit")
 
+    def test_a_spring_is_named_for_one_axis_that_gravity_loads(self):
+        """Of 20 N·m/rad at the elbow."""
+        sprung = [
+            replace(run, torque=run.torque + [0.0, 20.0] * run.motion.position) for run in runs()
+        ]
+        found = consistency_of(sprung)
+        assert found.impossible and found.overloaded == "elbow"
+        assert "[[robot.elements]]" in found.remedy and "elbow" in found.remedy
+        verdict = judged(implausible=Implausible((f"no body fits: {found.remedy}",), ()))
+        assert "[[robot.elements]]" in verdict.next_steps[0]
+        clean = consistency_of(runs())
+        assert clean.remedy == "check signs, torque constants, coupling and URDF"
+
     def test_a_negative_second_moment_is_an_active_bound(self):
         """That of the elbow's link about its own centre."""
         found = consistency_of(runs(I2yy=0.05, I2m=0.0))
@@ -585,6 +621,117 @@ class TestPositionJumps:
     )
     def test_other_steps_are_no_jumps(self, one):
         assert position_jumps(one) == []
+
+
+def frozen(one, rows):
+    """The knee's samples repeat the last one before the rows, which are measured again after."""
+    position = one.position.copy()
+    position[rows, 1] = position[rows.start - 1, 1]
+    return replace(one, position=position)
+
+
+def slipping(one, rows):
+    """The knee's samples are one older from each of the rows on: one repeats."""
+    number = np.arange(len(one.time))
+    late = number - np.searchsorted(rows, number, side="right")
+    return replace(one, position=np.column_stack([one.position[:, 0], one.position[late, 1]]))
+
+
+def without_rows(one, rows, rate):
+    """Rows are missing, and the stamps do not show it."""
+    kept = one.rows(np.delete(np.arange(len(one.time)), rows))
+    return replace(kept, time=np.arange(len(kept.time)) / rate)
+
+
+class TestStepsOfTheLog:
+    """Steps that a logger makes are not those of an encoder."""
+
+    @pytest.mark.parametrize(
+        "one",
+        [
+            frozen(uneven(1000.0), slice(5000, 5030)),
+            slipping(uneven(1000.0), np.array([4000, 5200, 6100, 7003])),
+            without_rows(uneven(1000.0), slice(5000, 5150), 1000.0),
+        ],
+        ids=["frozen samples", "repeated samples", "rows missing of all joints"],
+    )
+    def test_they_are_separate(self, one):
+        found = position_steps(one, "log.mcap")
+        assert found.logged and found.jumps == ()
+
+    def test_an_encoder_that_slips_while_its_value_freezes_has_jumped(self):
+        one = frozen(uneven(1000.0), slice(5000, 5030))
+        found = position_steps(with_jump(one, 0.2, slice(5030, None)))
+        assert [jump.joint for jump in found.jumps] == ["knee"]
+
+
+def arm_with(measured, seed=0, duration=20.0):
+    """Samples of the planted arm with another torque (motion, torque) -> (m, 2), and noise."""
+    motion = four_sines(np.arange(0.0, duration, 0.005), seed=seed)
+    torque = MODEL.torque(truth(), *motion[1:])
+    torque = measured(motion, torque) + gaussian(np.random.default_rng(seed), motion)
+    return as_samples(MODEL, motion, torque)
+
+
+def as_it_is(_, torque):
+    return torque
+
+
+def with_friction(factor):
+    friction = np.where(MODEL.friction_columns, truth(), 0.0)
+
+    def measured(motion, torque):
+        return torque + (factor - 1.0) * MODEL.torque(friction, *motion[1:])
+
+    return measured
+
+
+def changes_between(fitted, unseen):
+    training, held_out = [arm_with(fitted, 1)], [arm_with(unseen, 2)]
+    values = estimate_repetitions(MODEL, training).pooled.values
+    return find_changes(MODEL, values, training, held_out)
+
+
+class TestChangesToUnseenMotion:
+    """What differs for a joint between fitted and unseen motion, with its factor."""
+
+    def test_equal_motions_have_none(self):
+        assert changes_between(as_it_is, as_it_is) == ()
+
+    @pytest.mark.parametrize(
+        ("fitted", "unseen", "ratio"),
+        [([1.0, 1.3], [1.0, 1.0], 1 / 1.3), ([1.0, 1.0], [1.0, 1.3], 1.3)],
+    )
+    def test_the_torque_of_one_joint(self, fitted, unseen, ratio):
+        (found,) = changes_between(
+            lambda _, torque: fitted * torque, lambda _, torque: unseen * torque
+        )
+        assert (found.kind, found.joint) == ("gain", 1)
+        assert found.ratio == pytest.approx(ratio, abs=0.02)
+
+    @pytest.mark.parametrize("factor", [0.5, 2.0])
+    def test_friction(self, factor):
+        found = changes_between(as_it_is, with_friction(np.array([1.0, factor])))
+        assert [(one.kind, one.joint) for one in found] == [("friction", 1)]
+        assert found[0].ratio == pytest.approx(factor, abs=0.05)
+
+    def test_another_error_is_no_change(self):
+        def waved(motion, torque):
+            return torque + 3.0 * np.sin(40.0 * motion.time)[:, None]
+
+        assert changes_between(as_it_is, waved) == ()
+
+    def test_a_prediction_that_has_failed_is_no_change(self):
+        """Without it the error is less, but not that of the fitted motion."""
+
+        def other(motion, torque):
+            wave = np.sin(40.0 * motion.time)[:, None]
+            return 0.05 * torque + 0.3 * torque.std(axis=0) * wave
+
+        assert changes_between(as_it_is, other) == ()
+
+    def test_a_torque_of_the_other_sign_is_no_change(self):
+        assert changes_between(as_it_is, lambda _, torque: torque * [1.0, -1.0]) == ()
 
 
 LOADED_AXES = range(1, 4)  # of the UR5, whose rigid torque exceeds their friction

@@ -1,5 +1,6 @@
 """Verdicts on recordings of the NS 16 with one injected fault, and without."""
 
+import warnings
 from dataclasses import replace
 from typing import get_args
 
@@ -14,14 +15,16 @@ from identification.model.motion import Motion
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.validation.causes import Cause, Fault, Kind, find_causes
-from identification.validation.evidence import CellContext, Evidence, gather
+from identification.validation.changes import Change
+from identification.validation.evidence import CarriedLoad, CellContext, Evidence, gather
 from identification.validation.finding import Thresholds
-from identification.validation.plausibility import Implausible
+from identification.validation.plausibility import Dissipation, Implausible, NominalScale
 from identification.validation.prediction import PredictionError
 from identification.validation.residuals import (
     HARMONICS,
     BlockMean,
     FrictionDrift,
+    Outliers,
     Ripple,
     check_residuals,
 )
@@ -327,6 +330,73 @@ class TestJudgement:
         expected = {finding.next_step for finding in verdict.findings if finding.level == level}
         assert expected == set(verdict.next_steps) and "" not in expected
 
+    def test_an_axis_of_little_torque_does_not_decide_alone(self):
+        """A hundredth of the other's torque, or lost in noise, or small against its limit."""
+
+        def axes(torque, **context):
+            """Two axes with errors of 5 and 60 %; the torque of the second as a share of 10 N·m."""
+            error, power = an_error(np.array([0.05, 0.6])), np.array([1.0, torque**2])
+            error = replace(
+                error, squared=error.squared * power, torque_squared=error.torque_squared * power
+            )
+            return judged(held_out=error, training=error, **context)
+
+        assert not axes(0.03).good
+        assert axes(0.01).good
+        assert any("two 60% of 0.1 N·m" in one for one in axes(0.01).warnings)
+        assert axes(0.03, noise_floor=np.array([0.1, 0.2])).good
+        assert axes(0.03, torque_limit=np.array([30.0, 100.0])).good
+
+    def test_a_joint_several_times_worse_than_its_fit_is_not_good(self):
+        changes = {"training": an_error(np.array([0.05, 0.015])), "held_out": an_error(0.1)}
+        assert any("two 6.7 times, 10.0%" in reason for reason in judged(**changes).reasons)
+
+    @pytest.mark.parametrize(
+        ("change", "error", "level", "words"),
+        [
+            (Change("gain", 1, 0.91, 0.001, 0.01), 0.1, "wrong", "two 0.91 ± 0.002"),
+            (Change("gain", 1, 0.95, 0.001, 0.01), 0.05, "doubtful", "two 0.95 ± 0.002"),
+            (Change("friction", 0, 1.3, 0.01, 0.01), 0.1, "wrong", "one +30%"),
+            (Change("friction", 0, 0.92, 0.01, 0.01), 0.1, "doubtful", "one -8%"),
+        ],
+    )
+    def test_what_changed_is_named(self, change, error, level, words):
+        changes = {"changes": (change,), "held_out": an_error(error), "training": an_error(error)}
+        (found,) = (one for one in judged(**changes).findings if one.role == "cause")
+        assert found.level == level and words in found.words
+
+    def test_a_body_that_explains_the_error_is_not_unexplained(self):
+        changes = {"held_out": an_error(0.1), "noise_floor": np.full(2, 0.1), "causes": ()}
+        load = CarriedLoad(mass=2.0, explained=0.98, axes=2, half_interval=0.1)
+        words = " ".join(judged(**changes, load=load).reasons)
+        assert "explains 98%" in words and "none of the tested faults" not in words
+
+    def test_a_motion_in_one_direction_is_said(self):
+        verdict = judged(one_way=np.array([False, True]))
+        (found,) = (one for one in verdict.findings if "one direction" in one.words)
+        assert found.level == "doubtful" and found.words.startswith("two moved in one direction")
+        assert found.next_step == "record a motion in which two moves in both directions"
+
+    def test_all_negated_torques_are_one_cause(self):
+        """By the nominal model, or by friction that would drive every axis."""
+        signs = Implausible(("m1 is negative", "I2m is negative"), ())
+        nominal = NominalScale(np.full(2, -1.0), np.full(2, 0.1))
+        driving = Dissipation(np.full(2, -3.0), np.full(2, 0.1))
+        for known in ({"nominal_scale": nominal}, {"dissipation": driving}):
+            verdict = judged(implausible=signs, causes=caused("axis sign", 0), **known)
+            (reason,) = verdict.reasons
+            assert "all torques have the opposite sign" in reason
+            assert verdict.next_steps[0].startswith("set scale = -1")
+
+    def test_one_negated_torque_is_named_by_the_nominal_model(self):
+        scale = NominalScale(np.array([1.0, -1.0]), np.full(2, 0.1))
+        (reason,) = judged(nominal_scale=scale).reasons
+        assert "opposite sign" in reason and "two -1" in reason and "one" not in reason
+
+    def test_friction_that_drives_one_axis_is_not_all_torques(self):
+        dissipation = Dissipation(np.array([3.0, -3.0]), np.full(2, 0.1))
+        assert judged(dissipation=dissipation).good
+
     def test_good_findings(self):
         found = finding_of("against the controller's model", controller=an_error(0.09))
         assert found.level == "good" and "is 9.0%, of the identified model 5.0%" in found.words
@@ -382,6 +452,12 @@ class TestPatternsOfTheResidual:
         checks = {one.check for one in judged(residuals=clean).findings}
         assert "whiteness" in checks
         assert not {"torque ripple", "friction over time"} & checks
+
+    @pytest.mark.parametrize(("error", "named"), [(0.0004, False), (0.05, True)])
+    def test_an_error_of_zero_has_no_outliers(self, clean, error, named):
+        few = Outliers(np.full(2, 0.001), np.full(2, 0.95), an_error(0.2 * error))
+        verdict = judged(held_out=an_error(error), residuals=replace(clean, outliers=few))
+        assert ("outliers" in {one.check for one in verdict.findings}) == named
 
     @pytest.mark.parametrize(
         ("share", "level"), [(0.0, "good"), (0.9, "information"), (1.1, "doubtful")]
@@ -503,6 +579,47 @@ class TestCausesOfWholeRecordings:
         assert (cause.fault.kind, cause.fault.joints) == (kind, joints)
         if size := SIZES.get(kind):
             assert cause.size == pytest.approx(size, abs=4.0 * cause.std + 0.02 * size)
+
+
+class TestErrorsWithoutCause:
+    def test_a_joint_that_stands_is_not_interchanged(self):
+        """Not with joint 5, whose torque is small noise, either."""
+        motion = a_motion(1, duration=10.0, step=8e-3)
+        motion.position[:, 4], motion.velocity[:, 4], motion.acceleration[:, 4] = 0.3, 0.0, 0.0
+        torque = MODEL.torque(ns16_values(MODEL), *motion[1:])
+        torque += (
+            NOISE * torque.std(axis=0) * np.random.default_rng(3).standard_normal(torque.shape)
+        )
+        torque[:, 1] = np.random.default_rng(4).permutation(torque[:, 1])
+        samples = as_samples(MODEL, motion, torque, usable=np.ones(torque.shape, dtype=np.bool_))
+        assert not any(4 in one.fault.joints for one in causes([samples]))
+
+    @pytest.mark.parametrize("seed", [1, 2])
+    def test_friction_that_grows_with_the_load_is_named(self, seed):
+        """By a tenth of the rigid torque; no torque constant and no turned axis."""
+        one = recorded(seed)
+        rigid = np.where(MODEL.friction_columns, 0.0, ns16_values(MODEL))
+        direction = np.sign(one.motion.velocity)
+        load = np.abs(MODEL.torque(rigid, *one.motion[1:4], direction))
+        (cause,) = causes([replace(one, torque=one.torque + 0.2 * load * direction)])
+        assert cause.fault.kind == "load friction"
+        assert cause.size == pytest.approx(0.2, abs=0.03)
+
+    def test_an_error_that_no_fault_explains_has_none(self):
+        """A spring on one axis that the model lacks."""
+        one = recorded(1)
+        torque = one.torque.copy()
+        torque[:, 2] += 400.0 * np.sin(3.0 * one.motion.position[:, 2])
+        assert causes([replace(one, torque=torque)]) == ()
+
+    def test_extreme_torques_raise_no_warning(self):
+        """In a block without rows, and with torques near the limits of numbers."""
+        one = recorded(1)
+        torque = one.torque * np.where(np.arange(6) == 5, 1e-150, 1.0)
+        usable = one.usable & (np.arange(len(torque)) > 300)[:, None]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            causes([replace(one, torque=torque, usable=usable)])
 
 
 class TestCausesOfParts:

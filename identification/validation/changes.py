@@ -1,0 +1,131 @@
+r"""Difference of unseen from fitted motion, joint by joint: gain of the torque, or friction.
+
+On each part the measured torque of a joint is compared with its prediction,
+
+.. math:: \tau = (1 + g)\,\hat\tau + e \qquad \text{or} \qquad \tau = \hat\tau + h\,\hat\tau_f + e
+
+with the predicted torque and its friction part. A joint has changed if one of the two factors
+brings its error on unseen motion down to that of the fitted motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.validation.residuals import BlockMean, block_index, block_mean
+
+Array = NDArray[np.float64]
+ChangeKind = Literal["gain", "friction"]
+
+_KINDS: Final[tuple[ChangeKind, ...]] = ("gain", "friction")
+_SIGMAS: Final = 3.0  # standard deviations of a significant change
+# Smallest change that is named; a torque constant drifts by some per cent with the temperature of
+# its magnets.
+_LEAST: Final = 0.03
+# Error on unseen over fitted motion of a joint that may have changed; with the change, it is less.
+_GROWN: Final = 2.0
+# Share of the additional squared error that the change has to explain. Planted changes: at least
+# 0.95; another motion that the fitted one does not cover: below 0.6.
+_EXPLAINED: Final = 0.8
+# Ratio of remaining errors up to which the two kinds are alike, as for a joint that has little more
+# than friction: friction varies, a gain is set once.
+_ALIKE: Final = 1.1
+
+
+class Change(NamedTuple):
+    """Factor by which a joint's torque or friction on unseen motion differs from the fitted one."""
+
+    kind: ChangeKind
+    joint: int
+    ratio: float  # unseen over fitted
+    std: float  # standard deviation over blocks of time
+    relative: float  # remaining relative error of the joint on unseen motion
+
+
+class _Part(NamedTuple):
+    """Sums over one part of the motions, joint by joint (n,)."""
+
+    torque: Array  # of squared measured torque
+    error: Array  # of squared error
+    shares: tuple[BlockMean, BlockMean]  # g and h
+    explained: Array  # squared error that each of them explains (2, n)
+
+    @property
+    def relative(self) -> Array:
+        """Error over torque (n,), zero without torque."""
+        return _relative(self.error, self.torque)
+
+    @classmethod
+    def of(cls, model: RobotModel, values: Array, recordings: Sequence[Samples]) -> _Part:
+        """Compare measured with predicted torque in the usable rows of recordings."""
+        friction_values = np.where(model.friction_columns, values, 0.0)
+        torque, error = np.zeros((2, model.n_joints))
+        sums: tuple[list[Array], list[Array]] = ([], [])
+        for samples in recordings:
+            usable, block = samples.usable, block_index(samples)
+            predicted = samples.predicted_torque(model, values)
+            left = np.where(usable, samples.torque - predicted, 0.0)
+            torque += (np.where(usable, samples.torque, 0.0) ** 2).sum(axis=0)
+            error += (left**2).sum(axis=0)
+            columns = predicted, samples.predicted_torque(model, friction_values)
+            for table, column in zip(sums, columns, strict=True):
+                column = np.where(usable, column, 0.0)
+                table.append(_by_block(block, np.stack([column * left, column**2])))
+        products = np.array([sum(part.sum(axis=1) for part in table) for table in sums])
+        power = np.where(products[:, 1] > 0.0, products[:, 1], np.inf)
+        gain, friction = (block_mean(table) for table in sums)
+        return cls(torque, error, (gain, friction), products[:, 0] ** 2 / power)
+
+
+def find_changes(
+    model: RobotModel, values: Array, training: Sequence[Samples], held_out: Sequence[Samples]
+) -> tuple[Change, ...]:
+    """Compare unseen with fitted motion under parameters (p,); return the joints that changed."""
+    fitted, unseen = (_Part.of(model, values, runs) for runs in (training, held_out))
+    usual = np.maximum(fitted.relative, 1e-9)
+    found = []
+    for joint in np.flatnonzero(unseen.relative > _GROWN * usual).tolist():
+        beyond = unseen.relative[joint] ** 2 - usual[joint] ** 2
+        trials = []
+        for k, kind in enumerate(_KINDS):
+            own, reference = unseen.shares[k], fitted.shares[k]
+            base = 1.0 + float(np.nan_to_num(reference.mean[joint]))
+            share, std = float(own.mean[joint]), float(own.std[joint])
+            if not np.isfinite(share) or base <= 0.0:
+                continue
+            ratio, deviation = (1.0 + share) / base, std / base
+            error = unseen.error[joint] - unseen.explained[k, joint]
+            left = float(_relative(error, unseen.torque[joint]))
+            explains = unseen.relative[joint] ** 2 - left**2 > _EXPLAINED * beyond
+            # A factor near zero removes a prediction that is wrong, and explains nothing.
+            explains &= left < _GROWN * usual[joint]
+            size = abs(ratio - 1.0)
+            # A factor below zero is no change of one quantity.
+            if ratio > 0.0 and explains and size > max(_LEAST, _SIGMAS * deviation):
+                trials.append(Change(kind, joint, ratio, deviation, left))
+        if trials:
+            least = min(trial.relative for trial in trials)
+            alike = [trial for trial in trials if trial.relative <= _ALIKE * least]
+            found.append(alike[-1])
+    return tuple(found)
+
+
+def _by_block(block: NDArray[np.intp], values: Array) -> Array:
+    """Sum values (2, m, n) by block (2, B, n)."""
+    sums = np.zeros((len(values), int(block[-1]) + 1, values.shape[2]))
+    for table, rows in zip(sums, values, strict=True):
+        np.add.at(table, block, rows)
+    return sums
+
+
+def _relative(squares: Array, torque: Array) -> Array:
+    """Return the root of squares over squared torque, zero without torque."""
+    known = torque > 0.0
+    share = np.where(known, np.maximum(squares, 0.0) / np.where(known, torque, 1.0), 0.0)
+    return np.asarray(np.sqrt(share))

@@ -1,0 +1,55 @@
+"""Clock, wrapped angles and resolution of recordings, as the facts of a verdict."""
+
+import numpy as np
+import pytest
+
+from hil.identify.cell_context import grid_step
+from identification.signals.recording import UNWRAPPED, Recording, unwrap, unwrapped
+
+TIME = np.arange(0.0, 20.0, 0.01)
+TURNING = 2.5 * np.sin(0.4 * TIME) + 2.0 * np.sin(0.13 * TIME)  # rad, beyond half a turn
+SWINGING = 0.8 * np.sin(0.7 * TIME)
+ANGLES = np.column_stack([SWINGING, TURNING])
+
+
+class TestWrappedAngles:
+    @pytest.mark.parametrize("lowest", [-np.pi, 0.0])
+    def test_they_are_unwrapped(self, lowest):
+        wrapped = np.mod(ANGLES[:, 1] - lowest, 2.0 * np.pi) + lowest
+        assert np.abs(np.diff(wrapped)).max() > 6.0
+        found = unwrap(np.column_stack([SWINGING, wrapped]))
+        turns = (found[:, 1] - TURNING) / (2.0 * np.pi)
+        np.testing.assert_allclose(turns, np.rint(turns[0]), atol=1e-12)
+        np.testing.assert_array_equal(found[:, 0], SWINGING)
+
+    def test_the_joints_are_noted(self):
+        wrapped = np.mod(ANGLES + np.pi, 2.0 * np.pi) - np.pi
+        found = unwrapped(Recording(TIME, wrapped, ("swing", "turn")))
+        assert found.provenance[UNWRAPPED] == "turn"
+
+    def test_others_keep_every_bit(self):
+        one = Recording(TIME, ANGLES, ("swing", "turn"))
+        assert unwrapped(one) is one
+
+    @pytest.mark.parametrize("size", [-3.4, 4.5, 0.2])
+    def test_a_jump_of_another_size_stays(self, size):
+        """Such as a glitch to zero."""
+        jumped = ANGLES.copy()
+        jumped[800:805, 1] += size
+        assert unwrap(jumped) is jumped
+
+    def test_a_gap_alone_is_no_turn(self):
+        """The arm may have turned meanwhile."""
+        moved = ANGLES.copy()
+        moved[1000:, 1] += 2.0 * np.pi
+        assert unwrap(moved, np.arange(len(TIME)) == 1000) is moved
+
+
+class TestResolution:
+    def test_it_is_the_step_of_the_grid(self):
+        assert grid_step(np.rint(SWINGING / 3e-4) * 3e-4) == pytest.approx(3e-4)
+
+    def test_positions_in_double_precision_have_none(self):
+        assert grid_step(SWINGING) is None
+        noise = 1e-4 * np.random.default_rng(1).standard_normal(len(TIME))
+        assert grid_step(SWINGING + noise) is None
