@@ -116,7 +116,7 @@ def export_model(found: Identification, output: Path, to: FormatName) -> Exporte
     """
     arm = arm_of(found.cell, consistent_of(found), found.prepared.fitted)
     form, motion = FORMATS[to], _motion(found)
-    pooled = found.estimate.pooled
+    pooled = found.estimation.stated
     unknown = ", ".join(pooled.undetermined)
     remarks = (
         "Identified by hil; bodies are physically consistent parameters.",

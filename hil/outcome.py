@@ -38,7 +38,7 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
     consistency, essential = found.consistency, found.essential
     exports = exports_of(
         found.cell,
-        found.estimate.pooled,
+        found.estimation.stated,
         consistency if isinstance(consistency, str) else consistency.consistent,
         essential=None if isinstance(essential, str) else essential.estimate.names,
         provenance=provenance_of(found.results, found.paths),
