@@ -54,6 +54,16 @@ Kind = Annotated[
         "noise of the positions."
     ),
 ]
+ForceOption = Annotated[
+    bool, typer.Option("--force", help="Replace an archive that exists already.")
+]
+OutsideOption = Annotated[
+    bool,
+    typer.Option(
+        "--outside-limits",
+        help="Write the archive even if no row is within the limits of the URDF.",
+    ),
+]
 
 
 @dataclass(frozen=True)
@@ -132,6 +142,8 @@ def rosbag2(
     rename: Annotated[list[str] | None, typer.Option(metavar="RECORDED=URDF")] = None,
     held: Held = None,
     kind: Kind = "excitation",
+    force: ForceOption = False,
+    outside_limits: OutsideOption = False,
     json: JsonOption = False,
 ) -> None:
     """Import sensor_msgs/JointState messages from a rosbag2 or MCAP file.
@@ -157,6 +169,8 @@ def rosbag2(
         joint_names=names,
         held_joints=held or (),
         use=kind,
+        force=force,
+        outside_limits=outside_limits,
     )
     _print(path, json=json)
 
@@ -170,6 +184,8 @@ def log(
     arm: Described,
     held: Held = None,
     kind: Kind = "excitation",
+    force: ForceOption = False,
+    outside_limits: OutsideOption = False,
     uncoupled: bool = False,
     json: JsonOption = False,
 ) -> None:
@@ -203,6 +219,8 @@ def log(
         columns=ColumnMap.load(columns),
         held_joints=held or (),
         use=kind,
+        force=force,
+        outside_limits=outside_limits,
         coupled=not uncoupled,
     )
     _print(path, json=json)
