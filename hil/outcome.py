@@ -129,11 +129,7 @@ def exports_of(
     reason why there is none). IdentificationError: the estimate is of another model.
     """
     model = cell.model
-    # Single printable lines: names of archives may contain anything.
-    origin = {
-        key: " ".join("".join(c if c.isprintable() else " " for c in value).split())
-        for key, value in (provenance or {}).items()
-    }
+    origin = {key: single_line(value) for key, value in (provenance or {}).items()}
     possible = None if isinstance(consistent, str) else consistent
     contents: dict[str, str | None] = {
         PARAMETERS_JSON: parameters_json(
@@ -150,6 +146,16 @@ def exports_of(
         except IdentificationError as error:
             withheld[URDF] = str(error)
     return Exports({**contents, **dict.fromkeys(withheld)}, withheld)
+
+
+def single_line(text: str) -> str:
+    """Return a text as one printable line: names of archives may contain anything."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
+
+
+def archive_digests(provenance: Mapping[str, str]) -> set[str]:
+    """Return the archives of a provenance, each with its digest, in any order."""
+    return set(single_line(provenance.get("archives", "")).split(", "))
 
 
 def provenance_of(results: Results, archives: Sequence[Path]) -> dict[str, str]:

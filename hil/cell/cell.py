@@ -31,6 +31,7 @@ from .schema import (
     CellFile,
     ControllerTable,
     DriveTrainTable,
+    FrictionTable,
     JointFrictionTable,
     NominalTable,
     SimulationTable,
@@ -105,6 +106,25 @@ class Cell:
         }
         changed = self._with_robot(friction=table.model_copy(update={**changes, "joints": joints}))
         _ = changed.model
+        return changed
+
+    def with_friction_laws(self, laws: Sequence[Mapping[str, Any]]) -> Cell:
+        """Return the cell with a table `[robot.friction]` for each joint, in their order.
+
+        Further tables, of coupled motors, are those of the joints.
+
+        Raises:
+            ValueError: a table is invalid.
+        """
+        tables = dict(zip(self.joint_names, laws, strict=False))
+        common = FrictionTable.model_validate(dict(laws[0]))
+        joints = {
+            name: JointFrictionTable.model_validate({k: v for k, v in law.items() if k != "ripple"})
+            for name, law in tables.items()
+        }
+        changed = self._with_robot(friction=common.model_copy(update={"joints": joints}))
+        if [law.table() for law in changed.model.friction.laws] != [dict(law) for law in laws]:
+            raise ValueError("the friction laws are not those of this arm's joints")
         return changed
 
     def without_payload(self) -> Cell:

@@ -26,6 +26,7 @@ def __getattr__(name: str) -> Any:
 
     return getattr(run, name)
 
+
 def __dir__() -> list[str]:
     """Return all names, also those that are not loaded yet."""
     return [*globals(), *__all__]

@@ -19,6 +19,7 @@ def __getattr__(name: str) -> Any:
         return getattr(import_module(f"{__name__}.faulty"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
+
 def __dir__() -> list[str]:
     """Return all names, also those that are not loaded yet."""
     return [*globals(), *__all__]

@@ -216,3 +216,12 @@ def test_ctrl_c_stops_on_the_path_with_complete_archives(tmp_path: Path) -> None
     archive = open_archive(last)
     assert archive.complete
     assert archive.outcome.entries["outcome"] == "stopped"
+
+
+@pytest.mark.parametrize(
+    "package", ["hil", "hil.campaign", "hil.identify", "hil.testing", "identification"]
+)
+def test_tab_completion_lists_names_that_are_not_loaded_yet(package: str) -> None:
+    look = f"import {package} as package; print(set(package.__all__) - set(dir(package)))"
+    shown = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
+    assert shown.stdout == "set()\n"
