@@ -17,7 +17,7 @@ from drivers.drive_train import DriveTrain
 from drivers.errors import DriverError
 from drivers.guard import GuardLimits
 from drivers.transports.base import TransportSpec
-from hil.reading import parse_toml, read_text
+from hil.reading import parse_toml, read_text, remedy_for_missing
 from identification.excitation import Box, Workspace
 from identification.model.robot import RobotModel
 from planner import JointLimits
@@ -395,6 +395,8 @@ def _read(file: Path, path: Path, field: str, value: object, remedy: str) -> str
         return read_text(file)
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else error
+        if isinstance(error, FileNotFoundError):
+            remedy = remedy_for_missing(file, remedy)
         raise CellError(path, field, value, f"cannot be read ({why})", remedy) from error
 
 

@@ -110,7 +110,12 @@ class Described:
 
     def robot(self, recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
         """Return the robot of a cell file, URDF or DH table; `recorded` reads the joint names."""
-        exactly_one(urdf=self.urdf, cell=self.cell, dh=self.dh)
+        exactly_one(
+            "--urdf arm.urdf, or --cell cell.toml, or --dh table.csv with --convention",
+            urdf=self.urdf,
+            cell=self.cell,
+            dh=self.dh,
+        )
         law = FrictionLaw.from_table(
             {**friction_from(self.friction), "standstill": self.standstill}
         )

@@ -80,7 +80,7 @@ def new(
             a design needs beyond the URDF are assumed and listed.
         force: Replace an earlier file.
     """
-    exactly_one(urdf=urdf, dh=dh)
+    exactly_one("--urdf arm.urdf, or --dh table.csv with --convention", urdf=urdf, dh=dh)
     at_most_one(
         design_only=design_only, from_controller=from_controller, from_archive=from_archive_file
     )

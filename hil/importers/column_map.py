@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError,
 
 from hil.cell.errors import first_error
 from hil.errors import SourceError
-from hil.reading import parse_toml, read_text
+from hil.reading import parse_toml, read_text, remedy_for_missing
 
 ANGLES = {
     "rad": 1.0,
@@ -218,4 +218,7 @@ class ColumnMap(_Table):
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             problem = f"cannot be read ({reason})"
-            raise SourceError(path, problem, remedy="name a TOML file") from error
+            remedy = "name a TOML file"
+            if isinstance(error, FileNotFoundError):
+                remedy = remedy_for_missing(path, remedy)
+            raise SourceError(path, problem, remedy=remedy) from error

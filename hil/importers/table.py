@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hil.errors import SourceError
 from hil.importers.arrays import READERS
 from hil.importers.column_map import HOLE, Column, Format
-from hil.reading import read_text
+from hil.reading import read_text, remedy_for_missing
 
 Array = NDArray[np.float64]
 
@@ -58,6 +58,8 @@ class Table:
             reason = error.strerror if isinstance(error, OSError) else error
             problem = f"cannot be read ({reason})"
             remedy = f"name a text file, or one that ends in {', '.join(READERS)}"
+            if isinstance(error, FileNotFoundError):
+                remedy = remedy_for_missing(path, remedy)
             raise SourceError(path, problem, remedy=remedy) from error
         numbered = [
             (number, line)
