@@ -32,6 +32,7 @@ from hil.importers import (
     import_rosbag2,
     recorded_joints,
 )
+from hil.importers.column_map import ready_map, ready_maps
 from hil.progress import say
 from hil.terminal_text import printable
 from identification import FrictionLaw
@@ -204,7 +205,7 @@ def log(
     `map.toml` of `[time] column = "t"`, `[position] columns = "q{}"`, `[torque] columns = "tau{}"`
 
     Options:
-        columns: TOML file with the column map.
+        columns: TOML file with the column map, or a ready one by name (`hil import maps`).
         uncoupled: Leave the inertia and friction of coupled motors out of the model, to measure
             their contribution. Angles and torques remain those of the map.
     """
@@ -232,6 +233,28 @@ def log(
 
 
 app.command("log")(log)
+
+
+@app.command("maps")
+def maps(
+    name: Annotated[str | None, typer.Argument(help="The map to print.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """List the ready column maps of common logs, or print one as a start for another.
+
+    **Example:** `hil import maps ur_rtde > map.toml`
+    """
+    purposes = ready_maps()
+    if name is not None and name not in purposes:
+        remedy = f"there are {', '.join(purposes)}"
+        raise InputError(None, f"no ready map is called {name!r}", remedy=remedy)
+    if json:
+        print_json(purposes if name is None else {"name": name, "map": ready_map(name)})
+    elif name is not None:
+        typer.echo(ready_map(name), nl=False)
+    else:
+        for known, purpose in purposes.items():
+            say(f"{known:<18} {purpose}")
 
 
 def _print(path: Path, *, json: bool) -> None:

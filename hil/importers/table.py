@@ -25,6 +25,7 @@ _WRITTEN = (
     (",", "."), (";", "."), ("\t", "."), ("|", "."), (None, "."),
     (";", ","), ("\t", ","), ("|", ","), (None, ","),
 )  # fmt: skip
+_ROSTOPIC = "%time,"  # of `rostopic echo -p`
 _PROBED = 20  # lines
 _LONGEST = 1 << 31  # bytes; several times as many in memory
 _LONGEST_TIME = 30  # digits before the point, more than of nanoseconds since 1970
@@ -54,6 +55,8 @@ class Table:
         """
         try:
             text = read_text(path, _LONGEST).removeprefix("\ufeff")
+            if text.startswith(_ROSTOPIC):  # a header, not a comment
+                text = text.removeprefix("%")
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             problem = f"cannot be read ({reason})"

@@ -23,6 +23,7 @@ from hil.archive import Samples, open_archive, write_samples
 from hil.campaign import Campaign
 from hil.cli import COMMANDS, app, main
 from hil.errors import InputError
+from hil.progress import reporter
 from hil.results import Results
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 
@@ -136,7 +137,10 @@ def test_the_demo_writes_results_and_ends_with_the_verdict(tmp_path: Path) -> No
     [
         (["identify", "nothing.mcap"], "nothing.mcap"),
         (["identify", str(CELL_PATH)], "cell.toml"),
-        (["import", "rosbag2", "x.db3", "-o", "y.mcap"], "--urdf arm.urdf, or --cell cell.toml, or --dh table.csv"),
+        (
+            ["import", "rosbag2", "x.db3", "-o", "y.mcap"],
+            "--urdf arm.urdf, or --cell cell.toml, or --dh table.csv",
+        ),
         (["import", "rosbag2", "x.db3", "-o", "y.mcap", "--urdf", str(URDF_PATH)], "x.db3"),
         (
             ["import", "log", "x", "-o", "y", "--map", "m.toml", "--urdf", str(URDF_PATH)],
@@ -289,3 +293,12 @@ def test_a_required_choice_has_an_example_of_each(tmp_path: Path) -> None:
     done = hil("plan", tmp_path / "cell.toml")
     assert "--random 6" in done.stderr
     assert "--via FILE" in done.stderr
+
+
+def test_piped_output_has_messages_and_no_progress(capsys: pytest.CaptureFixture[str]) -> None:
+    piped = reporter()
+    with piped.task("smoothing", 2) as task:
+        task.advance(1, "half")
+        piped.say("one recording is short")
+        task.advance(1, "all")
+    assert capsys.readouterr().out == "one recording is short\n"

@@ -37,7 +37,7 @@ from hil.identify.sources import cell_of
 from hil.importers import ColumnMap, Convention, Robot, import_log, urdf_of_dh
 from hil.importers import arrays as array_files
 from hil.importers.arrays import ArrayFile
-from hil.importers.column_map import UNITS, Format
+from hil.importers.column_map import UNITS, Format, ready_map, ready_maps
 from hil.importers.findings import check_clock, examine
 from hil.importers.robot import _cell_text
 from hil.importers.table import Table
@@ -1159,3 +1159,60 @@ class TestRobotOptions:
             (place / "o.mcap").unlink()
         refused = self.refused(place, kind, *self.LOCKED, "--gravity", "0", "nan", "0")
         assert "robot.gravity" in refused
+
+
+READY = {
+    "ur_rtde": ("timestamp", "actual_q_{}", "actual_current_{}", 1.0, 1.0, "motor_current", " "),
+    "franka": ("time", "state.q[{}]", "state.tau_J[{}]", 1e3, 1.0, "torque", ","),
+    "franka_2017": ("duration", "q[{}]", "tau_J[{}]", 1e3, 1.0, "torque", ", "),
+    "kuka_rsi": ("IPOC", "AIPos.A{}", "GearTorque.A{}", 1e3, DEGREES, "torque", ","),
+    "ros_joint_states": (
+        "field.header.stamp", "field.position{}", "field.effort{}", 1e9, 1.0, "torque", ","
+    ),
+}  # fmt: skip
+VELOCITIES = {
+    "ur_rtde": "actual_qd_{}",
+    "franka": "state.dq[{}]",
+    "franka_2017": "dq[{}]",
+    "ros_joint_states": "field.velocity{}",
+}
+
+
+class TestReadyMaps:
+    """Maps of common logs, by name."""
+
+    def test_each_is_tested(self) -> None:
+        assert set(ready_maps()) == set(READY)
+
+    @pytest.mark.parametrize("name", READY)
+    def test_a_log_with_the_columns_of_its_maker(
+        self, name: str, robot: Robot, tmp_path: Path
+    ) -> None:
+        time, q, tau, per_second, per_rad, quantity, delimiter = READY[name]
+        first = 1 if name == "kuka_rsi" else 0
+        patterns = [q, *([VELOCITIES[name]] if name in VELOCITIES else []), tau]
+        titles = [
+            time,
+            *(text.replace("{}", str(j + first)) for text in patterns for j in range(3)),
+        ]
+        arrays = [TIME * per_second, Q * per_rad, *([Q] if len(patterns) == 3 else []), TAU]
+        body = [delimiter.join(map(repr, row)) for row in np.column_stack(arrays).tolist()]
+        path = tmp_path / "log.csv"
+        if name == "ros_joint_states":  # with texts, as `rostopic echo -p` writes them
+            titles = ["%time", "field.header.frame_id", "field.name0", *titles]
+            body = [f"17,base link,hip,{line}" for line in body]
+        path.write_text("\n".join([delimiter.join(titles), *body]) + "\n")
+        columns = ColumnMap.load(name)
+        import_log(path, tmp_path / "a.mcap", robot=robot, columns=columns, outside_limits=True)
+        found = open_archive(tmp_path / "a.mcap").columns
+        assert found["position"] == pytest.approx(Q)
+        assert found["motor_current" if quantity == "motor_current" else "torque"] == (
+            pytest.approx(TAU)
+        )
+        assert np.diff(found["stamp"]) == pytest.approx(1e7, abs=300)
+
+    def test_listed_and_printed(self) -> None:
+        listing = CliRunner().invoke(app, ["import", "maps"]).stdout
+        assert all(name in listing for name in READY)
+        assert CliRunner().invoke(app, ["import", "maps", "franka"]).stdout == ready_map("franka")
+        assert typed(["import", "maps", "frank"])[0] == 2
