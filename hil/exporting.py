@@ -232,7 +232,7 @@ def stored_model(folder: Path, reporter: Reporter) -> IdentifiedModel:
         cell.name,
         _arm(cell, standard, values),
         undetermined,
-        provenance,
+        present,
         _motion(prepared.held_out),
         results.verdict.line,
         results.verdict.good,

@@ -5,12 +5,15 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
+from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from hil.archive import open_archive
+from hil.archive.check import recording_date
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import file_digest, write_files
@@ -18,7 +21,7 @@ from hil.identify import Identification
 from hil.progress import Reporter
 from hil.reading import open_file
 from hil.report import ReportSeries, report_bytes
-from hil.results import ExportResult, Results
+from hil.results import ExportResult, OccasionResult, Results
 from identification import Estimate, IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
 from identification.export.parameters import parameters_csv, parameters_json
@@ -32,14 +35,16 @@ _LARGEST: Final = 1 << 30
 def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Results:
     """Write exports, `results.json` and report together; OutputError if impossible."""
     consistency, essential = found.consistency, found.essential
+    occasion = occasion_of(found)
+    origin = provenance_of(found.results, found.paths)
     exports = exports_of(
         found.cell,
         found.estimate.pooled,
         consistency if isinstance(consistency, str) else consistency.consistent,
         essential=None if isinstance(essential, str) else essential.estimate.names,
-        provenance=provenance_of(found.results, found.paths),
+        provenance={**origin, **occasion.entries()},
     )
-    results = found.results.model_copy(update={"exports": exports.result})
+    results = found.results.model_copy(update={"exports": exports.result, "occasion": occasion})
     files = {
         **exports.contents,
         RESULTS: results.to_json(),
@@ -52,6 +57,21 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
     reporter.say(f"written to {folder}: {RESULTS}, {', '.join(exports.result.written)}")
     reporter.say(f"report: {folder / REPORT}")
     return results
+
+
+def occasion_of(found: Identification) -> OccasionResult:
+    """Return dates of recording and identification, and the free fields of the cell file."""
+    archives = (open_archive(path, fields=()) for path in found.paths)
+    dates = sorted(filter(None, map(recording_date, archives)))
+    cell = found.cell.file.cell
+    return OccasionResult(
+        recorded_from=dates[0] if dates else None,
+        recorded_to=dates[-1] if dates else None,
+        identified_at=datetime.now(UTC).isoformat(timespec="seconds"),
+        operator=cell.operator,
+        serial_number=cell.serial_number,
+        notes=cell.notes,
+    )
 
 
 def rewrite_report(folder: Path) -> Results:

@@ -176,7 +176,7 @@ def read_overview(path: str | PathLike[str]) -> Overview:
     }
     return Overview(
         path=archive.path,
-        recorded=header.recorded_at or _origin(header.entries, archive),
+        recorded=recording_date(archive),
         title=title,
         outcome=f"{outcome.outcome}: {outcome.reason}" if outcome.reason else outcome.outcome,
         lost="; ".join([*(f"{k} {n}" for k, n in counts.items() if n), *outcome.losses]),
@@ -202,11 +202,16 @@ def read_overview(path: str | PathLike[str]) -> Overview:
     )
 
 
-def _origin(entries: Mapping[str, str], archive: Archive) -> str | None:
-    """Return the date of an imported recording whose clock counts from 1970; None for others."""
-    stamp = archive.columns["stamp"]
+def recording_date(archive: Archive) -> str | None:
+    """Return the date of a recording, ISO 8601; None if neither header nor clock have it.
+
+    Clocks of imported recordings that count from 1970 have it.
+    """
+    header, stamp = archive.header, archive.columns["stamp"]
+    if header.recorded_at is not None or header.kind != "imported":
+        return header.recorded_at
     try:
-        origin = int(entries.get("clock_origin_ns", "0"))
+        origin = int(header.entries.get("clock_origin_ns", "0"))
     except ValueError:
         return None
     seconds = (origin + int(stamp[0])) // 10**9 if len(stamp) else 0

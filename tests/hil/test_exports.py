@@ -306,3 +306,38 @@ class TestReuse:
         path.write_text(json.dumps(content))
         shown = command("export", folder, "--to", "urdf").stdout
         assert "are not of one identification" in shown
+
+
+def test_dates_and_free_fields_reach_results_parameters_and_report(
+    arm: IdentifiedArm, log: Path, tmp_path: Path
+) -> None:
+    """From the cell file over the archive's attachment."""
+    place = log.parent
+    (tmp_path / "arm.urdf").write_text(TWO_LINK)
+    fields = 'operator = "A. <Person>"\nserial_number = "SN 17"\nnotes = "cover off"\n'
+    (tmp_path / "cell.toml").write_text(
+        f'[cell]\nname = "arm"\nurdf = "arm.urdf"\n{fields}[robot]\n'
+    )
+    text = (place / "map.toml").read_text()
+    rows = np.loadtxt(place / "log.csv")
+    rows[:, 0] += 1_700_000_000.0
+    np.savetxt(tmp_path / "log.csv", rows, fmt="%.9f")
+    (tmp_path / "map.toml").write_text(text)
+    path = import_log(
+        tmp_path / "log.csv",
+        tmp_path / "log.mcap",
+        robot=Robot.from_cell(tmp_path / "cell.toml"),
+        columns=ColumnMap.load(tmp_path / "map.toml"),
+    )
+    command("identify", path, "-o", tmp_path / "result", "-q")
+    occasion = Results.load(tmp_path / "result" / "results.json").occasion
+    assert occasion is not None
+    assert occasion.recorded_from == "2023-11-14T22:13:20+00:00"
+    assert occasion.identified_at.startswith("20")
+    assert occasion.serial_number == "SN 17"
+    table = (tmp_path / "result" / "parameters.csv").read_text()
+    for line in ("# recorded: 2023-11-14", "# operator: A. <Person>", "# notes: cover off"):
+        assert line in table
+    page = (tmp_path / "result" / "report.html").read_text()
+    for part in ("A. &lt;Person&gt;", "SN 17", "2023-11-14T22:13:20"):
+        assert part in page
