@@ -131,6 +131,9 @@ class CellTable(Table):
     name: str = field("a short name of the cell", min_length=1, max_length=80)
     description: str = field("description, one or two sentences", "")
     urdf: str = field("the URDF file, relative to this cell file")
+    operator: str = field("who operates the arm; printed in reports", "", max_length=200)
+    serial_number: str = field("serial number of the arm; printed in reports", "", max_length=200)
+    notes: str = field("remarks; printed in reports", "", max_length=4000)
     assumed: list[str] = field("dotted names of fields whose values are assumed, not measured", [])
     mesh_folders: list[str] = field(
         "folders with the packages of package:// mesh paths, relative to this file",
