@@ -104,8 +104,8 @@ def controller_settings(cell: Cell, *, effects: bool = False) -> ControllerSetti
     return ControllerSettings(
         period=cell.period,
         open_mode=cell.controller.mode,
-        # Elastic gears and a delay of half a cycle need steps shorter than the cycle; rigid gears
-        # are integrated to second order under a constant current.
+        # Elastic gears and a delay of 0.5 ms need steps shorter than the period of the servo loops;
+        # rigid gears are integrated to second order under a constant current.
         substeps=2 if effects else 1,
         current_noise=cell.simulation.current_noise,
         current_resolution=cell.simulation.current_resolution,

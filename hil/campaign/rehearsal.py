@@ -143,7 +143,7 @@ LOOP_CYCLES: Final = 0.5
 RESONANCE: Final = 500.0
 """Resonance of a main axis, rotor against link, rad/s, where the cell has no elasticity."""
 FASTEST: Final = 800.0
-"""Highest resonance in any posture, rad/s: the simulated arm has steps of half a cycle."""
+"""Highest resonance in any posture, rad/s: the simulated arm has steps of 0.5 ms."""
 POSTURES: Final = 60  # Postures in which the resonances are computed
 MAIN_AXES: Final = 3
 SLOWEST_LOOP: Final = 0.002
