@@ -213,7 +213,6 @@ class SimulatedArm:
             delay_substeps=round(effects.delay / self._substep),
         )
         self.currents = [0.0] * n
-        self._noise = [0.0] * n
         self._load: Array | None = None
         self.disturbances = Disturbances(holding)
         self._ripple: TorqueRipple | None = None
@@ -237,15 +236,15 @@ class SimulatedArm:
         self._load = None if braked else disturbances.load
         if self._drift is not None:
             plant.scale_friction(self._drift.scale(plant.velocity, self._period))
-        self._noise = self._current_noise.draw()
 
     def run(self, target_currents: Sequence[float]) -> list[float]:
         """Simulate one period of the servo loops; return the encoder positions [motor rev].
 
         `target_currents` are (n,) [A].
         """
+        noise = self._current_noise.draw()
         for _ in range(self._substeps):
-            self.currents = self._loop.substep(target_currents, self._noise)
+            self.currents = self._loop.substep(target_currents, noise)
             self._step()
         return self.encoders()
 
@@ -256,10 +255,12 @@ class SimulatedArm:
     def run_unpowered_cycle(self) -> None:
         """Simulate a cycle with the drive off and closed brakes."""
         self.begin_cycle(braked=True)
-        for _ in range(self._loops * self._substeps):
-            self._loop.cut()
-            self.currents = [0.0] * len(self.currents)
-            self._step()
+        for _ in range(self._loops):
+            self._current_noise.draw()
+            for _ in range(self._substeps):
+                self._loop.cut()
+                self.currents = [0.0] * len(self.currents)
+                self._step()
         self.end_cycle()
 
     def _step(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,15 +15,17 @@ from typer.testing import CliRunner
 
 from drivers.drive_train import DriveTrain
 from hil.archive import open_archive
-from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop
+from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop, rehearsal
+from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
-from hil.campaign.rehearsal import CRITERIA, FASTEST, SPREAD, Rehearsal, Twin
+from hil.campaign.rehearsal import CRITERIA, FASTEST, SPREAD, Rehearsal, Twin, of_motions
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import OperatorStopError
 from hil.identify import identify_campaign
 from hil.progress import Silent, Task
 from planner import Move, plan_moves
+from sim_fixtures import ServoSettings
 from sim_fixtures.plant import ElasticPlant, PlantTruth
 from tests.hil.fast_cell import CELL, URDF, fast_campaign, fast_cell
 from tests.hil.new_cells import described_robot, filled_in
@@ -131,6 +134,44 @@ def test_a_wrong_cell_or_plan_fails(
         assert failed == expected
     with pytest.raises(NotRehearsedError, match="failed its rehearsal"):
         require_rehearsed(campaign.folder)
+
+
+@pytest.mark.parametrize("cycle_ms", [1, 4])
+def test_it_passes_at_any_cycle(tmp_path: Path, designed: Campaign, cycle_ms: int) -> None:
+    """At 2 ms: above."""
+    assert designed.cell.controller.cycle_ms == 2
+    cell = cell_of(tmp_path, CELL.replace("cycle_ms = 2", f"cycle_ms = {cycle_ms}"))
+    found = Campaign.create(tmp_path / "campaign", cell, designed.plan).rehearse()
+    assert found.passed, found.failures
+
+
+def test_an_unstable_servo_is_named_with_remedy_and_plot_command(
+    tmp_path: Path, designed: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unstable = replace(ServoSettings(), velocity_bandwidth=900.0, rotor_bandwidth=1600.0)
+    monkeypatch.setattr(
+        rehearsal, "ServoSettings", lambda current_lag: replace(unstable, current_lag=current_lag)
+    )
+    campaign = Campaign.create(tmp_path / "campaign", designed.cell, designed.plan)
+    found = campaign.rehearse()
+    failed = next(one for one in found.criteria if not one.passed)
+    assert "grows" in failed.sentence and "Hz" in failed.sentence
+    assert "the motion is not at fault" in failed.sentence
+    *command, last = shlex.split(failed.sentence.split("`")[-2])
+    assert command[:2] == ["hil", "plot"] and Path(command[2]).is_file()
+    assert (
+        CliRunner().invoke(app, [*command[1:], last, "-o", str(tmp_path / "x.png")]).exit_code == 0
+    )
+
+
+def test_a_motion_beyond_a_speed_limit_is_no_completed_one(designed: Campaign) -> None:
+    plain = CampaignFolder(designed.folder.rehearsed / "plain")
+    assert of_motions(designed.cell, plain, "plain", "").passed
+    velocity = [0.7 * speed for speed in designed.cell.file.limits.velocity_deg]
+    slow = designed.cell.with_values({"limits.velocity_deg": velocity})
+    found = of_motions(slow, plain, "plain", "")
+    assert not found.passed
+    assert "of its speed limit" in found.sentence and "hil plot" in found.sentence
 
 
 def test_a_cell_of_hardware_is_rehearsed_from_nominal_figures(
