@@ -369,7 +369,11 @@ def loops_per_cycle(period: float) -> int:
 
 def _means(rows: Sequence[list[float]]) -> list[float]:
     """Return the means over rows of equal length."""
-    return rows[0] if len(rows) == 1 else [sum(column) / len(rows) for column in zip(*rows, strict=True)]
+    return (
+        rows[0]
+        if len(rows) == 1
+        else [sum(column) / len(rows) for column in zip(*rows, strict=True)]
+    )
 
 
 class CurrentLoop:
