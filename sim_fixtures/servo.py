@@ -1,6 +1,7 @@
 """Servo of the simulated controller: position, velocity and current loops of each axis.
 
-All loops are on the motor side, once per `LOOP_PERIOD`, with encoder positions:
+All loops are on the motor side, once per cycle of up to 2 ms, with encoder
+positions, and each millisecond of a longer one:
 
     demanded speed  = target speed + position gain * (target - measured)
     target current  = model current + velocity gain * (speed error + its integral)
@@ -10,7 +11,7 @@ the dynamic model for the target motion of the cycle. The actual current follows
 with a lag and noise (`CurrentLoop`).
 
 The cycle in which the PC sends targets may be longer (`CycleServo`): as in a real drive, the loops
-do not get slower with it. At 2 ms they would excite the resonances of elastic gears.
+do not get slower with it.
 """
 
 from __future__ import annotations
@@ -29,8 +30,13 @@ from sim_fixtures.settings import ServoSettings
 
 Array = NDArray[np.float64]
 
+LONGEST_LOOP = 0.002
+"""Longest cycle in which the loops run once, s."""
 LOOP_PERIOD = 0.001
-"""Period of the loops, s; a cycle of the controller has a whole number of them."""
+"""Period of the loops in a longer cycle, s."""
+ROTOR_GAIN = 0.4
+"""Largest bandwidth with the rotor alone times the period of the loops: beyond some hundred rad/s
+the dead time of one period makes resonances of elastic gears grow."""
 COULOMB_SPEED = 0.02  # width of the sign change of the model's Coulomb torque [rad/s]
 
 
@@ -122,7 +128,7 @@ class Servo:
         self._resolution = current_resolution
         self._deadband = settings.deadband_counts / drive.encoder_counts
         self._rotor_gain = [
-            settings.rotor_bandwidth * inertia if inertia > 0.0 else inf
+            min(settings.rotor_bandwidth, ROTOR_GAIN / period) * inertia if inertia > 0.0 else inf
             for inertia in model.rotor_inertia.tolist()
         ]
         self._gear_squared = [ratio * ratio for ratio in drive.gear_ratio]
@@ -323,7 +329,7 @@ class CycleServo:
     ) -> None:
         """Run all loops of a cycle.
 
-        `drive_arm` applies target currents (n,) [A] for one `LOOP_PERIOD` and returns the encoder
+        `drive_arm` applies target currents (n,) [A] for one period of the loops and returns the encoder
         positions (n,) [motor rev] after it.
         """
         loops, n = self._loops, self._n_loops
@@ -364,7 +370,7 @@ class CycleServo:
 
 def loops_per_cycle(period: float) -> int:
     """Return the number of servo loops in a cycle of `period` [s]."""
-    return max(1, round(period / LOOP_PERIOD))
+    return round(period / LOOP_PERIOD) if period > 1.001 * LONGEST_LOOP else 1
 
 
 def _means(rows: Sequence[list[float]]) -> list[float]:

@@ -24,7 +24,13 @@ TYPED_ELSEWHERE = {
     "campaign.md": "tests/hil/test_campaign_day.py",
     "payload.md": "tests/hil/test_payload_command.py",
     **dict.fromkeys(
-        ("bring-your-own-robot.md", "first-hour.md", "other-robots.md", "simulators.md"),
+        (
+            "bring-your-own-robot.md",
+            "first-hour.md",
+            "first-hour-simulated.md",
+            "other-robots.md",
+            "simulators.md",
+        ),
         "tests/docs/test_typed_pages.py",
     ),
 }  # Pages whose commands another test types, one after the other
