@@ -329,8 +329,8 @@ class CycleServo:
     ) -> None:
         """Run all loops of a cycle.
 
-        `drive_arm` applies target currents (n,) [A] for one period of the loops and returns the encoder
-        positions (n,) [motor rev] after it.
+        `drive_arm` applies target currents (n,) [A] for one period of the loops and returns the
+        encoder positions (n,) [motor rev] after it.
         """
         loops, n = self._loops, self._n_loops
         loops.feed([speed / n for speed in demand.speed], demand.current)

@@ -148,6 +148,7 @@ def test_it_passes_at_any_cycle(tmp_path: Path, designed: Campaign, cycle_ms: in
 def test_an_unstable_servo_is_named_with_remedy_and_plot_command(
     tmp_path: Path, designed: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("sim_fixtures.servo.ROTOR_GAIN", 10.0)
     unstable = replace(ServoSettings(), velocity_bandwidth=900.0, rotor_bandwidth=1600.0)
     monkeypatch.setattr(
         rehearsal, "ServoSettings", lambda current_lag: replace(unstable, current_lag=current_lag)
