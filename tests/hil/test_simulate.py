@@ -243,12 +243,12 @@ def test_a_program_that_has_ended_costs_one_extension():
         assert key not in output
 
 
-def test_lines_that_come_back_are_collapsed(capsys):
+def test_lines_that_come_back_are_collapsed(capfd):
     status = Status(ControllerSettings(), quiet=False)
     phases = [Phase.CLOSED, Phase.OPENING] * 50 + [Phase.ENDED]
     for cycle, phase in enumerate(phases):
         status.watch(SimpleNamespace(phase=phase, reason=""), ServeCounts(cycles=cycle))
-    printed = capsys.readouterr().out
+    printed = capfd.readouterr().out
     assert printed.count("axes opening") == 3
     assert "lines not printed: 94" in printed
     assert printed.strip().endswith("ended")
