@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
+from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +13,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.archive import open_archive
+from hil.archive.check import recording_date
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import file_digest, write_files
@@ -19,7 +22,7 @@ from hil.identify import Identification
 from hil.progress import Reporter
 from hil.reading import open_file
 from hil.report import ReportSeries, report_bytes
-from hil.results import ExportResult, Results
+from hil.results import ExportResult, OccasionResult, Results
 from identification import Estimate, IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
 from identification.export.friction import median_load
@@ -36,15 +39,17 @@ _LARGEST: Final = 1 << 30
 def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Results:
     """Write exports, `results.json` and report together; OutputError if impossible."""
     consistency, essential = found.consistency, found.essential
+    occasion = occasion_of(found)
+    origin = provenance_of(found.results, found.paths)
     exports = exports_of(
         found.cell,
-        found.estimate.pooled,
+        found.estimation.stated,
         consistency if isinstance(consistency, str) else consistency.consistent,
         essential=None if isinstance(essential, str) else essential.estimate.names,
-        provenance=provenance_of(found.results, found.paths),
+        provenance={**origin, **occasion.entries()},
         load=median_load(found.cell.model, found.estimate.pooled.values, found.prepared.fitted),
     )
-    results = found.results.model_copy(update={"exports": exports.result})
+    results = found.results.model_copy(update={"exports": exports.result, "occasion": occasion})
     files = {
         **exports.contents,
         RESULTS: results.to_json(),
@@ -57,6 +62,21 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
     reporter.say(f"written to {folder}: {RESULTS}, {', '.join(exports.result.written)}")
     reporter.say(f"report: {folder / REPORT}")
     return results
+
+
+def occasion_of(found: Identification) -> OccasionResult:
+    """Return dates of recording and identification, and the free fields of the cell file."""
+    archives = (open_archive(path, fields=()) for path in found.paths)
+    dates = sorted(filter(None, map(recording_date, archives)))
+    cell = found.cell.file.cell
+    return OccasionResult(
+        recorded_from=dates[0] if dates else None,
+        recorded_to=dates[-1] if dates else None,
+        identified_at=datetime.now(UTC).isoformat(timespec="seconds"),
+        operator=cell.operator,
+        serial_number=cell.serial_number,
+        notes=cell.notes,
+    )
 
 
 def rewrite_report(folder: Path) -> Results:
@@ -137,11 +157,7 @@ def exports_of(
     reason why there is none). IdentificationError: the estimate is of another model.
     """
     model = cell.model
-    # Single printable lines: names of archives may contain anything.
-    origin = {
-        key: " ".join("".join(c if c.isprintable() else " " for c in value).split())
-        for key, value in (provenance or {}).items()
-    }
+    origin = {key: single_line(value) for key, value in (provenance or {}).items()}
     possible = None if isinstance(consistent, str) else consistent
     contents: dict[str, str | None] = {
         PARAMETERS_JSON: parameters_json(
@@ -158,6 +174,16 @@ def exports_of(
         except IdentificationError as error:
             withheld[URDF] = str(error)
     return Exports({**contents, **dict.fromkeys(withheld)}, withheld)
+
+
+def single_line(text: str) -> str:
+    """Return a text as one printable line: names of archives may contain anything."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
+
+
+def archive_digests(provenance: Mapping[str, str]) -> set[str]:
+    """Return the archives of a provenance, each with its digest, in any order."""
+    return set(single_line(provenance.get("archives", "")).split(", "))
 
 
 def provenance_of(results: Results, archives: Sequence[Path]) -> dict[str, str]:

@@ -83,7 +83,7 @@ class Silent:
 
 
 class LineReporter(Silent):
-    """One line per tenth of a task: for logs and pipes."""
+    """One line per tenth of a task: for logs."""
 
     def __init__(self) -> None:
         self._out = sys.stdout
@@ -92,6 +92,16 @@ class LineReporter(Silent):
         """Print the line at once."""
         self._out.write(printable(text) + "\n")
         self._out.flush()
+
+
+class Messages(LineReporter):
+    """Messages without progress: for output that is piped or redirected."""
+
+    @contextmanager
+    def task(self, title: str, total: float) -> Iterator[Task]:
+        """Report nothing: the result is what the output is for."""
+        del title, total
+        yield Task(lambda _done, _note: None)
 
 
 class Bar:
@@ -139,11 +149,11 @@ class _WithNote(Progress):
 
 
 def reporter(*, quiet: bool = False) -> Reporter:
-    """Return a reporter: bars on a terminal, lines elsewhere, nothing if `quiet`."""
+    """Return a reporter: bars on a terminal, messages only elsewhere, nothing if `quiet`."""
     if quiet:
         return Silent()
     console = Console()
-    return Bar(console) if console.is_terminal else LineReporter()
+    return Bar(console) if console.is_terminal else Messages()
 
 
 def say_at_once(text: str, descriptor: int = 1) -> None:

@@ -8,7 +8,9 @@ import os
 import stat
 import tomllib
 from datetime import UTC, datetime
+from difflib import get_close_matches
 from io import BufferedReader
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -92,6 +94,40 @@ def path_exists(path: Path) -> bool:
     return path.is_symlink() or path.exists()
 
 
+_MOST_SIBLINGS = 10_000
+
+
+def similar_path(path: Path) -> Path | None:
+    """Return the path beside a missing one whose name is most like it, or None.
+
+    Where the folder itself is missing, that is the path in the folder most like it.
+    """
+    if path_exists(path) or path.name in ("", ".."):
+        return None
+    folder = path.parent
+    if not folder.is_dir():
+        similar = similar_path(folder)
+        if similar is None or not similar.is_dir():
+            return None
+        return similar / path.name if path_exists(similar / path.name) else similar
+    try:
+        names = [entry.name for entry in islice(folder.iterdir(), _MOST_SIBLINGS)]
+    except OSError:
+        return None
+    found = get_close_matches(path.name, names, n=1)
+    return folder / found[0] if found else None
+
+
+def remedy_for_missing(path: Path, otherwise: str) -> str:
+    """Return the remedy for a path that is not there: a similar one, or `otherwise`."""
+    similar = similar_path(path)
+    if similar is not None:
+        return f"there is {similar}"
+    if not path_exists(path) and not path_exists(path.parent):
+        return f"there is no folder {path.parent}; {otherwise}"
+    return otherwise
+
+
 def read_input(path: Path, otherwise: str = "name another file") -> str:
     """Return the text of a file named by the user, or raise InputError."""
     try:
@@ -102,6 +138,8 @@ def read_input(path: Path, otherwise: str = "name another file") -> str:
             otherwise = "save it as UTF-8"
         elif reason == _NO_FILE:
             otherwise = "write it to a file first, and name that"
+        elif isinstance(error, FileNotFoundError):
+            otherwise = remedy_for_missing(path, otherwise)
         raise InputError(path, f"cannot be read ({reason})", remedy=otherwise) from error
 
 

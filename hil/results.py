@@ -191,6 +191,29 @@ class ExportResult(Frozen):
     withheld: dict[str, str]  #: Files that were not written, with the reason
 
 
+class OccasionResult(Frozen):
+    """When and by whom the arm was recorded and identified."""
+
+    recorded_from: str | None = None  #: Start of the first recording, ISO 8601; null if unknown
+    recorded_to: str | None = None  #: Start of the last one
+    identified_at: str  #: Time of the identification, ISO 8601
+    operator: str = ""  #: Of the cell file, as the following
+    serial_number: str = ""
+    notes: str = ""
+
+    def entries(self) -> dict[str, str]:
+        """Return what is known, by title."""
+        recorded = " to ".join(dict.fromkeys(filter(None, (self.recorded_from, self.recorded_to))))
+        rows = {
+            "recorded": recorded,
+            "identified": self.identified_at,
+            "operator": self.operator,
+            "serial number": self.serial_number,
+            "notes": self.notes,
+        }
+        return {title: text for title, text in rows.items() if text}
+
+
 SCHEMA_VERSION: Final = 3
 
 
@@ -420,6 +443,7 @@ class Results(Frozen):
     exports: ExportResult | None = None
     judgement: JudgementResult
     conduct: ConductResult | None = None  #: Null without a campaign folder
+    occasion: OccasionResult | None = None  #: Null in files of earlier versions
 
     @property
     def not_significant(self) -> list[str]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,9 @@ from hil.archive.header import (
     is_supported,
     motion_name,
 )
-from hil.archive.reader import Scan, open_archive, scan_archive, scan_file
+from hil.archive.reader import Archive, Scan, open_archive, scan_archive, scan_file
 from hil.archive.repair import is_intact
+from hil.errors import InputError
 
 OUTCOMES = ("completed", REJECTED, "stopped", "refused", "lost", "void", "interrupted", "unknown")
 
@@ -85,10 +87,34 @@ def _entry_faults(path: Path, found: Scan) -> Iterator[str]:
         yield f"outcome is {found.outcome.outcome!r}, not one of {', '.join(OUTCOMES)}"
 
 
+def archive_files(paths: Sequence[Path]) -> list[Path]:
+    """Return files, and all archives of folders; of a campaign those in its `archives`.
+
+    Raises:
+        InputError: a folder has none.
+    """
+    files: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            files.append(path)
+            continue
+        inside = sorted(path.glob("*.mcap")) or sorted(path.glob("archives/*.mcap"))
+        if not inside:
+            problem = "has no archive (*.mcap) in it, and none in its folder archives"
+            raise InputError(path, problem, remedy="name an archive, or a folder of them")
+        files += inside
+    return files
+
+
 _MOST_EVENTS = 20
 _SHOWN_ELSEWHERE = frozenset(
-    ("kind", "index", "attempt", "joint_names", "period", "attachments", "outcome", "reason")
-)
+    (
+        "kind", "index", "attempt", "joint_names", "period", "attachments", "outcome", "reason",
+        "recorded_at",
+    )
+)  # fmt: skip
+_DATES = range(946_684_800, 4_102_444_800)
+"""Seconds since 1970 of the years 2000 to 2100; other clocks do not count the time of day."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +122,7 @@ class Overview:
     """Overview of an archive, as `hil archive info` prints it; times in s, sizes in bytes.
 
     Attributes:
+        recorded: time of day of the recording, ISO 8601; None if it is not known.
         title: kind, index and attempt.
         outcome, lost: how it ended and why; what the link or this PC lost, "" where nothing.
         duration: from the first to the last sample.
@@ -107,6 +134,7 @@ class Overview:
     """
 
     path: Path
+    recorded: str | None
     title: str
     outcome: str
     lost: str
@@ -148,6 +176,7 @@ def read_overview(path: str | PathLike[str]) -> Overview:
     }
     return Overview(
         path=archive.path,
+        recorded=recording_date(archive),
         title=title,
         outcome=f"{outcome.outcome}: {outcome.reason}" if outcome.reason else outcome.outcome,
         lost="; ".join([*(f"{k} {n}" for k, n in counts.items() if n), *outcome.losses]),
@@ -171,3 +200,19 @@ def read_overview(path: str | PathLike[str]) -> Overview:
         events=tuple((one.time, one.name, one.text) for one in archive.events[:_MOST_EVENTS]),
         damage=archive.damage,
     )
+
+
+def recording_date(archive: Archive) -> str | None:
+    """Return the date of a recording, ISO 8601; None if neither header nor clock have it.
+
+    Clocks of imported recordings that count from 1970 have it.
+    """
+    header, stamp = archive.header, archive.columns["stamp"]
+    if header.recorded_at is not None or header.kind != "imported":
+        return header.recorded_at
+    try:
+        origin = int(header.entries.get("clock_origin_ns", "0"))
+    except ValueError:
+        return None
+    seconds = (origin + int(stamp[0])) // 10**9 if len(stamp) else 0
+    return datetime.fromtimestamp(seconds, UTC).isoformat() if seconds in _DATES else None

@@ -38,7 +38,7 @@ from hil.archive.header import (
 from hil.archive.schema import ArchivedEvent
 from hil.archive.search import find_records, verified_metadata, verify
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
-from hil.reading import open_file, parse_json
+from hil.reading import open_file, parse_json, remedy_for_missing
 
 NUMBERS = (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.MOTOR_CURRENT)
 """Channels with one message per sample."""
@@ -720,6 +720,10 @@ def scan_file(path: Path, **options: Any) -> Scan:
             return Scan(stream, **options)
     except OSError as error:
         remedy = "check whether it was moved or removed, and whether it can be copied"
+        if isinstance(error, IsADirectoryError):
+            remedy = "name an archive in it (*.mcap)"
+        elif isinstance(error, FileNotFoundError):
+            remedy = remedy_for_missing(path, "check whether it was moved or removed")
         raise ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy) from error
     except MemoryError as error:
         raise ArchiveError(

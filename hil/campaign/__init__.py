@@ -47,3 +47,8 @@ if not TYPE_CHECKING:  # which would accept any name
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         return getattr(import_module(f"{__name__}.{_HOME.get(name, 'errors')}"), name)
+
+
+def __dir__() -> list[str]:
+    """Return all names, also those that are not loaded yet."""
+    return [*globals(), *__all__]

@@ -17,7 +17,7 @@ from drivers.drive_train import DriveTrain
 from drivers.errors import DriverError
 from drivers.guard import GuardLimits
 from drivers.transports.base import TransportSpec
-from hil.reading import parse_toml, read_text
+from hil.reading import parse_toml, read_text, remedy_for_missing
 from identification.excitation import Box, Workspace
 from identification.model.robot import RobotModel
 from planner import JointLimits
@@ -31,6 +31,7 @@ from .schema import (
     CellFile,
     ControllerTable,
     DriveTrainTable,
+    FrictionTable,
     JointFrictionTable,
     NominalTable,
     SimulationTable,
@@ -105,6 +106,25 @@ class Cell:
         }
         changed = self._with_robot(friction=table.model_copy(update={**changes, "joints": joints}))
         _ = changed.model
+        return changed
+
+    def with_friction_laws(self, laws: Sequence[Mapping[str, Any]]) -> Cell:
+        """Return the cell with a table `[robot.friction]` for each joint, in their order.
+
+        Further tables, of coupled motors, are those of the joints.
+
+        Raises:
+            ValueError: a table is invalid.
+        """
+        tables = dict(zip(self.joint_names, laws, strict=False))
+        common = FrictionTable.model_validate(dict(laws[0]))
+        joints = {
+            name: JointFrictionTable.model_validate({k: v for k, v in law.items() if k != "ripple"})
+            for name, law in tables.items()
+        }
+        changed = self._with_robot(friction=common.model_copy(update={"joints": joints}))
+        if [law.table() for law in changed.model.friction.laws] != [dict(law) for law in laws]:
+            raise ValueError("the friction laws are not those of this arm's joints")
         return changed
 
     def without_payload(self) -> Cell:
@@ -375,6 +395,8 @@ def _read(file: Path, path: Path, field: str, value: object, remedy: str) -> str
         return read_text(file)
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else error
+        if isinstance(error, FileNotFoundError):
+            remedy = remedy_for_missing(file, remedy)
         raise CellError(path, field, value, f"cannot be read ({why})", remedy) from error
 
 

@@ -131,6 +131,9 @@ class CellTable(Table):
     name: str = field("a short name of the cell", min_length=1, max_length=80)
     description: str = field("description, one or two sentences", "")
     urdf: str = field("the URDF file, relative to this cell file")
+    operator: str = field("who operates the arm; printed in reports", "", max_length=200)
+    serial_number: str = field("serial number of the arm; printed in reports", "", max_length=200)
+    notes: str = field("remarks; printed in reports", "", max_length=4000)
     assumed: list[str] = field("dotted names of fields whose values are assumed, not measured", [])
     mesh_folders: list[str] = field(
         "folders with the packages of package:// mesh paths, relative to this file",
@@ -372,7 +375,7 @@ class ControllerTable(Table):
     """`[controller]`: the link to the controller."""
 
     transport: Literal["simulated", "udp", "can"] = field('"simulated", "udp" or "can"')
-    cycle_ms: Literal[1, 2] = field("the controller's cycle, 1 or 2 ms")
+    cycle_ms: Literal[1, 2, 4] = field("the controller's cycle, 1, 2 or 4 ms")
     mode: Literal[4] = field("the open mode of campaigns: 4 (absolute position)", 4)
     host: str = field("address of the controller", "10.2.12.150")
     port: Whole = field("UDP port, 1 to 65535", 1000, gt=0, lt=65536)

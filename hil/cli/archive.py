@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
-from hil.archive.check import Check, Overview, check_archive, read_overview
+from hil.archive.check import Check, Overview, archive_files, check_archive, read_overview
 from hil.archive.repair import repair as repair_archive
 from hil.cli import exit_code_of
 from hil.cli.arguments import JsonOption, print_json
@@ -24,14 +24,16 @@ NO_ARCHIVE = 2
 FAILED = 1
 LOST = 3
 
-Files = Annotated[list[Path], typer.Argument(help="The archives.", show_default=False)]
+Files = Annotated[
+    list[Path], typer.Argument(help="Archives, or folders of them.", show_default=False)
+]
 
 
 @app.command("info")
 def info(files: Files, as_json: JsonOption = False) -> None:
     """Print the content of archives: motion, joints, channels, sizes, attachments."""
     failed = 0
-    for path in files:
+    for path in archive_files(files):
         try:
             found = read_overview(path)
         except ArchiveError as error:
@@ -49,7 +51,7 @@ def check(files: Files, as_json: JsonOption = False) -> None:
     Exit status: 0 all conform, 5 at least one does not, 2 at least one is not an archive.
     """
     status = 0
-    for path in files:
+    for path in archive_files(files):
         try:
             found = check_archive(path)
         except ArchiveError as error:
@@ -135,19 +137,47 @@ def _check_dict(found: Check) -> dict[str, Any]:
     return {"file": str(entries.pop("path")), "archive": True, "keeps": found.conforms, **entries}
 
 
+_UNITS: Final[Mapping[str, str | Mapping[str, str]]] = {
+    "duration": "s",
+    "period": "s",
+    "size": "bytes",
+    "per_minute": "bytes/min",
+    "attachments": "bytes",
+    "channels": "messages",
+    "metadata": {
+        "clock_origin_ns": "ns",
+        "dropped_rows": "rows",
+        "motor_from_joint": "motor turns per joint turn",
+        "outcome.samples": "samples",
+        "outcome.events": "events",
+        "outcome.records_lost": "cycles",
+        "outcome.events_lost": "events",
+        "outcome.late_answers": "packets",
+        "outcome.answers_not_taken": "replies",
+        "outcome.lost_packets": "packets",
+        "outcome.repaired.samples_lost": "samples",
+    },
+}
+"""Units of the entries of an overview: of a row, or by the name of a table's row."""
+
+
 def _info_lines(found: Overview) -> list[str]:
-    """Return the entries of the overview, tables row by row; times in s, sizes in bytes."""
+    """Return the entries of the overview with their units, tables row by row."""
     lines = [str(found.path)]
     for key, value in found.to_dict().items():
         if key in ("file", "archive"):
             continue
+        unit = _UNITS.get(key, "")
         rows = value.items() if isinstance(value, dict) else value
         if isinstance(value, dict) or (isinstance(value, tuple) and key != "joint_names"):
-            lines.append(f"  {key}")
+            lines.append("  events (s)" if key == "events" else f"  {key}")
             for first, *others in rows:
-                lines.append(f"    {_cell(first):<26} {'  '.join(map(_cell, others))}")
+                of_row = unit if isinstance(unit, str) else unit.get(first, "")
+                shown = "  ".join(map(_cell, others))
+                lines.append(f"    {_cell(first):<26} {shown}{of_row and f' {of_row}'}")
         else:
-            lines.append(f"  {key:<12} {_cell(value)}")
+            shown = _cell(value)
+            lines.append(f"  {key:<12} {shown}{f' {unit}' if value and unit else ''}")
     if found.damage:
         lines.append(f"  to repair it: hil archive repair {found.path}")
     return lines
@@ -158,4 +188,4 @@ def _cell(value: object) -> str:
         return ", ".join(map(str, value))
     if isinstance(value, float):
         return f"{value:.6g}"
-    return str(value or "none")
+    return "none" if value in (None, "") else str(value)

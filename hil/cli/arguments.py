@@ -77,12 +77,15 @@ def at_most_one(**given: object) -> None:
         raise InputError(None, problem, field=" and ".join(typed), remedy="give one of them")
 
 
-def exactly_one(**given: object) -> None:
-    """Raise InputError unless one of several options was given; by their Python names."""
+def exactly_one(remedy: str, /, **given: object) -> None:
+    """Raise InputError unless one of several options was given; by their Python names.
+
+    `remedy` is a sentence with a value for each.
+    """
     at_most_one(**given)
     if all(value in (None, False, []) for value in given.values()):
         names = " or ".join(map(_option, given))
-        raise InputError(None, "one of them is required", field=names, remedy=f"give {names}")
+        raise InputError(None, "one of them is required", field=names, remedy=remedy)
 
 
 def _option(name: str) -> str:

@@ -32,6 +32,7 @@ from hil.importers import (
     import_rosbag2,
     recorded_joints,
 )
+from hil.importers.column_map import ready_map, ready_maps
 from hil.progress import say
 from hil.terminal_text import printable
 from identification import FrictionLaw
@@ -52,6 +53,16 @@ Kind = Annotated[
     typer.Option(
         help="Use of the recording. excitation: fitted. validation: predicted only. standstill: "
         "noise of the positions."
+    ),
+]
+ForceOption = Annotated[
+    bool, typer.Option("--force", help="Replace an archive that exists already.")
+]
+OutsideOption = Annotated[
+    bool,
+    typer.Option(
+        "--outside-limits",
+        help="Write the archive even if no row is within the limits of the URDF.",
     ),
 ]
 
@@ -100,7 +111,12 @@ class Described:
 
     def robot(self, recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
         """Return the robot of a cell file, URDF or DH table; `recorded` reads the joint names."""
-        exactly_one(urdf=self.urdf, cell=self.cell, dh=self.dh)
+        exactly_one(
+            "--urdf arm.urdf, or --cell cell.toml, or --dh table.csv with --convention",
+            urdf=self.urdf,
+            cell=self.cell,
+            dh=self.dh,
+        )
         law = FrictionLaw.from_table(
             {**friction_from(self.friction), "standstill": self.standstill}
         )
@@ -132,6 +148,8 @@ def rosbag2(
     rename: Annotated[list[str] | None, typer.Option(metavar="RECORDED=URDF")] = None,
     held: Held = None,
     kind: Kind = "excitation",
+    force: ForceOption = False,
+    outside_limits: OutsideOption = False,
     json: JsonOption = False,
 ) -> None:
     """Import sensor_msgs/JointState messages from a rosbag2 or MCAP file.
@@ -157,6 +175,8 @@ def rosbag2(
         joint_names=names,
         held_joints=held or (),
         use=kind,
+        force=force,
+        outside_limits=outside_limits,
     )
     _print(path, json=json)
 
@@ -170,6 +190,8 @@ def log(
     arm: Described,
     held: Held = None,
     kind: Kind = "excitation",
+    force: ForceOption = False,
+    outside_limits: OutsideOption = False,
     uncoupled: bool = False,
     json: JsonOption = False,
 ) -> None:
@@ -183,7 +205,7 @@ def log(
     `map.toml` of `[time] column = "t"`, `[position] columns = "q{}"`, `[torque] columns = "tau{}"`
 
     Options:
-        columns: TOML file with the column map.
+        columns: TOML file with the column map, or a ready one by name (`hil import maps`).
         uncoupled: Leave the inertia and friction of coupled motors out of the model, to measure
             their contribution. Angles and torques remain those of the map.
     """
@@ -203,12 +225,36 @@ def log(
         columns=ColumnMap.load(columns),
         held_joints=held or (),
         use=kind,
+        force=force,
+        outside_limits=outside_limits,
         coupled=not uncoupled,
     )
     _print(path, json=json)
 
 
 app.command("log")(log)
+
+
+@app.command("maps")
+def maps(
+    name: Annotated[str | None, typer.Argument(help="The map to print.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """List the ready column maps of common logs, or print one as a start for another.
+
+    **Example:** `hil import maps ur_rtde > map.toml`
+    """
+    purposes = ready_maps()
+    if name is not None and name not in purposes:
+        remedy = f"there are {', '.join(purposes)}"
+        raise InputError(None, f"no ready map is called {name!r}", remedy=remedy)
+    if json:
+        print_json(purposes if name is None else {"name": name, "map": ready_map(name)})
+    elif name is not None:
+        typer.echo(ready_map(name), nl=False)
+    else:
+        for known, purpose in purposes.items():
+            say(f"{known:<18} {purpose}")
 
 
 def _print(path: Path, *, json: bool) -> None:

@@ -48,6 +48,8 @@ def new(
     bind: str = "0.0.0.0",
     arm: Annotated[int, typer.Option(min=1, max=4)] = 1,
     wait: Annotated[float, typer.Option(min=0.0)] = 300.0,
+    base: Annotated[str | None, typer.Option(metavar="LINK")] = None,
+    tip: Annotated[str | None, typer.Option(metavar="LINK")] = None,
     fix: Annotated[list[str] | None, typer.Option(metavar="JOINT[=POSITION]")] = None,
     design_only: bool = False,
     force: bool = False,
@@ -74,20 +76,26 @@ def new(
         bind: Local address to listen on; 0.0.0.0 for all.
         arm: Arm number of the controller.
         wait: Time to wait for the controller, s.
+        base: Link from which the arm starts, of a robot with several arms. Joints that do not lie
+            between it and the tip are fixed. Default: the root of the URDF.
+        tip: Last link of the arm, such as the flange before a gripper. Default: every end.
         fix: Joint that does not move, at a position in rad or m (default 0; repeatable). Prismatic
             joints are always fixed.
         design_only: For an arm moved by another controller: no drive train and no link; values that
             a design needs beyond the URDF are assumed and listed.
         force: Replace an earlier file.
     """
-    exactly_one(urdf=urdf, dh=dh)
+    exactly_one("--urdf arm.urdf, or --dh table.csv with --convention", urdf=urdf, dh=dh)
     at_most_one(
         design_only=design_only, from_controller=from_controller, from_archive=from_archive_file
     )
+    if urdf is None and (base or tip):
+        problem, remedy = "are links of a URDF", "omit them with --dh"
+        raise InputError(None, problem, field="--base and --tip", remedy=remedy)
     _require_free(output, force=force)
     fixed = figures(fix or [], "--fix", "--fix finger=0.02 (rad or m)")
     if urdf is not None:
-        made = cell_of_urdf(urdf, fixed)
+        made = cell_of_urdf(urdf, fixed, base=base, tip=tip)
     else:
         assert dh is not None
         made = cell_of_dh(dh, convention_of(convention), fixed)

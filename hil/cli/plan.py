@@ -88,7 +88,11 @@ def plan(
     """
     if picture is not None:
         check_format(picture)
-    exactly_one(via=via, random=random)
+    exactly_one(
+        "--random 6 plans through six random points, --via FILE through those of a table",
+        via=via,
+        random=random,
+    )
     loaded = Cell.load(cell)
     frame = AngleFrame.of(loaded)
     points = (

@@ -7,11 +7,12 @@ from typing import Annotated
 
 import typer
 
+from hil.archive.check import archive_files
 from hil.cli.arguments import JsonOption, print_json
-from hil.errors import InputError
 from hil.files import make_folder
 from hil.plots import check_format, save
 from hil.plots.archive_view import draw_archive, view_of
+from hil.progress import say
 from hil.terminal_text import printable
 
 
@@ -32,17 +33,14 @@ def plot(
     **Example:** `hil plot runs/demo/archives/excitation_000_a1.mcap --joint 2 -o joint_2.svg`
 
     Options:
-        archive: The archive (*.mcap).
+        archive: The archive (*.mcap), or a folder, of which the first archive is plotted.
         output: The picture (*.png, *.svg, *.pdf). Default: the name of the archive with .png, in
             the working directory.
         start: Start of the plotted part, s.
         stop: End of the plotted part, s.
         joint: Plot this joint only, by name or number from 1 (repeatable).
     """
-    if archive.is_dir():
-        raise InputError(
-            archive, "is a folder", remedy=f"name an archive, such as one of {archive}/archives"
-        )
+    archive, *others = archive_files([archive])
     target = output or Path(archive.with_suffix(".png").name)
     check_format(target)
     view = view_of(archive, start=start, stop=stop, joints=tuple(joint or ()))
@@ -57,8 +55,12 @@ def plot(
             for quantity in view.quantities
         }
         span = {"start": view.start, "stop": view.stop}
-        print_json({"picture": str(target), **span, "peak_share_of_limit": peaks})
+        print_json(
+            {"archive": str(archive), "picture": str(target), **span, "peak_share_of_limit": peaks}
+        )
         return
+    if others:
+        say(f"note: {archive} is the first of {len(others) + 1} archives; name another to plot it")
     for problem in (view.facts.damage, view.facts.lost):
         if problem:
             typer.echo(printable(f"note: {problem}"))

@@ -25,3 +25,8 @@ def __getattr__(name: str) -> Any:
     from . import run
 
     return getattr(run, name)
+
+
+def __dir__() -> list[str]:
+    """Return all names, also those that are not loaded yet."""
+    return [*globals(), *__all__]

@@ -45,13 +45,16 @@ from identification.estimators.prior import (
     posterior_values,
 )
 from identification.estimators.robust import RobustEstimate, robust_estimate
+from identification.estimators.torque_scale import with_torque_scale
 from identification.factor.columns import instrument_factor
 from identification.factor.factor import (
     QR_CONDITION,
     Estimate,
     Factor,
+    inverse_variance,
     joint_weights,
     no_rows_message,
+    solve,
     total_factor,
 )
 from identification.selection.inner_prediction import Strength
@@ -61,6 +64,7 @@ from identification.validation.finding import joined
 
 from .options import Estimator, Options
 from .prepared import Prepared, known_parameters, samples_of
+from .torque_scale import TorqueScale, torque_scale
 
 # Hz. A narrower smoother removes part of the motion from the regressor, a bias that instruments
 # cannot correct. On simulated NS 16 logs with 100 to 1000 times the encoder noise, instrumental
@@ -89,6 +93,10 @@ class Estimation:
     with_prior: PosteriorEstimate
     refit: Refit  #: parameters by the estimator from a factor, to predict parts of the fitted rows
     warnings: tuple[str, ...]
+    #: the pooled result, with the uncertainty of the torque's scale in its covariance: no torque
+    #: measured by the same sensors shows that
+    stated: Estimate
+    notes: tuple[str, ...]  #: what the intervals assume
 
 
 def fit_with_transmitted_load(
@@ -184,7 +192,39 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
             " parameters poorly (solved by QR)"
         )
     refit = refit_of(model, name, posterior)
-    return Estimation(name, result, held_out, posterior, beside, refit, tuple(warnings))
+    scale = torque_scale(
+        cell,
+        [source.recording for source in prepared.sources.training],
+        simulated=prepared.sources.header.only_simulated,
+    )
+    precision = posterior.precision if name in _OF_PRIOR else None
+    return Estimation(
+        estimator=name,
+        result=result,
+        held_out=held_out,
+        posterior=posterior,
+        with_prior=beside,
+        refit=refit,
+        warnings=tuple(warnings),
+        stated=with_uncertain_scale(pooled, result.factor, precision, scale),
+        notes=(f"the intervals of the parameters are computed {scale.message}",),
+    )
+
+
+def with_uncertain_scale(
+    estimate: Estimate, factor: Factor, precision: Array | None, scale: TorqueScale
+) -> Estimate:
+    """Return the estimate with the uncertainty of the torque's scale in its covariance.
+
+    `precision` (p, p) is that of a prior beside the factor.
+    """
+    if not scale.std.any():
+        return estimate
+    weights = inverse_variance(estimate.noise_std**2)
+    equations = factor.weighted(weights)
+    if precision is not None:
+        equations = equations._replace(A=equations.A + precision)
+    return with_torque_scale(estimate, factor, weights, solve(equations).inverse, scale.std)
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +286,7 @@ class Posterior:
         return consistent_values(self.model, factor, weights, values, self.prior, effect)
 
     def solvable(self, factor: Factor) -> tuple[Posterior, list[str]]:
-        """Return the posterior, of all bodies if it fails for the possible ones, and why."""
+        """Return the posterior without restriction to possible bodies if that fails, and why."""
         try:
             self.values(factor)
         except SolverError as error:

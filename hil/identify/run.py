@@ -190,9 +190,7 @@ def identify_archives(
             if sources.in_sample:
                 consistency = replace(consistency, judged_on="in-sample")
             if consistency.impossible:  # no rigid bodies produce the predicted torque
-                impossible.append(
-                    f"{consistency.sentence}: check signs, torque constants, coupling and URDF"
-                )
+                impossible.append(f"{consistency.sentence}: {consistency.remedy}")
             elif consistency.costly:
                 warned.append(consistency.sentence)
         task.advance(1, "essential parameters")
@@ -346,10 +344,10 @@ def summarise(
             condition=pooled.condition,
             grouping=model.base.explanation(),
         ),
-        notes=list(prepared.notes),
+        notes=[*prepared.notes, *estimation.notes],
         parameters=_parameters(cell, estimation, truth),
         n_base=len(model.base.names),
-        uncertainty=results.UncertaintyResult.of(pooled),
+        uncertainty=results.UncertaintyResult.of(estimation.stated),
         repetitions=[source.name for source in sources.training],
         repetition_values=[one.values.tolist() for one in estimate.repetitions],
         noise_std=pooled.noise_std.tolist(),
@@ -500,7 +498,7 @@ def _parameters(
     cell: Cell, estimation: Estimation, truth: Array | None
 ) -> list[results.ParameterResult]:
     model, estimate, posterior = cell.model, estimation.result, estimation.with_prior
-    pooled, many = estimate.pooled, len(estimate.repetitions) > 1
+    pooled, many = estimation.stated, len(estimate.repetitions) > 1
     # Rows 29 and 31 of the paper's Table 2 have the other sign.
     ids = {row.pivot or row.parameter: row.id for row in TABLE2}
     is_ns16 = cell.urdf == URDF_PATH.read_text(encoding="utf-8")

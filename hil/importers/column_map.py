@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from importlib.resources import files
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
@@ -14,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError,
 
 from hil.cell.errors import first_error
 from hil.errors import SourceError
-from hil.reading import parse_toml, read_text
+from hil.reading import parse_toml, path_exists, read_text, remedy_for_missing
 
 ANGLES = {
     "rad": 1.0,
@@ -211,14 +212,16 @@ class ColumnMap(_Table):
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> ColumnMap:
-        """Read a map from a TOML file.
+        """Read a map from a TOML file, or the ready one of this name (`ready_maps`).
 
         Raises:
             SourceError: the file cannot be read, or is not a valid map.
         """
         path = Path(path)
         try:
-            return cls.model_validate(parse_toml(read_text(path)))
+            is_ready = str(path) in ready_maps() and not path_exists(path)
+            text = ready_map(str(path)) if is_ready else read_text(path)
+            return cls.model_validate(parse_toml(text))
         except ValidationError as error:
             wrong = first_error(path, error, cls, documentation=_DOCUMENTATION)
             problem, field, remedy = wrong.problem, wrong.field, wrong.remedy
@@ -226,4 +229,23 @@ class ColumnMap(_Table):
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             problem = f"cannot be read ({reason})"
-            raise SourceError(path, problem, remedy="name a TOML file") from error
+            remedy = f"name a TOML file, or a ready map: {', '.join(ready_maps())}"
+            if isinstance(error, FileNotFoundError):
+                remedy = remedy_for_missing(path, remedy)
+            raise SourceError(path, problem, remedy=remedy) from error
+
+
+def ready_maps() -> dict[str, str]:
+    """Return the first comment of each ready map, by its name."""
+    folder = files(f"{__package__}.maps")
+    names = sorted(file.name for file in folder.iterdir() if file.name.endswith(".toml"))
+    return {name.removesuffix(".toml"): _purpose(ready_map(name[:-5])) for name in names}
+
+
+def ready_map(name: str) -> str:
+    """Return the text of a ready map."""
+    return (files(f"{__package__}.maps") / f"{name}.toml").read_text("utf-8")
+
+
+def _purpose(text: str) -> str:
+    return text.partition("\n")[0].removeprefix("# ").partition(". ")[0].partition(": a ")[0]

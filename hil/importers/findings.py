@@ -6,9 +6,9 @@ Where another order fits better, its error is given with that of the map.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,14 @@ _SCALE_TOLERANCE: Final = 0.1  # of velocity over slope of the position, for fil
 _CORRELATED: Final = 0.7
 _TOO_FAST: Final = 3.0  # times the URDF's limit, of speed and of torque
 _NO_LIMIT: Final = 1e4  # some URDFs have larger figures for "none"
+_OTHER_UNIT: Final = 30.0  # between the errors of a nominal torque and a factor of 1000
+_THOUSAND: Final = 1000.0
+_BLOCK: Final = 0.05  # s, over which signals are averaged before they are differentiated
+_MOST_BLOCKS: Final = 2000
+_SIGNIFICANT: Final = 0.01  # of the largest nominal torque
+
+NominalTorque = Callable[[Array, Array, Array], Array]
+"""Torque of the nominal inertias by position, velocity and acceleration, each (m, n)."""
 
 
 def check_clock(stamp: NDArray[np.int64], path: Path) -> None:
@@ -70,15 +78,16 @@ def examine(
     urdf: str,
     *,
     locked: Mapping[str, float] | None = None,
+    nominal: NominalTorque | None = None,
 ) -> Findings:
     """Return the findings on samples of the joint side, in SI units.
 
-    `locked` are positions [rad or m] of joints that are not in the model, by name.
+    `locked` are positions [rad or m] of joints that are not in the model, by name; `nominal` is the
+    torque of the nominal inertias, None if the URDF has none.
     """
     time, position = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9), unwrap(samples.position)
     limits = limits_of(urdf, joint_names)
-    kinds = {joint.get("name"): joint.get("type") for joint in urdf_tree(urdf).findall("joint")}
-    turning = np.array([kinds[name] != "prismatic" for name in joint_names])
+    turning = _turning(urdf, joint_names)
     held = [f"{name} at {place:.4g}" for name, place in (locked or {}).items()]
     lines = [f"locked, rad or m: {', '.join(held)}"] if held else []
     if len(time) < 2:
@@ -90,9 +99,12 @@ def examine(
     if not _SLOWEST <= base.rate <= _FASTEST:
         warnings += [f"{base.rate:.3g} samples per second are unusual: check the unit of the time"]
     warnings += _positions(time, position, joint_names, limits, turning)
+    is_plausible = not warnings  # torques are compared with those of a plausible motion only
     if samples.velocity is not None:
         warnings += _velocities(time, position, samples.velocity, joint_names)
     warnings += _torques(samples, joint_names, limits.effort)
+    if is_plausible:
+        warnings += _torque_size(samples, joint_names, limits.effort, nominal)
     return Findings(lines=tuple(lines), warnings=tuple(warnings))
 
 
@@ -105,6 +117,11 @@ def limits_of(urdf: str, names: Sequence[str]) -> UrdfLimits:
         np.where(bounded, upper, np.inf),
         *(np.where((one > 0.0) & (one < _NO_LIMIT), one, np.inf) for one in (velocity, effort)),
     )
+
+
+def _turning(urdf: str, names: Sequence[str]) -> NDArray[np.bool_]:
+    kinds = {joint.get("name"): joint.get("type") for joint in urdf_tree(urdf).findall("joint")}
+    return np.array([kinds[name] != "prismatic" for name in names])
 
 
 def _range(name: str, position: Array, turns: bool, lower: float, upper: float) -> str:
@@ -123,6 +140,65 @@ def _fits(position: Array, limits: UrdfLimits) -> NDArray[np.bool_]:
     return np.asarray(above & (position.max(axis=0) <= limits.upper[:, None] + _TOLERANCE))
 
 
+class _Outside(NamedTuple):
+    """Positions that leave the limits of the URDF."""
+
+    rows: NDArray[np.bool_]  #: (m,) those with a joint outside
+    problem: str
+    remedy: str
+
+
+def _outside(
+    position: Array, names: Sequence[str], limits: UrdfLimits, turning: NDArray[np.bool_]
+) -> _Outside | None:
+    """Return which positions leave the limits of the URDF, and which reading would not."""
+    fits, joints = _fits(position, limits), range(len(names))
+    beyond = [joint for joint in joints if not fits[joint, joint]]
+    if not beyond:
+        return None
+    low, high = position.min(axis=0), position.max(axis=0)
+    ranges = ", ".join(f"{names[j]}: {low[j]:.3g} .. {high[j]:.3g}" for j in beyond)
+    outside = (position < limits.lower - _TOLERANCE) | (position > limits.upper + _TOLERANCE)
+    rows = np.asarray(outside.any(axis=1))
+    share = (
+        "every row leaves" if rows.all() else f"{_percent(float(rows.mean()))} of the rows leave"
+    )
+    problem = f"as mapped, {share} the limits of the URDF ({ranges})"
+    radians = np.where(turning, np.radians(position), position)
+    farthest = 3.0 * np.maximum(-limits.lower, limits.upper)
+    far = (np.maximum(-low, high) > farthest)[beyond].any()
+    columns = linear_sum_assignment(~fits + 1e-6 * (1.0 - np.eye(len(names))))[1]
+    check = "check unit, sign and zero in the column map"
+    if far and np.diag(_fits(radians, limits)).all():
+        remedy = 'as degrees read as radians, none would: write unit = "deg"'
+    elif fits[joints, columns].all():
+        order = ", ".join(names[int(j)] for j in np.argsort(columns))
+        remedy = (
+            f"with the columns those of {order}, none would: check the order of the joints, or "
+            f"{check}"
+        )
+    else:
+        remedy = check
+    return _Outside(rows, problem, remedy)
+
+
+def _percent(share: float) -> str:
+    """Return a share below 1 that does not read as all."""
+    return f"{min(100.0 * share, 99.9):.3g} %"
+
+
+def check_positions(position: Array, names: Sequence[str], urdf: str, path: Path) -> None:
+    """Check that some row of positions (m, n) [rad or m] is within the limits of the URDF.
+
+    Raises:
+        SourceError: none is.
+    """
+    outside = _outside(position, names, limits_of(urdf, names), _turning(urdf, names))
+    if outside is not None and outside.rows.all():
+        remedy = f"{outside.remedy}; if the limits are wrong: --outside-limits"
+        raise SourceError(path, outside.problem, field="position", remedy=remedy)
+
+
 def _positions(
     time: Array,
     position: Array,
@@ -131,31 +207,10 @@ def _positions(
     turning: NDArray[np.bool_],
 ) -> Iterator[str]:
     """Yield warnings where positions or speeds are outside the limits of the URDF."""
-    fits, joints = _fits(position, limits), range(len(names))
-    beyond = [joint for joint in joints if not fits[joint, joint]]
+    outside = _outside(position, names, limits, turning)
+    if outside is not None:
+        yield f"{outside.problem}; {outside.remedy}"
     low, high = position.min(axis=0), position.max(axis=0)
-    if beyond:
-        ranges = ", ".join(f"{names[j]}: {low[j]:.3g} .. {high[j]:.3g}" for j in beyond)
-        outside = (position < limits.lower - _TOLERANCE) | (position > limits.upper + _TOLERANCE)
-        text = (
-            f"as mapped, {100.0 * float(np.mean(outside.any(axis=1))):.3g} % of the rows leave the "
-            f"limits of the URDF ({ranges})"
-        )
-        radians = np.where(turning, np.radians(position), position)
-        farthest = 3.0 * np.maximum(-limits.lower, limits.upper)
-        far = (np.maximum(-low, high) > farthest)[beyond].any()
-        columns = linear_sum_assignment(~fits + 1e-6 * (1.0 - np.eye(len(names))))[1]
-        check = "check unit, sign and zero in the column map"
-        if far and np.diag(_fits(radians, limits)).all():
-            yield f'{text}; as degrees read as radians, none would: write unit = "deg"'
-        elif fits[joints, columns].all():
-            order = ", ".join(names[int(j)] for j in np.argsort(columns))
-            yield (
-                f"{text}; with the columns those of {order}, none would: check the order of the "
-                f"joints, or {check}"
-            )
-        else:
-            yield f"{text}: {check}"
     travel = float((high - low).max())
     if travel < _LEAST_TRAVEL:
         yield (
@@ -251,3 +306,69 @@ def _torques(samples: Samples, names: Sequence[str], limits: Array) -> Iterator[
                 f"the torque of {name} reaches {largest:.3g}, its limit in the URDF is "
                 f"{limit:.3g} N·m (or N): check its unit and side (motor or joint)"
             )
+
+
+def _torque_size(
+    samples: Samples, names: Sequence[str], limits: Array, nominal: NominalTorque | None
+) -> Iterator[str]:
+    """Yield a warning where torques have another order of magnitude than the arm needs.
+
+    Compared are root mean squares with those of the nominal inertias over the same motion, without
+    friction; without nominal inertias, the largest torques with the effort limits.
+    """
+    if samples.torque is None or not samples.torque.any():
+        return
+    expected = None if nominal is None else _nominal_rms(samples, nominal)
+    if expected is not None and expected.any():
+        compared = expected >= _SIGNIFICANT * expected.max()
+        rms = np.sqrt(np.mean(np.square(samples.torque), axis=0))
+        ratio, reference = rms[compared] / expected[compared], "those of the URDF's masses"
+        lowest = _OTHER_UNIT
+    else:
+        compared = np.isfinite(limits)
+        if not compared.any():
+            return
+        ratio = np.abs(samples.torque).max(axis=0)[compared] / limits[compared]
+        reference, lowest = "the effort limits of the URDF", _THOUSAND / _TOO_FAST
+    listing = ", ".join(
+        f"{name}: {value:.2g}" for name, value in zip(_those(names, compared), ratio, strict=True)
+    )
+    if ratio.max() < 1.0 / lowest:
+        yield (
+            f"the torques are too small for this arm: measured over {reference} {listing}; check "
+            "their unit (N·m read as mN·m would be 1000 times too small) and side (motor or joint)"
+        )
+    elif ratio.min() > _OTHER_UNIT:
+        yield (
+            f"the torques are too large for this arm: measured over {reference} {listing}; check "
+            "their unit (mN·m read as N·m would be 1000 times too large), side (motor or joint) "
+            "and the masses of the URDF"
+        )
+
+
+def _those(names: Sequence[str], which: NDArray[np.bool_]) -> list[str]:
+    return [name for name, chosen in zip(names, which.tolist(), strict=True) if chosen]
+
+
+def _nominal_rms(samples: Samples, nominal: NominalTorque) -> Array | None:
+    """Return the root mean square of the nominal torque over the motion (n,); None if too short.
+
+    Positions are averaged over blocks first, in which the noise of differences is small.
+    """
+    block = ((samples.stamp - samples.stamp[0]) // round(1e9 * _BLOCK)).astype(np.int64)
+    _, index, count = np.unique(block, return_inverse=True, return_counts=True)
+    mean = np.zeros((len(count), samples.position.shape[1]))
+    np.add.at(mean, index, samples.position)
+    mean /= count[:, None]
+    if len(mean) < 3:
+        return None
+    time = np.zeros(len(count))
+    np.add.at(time, index, (samples.stamp - samples.stamp[0]) * 1e-9)
+    time /= count
+    before, after = np.diff(time)[:-1, None], np.diff(time)[1:, None]
+    slopes = np.diff(mean, axis=0) / np.diff(time)[:, None]
+    velocity = (slopes[:-1] * after + slopes[1:] * before) / (before + after)
+    acceleration = 2.0 * np.diff(slopes, axis=0) / (before + after)
+    rows = slice(None, None, -(-len(velocity) // _MOST_BLOCKS))
+    torque = nominal(mean[1:-1][rows], velocity[rows], acceleration[rows])
+    return np.asarray(np.sqrt(np.mean(np.square(torque), axis=0)))

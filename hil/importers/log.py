@@ -35,6 +35,8 @@ def import_log(
     held_joints: Sequence[str] = (),
     use: Use = "excitation",
     coupled: bool = True,
+    force: bool = False,
+    outside_limits: bool = False,
 ) -> Path:
     """Convert a log to an archive of kind ``imported``, and return its path.
 
@@ -42,10 +44,13 @@ def import_log(
     map couples joints, the model gets the inertias and the friction of the coupled motors, unless
     its cell states otherwise or `coupled` is false. Angles and torques always use the coupling.
 
+    With `force` an existing archive is replaced; `outside_limits` accepts positions of which no row
+    is within the limits of the URDF.
+
     Raises:
         SourceError: a file cannot be read, a column is missing, a cell is not a number, or the map
             does not fit the robot.
-        ArchiveWriteError: the archive cannot be written.
+        ArchiveWriteError: the archive exists or cannot be written.
     """
     log = _Log(Path(source), columns, robot)
     with np.errstate(over="ignore", invalid="ignore"):  # such numbers are refused later
@@ -78,6 +83,8 @@ def import_log(
         period=None if columns.sample_rate is None else 1.0 / columns.sample_rate,
         use=use,
         clock=clock,
+        force=force,
+        outside_limits=outside_limits,
     )
 
 

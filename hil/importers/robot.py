@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Final, Literal
@@ -15,20 +17,29 @@ from numpy.typing import NDArray
 from hil.archive import Samples, write_samples
 from hil.cell import Cell
 from hil.cell.text import replaced_value
-from hil.errors import SourceError
-from hil.files import file_digest
+from hil.errors import ArchiveWriteError, SourceError
+from hil.files import file_digest, replace_file
+from hil.identify.cell_context import nominal_of
 from hil.importers.dh import Convention, urdf_of_dh
-from hil.importers.findings import check_clock, examine, limits_of
-from hil.reading import read_input
+from hil.importers.findings import (
+    NominalTorque,
+    check_clock,
+    check_positions,
+    examine,
+    limits_of,
+)
+from hil.reading import path_exists, read_input
 from identification import FrictionLaw
 from identification.errors import ModelError
 from identification.model.kinematics import pinocchio_model
+from identification.model.regressor import LINK_SYMBOLS
 from planner.toml_text import toml_value
 
 Use = Literal["excitation", "validation", "standstill"]
 
 _MOST: Final = 1e12
 """Largest value of any quantity, in any unit; sums of its squares do not overflow."""
+_MASS: Final = LINK_SYMBOLS.index("m")
 STANDARD_GRAVITY: Final = (0.0, 0.0, -9.81)
 IMPORTED_LAW: Final = FrictionLaw(third=None, offset=True)
 """Default friction law of an imported robot. A term in v² or v³ that the motion does not need makes
@@ -125,6 +136,17 @@ class Robot:
         cell = Cell.from_texts(text, urdf, path)
         return cls(text, urdf, cell.joint_names, cell.file.robot.locked)
 
+    def nominal_torque(self) -> NominalTorque | None:
+        """Return the torque of the nominal inertias; None if the URDF has no masses.
+
+        Several links with one and the same mass have placeholders, not masses.
+        """
+        cell = Cell.from_texts(self.cell, self.urdf, Path("cell.toml"))
+        nominal, masses = nominal_of(cell), cell.model.chain.inertial[:, _MASS]
+        if nominal is None or (len(masses) > 1 and np.ptp(masses) == 0.0):
+            return None
+        return partial(cell.model.torque, nominal.values)
+
     def attachments(self) -> dict[str, bytes]:
         """Return the texts as attachments of an archive."""
         return {"cell.toml": self.cell.encode(), "robot.urdf": self.urdf.encode()}
@@ -203,25 +225,45 @@ def write_imported(
     period: float | None = None,
     use: Use = "excitation",
     clock: Path | None = None,
+    force: bool = False,
+    outside_limits: bool = False,
 ) -> Path:
     """Write samples of the joint side in SI units, joints in the robot's order, as an archive.
 
     Findings on their plausibility (:mod:`hil.importers.findings`) are stored in its metadata.
     `period` is the sampling step [s] of a recording at a fixed rate, `clock` the file that the
-    stamps come from, by default the first `source`.
+    stamps come from, by default the first `source`. With `force` an existing archive is replaced
+    once the new one is complete; `outside_limits` accepts positions of which no row is within the
+    limits of the URDF.
 
     Raises:
-        SourceError: no sample, a value that is not finite or above 1e12, or an invalid clock.
-        ArchiveWriteError: the archive cannot be written.
+        SourceError: no sample, a value that is not finite or above 1e12, an invalid clock, or no
+            row within the limits of the URDF.
+        ArchiveWriteError: the archive exists or cannot be written.
     """
+    output = Path(output)
+    if any(output.resolve() == path.resolve() for path in source):
+        problem, remedy = "is the recording itself", "choose another name (-o)"
+        raise ArchiveWriteError(output, problem, remedy=remedy)
+    if not force and path_exists(output):
+        remedy = "choose another name (-o), or replace it with --force"
+        raise ArchiveWriteError(output, "exists already", remedy=remedy)
     _check(samples, source[0], robot.joint_names)
     check_clock(samples.stamp, clock or source[0])
+    if not outside_limits:
+        check_positions(samples.position, robot.joint_names, robot.urdf, source[0])
     unknown = [name for name in held_joints if name not in robot.joint_names]
     if unknown:
         problem = f"no joint is called {unknown[0]!r}"
         remedy = f"the robot's joints are {', '.join(robot.joint_names)}"
         raise SourceError(source[0], problem, field="held joints", remedy=remedy)
-    findings = examine(samples, robot.joint_names, robot.urdf, locked=robot.locked)
+    findings = examine(
+        samples,
+        robot.joint_names,
+        robot.urdf,
+        locked=robot.locked,
+        nominal=robot.nominal_torque(),
+    )
     entries = {
         **metadata,
         "source": json.dumps([path.name for path in source]),
@@ -230,14 +272,33 @@ def write_imported(
         "use": use,
         "findings": json.dumps(findings.model_dump()),
     }
-    return write_samples(
-        output,
-        samples,
-        joint_names=robot.joint_names,
-        metadata=entries,
-        attachments=robot.attachments(),
-        period=period,
-    )
+
+    def write(path: Path) -> Path:
+        return write_samples(
+            path,
+            samples,
+            joint_names=robot.joint_names,
+            metadata=entries,
+            attachments=robot.attachments(),
+            period=period,
+        )
+
+    if not force:
+        return write(output)
+    with _replaced(output) as temporary:
+        write(temporary)
+    return output
+
+
+@contextmanager
+def _replaced(output: Path) -> Iterator[Path]:
+    """Replace an archive by the yielded one; errors of that are those of the archive."""
+    try:
+        with replace_file(output) as temporary:
+            yield temporary
+    except OSError as error:
+        problem = f"cannot be replaced ({error.strerror})"
+        raise ArchiveWriteError(output, problem, remedy="choose another name (-o)") from error
 
 
 def _check(samples: Samples, source: Path, joints: Sequence[str]) -> None:

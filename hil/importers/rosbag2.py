@@ -181,6 +181,8 @@ def import_rosbag2(
     joint_names: Mapping[str, str] | None = None,
     held_joints: Sequence[str] = (),
     use: Use = "excitation",
+    force: bool = False,
+    outside_limits: bool = False,
 ) -> Path:
     """Convert the joint states of a bag to an archive of kind ``imported``, and return its path.
 
@@ -190,9 +192,12 @@ def import_rosbag2(
     in the messages' headers; where all are empty, the bag's. The effort is a joint torque [N·m] or
     a motor current [A].
 
+    With `force` an existing archive is replaced; `outside_limits` accepts positions of which no row
+    is within the limits of the URDF.
+
     Raises:
         SourceError: no bag, no such topic, a joint that was not recorded, a value not finite.
-        ArchiveWriteError: the archive cannot be written.
+        ArchiveWriteError: the archive exists or cannot be written.
     """
     files = bag_files(Path(source))
     with _messages(files, topic) as (topic, messages):
@@ -206,6 +211,8 @@ def import_rosbag2(
         metadata=metadata,
         held_joints=held_joints,
         use=use,
+        force=force,
+        outside_limits=outside_limits,
     )
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hil.errors import SourceError
 from hil.importers.arrays import READERS
 from hil.importers.column_map import HOLE, Column, Format
-from hil.reading import read_text
+from hil.reading import read_text, remedy_for_missing
 
 Array = NDArray[np.float64]
 
@@ -25,6 +25,7 @@ _WRITTEN = (
     (",", "."), (";", "."), ("\t", "."), ("|", "."), (None, "."),
     (";", ","), ("\t", ","), ("|", ","), (None, ","),
 )  # fmt: skip
+_ROSTOPIC = "%time,"  # of `rostopic echo -p`
 _PROBED = 20  # lines
 _LONGEST = 1 << 31  # bytes; several times as many in memory
 _LONGEST_TIME = 30  # digits before the point, more than of nanoseconds since 1970
@@ -54,10 +55,14 @@ class Table:
         """
         try:
             text = read_text(path, _LONGEST).removeprefix("\ufeff")
+            if text.startswith(_ROSTOPIC):  # a header, not a comment
+                text = text.removeprefix("%")
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             problem = f"cannot be read ({reason})"
             remedy = f"name a text file, or one that ends in {', '.join(READERS)}"
+            if isinstance(error, FileNotFoundError):
+                remedy = remedy_for_missing(path, remedy)
             raise SourceError(path, problem, remedy=remedy) from error
         numbered = [
             (number, line)

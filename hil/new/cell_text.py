@@ -10,6 +10,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Final, get_origin
 
@@ -259,13 +260,111 @@ def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -
     return replace(made, urdf=made.urdf or text, known=Known(notes=(note,)) | made.known)
 
 
-def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
+def cell_of_urdf(
+    path: Path,
+    fixed: Mapping[str, float],
+    *,
+    base: str | None = None,
+    tip: str | None = None,
+) -> NewCell:
     """Return the cell of the URDF of an open chain (else InputError).
 
     Joints in `fixed` are fixed at these positions [rad or m], prismatic joints at zero (or the
-    nearest position in their range), mimic joints at their offset; notes report this.
+    nearest position in their range), mimic joints at their offset; notes report this. With links
+    `base` and `tip`, all joints that do not lie between them are fixed as well.
     """
-    return _cell_of(path, read_input(path, "name a URDF"), fixed)
+    text = read_input(path, "name a URDF")
+    if base is None and tip is None:
+        return _cell_of(path, text, fixed)
+    between = set(_joints_between(path, text, base, tip))
+    names = _chain(path, text).joint_names
+    others = [name for name in names if name not in between and name not in fixed]
+    if len(others) == len(names):
+        problem = f"no joint moves between {base or 'the root'} and {tip or 'the tip'}"
+        raise InputError(path, problem, field="--base, --tip", remedy=_LINKS_REMEDY)
+    limits = urdf_limits(text, others)
+    nearest = np.clip(0.0, limits.lower, limits.upper).tolist()
+    made = _cell_of(path, text, {**dict(zip(others, nearest, strict=True)), **fixed})
+    if not others:
+        return made
+    note = (
+        f"fixed, as they do not lie between {base or 'the root'} and {tip or 'the tip'}: "
+        f"{', '.join(others)}"
+    )
+    return replace(made, known=made.known | Known(notes=(note,)))
+
+
+_LINKS_REMEDY: Final = "name links of the URDF, the tip farther from the root than the base"
+
+
+def _joints_between(path: Path, text: str, base: str | None, tip: str | None) -> list[str]:
+    """Return the joints of the URDF on the way from a link to another, either end open."""
+    to_link = {
+        child.get("link", ""): (joint.get("name", ""), parent.get("link", ""))
+        for joint in urdf_tree(text).findall("joint")
+        for child in joint.findall("child")
+        for parent in joint.findall("parent")
+    }
+    links = sorted({*to_link, *(parent for _, parent in to_link.values())})
+    for option, link in (("--base", base), ("--tip", tip)):
+        if link is not None and link not in links:
+            similar = get_close_matches(link, links, n=3) or links
+            remedy = f"its links are {', '.join(similar[:_MOST_LISTED])}"
+            raise InputError(path, f"has no link {link!r}", field=option, remedy=remedy)
+    ends = [tip] if tip is not None else list(to_link)
+    found: dict[str, None] = {}
+    for end in ends:
+        way, link = list[str](), end
+        while link != base and link in to_link:
+            name, link = to_link[link]
+            way.append(name)
+        if base is None or link == base:
+            found |= dict.fromkeys(way)
+        elif tip is not None:
+            problem = f"link {tip!r} does not hang on link {base!r}"
+            raise InputError(path, problem, field="--tip", remedy=_LINKS_REMEDY)
+    return list(found)
+
+
+_GRIPPER: Final = re.compile(
+    r"finger|gripper|hand_|_hand|thumb|knuckle|claw|jaw|pinky|palm", re.IGNORECASE
+)
+_MOST_LISTED: Final = 12
+
+
+def _branches(chain: Chain) -> list[str]:
+    """Return the last joint of each branch of a tree of joints."""
+    parents = set(chain.parents.tolist())
+    return [name for k, name in enumerate(chain.joint_names) if k not in parents]
+
+
+def _note_on_branches(text: str, chain: Chain) -> list[str]:
+    """Return a note on a gripper or further arms among the joints that move."""
+    notes = []
+    links = {
+        joint.get("name", ""): child.get("link", "")
+        for joint in urdf_tree(text).findall("joint")
+        for child in joint.findall("child")
+    }
+    fingers = [
+        name
+        for name in chain.joint_names
+        if _GRIPPER.search(name) or _GRIPPER.search(links.get(name, ""))
+    ]
+    if fingers:
+        fixing = " ".join(f"--fix {name}" for name in fingers[:_MOST_LISTED])
+        notes.append(
+            f"{', '.join(fingers)} look like joints of a gripper or hand by their names: fix those "
+            f"that are not identified ({fixing}), or name the last link of the arm (--tip LINK)"
+        )
+    ends = [name for name in _branches(chain) if name not in fingers]
+    if len(ends) > 1:
+        tips = ", ".join(links.get(name, name) for name in ends[:_MOST_LISTED])
+        notes.append(
+            f"the joints form {len(ends)} branches, with the last moving links {tips}: choose one "
+            "arm with --base LINK --tip LINK"
+        )
+    return notes
 
 
 def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
@@ -298,7 +397,9 @@ def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
         for name, (leader, _) in following.items()
     ]
     used = with_fixed(text, positions) if positions else text
-    moving = _chain(path, used).joint_names
+    moving_chain = _chain(path, used)
+    moving = moving_chain.joint_names
+    notes += _note_on_branches(used, moving_chain)
     shapes = _COLLISION.findall(text)
     if not shapes:
         notes.append(

@@ -366,12 +366,11 @@ def _load_friction(
 
     `part` are the rows that a filter of the torque needs.
     """
-    rigid = np.where(model.friction_columns, 0.0, values)
     motion = samples.motion.rows(part)
     direction = motion.direction
     if direction is None:
         direction = model.friction.direction(*motion[:3])
-    load = np.abs(model.torque(rigid, *motion[1:4], direction)) * direction
+    load = np.abs(model.gear_torque(values, *motion[1:4])) * direction[:, : model.n_joints]
     if len(part) == len(some):
         return np.asarray(load)
     columns = [samples.as_measured(j, load[:, j : j + 1])[some] for j in range(model.n_joints)]

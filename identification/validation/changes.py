@@ -64,7 +64,6 @@ class _Part(NamedTuple):
     @classmethod
     def of(cls, model: RobotModel, values: Array, recordings: Sequence[Samples]) -> _Part:
         """Compare measured with predicted torque in the usable rows of recordings."""
-        friction_values = np.where(model.friction_columns, values, 0.0)
         torque, error = np.zeros((2, model.n_joints))
         sums: tuple[list[Array], list[Array]] = ([], [])
         for samples in recordings:
@@ -73,7 +72,7 @@ class _Part(NamedTuple):
             left = np.where(usable, samples.torque - predicted, 0.0)
             torque += (np.where(usable, samples.torque, 0.0) ** 2).sum(axis=0)
             error += (left**2).sum(axis=0)
-            columns = predicted, samples.predicted_torque(model, friction_values)
+            columns = predicted, samples.predicted_torque(model, values, model.friction_columns)
             for table, column in zip(sums, columns, strict=True):
                 column = np.where(usable, column, 0.0)
                 table.append(_by_block(block, np.stack([column * left, column**2])))

@@ -19,10 +19,11 @@ import pytest
 from typer.testing import CliRunner
 
 import hil as hil_package
-from hil.archive import open_archive
+from hil.archive import Samples, open_archive, write_samples
 from hil.campaign import Campaign
 from hil.cli import COMMANDS, app, main
 from hil.errors import InputError
+from hil.progress import reporter
 from hil.results import Results
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 
@@ -136,7 +137,10 @@ def test_the_demo_writes_results_and_ends_with_the_verdict(tmp_path: Path) -> No
     [
         (["identify", "nothing.mcap"], "nothing.mcap"),
         (["identify", str(CELL_PATH)], "cell.toml"),
-        (["import", "rosbag2", "x.db3", "-o", "y.mcap"], "give --urdf or --cell or --dh"),
+        (
+            ["import", "rosbag2", "x.db3", "-o", "y.mcap"],
+            "--urdf arm.urdf, or --cell cell.toml, or --dh table.csv",
+        ),
         (["import", "rosbag2", "x.db3", "-o", "y.mcap", "--urdf", str(URDF_PATH)], "x.db3"),
         (
             ["import", "log", "x", "-o", "y", "--map", "m.toml", "--urdf", str(URDF_PATH)],
@@ -174,6 +178,16 @@ def test_a_stopped_demo_is_resumed(campaign: Campaign, tmp_path: Path) -> None:
     # Attempt numbers are not reused.
     assert (folder / "archives" / "validation_001_a2.mcap").exists()
     assert (folder / "report.html").exists()
+
+
+@pytest.mark.parametrize("option", ["--repetitions", "--validation", "--seed"])
+def test_a_resumed_demo_ignores_no_option(campaign: Campaign, tmp_path: Path, option: str) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(campaign.folder.root, folder)
+    words = ["demo", "--output", str(folder), "--resume", option, "77"]
+    refused = CliRunner().invoke(app, words)
+    assert f"was begun with {option} " in str(refused.exception)
+    assert f"omit {option} with --resume" in str(refused.exception)
 
 
 def test_force_removes_only_a_campaign(campaign: Campaign, tmp_path: Path) -> None:
@@ -216,3 +230,85 @@ def test_ctrl_c_stops_on_the_path_with_complete_archives(tmp_path: Path) -> None
     archive = open_archive(last)
     assert archive.complete
     assert archive.outcome.entries["outcome"] == "stopped"
+
+
+@pytest.mark.parametrize(
+    "package", ["hil", "hil.campaign", "hil.identify", "hil.testing", "identification"]
+)
+def test_tab_completion_lists_names_that_are_not_loaded_yet(package: str) -> None:
+    look = f"import {package} as package; print(set(package.__all__) - set(dir(package)))"
+    shown = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
+    assert shown.stdout == "set()\n"
+
+
+class TestMistypedPaths:
+    """A path that is not there is answered with the one beside it that is most like it."""
+
+    @pytest.fixture
+    def folder(self, tmp_path: Path) -> Path:
+        (tmp_path / "run").mkdir()
+        for name in ("first.mcap", "second.mcap"):
+            write_samples(
+                tmp_path / "run" / name,
+                Samples(np.arange(3) * 10**7, np.zeros((3, 1)), torque=np.zeros((3, 1))),
+                joint_names=("a",),
+                metadata={"clock_origin_ns": str(1_700_000_000 * 10**9), "importer": "log"},
+            )
+        return tmp_path / "run"
+
+    @pytest.mark.parametrize("command", ["identify", "plot", "archive check", "archive info"])
+    @pytest.mark.parametrize("typed", ["run/frist.mcap", "runn/first.mcap"])
+    def test_nearest_name(self, folder: Path, command: str, typed: str) -> None:
+        done = hil(*command.split(), folder.parent / typed)
+        assert done.returncode == 2
+        assert f"there is {folder / 'first.mcap'}" in done.stderr
+
+    def test_nothing_alike(self, tmp_path: Path) -> None:
+        done = hil("archive", "check", tmp_path / "x.mcap")
+        assert "check whether it was moved or removed" in done.stderr
+        done = hil("archive", "check", tmp_path / "absent" / "x.mcap")
+        assert f"there is no folder {tmp_path / 'absent'}" in done.stderr
+
+    def test_other_inputs(self, folder: Path) -> None:
+        (folder / "arm.urdf").write_text("<robot name='a'/>")
+        done = hil("new", "--urdf", folder / "amr.urdf", "-o", folder / "c.toml")
+        assert f"there is {folder / 'arm.urdf'}" in done.stderr
+
+    def test_folders_are_accepted(self, folder: Path) -> None:
+        done = hil("archive", "check", folder)
+        assert [line.partition(":")[0] for line in done.stdout.splitlines()] == [
+            str(folder / "first.mcap"),
+            str(folder / "second.mcap"),
+        ]
+        done = hil("plot", folder, "-o", folder / "a.png")
+        assert (folder / "a.png").exists()
+        assert f"{folder / 'first.mcap'} is the first of 2 archives" in done.stdout
+
+    def test_folder_without_an_archive(self, tmp_path: Path) -> None:
+        done = hil("archive", "info", tmp_path)
+        assert done.returncode == 2
+        assert "has no archive (*.mcap) in it" in done.stderr
+
+    def test_info_has_the_date_on_top_and_units(self, folder: Path) -> None:
+        lines = hil("archive", "info", folder / "first.mcap").stdout.splitlines()
+        assert lines[1].split() == ["recorded", "2023-11-14T22:13:20+00:00"]
+        shown = {line.split()[0]: line.split()[-1] for line in lines[1:] if len(line.split()) > 1}
+        assert shown["duration"] == "s"
+        assert shown["size"] == "bytes"
+        assert shown["clock_origin_ns"] == "ns"
+        assert shown["outcome.samples"] == "samples"
+
+
+def test_a_required_choice_has_an_example_of_each(tmp_path: Path) -> None:
+    done = hil("plan", tmp_path / "cell.toml")
+    assert "--random 6" in done.stderr
+    assert "--via FILE" in done.stderr
+
+
+def test_piped_output_has_messages_and_no_progress(capsys: pytest.CaptureFixture[str]) -> None:
+    piped = reporter()
+    with piped.task("smoothing", 2) as task:
+        task.advance(1, "half")
+        piped.say("one recording is short")
+        task.advance(1, "all")
+    assert capsys.readouterr().out == "one recording is short\n"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,7 +19,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 from typer.testing import CliRunner
 
+from hil import exporting
 from hil.cli import app
+from hil.identify import Identification
 from hil.importers import ColumnMap, Robot, import_log
 from hil.outcome import FILES, Exports
 from hil.results import Results
@@ -235,3 +238,106 @@ class TestCommand:
         output = command("export", log, "--to", "mjcf").stdout
         assert "not read back: MuJoCo is not installed" in output
         assert (tmp_path / "identified.xml").read_text().startswith("<mujoco")
+
+
+@pytest.fixture(scope="module")
+def identified(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with an archive and the files of its identification."""
+    folder = tmp_path_factory.mktemp("folder")
+    shutil.copy(log, folder)
+    command("identify", folder, "-q")
+    return folder
+
+
+class TestReuse:
+    """`hil export` of a folder with the files of an identification."""
+
+    @pytest.fixture
+    def folder(self, identified: Path, tmp_path: Path) -> Path:
+        return Path(shutil.copytree(identified, tmp_path / "folder"))
+
+    def test_the_file_is_that_of_a_new_identification(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        new, stored = folder / "new.urdf", folder / "stored.urdf"
+        again = command("export", folder, "--to", "urdf", "--again", "-o", new)
+        assert "parameters: from" not in again.stdout
+
+        def identify(*_: object, **__: object) -> Identification:
+            raise AssertionError("the parameters are there")
+
+        monkeypatch.setattr(exporting, "identify_paths", identify)
+        reused = command("export", folder, "--to", "urdf", "-o", stored)
+        assert f"parameters: from {folder}/results.json and parameters.json" in reused.stdout
+        assert stored.read_text() == new.read_text()
+
+    def test_files_of_other_archives_are_not_used(self, folder: Path, log: Path) -> None:
+        place = log.parent
+        import_log(
+            place / "log.csv",
+            folder / "another.mcap",
+            robot=Robot.from_urdf(place / "arm.urdf"),
+            columns=ColumnMap.load(place / "map.toml"),
+            use="validation",
+        )
+        shown = command("export", folder, "--to", "urdf").stdout
+        assert "identified again: its archives are others" in shown
+
+    @pytest.mark.parametrize(
+        ("name", "change", "reason"),
+        [
+            ("parameters.json", None, "there is no parameters.json"),
+            ("results.json", "{", "its files cannot be read"),
+            ("parameters.json", "[]", "its files cannot be read"),
+        ],
+    )
+    def test_unusable_files_are_named(
+        self, folder: Path, name: str, change: str | None, reason: str
+    ) -> None:
+        (folder / name).unlink()
+        if change is not None:
+            (folder / name).write_text(change)
+        assert f"identified again: {reason}" in command("export", folder, "--to", "urdf").stdout
+
+    def test_parameters_of_another_identification_are_not_used(self, folder: Path) -> None:
+        path = folder / "parameters.json"
+        content = json.loads(path.read_text())
+        content["provenance"]["verdict"] = "good: of another day"
+        path.write_text(json.dumps(content))
+        shown = command("export", folder, "--to", "urdf").stdout
+        assert "are not of one identification" in shown
+
+
+def test_dates_and_free_fields_reach_results_parameters_and_report(
+    arm: IdentifiedArm, log: Path, tmp_path: Path
+) -> None:
+    """From the cell file over the archive's attachment."""
+    place = log.parent
+    (tmp_path / "arm.urdf").write_text(TWO_LINK)
+    fields = 'operator = "A. <Person>"\nserial_number = "SN 17"\nnotes = "cover off"\n'
+    (tmp_path / "cell.toml").write_text(
+        f'[cell]\nname = "arm"\nurdf = "arm.urdf"\n{fields}[robot]\n'
+    )
+    text = (place / "map.toml").read_text()
+    rows = np.loadtxt(place / "log.csv")
+    rows[:, 0] += 1_700_000_000.0
+    np.savetxt(tmp_path / "log.csv", rows, fmt="%.9f")
+    (tmp_path / "map.toml").write_text(text)
+    path = import_log(
+        tmp_path / "log.csv",
+        tmp_path / "log.mcap",
+        robot=Robot.from_cell(tmp_path / "cell.toml"),
+        columns=ColumnMap.load(tmp_path / "map.toml"),
+    )
+    command("identify", path, "-o", tmp_path / "result", "-q")
+    occasion = Results.load(tmp_path / "result" / "results.json").occasion
+    assert occasion is not None
+    assert occasion.recorded_from == "2023-11-14T22:13:20+00:00"
+    assert occasion.identified_at.startswith("20")
+    assert occasion.serial_number == "SN 17"
+    table = (tmp_path / "result" / "parameters.csv").read_text()
+    for line in ("# recorded: 2023-11-14", "# operator: A. <Person>", "# notes: cover off"):
+        assert line in table
+    page = (tmp_path / "result" / "report.html").read_text()
+    for part in ("A. &lt;Person&gt;", "SN 17", "2023-11-14T22:13:20"):
+        assert part in page

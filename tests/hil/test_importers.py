@@ -7,6 +7,8 @@ import os
 import resource
 import signal
 import struct
+import subprocess
+import sys
 import tomllib
 import zipfile
 from collections.abc import Sequence
@@ -29,13 +31,13 @@ from typer.testing import CliRunner
 from hil.archive import ArchiveHeader, Findings, Samples, open_archive
 from hil.cell import Cell
 from hil.cli import app
-from hil.errors import InputError, SourceError
+from hil.errors import ArchiveWriteError, InputError, SourceError
 from hil.identify.cell_context import nominal_of
 from hil.identify.sources import cell_of
-from hil.importers import ColumnMap, Convention, Robot, urdf_of_dh
+from hil.importers import ColumnMap, Convention, Robot, import_log, urdf_of_dh
 from hil.importers import arrays as array_files
 from hil.importers.arrays import ArrayFile
-from hil.importers.column_map import UNITS, Format
+from hil.importers.column_map import UNITS, Format, ready_map, ready_maps
 from hil.importers.findings import check_clock, examine
 from hil.importers.robot import _cell_text
 from hil.importers.table import Table
@@ -45,6 +47,7 @@ from identification.model.kinematics import chain_from_urdf
 from tests.hil.simulated_logs import (
     JOINTS,
     Simulated,
+    column_map,
     simulate,
     three_joint_robot,
     urdf_path,
@@ -821,7 +824,7 @@ def panda() -> Simulated:
 
 
 def warnings(
-    arm: Simulated, *, position=1.0, velocity=1.0, torque=1.0, clock=1.0, order=None
+    arm: Simulated, *, position=1.0, velocity=1.0, torque=1.0, clock=1.0, order=None, masses=True
 ) -> list[str]:
     stamp = np.rint(arm.time * clock * 1e9).astype(np.int64)
     columns = slice(None) if order is None else list(order)
@@ -831,7 +834,9 @@ def warnings(
         velocity=arm.velocity[:, columns] * velocity,
         torque=arm.torque * torque,
     )
-    return list(examine(samples, arm.joint_names, arm.urdf.read_text()).warnings)
+    robot = Robot.from_urdf(arm.urdf, recorded=arm.joint_names)
+    nominal = robot.nominal_torque() if masses else None
+    return list(examine(samples, arm.joint_names, robot.urdf, nominal=nominal).warnings)
 
 
 def factors(warning: str) -> dict[str, float]:
@@ -879,7 +884,7 @@ class TestWarnings:
     def test_positions_in_degrees_order_or_zero(self, panda: Simulated) -> None:
         """The ranges of joints 4 and 6 of this arm exclude each other."""
         (sentence, *others) = warnings(panda, position=DEGREES, velocity=DEGREES)
-        assert sentence.startswith("as mapped, 100 % of the rows leave the limits of the URDF")
+        assert sentence.startswith("as mapped, every row leaves the limits of the URDF")
         assert 'as degrees read as radians, none would: write unit = "deg"' in sentence
         assert all("degrees" in other for other in others)
         found = warnings(replace(panda, position=panda.position[:, ORDER]))
@@ -888,6 +893,106 @@ class TestWarnings:
         found = warnings(replace(panda, position=panda.position + 20.0 * (np.arange(7) == 3)))
         assert "check unit, sign and zero in the column map" in found[0]
         assert "order" not in found[0]
+
+
+TOO_SMALL = "the torques are too small for this arm: measured over "
+TOO_LARGE = "the torques are too large for this arm: measured over "
+
+
+class TestSizeOfTorques:
+    def test_another_order_of_magnitude_is_named(self, arm: Simulated, panda: Simulated) -> None:
+        """Against the masses of the URDF, whatever its effort limits are."""
+        for robot in (arm, panda):
+            (sentence,) = warnings(robot, torque=1e-3)
+            assert sentence.startswith(f"{TOO_SMALL}those of the URDF's masses")
+            assert "N·m read as mN·m would be 1000 times too small" in sentence
+            *limits, sentence = warnings(robot, torque=1e3)
+            assert sentence.startswith(f"{TOO_LARGE}those of the URDF's masses")
+            assert all("its limit in the URDF" in limit for limit in limits)
+
+    def test_without_masses_the_effort_limits_are_the_measure(self, arm: Simulated) -> None:
+        (sentence,) = warnings(arm, torque=1e-3, masses=False)
+        assert sentence.startswith(f"{TOO_SMALL}the effort limits of the URDF")
+        assert warnings(arm, masses=False) == []
+
+    @pytest.mark.parametrize("factor", [0.2, 5.0])
+    def test_gains_and_friction_within_an_order_are_not_doubted(
+        self, panda: Simulated, factor: float
+    ) -> None:
+        assert not any("for this arm" in line for line in warnings(panda, torque=factor))
+
+    def test_equal_masses_are_placeholders(self, tmp_path: Path, panda: Simulated) -> None:
+        assert three_joint_robot(tmp_path).nominal_torque() is None
+        assert Robot.from_urdf(panda.urdf, recorded=panda.joint_names).nominal_torque() is not None
+
+
+def typed(arguments: Sequence[str]) -> tuple[int, str]:
+    """Exit status and all output of the program."""
+    done = subprocess.run([sys.executable, "-m", "hil", *arguments], capture_output=True, text=True)
+    return done.returncode, done.stdout + done.stderr
+
+
+class TestReplacing:
+    """`hil import log` onto an archive that exists, and of a log that cannot be right."""
+
+    @pytest.fixture
+    def command(self, panda: Simulated, tmp_path: Path) -> list[str]:
+        np.savez(tmp_path / "log.npz", q=panda.position, d=np.degrees(panda.position), t=panda.time)
+        for name in "qd":
+            text = f'[position]\ncolumns = "{name}"\n[time]\ncolumn = "t"\n'
+            (tmp_path / f"{name}.toml").write_text(
+                f"joints = {json.dumps(panda.joint_names)}\n{text}"
+            )
+        words = ["import", "log", str(tmp_path / "log.npz"), "-o", str(tmp_path / "a.mcap")]
+        return [*words, "--urdf", str(panda.urdf), "--lock-others", "--map"]
+
+    def test_only_with_force(self, command: list[str], tmp_path: Path) -> None:
+        right = [*command, str(tmp_path / "q.toml")]
+        assert typed(right)[0] == 0
+        before = (tmp_path / "a.mcap").read_bytes()
+        status, shown = typed(right)
+        assert status == 2
+        assert "exists already" in shown
+        assert "--force" in shown
+        status, shown = typed([*right, "--force", "--kind", "validation"])
+        assert status == 0, shown
+        assert open_archive(tmp_path / "a.mcap").header.purpose == "validation"
+        assert (tmp_path / "a.mcap").read_bytes() != before
+        assert sorted(path.suffix for path in tmp_path.iterdir()) == [
+            ".mcap",
+            ".npz",
+            ".toml",
+            ".toml",
+        ]
+
+    def test_never_by_one_without_a_row_within_the_limits(
+        self, command: list[str], tmp_path: Path
+    ) -> None:
+        assert typed([*command, str(tmp_path / "q.toml")])[0] == 0
+        before = (tmp_path / "a.mcap").read_bytes()
+        wrong = [*command, str(tmp_path / "d.toml"), "--force"]
+        status, shown = typed(wrong)
+        assert status == 2
+        assert "every row leaves the limits of the URDF" in shown
+        assert 'write unit = "deg"' in shown
+        assert (tmp_path / "a.mcap").read_bytes() == before
+        status, shown = typed([*wrong, "--outside-limits"])
+        assert status == 0
+        assert "warning: as mapped, every row leaves" in shown
+
+    def test_never_the_recording_itself(self, panda: Simulated, tmp_path: Path) -> None:
+        np.savez(tmp_path / "log.npz", q=panda.position)
+        before = (tmp_path / "log.npz").read_bytes()
+        robot = Robot.from_urdf(panda.urdf, recorded=panda.joint_names)
+        with pytest.raises(ArchiveWriteError, match="is the recording itself"):
+            import_log(
+                tmp_path / "log.npz",
+                tmp_path / "log.npz",
+                robot=robot,
+                columns=column_map(position={"columns": "q"}),
+                force=True,
+            )
+        assert (tmp_path / "log.npz").read_bytes() == before
 
 
 class TestClock:
@@ -939,6 +1044,7 @@ class TestImportCommand:
         )
         arguments = ["import", "log", str(tmp_path / "log.npz"), "-o", str(tmp_path / "log.mcap")]
         arguments += ["--map", str(tmp_path / "map.toml"), "--urdf", str(arm.urdf)]
+        arguments += ["--outside-limits"]
         result = CliRunner().invoke(app, [*arguments, "--kind", "validation"])
         assert result.exit_code == 0
         assert "2000 samples in 19.99 s, 100 Hz" in result.stdout
@@ -1053,3 +1159,60 @@ class TestRobotOptions:
             (place / "o.mcap").unlink()
         refused = self.refused(place, kind, *self.LOCKED, "--gravity", "0", "nan", "0")
         assert "robot.gravity" in refused
+
+
+READY = {
+    "ur_rtde": ("timestamp", "actual_q_{}", "actual_current_{}", 1.0, 1.0, "motor_current", " "),
+    "franka": ("time", "state.q[{}]", "state.tau_J[{}]", 1e3, 1.0, "torque", ","),
+    "franka_2017": ("duration", "q[{}]", "tau_J[{}]", 1e3, 1.0, "torque", ", "),
+    "kuka_rsi": ("IPOC", "AIPos.A{}", "GearTorque.A{}", 1e3, DEGREES, "torque", ","),
+    "ros_joint_states": (
+        "field.header.stamp", "field.position{}", "field.effort{}", 1e9, 1.0, "torque", ","
+    ),
+}  # fmt: skip
+VELOCITIES = {
+    "ur_rtde": "actual_qd_{}",
+    "franka": "state.dq[{}]",
+    "franka_2017": "dq[{}]",
+    "ros_joint_states": "field.velocity{}",
+}
+
+
+class TestReadyMaps:
+    """Maps of common logs, by name."""
+
+    def test_each_is_tested(self) -> None:
+        assert set(ready_maps()) == set(READY)
+
+    @pytest.mark.parametrize("name", READY)
+    def test_a_log_with_the_columns_of_its_maker(
+        self, name: str, robot: Robot, tmp_path: Path
+    ) -> None:
+        time, q, tau, per_second, per_rad, quantity, delimiter = READY[name]
+        first = 1 if name == "kuka_rsi" else 0
+        patterns = [q, *([VELOCITIES[name]] if name in VELOCITIES else []), tau]
+        titles = [
+            time,
+            *(text.replace("{}", str(j + first)) for text in patterns for j in range(3)),
+        ]
+        arrays = [TIME * per_second, Q * per_rad, *([Q] if len(patterns) == 3 else []), TAU]
+        body = [delimiter.join(map(repr, row)) for row in np.column_stack(arrays).tolist()]
+        path = tmp_path / "log.csv"
+        if name == "ros_joint_states":  # with texts, as `rostopic echo -p` writes them
+            titles = ["%time", "field.header.frame_id", "field.name0", *titles]
+            body = [f"17,base link,hip,{line}" for line in body]
+        path.write_text("\n".join([delimiter.join(titles), *body]) + "\n")
+        columns = ColumnMap.load(name)
+        import_log(path, tmp_path / "a.mcap", robot=robot, columns=columns, outside_limits=True)
+        found = open_archive(tmp_path / "a.mcap").columns
+        assert found["position"] == pytest.approx(Q)
+        assert found["motor_current" if quantity == "motor_current" else "torque"] == (
+            pytest.approx(TAU)
+        )
+        assert np.diff(found["stamp"]) == pytest.approx(1e7, abs=300)
+
+    def test_listed_and_printed(self) -> None:
+        listing = CliRunner().invoke(app, ["import", "maps"]).stdout
+        assert all(name in listing for name in READY)
+        assert CliRunner().invoke(app, ["import", "maps", "franka"]).stdout == ready_map("franka")
+        assert typed(["import", "maps", "frank"])[0] == 2

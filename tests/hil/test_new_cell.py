@@ -36,6 +36,7 @@ from hil.simulation import simulated_link
 from hil.testing import shortened
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 from tests.hil.new_cells import TWO_JOINTS, described_robot, filled_in
+from tests.hil.simulated_logs import urdf_path
 
 UR10 = "ur_description/urdf/ur10_robot.urdf"
 PANDA = "panda_description/urdf/panda.urdf"
@@ -333,3 +334,58 @@ def test_a_file_that_is_not_a_urdf_gives_one_line(tmp_path: Path) -> None:
     (line,) = done.stderr.splitlines()  # and none of the library that read it
     assert line.startswith(f"error: {tmp_path / 'arm.urdf'}: ")
     assert "Traceback" not in done.stderr
+
+
+HAND = """<robot name="hand">
+<link name="base"/><link name="arm"/><link name="tool"/><link name="f"/>
+<joint name="shoulder" type="continuous"><parent link="base"/><child link="arm"/></joint>
+<joint name="mount" type="fixed"><parent link="arm"/><child link="tool"/></joint>
+<joint name="left_finger" type="continuous"><parent link="tool"/><child link="f"/></joint>
+</robot>"""
+
+
+class TestOneArmOfARobot:
+    """--base and --tip, and the notes that lead to them."""
+
+    def test_arm_between_two_links(self) -> None:
+        baxter = urdf_path("baxter.urdf")
+        assert len(cell_of_urdf(baxter, {}).joint_names) == 15
+        made = cell_of_urdf(baxter, {}, base="torso", tip="left_wrist")
+        assert made.joint_names == (
+            "left_s0", "left_s1", "left_e0", "left_e1", "left_w0", "left_w1", "left_w2"
+        )  # fmt: skip
+        note = next(note for note in made.known.notes if note.startswith("fixed, as they do not"))
+        assert "right_w2" in note
+        assert not any("branches" in note for note in made.known.notes)
+
+    def test_branches_are_named(self) -> None:
+        notes = cell_of_urdf(urdf_path("baxter.urdf"), {}).known.notes
+        assert any(
+            "3 branches, with the last moving links head, left_wrist, right_wrist" in note
+            for note in notes
+        )
+
+    def test_joints_that_look_like_a_gripper_are_named(self, tmp_path: Path) -> None:
+        path = tmp_path / "hand.urdf"
+        path.write_text(HAND)
+        made = cell_of_urdf(path, {})
+        assert any("left_finger look like joints of a gripper" in note for note in made.known.notes)
+        made = cell_of_urdf(path, {}, tip="tool")
+        assert made.joint_names == ("shoulder",)
+        assert not any("gripper" in note for note in made.known.notes)
+
+    @pytest.mark.parametrize(
+        ("links", "sentence"),
+        [
+            ({"tip": "tol"}, "--tip: has no link 'tol'; its links are tool"),
+            ({"base": "arm", "tip": "base"}, "link 'base' does not hang on link 'arm'"),
+            ({"base": "arm", "tip": "tool"}, "no joint moves between arm and tool"),
+        ],
+    )
+    def test_links_that_bound_no_arm_are_refused(
+        self, tmp_path: Path, links: dict[str, str], sentence: str
+    ) -> None:
+        path = tmp_path / "hand.urdf"
+        path.write_text(HAND)
+        with pytest.raises(InputError, match=sentence):
+            cell_of_urdf(path, {}, **links)

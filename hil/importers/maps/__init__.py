@@ -1,0 +1,1 @@
+"""Ready column maps of common logs; `hil import maps` lists them."""
