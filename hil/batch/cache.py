@@ -28,9 +28,8 @@ from hil.errors import InputError
 from hil.files import digest, json_digest, replace_file
 from hil.identify.prepared import Settings
 from hil.reading import open_file
-from identification.estimators.consistent import Shrinkage
 from identification.factor.factor import Estimate, Factor
-from identification.selection.inner_prediction import Choice
+from identification.selection.inner_prediction import Choice, Strength
 from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
 from planner.arrays import DAMAGED
@@ -44,7 +43,7 @@ _HEAD: Final = struct.Struct("<8sII")  # magic, length of the JSON text, checksu
 _KINDS: Final[dict[str, type[np.generic]]] = {"f": np.float64, "i": np.intp}
 _TYPES: Final[dict[str, type[Any]]] = {
     kind.__name__: kind
-    for kind in (Estimate, Factor, Settings, Preprocessing, LowPassShape, Shrinkage, Choice)
+    for kind in (Estimate, Factor, Settings, Preprocessing, LowPassShape, Strength, Choice)
 }
 
 LIBRARIES: Final = ("numpy", "scipy", "pin")  # that determine the numbers

@@ -17,34 +17,31 @@ from hil.archive import Archive
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.files import json_digest
-from hil.identify.estimating import centre_of, fit_of
+from hil.identify.estimating import Posterior, fit_of, fit_with_transmitted_load
 from hil.identify.options import Options
 from hil.identify.prepared import (
     MAX_RECORDINGS,
     Settings,
     carried_over,
     decide,
+    known_parameters,
     samples_of,
     validation_samples,
 )
-from hil.identify.sources import Source, all_fitted, known_warnings, source_of
+from hil.identify.sources import Source, Sources, all_fitted, known_warnings, source_of
 from hil.progress import Reporter, Silent
 from identification import IdentificationError
-from identification.estimators.consistent import Shrinkage, fit_shrunk
-from identification.estimators.covariance import block_covariance
+from identification.estimators.consistent import SolverError
+from identification.estimators.covariance import solve_with_prior
 from identification.estimators.delay import rate_products, with_uncertain_delay
 from identification.estimators.least_squares import fit_least_squares, no_narrower
+from identification.estimators.prior import ScoreScatter, body_prior
 from identification.factor.factor import (
     QR_CONDITION,
     Estimate,
     Factor,
-    joint_weights,
-    mark_undetermined,
-    no_rows_message,
-    solve,
+    require_rows,
 )
-from identification.model.robot import RobotModel
-from identification.signals.samples import Samples
 
 from .cache import CacheLocation, cacheable, code_digest
 from .discovery import (
@@ -71,6 +68,8 @@ _NAMED: Final = 12  # different warnings that are listed
 BUNDLE: Final = 16
 """Archives in one entry of the cache: a summary of each and one sum, fifty times its size."""
 
+cacheable(ScoreScatter)
+
 
 @cacheable
 @dataclass(frozen=True, eq=False)
@@ -79,9 +78,10 @@ class Summary:
 
     ref: ArchiveRef
     total: Factor  #: its factor as one block
-    #: the estimate from it alone, with cluster-robust covariance; None of a validation run
+    #: the estimate from it alone without prior, with cluster-robust covariance; None of a
+    #: validation run
     fit: Estimate | None
-    design_effect: float  #: ratio of its mean variance to that of white residuals
+    scatter: ScoreScatter | None  #: for the estimate with a prior; None of a validation run
     warnings: tuple[str, ...] = ()  #: about the archive
     #: (n, p, p + 1), see :func:`identification.estimators.delay.rate_products`; None where the
     #: delay is known, or the archive is not fitted
@@ -104,7 +104,7 @@ class Bundle:
 def settings_digest(settings: Settings) -> str:
     """Return the digest of the settings that determine the factor of an archive."""
     entries = asdict(settings)
-    for later in ("shrinkage", "choices"):  # of the estimate only
+    for later in ("strength", "choices"):  # of the estimate only
         del entries[later]
     return json_digest([entries, code_digest()])
 
@@ -191,12 +191,25 @@ def decide_settings(
     standstill = None if rest is None else rest.recording
     sources = all_fitted(cell_in(fitted[0][0]), fitted, standstill)
     if arms is None:
-        settings = decide(sources, options, Silent()).settings
+        settings = _with_loading(decide(sources, options, Silent()).settings, sources)
     else:
         settings = carried_over(arms, sources, options)
     if not broken:
         cache.put(refs[0].location, decision_digest(options, arms, refs), settings)
     return settings, broken
+
+
+def _with_loading(settings: Settings, sources: Sources) -> Settings:
+    """Return settings with the parameters that load the gears, if friction grows with the load.
+
+    All archives of an arm have them, so that their factors can be added.
+    """
+    cell = settings.with_friction_law(sources.cell)
+    if not cell.model.friction.has_load:
+        return settings
+    fitted = [samples_of(source, cell, settings) for source in sources.training[:MAX_RECORDINGS]]
+    loaded = fit_with_transmitted_load(cell, fitted, settings.strength)
+    return replace(settings, loading=tuple(loaded.result.values.tolist()))
 
 
 # Factors
@@ -213,8 +226,14 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, Factor
     cell, fitted = cell_in(archive, settings), ref.use == "excitation"
     samples = (samples_of if fitted else validation_samples)(source, cell, settings)
     model = cell.model
+    if settings.loading is not None:
+        samples = samples.with_load(model, np.array(settings.loading))
     factor = Factor.by_time(model, samples)
-    fit, effect = _fit(model, samples, factor) if fitted else (None, 1.0)
+    fit, scatter = None, None
+    if fitted:
+        fit = fit_least_squares(model, [samples], factor=factor)
+        prior = body_prior(model, factor, known=known_parameters(cell))
+        scatter = ScoreScatter.of(factor, prior.gaussian)
     warnings = [*known_warnings(cell, archive), *archive.header.findings.warnings]
     if source.merged:
         warnings.append(source.merged)
@@ -224,21 +243,10 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, Factor
         ref=ref,
         total=factor.merged(max(1, len(factor))),
         fit=fit,
-        design_effect=effect,
+        scatter=scatter,
         warnings=tuple(warnings),
         products=rate_products(model, samples) if fitted and settings.delay_variance else None,
     ), factor
-
-
-def _fit(model: RobotModel, samples: Samples, factor: Factor) -> tuple[Estimate, float]:
-    """Return the estimate, and the mean ratio of its variances to those of white residuals."""
-    found = fit_least_squares(model, [samples], factor=factor)
-    weights = joint_weights(factor)
-    if found.undetermined:
-        return found, block_covariance(factor, weights, found.values).design_effect
-    information = factor.weighted(weights).A
-    trace = np.einsum("ij,ji->", information, found.covariance)
-    return found, float(trace) / factor.n_parameters
 
 
 def split_bundles(refs: Sequence[ArchiveRef]) -> list[tuple[ArchiveRef, ...]]:
@@ -538,7 +546,7 @@ class _Batch:
     def _arm(self, arm: Arm, members: Sequence[_Campaign], advance: Advance) -> list[LevelEstimate]:
         """Return the estimates of an arm: repetitions, campaigns, and the pooled one."""
         name = cast(BatchEstimator, self.options.estimator)
-        estimator = Estimator(name, arm.cell.model, members[0].ready)
+        estimator = Estimator(name, arm.cell, members[0].ready)
         everything, campaigns = Group(), list[LevelEstimate]()
         for one in members:
             group, found = self._campaign(one, estimator, advance)
@@ -554,8 +562,9 @@ class _Batch:
             text = "pooled over campaigns whose cells state different payloads or delays, which are"
             apart = [f"{text} compensated: {'; '.join(setups)}"] if len(setups) > 1 else []
             with self._failing(f"arm {arm.digest[:8]}"):
-                centre = estimator.centre(everything.total)
-                levels.append(sum_level("pooled", estimator, everything, centre, apart))
+                posterior, notes = estimator.posterior(everything.total)
+                notes = [*notes, *apart]
+                levels.append(sum_level("pooled", estimator, everything, posterior, notes))
         return levels
 
     def _campaign(
@@ -574,11 +583,12 @@ class _Batch:
         levels: list[LevelEstimate] = []
         if group.total is not None:
             with self._failing(one.key.campaign):
-                centre = estimator.centre(group.total)
+                posterior, notes = estimator.posterior(group.total)
+                share = 1.0 / len(summaries)
                 group.repetitions = [
-                    repetition_level(estimator, each, used, centre) for each in summaries
+                    repetition_level(estimator, each, used, posterior, share) for each in summaries
                 ]
-                levels.append(sum_level("campaign", estimator, group, centre))
+                levels.append(sum_level("campaign", estimator, group, posterior, notes))
         return group, levels
 
     @contextmanager
@@ -639,55 +649,52 @@ def plus(one: Any, other: Any) -> Any:
 
 
 class Estimator:
-    """An estimator for one arm; the model has the friction law of its settings."""
+    """An estimator for one arm; the cell has the friction law of its settings."""
 
-    def __init__(self, name: BatchEstimator, model: RobotModel, settings: Settings) -> None:
-        self.name, self.model, self.delay_variance = name, model, settings.delay_variance
-        self._shrinkage = settings.shrinkage if name == "auto" else Shrinkage()
+    def __init__(self, name: BatchEstimator, cell: Cell, settings: Settings) -> None:
+        self.name, self.cell, self.model = name, cell, cell.model
+        self._delay_variance, self._strength = settings.delay_variance, settings.strength
 
-    def centre(self, total: Factor) -> Array | None:
-        """Return the centre of shrinkage of a sum and its archives (p,); None for none.
+    def posterior(self, total: Factor) -> tuple[Posterior | None, list[str]]:
+        """Return the posterior of a sum and its archives, and notes; None: there is no prior.
 
         Raises:
             IdentificationError: there is no usable row.
         """
-        if not total.samples.any():
-            raise IdentificationError(no_rows_message(self.model))
-        if self._shrinkage.strength == 0.0:
-            return None
-        return centre_of(self.model, total, self._shrinkage)[0]
+        require_rows(self.model, total)
+        if self.name != "auto":
+            return None, []
+        return Posterior.of(self.cell, total, self.name, self._strength).solvable(total)
 
-    def of_archive(self, summary: Summary, centre: Array | None) -> Estimate:
-        """Return the estimate from one archive, shrunk towards the centre of all.
+    def of_archive(self, summary: Summary, posterior: Posterior | None, share: float) -> Estimate:
+        """Return the estimate from one archive, this share of those of the posterior.
 
-        That of the consistent estimator is unconstrained, as in `hil identify`. The covariance is
-        that of the unconstrained estimate, shrunk by the same factor.
+        That of the consistent estimator is unconstrained, as in `hil identify`. The scatter of the
+        scores is that of the archive by itself.
         """
+        fit, scatter = summary.fit, summary.scatter
+        assert fit is not None and scatter is not None, "it was fitted"
+        if posterior is None:
+            return fit
         # A copy: the total itself does not cache what is computed here.
-        own, total = summary.fit, replace(summary.total)
-        assert own is not None, "it was fitted"
-        if centre is None or math.isinf(self._shrinkage.strength):
-            return own
-        shrunk = fit_shrunk(self.model, (), self._shrinkage, centre=centre, factor=total)
-        equations = total.weighted(joint_weights(total))
-        prior = self._shrinkage.strength * np.diag(equations.A)
-        solution = solve(equations._replace(A=equations.A + np.diag(prior)))
-        share = solution.inverse @ equations.A
-        known = np.where(np.isfinite(own.covariance), own.covariance, 0.0)
-        covariance = share @ known @ share.T
-        effect = max(1.0, summary.design_effect)
-        covariance += effect * (solution.inverse * prior) @ solution.inverse
-        mark_undetermined(covariance, solution.determined)
-        intervals = own.method.partition(", ")[2]
+        total = replace(summary.total)
+        try:
+            result = posterior.fit(total, share)
+        except SolverError:
+            result = posterior.free(total, share)
+        found = result.estimate
+        precision = share * posterior.precision
+        weights = posterior.weights(total, share)
+        solution = solve_with_prior(total.weighted(weights), precision)
         return replace(
-            shrunk,
-            covariance=covariance,
-            interval_factor=own.interval_factor,
-            method=f"weighted least squares, {self._shrinkage.describe()}; {intervals}",
+            found,
+            covariance=scatter.covariance(solution.root, precision, result.design_effect),
+            interval_factor=scatter.interval_factor,
+            method=f"{found.method.partition('; ')[0]}; {scatter.words}",
         )
 
-    def of_group(self, group: Group, centre: Array | None) -> Estimate:
-        """Return the estimate from a sum over archives, shrunk towards its centre.
+    def of_group(self, group: Group, posterior: Posterior | None) -> Estimate:
+        """Return the estimate from a sum over archives, with the posterior of that sum.
 
         Its intervals are at least as wide as the scatter of repetitions of one motion.
 
@@ -695,15 +702,20 @@ class Estimator:
             IdentificationError: there is no consistent solution.
         """
         assert group.total is not None
-        fit = fit_of(self.model, self.name, self._shrinkage, centre)
-        found = fit((), group.total)
+        if posterior is None:
+            found = fit_of(self.model, self.name)((), group.total)
+        else:
+            found = posterior.fit(group.total).estimate
         motions = {ref.motion for ref in group.refs}
         if len(motions) == 1 and "" not in motions:
             values = np.array([one.values for one in group.repetitions])
             found = replace(found, covariance=no_narrower(found.covariance, values))
         if group.products is None:
             return found
-        return with_uncertain_delay(found, group.total, group.products, self.delay_variance)
+        precision = None if posterior is None else posterior.precision
+        return with_uncertain_delay(
+            found, group.total, group.products, self._delay_variance, precision
+        )
 
 
 def warning_lines(warned: Sequence[tuple[ArchiveRef, Sequence[str]]]) -> tuple[str, ...]:
@@ -721,14 +733,18 @@ def warning_lines(warned: Sequence[tuple[ArchiveRef, Sequence[str]]]) -> tuple[s
 
 
 def repetition_level(
-    estimator: Estimator, summary: Summary, settings: str, centre: Array | None = None
+    estimator: Estimator,
+    summary: Summary,
+    settings: str,
+    posterior: Posterior | None = None,
+    share: float = 1.0,
 ) -> LevelEstimate:
-    """Return the estimate of one archive, shrunk towards the centre of its group.
+    """Return the estimate of one archive, this share of its group, with the group's posterior.
 
     Its arrays are copies: a batch may have very many.
     """
     ref, model = summary.ref, estimator.model
-    found = estimator.of_archive(summary, centre)
+    found = estimator.of_archive(summary, posterior, share)
     own = {name: getattr(found, name).copy() for name in ("values", "noise_std", "samples")}
     nothing = np.full(model.n_joints, np.nan)
     return LevelEstimate.of(
@@ -757,19 +773,20 @@ def sum_level(
     level: Level,
     estimator: Estimator,
     group: Group,
-    centre: Array | None,
+    posterior: Posterior | None,
     warnings: Sequence[str] = (),
 ) -> LevelEstimate:
-    """Return the estimate of a campaign, or of all campaigns of an arm, for its centre if any.
+    """Return the estimate of a campaign, or of all campaigns of an arm, with its posterior if any.
 
     Raises:
         IdentificationError: there is no estimate.
     """
     assert group.total is not None
-    refs, found = group.refs, estimator.of_group(group, centre)
+    refs, found = group.refs, estimator.of_group(group, posterior)
     setups = {ref.setup for ref in refs}
     unseen = Factor.zero(estimator.model) if group.unseen is None else group.unseen
-    if not found.undetermined and found.condition > QR_CONDITION:
+    poor = not found.undetermined and found.condition > QR_CONDITION
+    if posterior is None and poor:
         conditioning = (
             f"the scaled condition number is {found.condition:.2g}: the motion separates some"
             " parameters poorly, and sums of squares lose digits there; `hil identify` on these"

@@ -32,7 +32,7 @@ from identification.estimators.least_squares import (
     estimate_repetitions,
     fit_least_squares,
 )
-from identification.estimators.load_friction import fit_with_load
+from identification.estimators.load_friction import LoadFit, fit_with_load
 from identification.estimators.losses import Huber, Loss, Tukey
 from identification.estimators.prior import (
     BODY_SHARE,
@@ -99,6 +99,19 @@ class Estimation:
     notes: tuple[str, ...]  #: what the intervals assume
 
 
+def fit_with_transmitted_load(
+    cell: Cell, fitted: Sequence[Samples], strength: Strength
+) -> LoadFit[Estimate]:
+    """Return the posterior with the torque that the gears transmit, as a fixed point."""
+    model = cell.model
+
+    def fit(samples: Sequence[Samples]) -> Estimate:
+        total = total_factor(model, samples)
+        return Posterior.of(cell, total, "auto", strength).fit(total).estimate
+
+    return fit_with_load(model, fitted, fit)
+
+
 def with_transmitted_load(prepared: Prepared) -> Prepared:
     """Return samples that carry the torque that the gears transmit.
 
@@ -108,12 +121,7 @@ def with_transmitted_load(prepared: Prepared) -> Prepared:
     model = cell.model
     if not model.friction.has_load:
         return prepared
-
-    def fit(samples: Sequence[Samples]) -> Estimate:
-        total = total_factor(model, samples)
-        return Posterior.of(cell, total, "auto", prepared.settings.strength).fit(total).estimate
-
-    loaded = fit_with_load(model, prepared.fitted, fit)
+    loaded = fit_with_transmitted_load(cell, prepared.fitted, prepared.settings.strength)
     values = loaded.result.values
     training = tuple(samples.with_load(model, values) for samples in prepared.training)
     held_out = training
@@ -255,9 +263,9 @@ class Posterior:
         effect = share * self.design_effect
         return fit_posterior(self.model, factor, self.prior.gaussian, effect)
 
-    def weights(self, factor: Factor) -> Array:
+    def weights(self, factor: Factor, share: float = 1.0) -> Array:
         """Return the weights of the joints (n,): inverse variances of their residuals."""
-        return posterior_values(factor, self.prior.gaussian, self.design_effect)[1]
+        return posterior_values(factor, self.prior.gaussian, share * self.design_effect)[1]
 
     def fit(self, factor: Factor, share: float = 1.0) -> PosteriorEstimate:
         """Fit a factor that is this share of the rows, with the prior counting as for all."""

@@ -56,6 +56,9 @@ class Settings:
     delay_variance: float = 0.0  #: of an estimated delay [s²]; zero for a stated one
     strength: Strength = Strength()  # noqa: RUF009 - frozen
     choices: tuple[Choice, ...] = ()  #: made by inner prediction
+    #: parameters (p,) of bodies and drives that load the gears, for friction that grows with it;
+    #: None: it does not, or they are estimated with it
+    loading: tuple[float, ...] | None = None
 
     def preprocessed(self, **changes: Any) -> Settings:
         """Return these settings with changes of the preprocessing."""

@@ -29,6 +29,7 @@ from identification.factor.factor import (
     FINE_BLOCK,
     Estimate,
     Factor,
+    NormalEquations,
     Solution,
     augmented_rows,
     block_slices,
@@ -65,6 +66,7 @@ class Clustered:
 
     covariance: Array  # (p, p), infinite variances of undetermined parameters
     root: Array  # S (p, k) with S S' the inverse of the information, with that of a prior
+    scores: Array  # (R, k), corrected; ``S scores' scores S'`` is the covariance but for a prior's
     determined: NDArray[np.bool_]  # (p,)
     design_effect: float  # mean ratio of the variance to that of white residuals
     interval_factor: float  # standard deviations in half a 95 % interval
@@ -92,8 +94,7 @@ def block_covariance(
     equations = factor.weighted(weights)
     solution = solve(equations)
     if prior is not None:
-        equations = equations._replace(A=equations.A + design_effect * prior)
-        solution = solve(equations, _WORST_WITH_PRIOR)
+        solution = solve_with_prior(equations, design_effect * prior)
     root, scores = solution.root, merged(scores, length)
     shares = np.empty((len(scores), root.shape[1], root.shape[1]))
     for start in range(0, len(scores), _AT_ONCE):
@@ -102,6 +103,11 @@ def block_covariance(
         shares[part] = _shares(information, root, root)
     spread = None if prior is None else design_effect**2 * prior
     return _sandwich(shares, scores, solution, length * FINE_BLOCK, spread)
+
+
+def solve_with_prior(equations: NormalEquations, precision: Array) -> Solution:
+    """Solve with the information (p, p) of a prior of mean zero, by which all is determined."""
+    return solve(equations._replace(A=equations.A + precision), _WORST_WITH_PRIOR)
 
 
 def cluster_covariance(
@@ -152,6 +158,7 @@ def _sandwich(
     return Clustered(
         covariance=covariance,
         root=solution.root,
+        scores=corrected,
         determined=solution.determined,
         design_effect=effect,
         interval_factor=float(student_limit(0.025, max(1, count - 1))),

@@ -268,6 +268,36 @@ def fit_posterior(
     return PosteriorEstimate(estimate, prior.mean, prior.std, prior.words, design_effect)
 
 
+@dataclass(frozen=True, eq=False)
+class ScoreScatter:
+    """Cluster-robust scatter of the scores of a factor by time, for estimates from its sum."""
+
+    rows: Array  #: (k, p), ``rows' rows`` is the covariance of the sum of the scores
+    interval_factor: float  #: standard deviations in half a 95 % interval
+    words: str  #: description of the covariance
+
+    @classmethod
+    def of(cls, factor: Factor, prior: GaussianPrior) -> ScoreScatter:
+        """Return the scatter at the posterior of a prior, which may be vague."""
+        effect = design_effect_of(factor, prior)
+        values, weights = posterior_values(factor, prior, effect)
+        spread = block_covariance(factor, weights, values, prior.information, effect)
+        size = _length(spread.root, axis=1)
+        of_parameters = np.linalg.pinv(spread.root / size[:, None]) / size
+        # Not all blocks, of which there may be very many, but rows of the same products.
+        triangle = np.linalg.qr(spread.scores, mode="r")
+        return cls(triangle @ of_parameters, spread.interval_factor, spread.words)
+
+    def covariance(self, root: Array, precision: Array, design_effect: float) -> Array:
+        """Return the covariance of a posterior (p, p).
+
+        `root` S (p, k) with S S' the inverse of the information of data and prior, of which
+        `precision` (p, p) is the prior's as it counts, see :func:`block_covariance`.
+        """
+        data, prior = self.rows @ root @ root.T, root.T @ precision @ root
+        return np.asarray(data.T @ data + design_effect * root @ prior @ root.T)
+
+
 def design_effect_of(factor: Factor, prior: GaussianPrior) -> float:
     """Return how many rows count as one, at least one.
 
@@ -402,7 +432,7 @@ def _torque_over_columns(model: RobotModel, factor: Factor) -> Array:
     size = np.sqrt(whole / np.where(acting.any(axis=0), columns.sum(axis=0), 1.0))
     # Without a row that shows it, a coefficient of the size of the torque.
     rms = np.sqrt(power.sum() / max(1, int(factor.samples.sum()))) or 1.0
-    return np.where(size > 0.0, size, rms)
+    return np.asarray(np.where(size > 0.0, size, rms))
 
 
 def torque_scatter(model: RobotModel, factor: Factor) -> Array:

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.files import write_files
-from hil.identify.run import consistency_of
+from hil.identify.estimating import Posterior
 from hil.outcome import Exports, exports_of
 from identification import Estimate
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import Factor, estimate, joint_weights
 from identification.selection.essential import Elimination, choose_essential
-from identification.validation.plausibility import ConsistencyCheck
+from identification.selection.inner_prediction import Strength
+from identification.validation.plausibility import ConsistencyCheck, check_consistency
 from tests.identification.two_link import simulated, sine_motion, values_of
 
 Array = NDArray[np.float64]
@@ -89,8 +90,16 @@ def identified_arm(
     weights = joint_weights(training)
     free = with_block_covariance(estimate(model, training, weights), training, weights)
     unseen = sum(held_out, Factor.zero(model))
-    consistency = consistency_of(model, training, unseen)
-    assert isinstance(consistency, ConsistencyCheck), consistency
+    posterior = Posterior.of(cell, training, "auto", Strength())
+    consistency = check_consistency(
+        model,
+        training,
+        unseen,
+        posterior.free(training).estimate,
+        weights=posterior.weights(training),
+        prior=posterior.prior,
+        design_effect=posterior.design_effect,
+    )
     essential = choose_essential(model, training, held_out)
     return IdentifiedArm(cell, truth, free, consistency, essential)
 

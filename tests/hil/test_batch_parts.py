@@ -44,8 +44,7 @@ from hil.batch.workers import Unused, Workers
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, TorsionSpringTable
 from hil.identify.prepared import Settings
-from identification.estimators.consistent import Shrinkage
-from identification.selection.inner_prediction import Choice
+from identification.selection.inner_prediction import Choice, Strength
 from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
 from sim_fixtures.ns16 import CELL_PATH
@@ -137,7 +136,8 @@ class TestCache:
             Preprocessing(torque_bandwidth=1.0 / 3.0, torque_shape=LowPassShape(2, causal=True)),
             friction={"presliding": 1e-4, "third": "none"},
             noise_variance=(1e-9 / 3.0,) * 6,
-            shrinkage=Shrinkage(np.inf),
+            strength=Strength(10.0, consistent=True),
+            loading=(1.0 / 3.0, -2.0),
             choices=(Choice("rows", ("slow", "rests"), (0.1, np.inf), 0),),
         )
         cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
@@ -179,7 +179,9 @@ class TestDigests:
 
     def test_that_of_settings_ignores_those_of_the_estimate(self):
         stated = Settings(Preprocessing(torque_delay=0.002), noise_variance=(1e-9,) * 6)
-        estimate = replace(stated, shrinkage=Shrinkage(0.1), choices=(Choice("rows", (), (), 0),))
+        estimate = replace(
+            stated, strength=Strength(10.0, consistent=True), choices=(Choice("rows", (), (), 0),)
+        )
         assert settings_digest(stated) == settings_digest(estimate)
         others = [
             stated.preprocessed(velocity="measured"),
@@ -189,6 +191,7 @@ class TestDigests:
             replace(stated, noise_variance=None),
             replace(stated, friction={"presliding": 1e-4}),
             replace(stated, delay_variance=1e-9),
+            replace(stated, loading=(1.0, 2.0)),
         ]
         assert len({settings_digest(one) for one in (stated, *others)}) == 1 + len(others)
         assert sum_key([a_ref(0), a_ref(1)], stated) != sum_key([a_ref(1), a_ref(0)], stated)
