@@ -248,7 +248,7 @@ def _triangles(matrices: Array) -> Array:
 
 
 def _coupled_rotors(model: RobotModel, size: Array) -> Cone:
-    """Return the cone of the rotor inertia matrix of coupled joints, in units of `size` (s + k,)."""
+    """Return the cone of the coupled joints' rotor inertia matrix in units of `size` (s + k,)."""
     layout = model.layout
     joints = sorted({joint for pair in layout.pairs for joint in pair})
     places = np.concatenate([layout.rotors[joints], layout.couplings])

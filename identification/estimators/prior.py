@@ -20,7 +20,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.estimators.covariance import Clustered, block_covariance
+from identification.errors import IdentificationError
+from identification.estimators.covariance import block_covariance
 from identification.factor.factor import (
     Estimate,
     Factor,
@@ -190,10 +191,14 @@ def posterior_values(
         weights = np.where(factor.samples > 0, 1.0 / np.maximum(variance, floor), 0.0)
         equations = factor.weighted(weights)
         scale = np.sqrt(np.diag(equations.A) + length**2)
-        values = prior.mean + np.linalg.solve(
-            (equations.A + precision) / np.outer(scale, scale),
-            (equations.b - equations.A @ prior.mean) / scale,
-        ) / scale
+        values = (
+            prior.mean
+            + np.linalg.solve(
+                (equations.A + precision) / np.outer(scale, scale),
+                (equations.b - equations.A @ prior.mean) / scale,
+            )
+            / scale
+        )
         before, variance = variance, factor.squared_errors(values) / rows
         if np.all(np.abs(variance - before) <= _SETTLED * before):
             break
@@ -370,12 +375,8 @@ def body_lengths(model: RobotModel) -> Array:
     distance = np.linalg.norm(model.chain.translation[1:], axis=1)
     usual = float(distance.mean()) if len(distance) else 0.0
     smallest = _SMALLEST_BODY * usual or _SMALLEST_BODY
-    return np.maximum.reduce([
-        centre,
-        gyration,
-        np.append(distance, 0.0),
-        np.full(model.n_joints, smallest),
-    ])  # fmt: skip
+    reach = np.maximum(np.append(distance, 0.0), smallest)
+    return np.asarray(np.maximum(np.maximum(centre, gyration), reach))
 
 
 def _outboard_inertia(model: RobotModel, masses: Array, length: Array) -> Array:
@@ -390,7 +391,7 @@ def _outboard_inertia(model: RobotModel, masses: Array, length: Array) -> Array:
 
 
 def _torque_over_columns(model: RobotModel, factor: Factor) -> Array:
-    """Return the coefficient (p,) with which a column alone makes its joints' torque vary as it does.
+    """Return the coefficient (p,) with which a column alone makes its joints' torque vary.
 
     A joint without an offset is taken to vary about zero.
     """

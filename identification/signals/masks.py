@@ -119,7 +119,7 @@ def mask_rows(
     reversal = near_any_reversal(model, motion, REVERSAL_PERIODS / bandwidth)
     reasons = {EDGE: np.broadcast_to(edge[:, None], shape)}
     if left_out == "rests":
-        rest = long_rests(motion.time, still.all(axis=1, keepdims=True))
+        rest = long_rests(motion.time, np.all(still, axis=1)[:, None])
         reasons |= {REST: np.broadcast_to(rest, shape)}
     elif left_out == "halts":
         at_once = near_any_reversal(model, motion, np.zeros(shape[1]))
