@@ -113,8 +113,8 @@ class Program:
         """
         import clarabel  # slow import of what most identifications do not need
 
-        # In variables y = R u - Q' z the objective is |y|²: as exact where the prior alone counts as
-        # where the data are many orders of magnitude more precise.
+        # In variables y = R u - Q' z the objective is |y|²: as exact where the prior alone counts
+        # as where the data are many orders of magnitude more precise.
         q, triangle = np.linalg.qr(_of_full_rank(rows @ self.to_parameters))
         middle = np.linalg.solve(triangle, q[: len(target)].T @ target)
         constraints, bounds, cones = self._constraints(clarabel)
@@ -227,13 +227,12 @@ def consistent_values(
 
 
 def _of_full_rank(matrix: Array) -> Array:
-    """Return rows (r, v), with unit rows for variables that these and the ones before leave open."""
-    if len(matrix) >= matrix.shape[1]:
-        distance = np.abs(np.diag(np.linalg.qr(matrix, mode="r")))
-        open_ones = distance <= _DEPENDENT * np.linalg.norm(matrix, axis=0)
-    else:
-        open_ones = np.ones(matrix.shape[1], dtype=np.bool_)
-    return np.concatenate([matrix, np.eye(matrix.shape[1])[open_ones]])
+    """Return rows (r, v), with a unit row for each variable that depends on those before it."""
+    identity = np.eye(matrix.shape[1])
+    square = np.concatenate([matrix, np.zeros_like(identity)])
+    distance = np.abs(np.diag(np.linalg.qr(square, mode="r")))
+    dependent = distance <= _DEPENDENT * np.linalg.norm(matrix, axis=0)
+    return np.concatenate([matrix, identity[dependent]])
 
 
 def _symmetric_basis() -> Array:

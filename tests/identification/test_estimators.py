@@ -1030,6 +1030,17 @@ class TestConsistentValues:
         known = prior.std > 0.0
         assert np.abs((bodies - expected) / prior.std)[known].max() < 1e-3
 
+    def test_bodies_without_prior_and_effect_are_possible(self):
+        """The mass of the first link, which only turns about its axis."""
+        factor, _, _, weights = self.posterior(truth())
+        name = next(name for name in MODEL.layout.names if name.startswith("m"))
+        prior = body_prior(MODEL, factor, known={name: (0.0, np.inf)})
+        found = consistent_estimate(MODEL, factor, weights=weights, prior=prior)
+        assert_consistent(MODEL, found)
+        values, _ = posterior_values(factor, prior.gaussian)
+        std = fit_posterior(MODEL, factor, prior.gaussian, 1.0).estimate.std
+        assert np.abs((found.estimate.values - values) / std).max() < 0.1
+
     def test_rows_that_hardly_count_leave_the_prior(self):
         factor, prior, _, weights = self.posterior(truth())
         found = consistent_estimate(MODEL, factor, weights=weights, prior=prior, design_effect=1e12)
