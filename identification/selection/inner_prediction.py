@@ -3,9 +3,8 @@
 Each recording is cut into `FOLDS` segments. Parameters are estimated from all segments but one and
 predict all rows of that one, including rest. The score of a candidate is ``||e|| / ||tau||`` over
 all joints, geometric mean over the segments, so that no hard one decides alone. A candidate
-replaces the one before it only if its error is lower by more than the standard error of the
-difference over the segments (one-standard-error rule, Breiman et al. 1984). Held-out data are not
-read.
+replaces the first one only if its error is lower by more than the standard error of the difference
+over the segments (one-standard-error rule, Breiman et al. 1984). Held-out data are not read.
 """
 
 from __future__ import annotations
@@ -126,7 +125,7 @@ class Settings:
 
     model: RobotModel  # with its friction
     preprocessing: Preprocessing  # of recordings into samples
-    strength: Strength = Strength()
+    strength: Strength = Strength()  # of the prior
 
     @property
     def key(self) -> tuple[Columns, Preprocessing, Strength]:
@@ -173,8 +172,8 @@ class Choice:
 
     name: str  # of the setting
     candidates: tuple[str, ...]  # descriptions
-    # ``||e|| / ||tau||`` over all joints, of a low-pass the geometric mean by joint; geometric mean
-    # over the segments
+    # ``||e|| / ||tau||`` over all joints, of a low-pass their geometric mean by joint; geometric
+    # mean over the segments
     errors: tuple[float, ...]
     chosen: int  # index of the candidate
 
@@ -569,11 +568,9 @@ class _Trial:
                 if symbol != "fo"
             ]
             coulomb = coefficients.get("f0", 0.0)
+            least = float(np.sum(forces, axis=0).min())
             # Friction that hardly shows in the torque is not worth a judgement.
-            if (
-                coulomb > _SHOWN * scatter
-                and np.sum(forces, axis=0).min() < _LEAST_FRICTION * coulomb
-            ):
+            if coulomb > _SHOWN * scatter and least < _LEAST_FRICTION * coulomb:
                 return False
         return True
 

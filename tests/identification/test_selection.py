@@ -19,10 +19,19 @@ from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.selection.essential import CutRule, choose_essential, eliminate
 from identification.selection.inner_prediction import (
+    CONSISTENT,
     DELAY,
+    LOAD,
     LOW_PASS,
+    SHORT,
+    STRENGTH,
+    WORTHWHILE,
+    Errors,
+    Folds,
     Question,
     Settings,
+    Strength,
+    _Trial,
     choose_settings,
 )
 from identification.signals.recording import Recording
@@ -204,6 +213,8 @@ class TestChoice:
 CAUSAL = LowPassShape(order=2, causal=True)
 RATE = 200.0  # Hz
 BANDWIDTH = 3.0  # Hz
+LONG = 25.0
+"""Duration [s] of which the fitted part has all questions asked."""
 
 
 def a_recording(
@@ -244,7 +255,7 @@ def chosen(recording, questions, *, model=MODEL, leaks=False, ripple=(), low_pas
 class TestChosenSettings:
     @pytest.mark.parametrize("distance", [1e-4, 1e-3])
     def test_the_true_presliding_is_found(self, distance):
-        recording = a_recording(MODEL.with_friction(presliding=distance))
+        recording = a_recording(MODEL.with_friction(presliding=distance), duration=LONG)
         settings, _ = chosen(recording, {"presliding", "bandwidth"})
         assert settings.model.friction.laws[0].presliding == distance
 
@@ -289,20 +300,139 @@ class TestChosenSettings:
         assert name in [one.name for one in choices if one.chosen]
         assert (settings.preprocessing.torque_bandwidth is None) == (name == DELAY)
 
-    def test_least_squares_stays_if_it_predicts_equally(self):
-        settings, choices = chosen(a_recording(), {"estimator"})
-        assert settings.shrinkage.strength == 0.0
-        assert choices[-1].candidates[choices[-1].chosen] == "least squares"
+    def test_the_stated_term_stays_unless_another_is_clearly_better(self):
+        """Friction without a third term, and a statement that there is one."""
+        stated = MODEL.with_friction(third="quadratic")
+        settings, choices = chosen(a_recording(), {"friction"}, model=stated)
+        assert settings.model.friction.laws[0].third == "quadratic"
+        errors = next(one.errors for one in choices if one.name == "friction at speed")
+        assert min(errors) > (1.0 - WORTHWHILE) * errors[0]
+
+    @pytest.mark.parametrize("shares", [(0.12, 0.06), (0.0, 0.0)])
+    def test_load_friction_is_chosen_where_it_is(self, shares):
+        loaded = MODEL.with_friction(load=True)
+        recording = a_recording(loaded, np.append(truth(), shares), duration=LONG)
+        settings, choices = chosen(recording, {"friction"})
+        assert settings.model.friction.has_load == any(shares)
+        assert LOAD in [one.name for one in choices]
+
+    def test_a_negative_share_of_load_is_none(self):
+        loaded = MODEL.with_friction(load=True)
+        recording = a_recording(loaded, np.append(truth(), (-0.12, -0.06)), duration=LONG)
+        settings, choices = chosen(recording, {"friction"})
+        decision = next(one for one in choices if one.name == LOAD)
+        assert decision.errors[1] < 0.9 * decision.errors[0]
+        assert not settings.model.friction.has_load
+
+    def test_the_prior_has_the_strength_of_the_residuals_without_cause(self):
+        """White noise, and a description that is right: no candidate is clearly better."""
+        settings, choices = chosen(a_recording(duration=LONG), {"estimator"})
+        assert settings.strength.weight == 1.0
+        assert [one.name for one in choices] == [STRENGTH, CONSISTENT]
+        # That bodies can exist is first, as it costs nothing.
+        assert settings.strength.consistent
+
+    def test_a_negative_friction_is_not_made_possible(self):
+        """Constraints that predict clearly worse are given up."""
+        values = truth()
+        values[MODEL.parameter_names.index("f1_1")] = -15.0
+        settings, choices = chosen(a_recording(values=values), {"estimator"})
+        assert not settings.strength.consistent
+        decision = next(one for one in choices if one.name == CONSISTENT)
+        assert decision.errors[1] < (1.0 - WORTHWHILE) * decision.errors[0]
+
+    def test_a_short_recording_asks_fewer_questions(self):
+        """The first candidates stay."""
+        asked = {"bandwidth", "presliding", "rows", "velocity", "estimator"}
+        names = {
+            duration: {one.name for one in chosen(a_recording(duration=duration), asked)[1]}
+            for duration in (0.9 * SHORT, LONG)
+        }
+        lost = {"bandwidth of the motion", "presliding displacement", STRENGTH}
+        assert names[LONG] - names[0.9 * SHORT] == lost
+        assert "rows that are left out" in names[0.9 * SHORT]
 
     def test_a_joint_may_rest_in_some_segments(self):
         """Joints that move one after the other have segments without rows."""
-        recording = a_recording()
+        recording = a_recording(duration=LONG)
         position = recording.position.copy()
-        position[:350, 0] = position[350, 0]
+        position[:875, 0] = position[875, 0]
         rested = replace(recording, position=position)
         _, choices = chosen(rested, {"presliding", "rows", "estimator"})
-        assert [one.name for one in choices][-1] == "estimator"
+        assert [one.name for one in choices][-1] == CONSISTENT
         assert all(np.isfinite(one.errors).all() for one in choices)
+
+
+def decided(*errors):
+    """Index of the candidate that is chosen by its errors in segments (k,) with one joint."""
+    trial = _Trial(lambda *_: [], None)
+    start = Settings(MODEL, Preprocessing())
+    candidates = [
+        replace(start, preprocessing=Preprocessing(rigid_bandwidth=10.0 + k))
+        for k in range(len(errors))
+    ]
+    scores = dict(zip((one.key for one in candidates), errors, strict=True))
+    trial.errors = lambda settings, _rows: Errors(
+        np.square(scores[settings.key])[:, None], np.ones((len(errors[0]), 1))
+    )
+    return trial.decide("", candidates).choice
+
+
+class TestClearlyBetter:
+    """A candidate has to be better than the first by a share and its standard error."""
+
+    FIRST = np.linspace(0.1, 0.4, 10)
+
+    def test_by_less_than_the_share_it_is_not(self):
+        assert decided(self.FIRST, 0.995 * self.FIRST).chosen == 0
+        assert decided(self.FIRST, 0.98 * self.FIRST).chosen == 1
+
+    def test_by_less_than_its_standard_error_it_is_not(self):
+        scatter = np.tile([0.5, -0.5], 5)
+        for change, chosen_one in ((-0.1, 0), (-0.2, 1)):  # standard error 0.17
+            other = self.FIRST * np.exp(change + scatter)
+            assert decided(self.FIRST, other).chosen == chosen_one
+
+    def test_a_hard_segment_does_not_decide_alone(self):
+        """Means are geometric."""
+        other = 0.9 * self.FIRST
+        other[0] = 2.0 * self.FIRST[0]
+        choice = decided(self.FIRST, other)
+        expected = [np.exp(np.mean(np.log(one))) for one in (self.FIRST, other)]
+        assert choice.errors == pytest.approx(expected)
+        assert choice.chosen == 0  # its standard error is that of the hard one
+
+    def test_of_several_the_best_is_taken(self):
+        assert decided(self.FIRST, 0.95 * self.FIRST, 0.8 * self.FIRST).chosen == 2
+        assert decided(self.FIRST, 0.8 * self.FIRST, 0.95 * self.FIRST).chosen == 1
+
+    def test_what_predicts_nothing_is_replaced(self):
+        nothing = np.full(10, np.inf)
+        assert decided(nothing, self.FIRST).chosen == 1
+        assert decided(self.FIRST, nothing).chosen == 0
+
+
+class TestStrength:
+    def test_it_multiplies_the_rows_that_count_as_one(self):
+        assert Strength(4.0).design_effect(10.0) == 40.0
+        assert Strength(0.25).design_effect(2.0) == 1.0  # no row counts more than once
+
+
+class TestFolds:
+    def test_a_segment_is_predicted_from_all_others(self):
+        recording = a_recording()
+        samples = prepare(recording, MODEL, options=Preprocessing(left_out="slow"))
+        folds = Folds.of(MODEL, [samples])
+        values = truth()
+        errors = folds.errors(lambda _: values)
+        edges = np.linspace(0, len(samples.torque), len(errors.squares) + 1).round().astype(int)
+        error = samples.torque - samples.predicted_torque(MODEL, values)
+        for k, part in enumerate(pairwise(edges)):
+            expected = np.square(error[slice(*part)]).sum(axis=0)
+            np.testing.assert_allclose(errors.squares[k], expected, rtol=1e-6)
+            rows = samples.usable.copy()
+            rows[slice(*part)] = False
+            np.testing.assert_array_equal(folds.without(k).samples, rows.sum(axis=0))
 
 
 class TestHeldOutRows:
@@ -321,12 +451,12 @@ class TestHeldOutRows:
         return [one.errors for one in chosen(recording, set(self.QUESTIONS), leaks=leaks)[1]]
 
     def test_changing_them_has_no_effect(self):
-        recording = a_recording()
+        recording = a_recording(duration=LONG)
         sound = self.errors(recording, leaks=False)
         assert sound == self.errors(self.corrupted(recording), leaks=False)
 
     def test_a_leak_would_be_detected(self):
-        recording = a_recording()
+        recording = a_recording(duration=LONG)
         sound = self.errors(recording, leaks=True)
         assert sound != self.errors(self.corrupted(recording), leaks=True)
 
@@ -334,10 +464,10 @@ class TestHeldOutRows:
 def held_out_error(recording, settings):
     """Return ||tau - tau_hat|| / ||tau|| of the held-out rows."""
     model = settings.model
-    fitted, rest = (
-        prepare(recording.between(*part), model, options=settings.preprocessing)
-        for part in ((0, cut(recording)), (cut(recording), recording.n_samples))
-    )
+    # Cut when filtered: a low-pass forwards that starts at the cut would not be that of the torque.
+    samples = prepare(recording, model, options=settings.preprocessing)
+    edges = 0, cut(recording), recording.n_samples
+    fitted, rest = (samples.between(*part) for part in pairwise(edges))
     values = estimate(model, Factor.of(model, fitted)).values
     error = rest.torque - rest.predicted_torque(model, values)
     return float(np.linalg.norm(error) / np.linalg.norm(rest.torque))
@@ -346,7 +476,7 @@ def held_out_error(recording, settings):
 def low_pass_of(shape, seed=0):
     """Return a filtered recording and the chosen settings."""
     questions = frozenset[Question]({"bandwidth", "presliding", "rows", "low-pass"})
-    recording = a_recording(noise=0.5 * NOISE, duration=20.0, shape=shape, seed=seed)
+    recording = a_recording(noise=0.5 * NOISE, duration=LONG, shape=shape, seed=seed)
     return recording, chosen(recording, questions)[0]
 
 

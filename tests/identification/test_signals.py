@@ -19,6 +19,7 @@ from identification.signals.masks import (
     EDGE,
     END_PERIODS,
     LONGEST_END,
+    REST,
     REVERSAL,
     SATURATED,
     STANDSTILL,
@@ -185,6 +186,46 @@ def recorded(seed, *, start=0.0, clock=0.0, pace=1.0, noise=0):
 
 def resting():
     return replace(recorded(1), position=np.ones((4000, 2)))
+
+
+class TestAveraged:
+    """Means of consecutive samples."""
+
+    def test_all_channels_are_means_at_about_the_rate(self):
+        recording = a_recording(203)
+        averaged = recording.averaged(125.0)
+        assert averaged.n_samples == 203 // 8
+        for name in ("time", "position", "torque", "commanded_position"):
+            values = getattr(recording, name)[:200]
+            expected = values.reshape(25, 8, *values.shape[1:]).mean(axis=1)
+            np.testing.assert_allclose(getattr(averaged, name), expected, rtol=1e-12)
+
+    def test_a_lower_rate_is_kept(self):
+        recording = a_recording()
+        assert recording.averaged(600.0) is recording
+
+    def test_a_linear_model_stays_true(self):
+        recording = a_recording()
+        gains = np.random.default_rng(3).standard_normal((3, 3))
+        linear = replace(recording, torque=recording.position @ gains + 2.0)
+        averaged = linear.averaged(100.0)
+        np.testing.assert_allclose(averaged.torque, averaged.position @ gains + 2.0, rtol=1e-12)
+
+    @pytest.mark.parametrize("reported", [True, False])
+    def test_no_mean_is_of_samples_beside_a_gap(self, reported):
+        """A segment shorter than a mean is left out."""
+        time = np.arange(200) * 1e-3
+        gap = np.zeros(200, dtype=np.bool_)
+        gap[[61, 64, 150]] = True
+        if not reported:
+            time += 0.5 * np.cumsum(gap)
+        recording = replace(a_recording(), time=time, gap_before=gap if reported else None)
+        averaged = recording.averaged(125.0)
+        lengths = [part.stop - part.start for part in averaged.segments()]
+        assert lengths == [61 // 8, 86 // 8, 50 // 8]
+        starts = np.concatenate([8 * np.arange(7), 64 + 8 * np.arange(10), 150 + 8 * np.arange(6)])
+        expected = recording.position[starts[:, None] + np.arange(8)].mean(axis=1)
+        np.testing.assert_allclose(averaged.position, expected, rtol=1e-12)
 
 
 class TestTrueTimes:
@@ -596,9 +637,38 @@ class TestExcludedRows:
         for reason in (EDGE, STANDSTILL, REVERSAL, SATURATED):
             assert np.all(mask.counts[reason] > 0)
 
-    def test_rests_exclude_two_rows_at_a_reversal(self):
+    def still(self, *joints):
+        """Masks of a motion in which joints stand for half of the time."""
         motion, recording = motion_and_recording()
-        mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), left_out="rests")
+        halt = np.zeros(len(TIME), dtype=np.bool_)
+        halt[len(TIME) // 4 : 3 * len(TIME) // 4] = True
+        for joint in joints:
+            motion.velocity[halt, joint] = 0.0
+        masks = {
+            left_out: mask_rows(recording, SLIDING, motion, np.full(2, 40.0), left_out=left_out)
+            for left_out in ("rests", "halts", "slow", "none")
+        }
+        return halt, masks
+
+    def test_a_joint_that_stands_while_another_moves_holds_its_load(self):
+        halt, masks = self.still(1)
+        assert not masks["rests"].reasons[REST].any()
+        assert masks["rests"].usable[halt].all()
+        assert masks["halts"].reasons[REST][halt, 1].all()
+        assert not masks["halts"].reasons[REST][:, 0].any()
+        assert masks["slow"].reasons[STANDSTILL][halt, 1].all()
+
+    def test_a_rest_of_the_whole_arm_is_left_out(self):
+        halt, masks = self.still(0, 1)
+        assert masks["rests"].reasons[REST][halt].all()
+        assert masks["none"].usable[halt].all()
+        # A reversal of one joint is none, and stays.
+        assert not masks["rests"].reasons[REST][~halt].any()
+        assert REVERSAL not in masks["rests"].reasons
+
+    def test_halts_exclude_two_rows_at_a_reversal(self):
+        motion, recording = motion_and_recording()
+        mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), left_out="halts")
         for joint, speed in enumerate(motion.velocity.T):
             last = np.flatnonzero(speed[1:] * speed[:-1] < 0.0)
             assert last.size
