@@ -278,10 +278,9 @@ class ScoreScatter:
 
     @classmethod
     def of(cls, factor: Factor, prior: GaussianPrior) -> ScoreScatter:
-        """Return the scatter at the posterior of a prior, which may be vague."""
-        effect = design_effect_of(factor, prior)
-        values, weights = posterior_values(factor, prior, effect)
-        spread = block_covariance(factor, weights, values, prior.information, effect)
+        """Return the scatter at the posterior of a prior, each row of data counted as one."""
+        values, weights = posterior_values(factor, prior)
+        spread = block_covariance(factor, weights, values, prior.information)
         size = _length(spread.root, axis=1)
         of_parameters = np.linalg.pinv(spread.root / size[:, None]) / size
         # Not all blocks, of which there may be very many, but rows of the same products.
