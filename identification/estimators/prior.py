@@ -350,8 +350,9 @@ def body_prior(
     Bodies: the nominal ones with a deviation of `share` of the mass, times the body's length, times
     its square. Without masses in the description, or with masses that have no relation to the
     torque of the factor: zero with bodies that could make all of the torque. Rotors: zero, with the
-    inertia of the links outboard. Friction, offsets and elements: zero, with a coefficient that
-    could make all of the joint's torque. `known` replaces mean and standard deviation by name:
+    inertia of the links outboard or, if larger, what makes half of the torque's scatter. Friction,
+    offsets and elements: zero, with a coefficient that makes half of it. `known` replaces mean and
+    standard deviation by name:
     ``{"I3m": (1.2, 0.2), "f0_1": (40.0, 40.0)}``.
     """
     layout, b = model.layout, model.base.rank
@@ -361,7 +362,8 @@ def body_prior(
     combinations[:b, : layout.size] = model.base.grouping
     combinations[b:, layout.size :] = np.eye(len(others))
     mean, std = np.zeros(len(names)), np.zeros(len(names))
-    std[layout.size :] = _torque_over_columns(model, factor)[b:]
+    whole_torque = _torque_over_columns(model, factor)
+    std[layout.size :] = whole_torque[b:]
     for k, term in enumerate(model.friction.terms, layout.size):
         if term.term.of_load:
             std[k] = LOAD_SHARE
@@ -380,12 +382,17 @@ def body_prior(
     )
     std[layout.links] = scales
     std[layout.rotors] = _outboard_inertia(model, masses, length)
-    pairs = [np.sqrt(std[layout.rotors][i] * std[layout.rotors][j]) for i, j in layout.pairs]
-    std[layout.couplings] = pairs
     words = f"nominal bodies to {100.0 * share:g} %"
     if reason:
         std[: layout.size] *= _torque_scale(model, factor, combinations[:, : layout.size], std)
         words = f"bodies of the size of the torque, as {reason}"
+    # Motors of a wrist are heavier, seen through their gears, than what they move.
+    for rotor in layout.rotors.tolist():
+        if rotor in model.base.pivots:
+            column = int(np.flatnonzero(model.base.pivots == rotor)[0])
+            std[rotor] = max(std[rotor], whole_torque[column])
+    pairs = [np.sqrt(std[layout.rotors][i] * std[layout.rotors][j]) for i, j in layout.pairs]
+    std[layout.couplings] = pairs
     for name, (value, spread) in (known or {}).items():
         mean[names.index(name)], std[names.index(name)] = value, spread
     if known:
