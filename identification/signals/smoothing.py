@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from identification.signals.recording import RecordingError
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 
 STANDSTILL_WINDOW: Final = 0.1  # s
@@ -334,6 +335,21 @@ class LowPassShape:
     def lag(self, bandwidth: float) -> float:
         """Return the delay [s] of slow signals by a causal low-pass [Hz]."""
         return 1.0 / (2.0 * math.pi * bandwidth * math.sin(math.pi / (2.0 * self.order)))
+
+    def response(self, frequency: Array, bandwidth: float) -> tuple[Complex, Complex]:
+        """Return gain H and lag ``i d(ln H)/dw`` [s] at frequencies [Hz], of the shape of these.
+
+        The real part of the lag is the group delay.
+        """
+        # Poles of the prototype of 1 rad/s; backwards they are mirrored.
+        angle = np.pi * (2.0 * np.arange(self.order) + 1.0 + self.order) / (2.0 * self.order)
+        poles = np.exp(1j * angle)
+        if not self.causal:
+            poles = np.concatenate([poles, -poles])
+        ratio = np.asarray(frequency, dtype=np.float64)[..., None] / bandwidth
+        factors = 1.0 - 1j * ratio / poles
+        lag = -(1.0 / (poles * factors)).sum(axis=-1) / (2.0 * np.pi * bandwidth)
+        return np.asarray(1.0 / factors.prod(axis=-1)), np.asarray(lag)
 
     def __str__(self) -> str:
         poles = "one pole" if self.order == 1 else f"{self.order} poles"
