@@ -35,7 +35,9 @@ LOWEST_BANDWIDTH: Final = 0.5  # Hz
 _WORTHWHILE: Final = 0.05  # required relative reduction of the residual, mean over joints
 _COARSE: Final = 4.0  # candidates per decade of bandwidth, before refinement
 _REFINED: Final = 5  # candidates between the neighbours of the best
-_CLOSE: Final = 0.07  # of the logarithm, between the last candidates, about their parabola's vertex
+# Spacings about the vertex of a parabola, of the logarithm: for all shapes, then for the best. With
+# little noise the minimum is narrower than a parabola.
+_CLOSE: Final = (0.07, 0.02)
 _RATE: Final = 250.0  # Hz; rows beyond it are averaged
 
 # Half a period of the lowest bandwidth: shorter stretches do not show it, and shorter rests between
@@ -250,11 +252,14 @@ class _Spectra:
         grids = np.array([_around(*pair) for pair in zip(grids, heights, strict=True)])
         heights = self._heights(kinds, grids)
         lowest = np.array([_vertex(*pair) for pair in zip(grids, heights, strict=True)])
-        grids = lowest[:, None] + _CLOSE * np.array([-1.0, 0.0, 1.0])
-        heights = self._heights(kinds, grids)
-        least = int(np.argmin(heights.min(axis=1)))
-        width = math.exp(np.clip(_vertex(grids[least], heights[least]), *ends))
-        best = kinds[least]._replace(bandwidth=width)
+        for step in _CLOSE:
+            grids = lowest[:, None] + step * np.array([-1.0, 0.0, 1.0])
+            heights = self._heights(kinds, grids)
+            least = int(np.argmin(heights.min(axis=1)))
+            kinds = kinds[least : least + 1]
+            lowest = np.array([_vertex(grids[least], heights[least])])
+        width = math.exp(np.clip(lowest[0], *ends))
+        best = kinds[0]._replace(bandwidth=width)
         return float(self.misfits([best])[0]), best
 
     def _heights(self, kinds: Sequence[_Filter], grids: Array) -> Array:
