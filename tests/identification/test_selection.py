@@ -496,6 +496,32 @@ class TestLowPassShape:
         if shape.causal:
             assert lag[0] == pytest.approx(shape.lag(BANDWIDTH))
 
+    @pytest.mark.parametrize("order", [1, 2, 4])
+    @pytest.mark.parametrize("count", [3, 40, 2407, 2408])
+    def test_both_ways_is_the_filter_in_time(self, order, count):
+        """Equal away from the ends, which it reflects over a whole length."""
+        rng = np.random.default_rng(order)
+        columns = np.cumsum(rng.standard_normal((count, 11)), axis=0)
+        sections = butter(order, BANDWIDTH, fs=RATE, output="sos")
+        reflected = np.concatenate([
+            2.0 * columns[0] - columns[:0:-1], columns, 2.0 * columns[-1] - columns[-2::-1],
+        ])  # fmt: skip
+        expected = sosfiltfilt(sections, reflected, axis=0, padlen=0)[count - 1 : 2 * count - 1]
+        filtered = low_passed(np.arange(count) / RATE, columns, BANDWIDTH, LowPassShape(order))
+        inner = slice(count // 3, count - count // 3)
+        size = np.abs(columns).max()
+        if count > 1000:
+            assert filtered == pytest.approx(expected, abs=1e-6 * size)
+            assert filtered[inner] == pytest.approx(expected[inner], abs=1e-9 * size)
+        # Reflected points stay; a reflection is cut where 1e-6 of the response is left.
+        assert filtered[[0, -1]] == pytest.approx(columns[[0, -1]], abs=1e-6 * size)
+
+    @pytest.mark.parametrize("shape", WITHOUT_PHASE[1:], ids=str)
+    def test_both_ways_leaves_a_line_as_it_is(self, shape):
+        time = np.arange(500) / RATE
+        line = (3.0 - 2.0 * time)[:, None]
+        assert low_passed(time, line, BANDWIDTH, shape) == pytest.approx(line, abs=1e-12)
+
     def test_uneven_times_are_interpolated(self):
         time = np.arange(4000) / RATE
         uneven = time + 0.3 / RATE * np.random.default_rng(3).uniform(-1.0, 1.0, len(time))
