@@ -1,37 +1,61 @@
-"""Low-pass of the recorded torque, estimated from the recording."""
+"""Low-pass of the recorded torque, estimated from the recording.
+
+A low-pass and a delay are one complex weight per frequency. The unfiltered columns of a joint,
+[W | torque of known loads | recorded torque], are transformed once and summed to Gram matrices of
+narrow bands of frequency; the residual of any filter is then a weighted sum of these (Parseval).
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Final
+from itertools import product
+from typing import Final, NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
-from identification.factor.factor import Factor, count_by_block, estimate
+from identification.factor.factor import EqualRuns, add_grams, equal_runs
 from identification.model.robot import RobotModel
 from identification.signals.masks import LONGEST_END, edge_rows
 from identification.signals.recording import Recording
-from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, prepare
+from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, Samples, prepare
 from identification.signals.smoothing import (
     FORWARDS,
-    SMOOTHER,
     WITHOUT_PHASE,
     LowPassShape,
-    low_passed,
     noiseless_above,
 )
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 LOWEST_BANDWIDTH: Final = 0.5  # Hz
 _WORTHWHILE: Final = 0.05  # required relative reduction of the residual, mean over joints
 _COARSE: Final = 4.0  # candidates per decade of bandwidth, before refinement
+_REFINED: Final = 5  # candidates between the neighbours of the best
+# Spacings about the vertex of a parabola, of the logarithm: for all shapes, then for the best. With
+# little noise the minimum is narrower than a parabola.
+_CLOSE: Final = (0.07, 0.02)
 _RATE: Final = 250.0  # Hz; rows beyond it are averaged
-_SHORTEST: Final = 12  # samples
+
+# Half a period of the lowest bandwidth: shorter stretches do not show it, and shorter rests between
+# stretches stay in, as leaving them out costs more rows beside them.
+_SHORTEST: Final = 0.5 / LOWEST_BANDWIDTH  # s
+# Share of a stretch over which its weight rises and falls. Window and filter commute up to the
+# change of the window during the filter's lag; a window without a level part would be the most
+# accurate, but the rows of the middle alone would decide.
+_TAPERED: Final = 0.5
+_UNEVEN: Final = 0.01  # of a step; rows at other times are interpolated
+_PADDING: Final = 1.0 / LOWEST_BANDWIDTH  # s of zeros, against the periodicity of the transform
+
+# Gains and phases are constant in a band. A delay of 50 ms turns the phase by 3 mrad in the lowest
+# bands and by 0.15 rad at 30 Hz from its centre, where arms have hardly any torque.
+_BAND: Final = 0.03  # width as a share of the frequency
+_NARROWEST: Final = 0.02  # Hz
+_SMALLEST_NOISE: Final = 1e-6  # share of the RMS torque, for joints that fit exactly
+_RIDGE: Final = 1e-11  # of columns of unit length, as the limit of condition of Gram matrices
 
 
 def torque_noiseless_above(recording: Recording) -> float | None:
@@ -39,6 +63,14 @@ def torque_noiseless_above(recording: Recording) -> float | None:
     if recording.torque is None:
         return None
     return noiseless_above(recording.time, recording.torque, recording.segments())
+
+
+class _Filter(NamedTuple):
+    """Low-pass and delay of the torque."""
+
+    delay: float  # [s]
+    shape: LowPassShape | None = None
+    bandwidth: float = math.inf  # [Hz]
 
 
 def possible_low_passes(
@@ -55,109 +87,336 @@ def possible_low_passes(
     Causal filters are compared without a delay; a kind whose residuals are not clearly smaller than
     with a delay alone is left out. `undelayed` is the delay [s] without a low-pass, by default that
     of the options; `noise_variance` (n,) as for :func:`identification.signals.samples.smooth`.
+
+    Rows count in stretches of motion of the whole arm of a second or more, whatever rows the
+    options leave out: reversals and slow motion of a joint show a filter best, and a filter does
+    not end at them.
     """
     still = options.torque_delay if undelayed is None else undelayed
-    wide = replace(options, rigid_bandwidth=RIGID_BANDWIDTH, torque_bandwidth=None)
-    channels = {
-        delay: _Channel.of(recording, model, noise_variance, replace(wide, torque_delay=delay))
-        for delay in {still, options.torque_delay}
-    }
+    mean = recording.averaged(_RATE)
+    if noise_variance is not None:
+        noise_variance = noise_variance * mean.n_samples / recording.n_samples
+    wide = replace(
+        options,
+        rigid_bandwidth=RIGID_BANDWIDTH,
+        torque_bandwidth=None,
+        torque_delay=still,
+        smooth_torque=False,
+        left_out="rests",
+    )
+    samples = prepare(mean, model, noise_variance=noise_variance, options=wide)
+    # Without the ends, where the smoothed motion is inaccurate.
+    spectra = _Spectra.of(model, samples, ~edge_rows(mean, LONGEST_END), still)
+    if not spectra.joints:
+        return ()
+    delays = tuple(dict.fromkeys((still, options.torque_delay)))
     # A low-pass must be better than a delay alone.
-    enough = min(one.misfit() for one in channels.values()) + math.log(1.0 - _WORTHWHILE)
-    found = []
-    for delays, shapes in ((tuple(channels), WITHOUT_PHASE), ((still,), FORWARDS)):
-        fits = [
-            (*channels[delay].best(shape), delay, shape) for delay in delays for shape in shapes
-        ]
-        misfit, width, delay, shape = min(fits, key=lambda one: one[0])
+    enough = spectra.misfits([_Filter(delay) for delay in delays]).min()
+    enough += math.log(1.0 - _WORTHWHILE)
+    possible = []
+    for kind_delays, shapes in ((delays, WITHOUT_PHASE), ((still,), FORWARDS)):
+        kinds = [_Filter(delay, shape) for delay, shape in product(kind_delays, shapes)]
+        misfit, best = spectra.best(kinds)
         if misfit < enough:
-            found.append(
-                replace(options, torque_delay=delay, torque_bandwidth=width, torque_shape=shape)
+            assert best.shape is not None
+            possible.append(
+                replace(
+                    options,
+                    torque_delay=best.delay,
+                    torque_bandwidth=best.bandwidth,
+                    torque_shape=best.shape,
+                )
             )
-    return tuple(found)
+    return tuple(possible)
+
+
+class _Joint(NamedTuple):
+    """Sums over B bands of the windowed spectra of a joint with c columns.
+
+    Products with the torque y are complex, of the conjugate of the first factor.
+    """
+
+    columns: NDArray[np.intp]  # parameter indices (c,)
+    # Products of [W | known load] (B, (c + 1)²). Their imaginary parts cancel, since a filter has
+    # one gain for all of them.
+    gram: Array
+    # Real and imaginary parts of the products of [W | known load] with the torque, and with the
+    # torque in the window's slope, one below the other (4 B, c + 1).
+    cross: Array
+    power: float  # squared torque
+    slope_cross: Complex  # of the torque with itself in the window's slope (B,) [1/s]
+    slope_power: Array  # squared torque in the window's slope (B,) [1/s²]
+    rows: float  # sum of the squared window
+
+    @classmethod
+    def of(cls, columns: NDArray[np.intp], gram: Array, rows: float) -> _Joint:
+        """Take apart the sums (B, c + 5, c + 5) of :meth:`_Segment.add`."""
+        own = slice(0, -4)
+        return cls(
+            columns,
+            np.ascontiguousarray(gram[:, own, own]).reshape(len(gram), -1),
+            np.concatenate([gram[:, own, place] for place in (-4, -3, -2, -1)]),
+            float(gram[:, -4, -4].sum()),
+            gram[:, -4, -2] + 1j * gram[:, -4, -1],
+            gram[:, -2, -2],
+            rows,
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class _Channel:
-    """Unfiltered rows of each joint, averaged to a rate of about 250 Hz."""
+class _Spectra:
+    """Spectra of the joints with stretches of motion."""
 
-    model: RobotModel
-    time: Array  # (m,) [s]
-    segments: tuple[slice, ...]  # stretches without a gap
-    # per joint its columns and, last, the torque of known loads (m, c + 1)
-    blocks: tuple[Array, ...]
-    torque: Array  # recorded (m, n)
-    usable: NDArray[np.bool_]  # (m, n)
+    joints: tuple[_Joint, ...]
+    frequency: Array  # of the bands (B,) [Hz]
+    delay: float  # of the torque behind the motion, already compensated [s]
+    highest: float  # bandwidth [Hz]
+    n_parameters: int
 
     @classmethod
     def of(
-        cls,
-        recording: Recording,
-        model: RobotModel,
-        noise_variance: Array | None,
-        options: Preprocessing,
-    ) -> _Channel:
-        samples = prepare(recording, model, noise_variance=noise_variance, options=options)
-        # Without the ends, which filters distort.
-        usable = samples.usable & ~edge_rows(recording, LONGEST_END)[:, None]
+        cls, model: RobotModel, samples: Samples, inside: NDArray[np.bool_], delay: float
+    ) -> _Spectra:
+        """Transform unfiltered samples, prepared with a delay [s], in the rows inside (m,)."""
+        time, usable = samples.motion.time, samples.usable & inside[:, None]
         load = samples.known_torque(model)
-        every = max(1, round(1.0 / (_RATE * float(np.median(np.diff(recording.time))))))
-        counts = [(one.stop - one.start) // every for one in samples.segments]
-        lasting = [
-            (one.start, count)
-            for one, count in zip(samples.segments, counts, strict=True)
-            if count >= _SHORTEST
-        ]
+        torque = samples.torque + load
+        step = float(np.median(np.diff(time)))
+        edges = _band_edges(0.5 / step)
+        segments = [_Segment.of(time, segment, edges) for segment in samples.segments]
+        count = np.sum([one.bins for one in segments], axis=0)
+        bands = np.flatnonzero(count)
+        total = np.sum([one.bins * one.frequency for one in segments], axis=0)
+        joints = []
+        for joint, (block, columns) in enumerate(zip(*samples.regressor(model), strict=True)):
+            table = np.vstack([block.T, load[:, joint], torque[:, joint]])
+            gram = np.zeros((len(count), len(table) + 3, len(table) + 3))
+            rows = sum(one.add(gram, table, usable[:, joint]) for one in segments)
+            if rows > 0.0:
+                joints.append(_Joint.of(columns, gram[bands], rows))
+        frequency = total[bands] / count[bands]
+        return cls(tuple(joints), frequency, delay, 0.25 / step, model.n_parameters)
 
-        def average(values: Array) -> Array:
-            """Average rows, equally for torque and regressor."""
-            parts = [
-                values[start : start + count * every].reshape(count, every, *values.shape[1:])
-                for start, count in lasting
+    def response(self, channel: _Filter) -> tuple[Complex, Complex]:
+        """Return gain and lag [s] of a filter in the bands (B,)."""
+        late = channel.delay - self.delay
+        gain = np.exp(-2j * np.pi * self.frequency * late)
+        lag = np.full(len(gain), late, dtype=np.complex128)
+        if channel.shape is not None:
+            other_gain, other_lag = channel.shape.response(self.frequency, channel.bandwidth)
+            gain, lag = gain * other_gain, lag + other_lag
+        return gain, lag
+
+    def misfits(self, filters: Sequence[_Filter]) -> Array:
+        """Return the mean log standard deviation of the residual of each of k filters (k,).
+
+        Of weighted least squares, as :func:`identification.factor.factor.estimate`.
+        """
+        responses = [self.response(channel) for channel in filters]
+        gain, lag = (np.array(part) for part in zip(*responses, strict=True))
+        sums = [_filtered(joint, gain, lag) for joint in self.joints]
+        rows = np.array([joint.rows for joint in self.joints])
+        power = np.array([joint.power for joint in self.joints])
+        variance = np.broadcast_to(power / rows, (len(filters), len(rows)))
+        smallest = np.maximum(_SMALLEST_NOISE**2 * power / rows, np.finfo(np.float64).tiny)
+        for _ in range(2):  # with weights of the torque, then of the residual
+            values = self._solved(sums, 1.0 / np.maximum(variance, smallest))
+            squares = [
+                _squared_error(products, values[:, joint.columns])
+                for joint, products in zip(self.joints, sums, strict=True)
             ]
-            return np.concatenate([part.mean(axis=1) for part in parts])
+            variance = np.column_stack(squares) / rows
+        return np.asarray(0.5 * np.log(np.maximum(variance, smallest)).mean(axis=1))
 
-        edges = np.cumsum([0, *(count for _, count in lasting)]).tolist()
-        return cls(
-            model=model,
-            time=average(recording.time),
-            segments=tuple(slice(a, b) for a, b in pairwise(edges)),
-            blocks=tuple(
-                average(np.column_stack([block, own]))
-                for block, own in zip(samples.regressor(model).blocks, load.T, strict=True)
-            ),
-            torque=average(samples.torque + load),
-            usable=average(usable.astype(np.float64)) == 1.0,
-        )
+    def _solved(self, sums: Sequence[_Products], weights: Array) -> Array:
+        """Return the parameters (k, p) of joint weights (k, j)."""
+        count, size = len(weights), self.n_parameters
+        matrix, right = np.zeros((count, size * size)), np.zeros((count, size))
+        for joint, products, weight in zip(self.joints, sums, weights.T, strict=True):
+            places = (joint.columns[:, None] * size + joint.columns).ravel()
+            matrix[:, places] += weight[:, None] * products.gram.reshape(count, -1)
+            right[:, joint.columns] += weight[:, None] * products.cross
+        square = matrix.reshape(count, size, size)
+        length = np.sqrt(np.diagonal(square, axis1=1, axis2=2))
+        length = np.where(length > 0.0, length, 1.0)
+        square /= length[:, :, None] * length[:, None, :]
+        square += _RIDGE * np.eye(size)
+        return np.asarray(np.linalg.solve(square, (right / length)[..., None])[..., 0] / length)
 
-    def misfit(self, bandwidth: float | None = None, shape: LowPassShape = SMOOTHER) -> float:
-        """Return the mean log standard deviation of the residual of moving joints."""
-        tables = []
-        for joint, block in enumerate(self.blocks):
-            if bandwidth is not None:
-                parts = [(self.time[one], block[one]) for one in self.segments]
-                block = np.concatenate([low_passed(*part, bandwidth, shape) for part in parts])
-            table = np.column_stack([block[:, :-1], self.torque[:, joint] - block[:, -1]])
-            tables.append(np.where(self.usable[:, joint], table.T, 0.0))
-        index = np.zeros(len(self.usable), dtype=np.intp)
-        counts, names = count_by_block(index, self.usable), self.model.parameter_names
-        factor = Factor.of_rows([(index, tables)], counts, self.model.plan.columns, names)
-        found = estimate(self.model, factor)
-        return float(np.nanmean(np.log(found.noise_std)))
-
-    def best(self, shape: LowPassShape) -> tuple[float, float]:
-        """Return the least misfit of a shape, and its bandwidth [Hz]."""
-
-        def misfit(log_bandwidth: float) -> float:
-            return self.misfit(math.exp(log_bandwidth), shape)
-
-        highest = 0.25 / float(np.median(np.diff(self.time)))
-        ends = np.log(LOWEST_BANDWIDTH), np.log(max(highest, 2.0 * LOWEST_BANDWIDTH))
+    def best(self, kinds: Sequence[_Filter]) -> tuple[float, _Filter]:
+        """Return the least misfit of shapes and delays over all bandwidths, and its filter."""
+        ends = np.log(LOWEST_BANDWIDTH), np.log(max(self.highest, 2.0 * LOWEST_BANDWIDTH))
         count = max(4, round(_COARSE * (ends[1] - ends[0]) / np.log(10.0)) + 1)
-        grid = np.linspace(*ends, count)
-        best = int(np.argmin([misfit(point) for point in grid]))
-        around = grid[max(best - 1, 0)], grid[min(best + 1, count - 1)]
-        fine = scipy.optimize.minimize_scalar(
-            misfit, bounds=around, method="bounded", options={"xatol": 0.02}
-        )
-        return float(fine.fun), float(np.exp(fine.x))
+        grids = np.tile(np.linspace(*ends, count), (len(kinds), 1))
+        heights = self._heights(kinds, grids)
+        grids = np.array([_around(*pair) for pair in zip(grids, heights, strict=True)])
+        heights = self._heights(kinds, grids)
+        lowest = np.array([_vertex(*pair) for pair in zip(grids, heights, strict=True)])
+        for step in _CLOSE:
+            grids = lowest[:, None] + step * np.array([-1.0, 0.0, 1.0])
+            heights = self._heights(kinds, grids)
+            least = int(np.argmin(heights.min(axis=1)))
+            kinds = kinds[least : least + 1]
+            lowest = np.array([_vertex(grids[least], heights[least])])
+        width = math.exp(np.clip(lowest[0], *ends))
+        best = kinds[0]._replace(bandwidth=width)
+        return float(self.misfits([best])[0]), best
+
+    def _heights(self, kinds: Sequence[_Filter], grids: Array) -> Array:
+        """Return the misfits of kinds (k,) at log bandwidths (k, w)."""
+        filters = [
+            kind._replace(bandwidth=width)
+            for kind, grid in zip(kinds, np.exp(grids).tolist(), strict=True)
+            for width in grid
+        ]
+        return self.misfits(filters).reshape(grids.shape)
+
+
+class _Products(NamedTuple):
+    """Sums of a joint's filtered columns for k filters, without the known load."""
+
+    gram: Array  # W'W (k, c, c)
+    cross: Array  # W'y (k, c)
+    power: Array  # y'y (k,)
+
+
+def _filtered(joint: _Joint, gain: Complex, lag: Complex) -> _Products:
+    """Return the sums of a joint with gains (k, B), and lags [s] for the window.
+
+    With a window v, ``v (h * x) = h * (v x) + v' (t h * x)`` up to v'', and the last term is the
+    lag's share of the recorded torque in the window's slope.
+    """
+    width = joint.cross.shape[1]
+    gram = (np.abs(gain) ** 2 @ joint.gram).reshape(-1, width, width)
+    late = gain * lag.conj()
+    weights = np.concatenate([gain.real, gain.imag, -late.real, -late.imag], axis=1)
+    cross = weights @ joint.cross
+    power = (
+        joint.power - 2.0 * (lag @ joint.slope_cross).real + np.abs(lag) ** 2 @ joint.slope_power
+    )
+    return _Products(
+        gram[:, :-1, :-1],
+        cross[:, :-1] - gram[:, :-1, -1],
+        power - 2.0 * cross[:, -1] + gram[:, -1, -1],
+    )
+
+
+def _squared_error(products: _Products, values: Array) -> Array:
+    """Return the squared residual (k,) of a joint's parameters (k, c)."""
+    pull = (products.gram @ values[..., None])[..., 0] - 2.0 * products.cross
+    return np.asarray(products.power + (values * pull).sum(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Segment:
+    """A stretch of rows without a gap, and the frequencies of its transform."""
+
+    time: Array  # of the rows (m,) [s]
+    rows: slice  # of the recording
+    step: float  # [s]
+    length: int  # of the transform
+    runs: list[EqualRuns]  # real and imaginary parts of the frequencies of each band
+    bins: NDArray[np.intp]  # frequencies per band (B,)
+    frequency: Array  # their mean (B,) [Hz]
+
+    @classmethod
+    def of(cls, time: Array, rows: slice, edges: Array) -> _Segment:
+        """Return a segment, for bands with lower edges (B,) [Hz]."""
+        time = time[rows]
+        step = float(time[-1] - time[0]) / max(len(time) - 1, 1) or 1.0
+        length = len(time) + round(_PADDING / step)
+        factor = max(1, 2 ** (length.bit_length() - 5))  # of a length that is quick to transform
+        length = -(-length // factor) * factor
+        frequency = np.fft.rfftfreq(length, step)
+        index = np.searchsorted(edges, frequency, side="right") - 1
+        bins = np.bincount(index, minlength=len(edges))
+        total = np.bincount(index, frequency, minlength=len(edges))
+        runs = equal_runs(np.repeat(index, 2))
+        return cls(time, rows, step, length, runs, bins, total / np.maximum(bins, 1))
+
+    def add(self, gram: Array, table: Array, usable: NDArray[np.bool_]) -> float:
+        """Add the spectra of a joint's table to its sums, in place.
+
+        The table (c + 2, m) has the torque last. The sums (B, c + 5, c + 5) are of its rows, the
+        torque turned by -90 degrees, the torque in the window's slope, and that turned. Returned is
+        the sum of the squared window.
+        """
+        signals = table[:, self.rows]
+        windowed, levels, rows = np.zeros((len(table) + 1, len(self.time))), [], 0.0
+        for start, stop in _stretches(self.time, usable[self.rows]):
+            window = _window(stop - start + 2)
+            slope = np.gradient(window, self.step)[1:-1]
+            window, part = window[1:-1], signals[:, start:stop]
+            # Low-passes leave a constant as it is: it is no part of the spectrum of the window.
+            level = part @ window**2 / (window @ window)
+            part = part - level[:, None]
+            windowed[:-1, start:stop] = part * window
+            windowed[-1, start:stop] = part[-1] * slope
+            levels.append(level * np.linalg.norm(window))
+            rows += float(window @ window)
+        if not levels:
+            return 0.0
+        spectrum = np.fft.rfft(self._even(windowed), self.length)
+        spectrum[:, 1 : (self.length + 1) // 2] *= math.sqrt(2.0)
+        spectrum /= math.sqrt(self.length)
+        torque, slope = spectrum[-2:]
+        spectrum = np.vstack([spectrum[:-1], -1j * torque, slope, -1j * slope])
+        # Real and imaginary part of each frequency side by side.
+        add_grams(gram, spectrum.view(np.float64), self.runs)
+        constant = np.array(levels)
+        gram[0, :-3, :-3] += constant.T @ constant
+        return rows
+
+    def _even(self, signals: Array) -> Array:
+        """Interpolate signals (c, m) at even times."""
+        even = np.linspace(self.time[0], self.time[-1], len(self.time))
+        step = even[1] - even[0]
+        if np.abs(self.time - even).max() <= _UNEVEN * step:
+            return signals
+        return np.array([np.interp(even, self.time, signal) for signal in signals])
+
+
+def _window(length: int) -> Array:
+    """Return a window (length,) from zero to zero, level but for `_TAPERED` of it (Tukey 1967)."""
+    place = np.linspace(0.0, 1.0, length)
+    from_end = np.minimum(place, 1.0 - place) / (0.5 * _TAPERED)
+    return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.minimum(from_end, 1.0)))
+
+
+def _stretches(time: Array, usable: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Yield start and stop of the stretches of usable rows (m,) that show a low-pass."""
+    edges = np.flatnonzero(np.diff(usable.astype(np.int8), prepend=0, append=0))
+    runs: list[tuple[int, int]] = []
+    for start, stop in edges.reshape(-1, 2).tolist():
+        if runs and time[start] - time[runs[-1][1] - 1] < _SHORTEST:
+            start = runs.pop()[0]
+        runs.append((start, stop))
+    for start, stop in runs:
+        if time[stop - 1] - time[start] >= _SHORTEST:
+            yield start, stop
+
+
+def _band_edges(highest: float) -> Array:
+    """Return the lower edges of bands (B,) [Hz] from zero up to a frequency."""
+    turn = _NARROWEST / _BAND
+    if highest <= turn:
+        return np.arange(0.0, highest, _NARROWEST)
+    wide = np.arange(math.log(turn), math.log(highest), _BAND)
+    return np.concatenate([np.arange(0.0, turn - 0.5 * _NARROWEST, _NARROWEST), np.exp(wide)])
+
+
+def _around(grid: Array, heights: Array) -> Array:
+    """Return `_REFINED` points between the neighbours of the lowest of a grid (w,)."""
+    best = int(np.argmin(heights))
+    return np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], _REFINED)
+
+
+def _vertex(grid: Array, heights: Array) -> float:
+    """Return the minimum of a parabola at the lowest of an even grid (w,), within a step."""
+    best = int(np.argmin(heights))
+    if best in {0, len(grid) - 1}:
+        return float(grid[best])
+    before, lowest, after = heights[best - 1 : best + 2]
+    curvature = before - 2.0 * lowest + after
+    moved = 0.5 * (before - after) / curvature if curvature > 0.0 else 0.0
+    return float(grid[best] + moved * (grid[1] - grid[0]))

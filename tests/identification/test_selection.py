@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfilt, sosfiltfilt
 
 from identification.errors import IdentificationError
@@ -500,6 +501,98 @@ class TestLowPass:
         assert low_pass_of(None, seed)[1].preprocessing.torque_bandwidth is None
 
 
+def late_by(recording, delay):
+    """Return a recording whose torque is logged later [s]."""
+    time = recording.time
+    torque = [np.interp(time - delay, time, column) for column in recording.torque.T]
+    return replace(recording, torque=np.column_stack(torque))
+
+
+def with_pauses(shape):
+    """Return three motions of 5 s with rests of 2 s between them, through a low-pass."""
+    span, pause, count = 5.0, 2.0, 3
+    time = np.arange(0.0, count * (span + pause), 1.0 / RATE)
+    moving = time % (span + pause) < span
+    # The time along the motion stands during a pause; the motion begins and ends at rest.
+    along = np.cumsum(moving) / RATE
+    rise = np.sin(np.pi * along / span) ** 4
+    position = rise[:, None] * np.sin(along[:, None] * [5.0, 7.0] + np.array([0.0, 1.0]))
+    velocity = np.gradient(position, time, axis=0)
+    motion = Motion(time, position, velocity, np.gradient(velocity, time, axis=0))
+    return a_recording(noise=0.5 * NOISE, shape=shape, motion=motion)
+
+
+class TestPossibleLowPasses:
+    """Filters that are found in the recording alone."""
+
+    @staticmethod
+    def of_kind(possible, causal):
+        return [one for one in possible if one.torque_shape.causal == causal]
+
+    @pytest.mark.parametrize("shape", [*WITHOUT_PHASE[1:], *FORWARDS], ids=str)
+    def test_bandwidth_and_poles_are_right(self, shape):
+        recording = a_recording(noise=0.5 * NOISE, duration=20.0, shape=shape)
+        (best,) = self.of_kind(possible_low_passes(recording, MODEL), shape.causal)
+        assert best.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.03)
+        assert best.torque_shape == shape
+
+    @pytest.mark.parametrize("rate", [1000.0, 80.0])
+    def test_the_rate_does_not_matter(self, rate):
+        """At a higher rate rows are averaged."""
+        shape = LowPassShape(order=2)
+        motion = three_sines(2, duration=20.0, step=1.0 / rate)
+        recording = a_recording(noise=0.5 * NOISE, motion=motion)
+        sections = butter(2, BANDWIDTH, fs=rate, output="sos")
+        filtered = replace(recording, torque=sosfiltfilt(sections, recording.torque, axis=0))
+        (best,) = self.of_kind(possible_low_passes(filtered, MODEL), causal=False)
+        assert best.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.05)
+        assert best.torque_shape == shape
+
+    def test_it_is_found_beside_a_delay(self):
+        shape = LowPassShape(order=2)
+        recording = late_by(a_recording(noise=0.5 * NOISE, duration=20.0, shape=shape), 0.03)
+        how = Preprocessing(torque_delay=0.03)
+        (best,) = self.of_kind(
+            possible_low_passes(recording, MODEL, options=how, undelayed=0.0), causal=False
+        )
+        assert best.torque_delay == 0.03
+        assert best.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.05)
+
+    @pytest.mark.parametrize("delay", [0.0, 0.03])
+    def test_a_delay_alone_is_none(self, delay):
+        recording = late_by(a_recording(noise=0.5 * NOISE, duration=20.0), delay)
+        how = Preprocessing(torque_delay=delay)
+        assert not possible_low_passes(recording, MODEL, options=how, undelayed=0.0)
+
+    @pytest.mark.parametrize("shape", [LowPassShape(2), LowPassShape(2, causal=True)], ids=str)
+    def test_rests_and_gaps_do_not_matter(self, shape):
+        paused = with_pauses(shape)
+        whole = a_recording(noise=0.5 * NOISE, duration=20.0, shape=shape)
+        gap = (whole.time > 9.0) & (whole.time < 10.0)
+        for recording in (paused, whole.rows(~gap)):
+            (best,) = self.of_kind(possible_low_passes(recording, MODEL), shape.causal)
+            assert best.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.1)
+
+    def test_times_may_be_uneven(self):
+        shape = LowPassShape(order=2)
+        recording = a_recording(noise=0.5 * NOISE, duration=20.0, shape=shape)
+        rng = np.random.default_rng(7)
+        time = recording.time + 0.3 / RATE * rng.uniform(-1.0, 1.0, recording.n_samples)
+        uneven = replace(
+            recording,
+            time=time,
+            position=CubicSpline(recording.time, recording.position)(time),
+            torque=CubicSpline(recording.time, recording.torque)(time),
+        )
+        (best,) = self.of_kind(possible_low_passes(uneven, MODEL), causal=False)
+        assert best.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.05)
+
+    def test_an_arm_that_stands_shows_none(self):
+        recording = a_recording()
+        stands = replace(recording, position=np.zeros_like(recording.position))
+        assert possible_low_passes(stands, MODEL) == ()
+
+
 class TestLowPassShape:
     """Gain at the bandwidth: 1/2 without phase, 1/sqrt(2) if causal."""
 
@@ -510,6 +603,54 @@ class TestLowPassShape:
         inner = low_passed(time, sine, BANDWIDTH, shape)[1000:3000]
         gain = inner.std() / sine[1000:3000].std()
         assert gain == pytest.approx(np.sqrt(0.5) if shape.causal else 0.5, rel=0.01)
+
+    @pytest.mark.parametrize("shape", [*WITHOUT_PHASE, *FORWARDS], ids=str)
+    @pytest.mark.parametrize("frequency", [1.0, 3.0, 5.0])
+    def test_the_response_is_that_of_the_filter(self, shape, frequency):
+        time = np.arange(8000) / (2.0 * RATE)
+        turn = 2.0 * np.pi * frequency * time
+        both = low_passed(time, np.column_stack([np.cos(turn), np.sin(turn)]), BANDWIDTH, shape)
+        measured = ((both[:, 0] + 1j * both[:, 1]) * np.exp(-1j * turn))[3000:5000].mean()
+        gain, _ = shape.response(np.array([frequency]), BANDWIDTH)
+        assert gain[0] == pytest.approx(measured, abs=2e-3)
+
+    @pytest.mark.parametrize("shape", [*WITHOUT_PHASE, *FORWARDS], ids=str)
+    def test_its_lag_is_the_derivative_of_its_logarithm(self, shape):
+        frequency, step = np.array([0.0, 1.0, 3.0, 20.0]), 1e-4
+        _, lag = shape.response(frequency, BANDWIDTH)
+        before, after = (
+            shape.response(frequency + sign * step, BANDWIDTH)[0] for sign in (-1.0, 1.0)
+        )
+        slope = np.log(after / before) / (4.0 * np.pi * step)
+        assert lag == pytest.approx(1j * slope, abs=1e-6)
+        if shape.causal:
+            assert lag[0] == pytest.approx(shape.lag(BANDWIDTH))
+
+    @pytest.mark.parametrize("order", [1, 2, 4])
+    @pytest.mark.parametrize("count", [3, 40, 2407, 2408])
+    def test_both_ways_is_the_filter_in_time(self, order, count):
+        """Equal away from the ends, which it reflects over a whole length."""
+        rng = np.random.default_rng(order)
+        columns = np.cumsum(rng.standard_normal((count, 11)), axis=0)
+        sections = butter(order, BANDWIDTH, fs=RATE, output="sos")
+        reflected = np.concatenate([
+            2.0 * columns[0] - columns[:0:-1], columns, 2.0 * columns[-1] - columns[-2::-1],
+        ])  # fmt: skip
+        expected = sosfiltfilt(sections, reflected, axis=0, padlen=0)[count - 1 : 2 * count - 1]
+        filtered = low_passed(np.arange(count) / RATE, columns, BANDWIDTH, LowPassShape(order))
+        inner = slice(count // 3, count - count // 3)
+        size = np.abs(columns).max()
+        if count > 1000:
+            assert filtered == pytest.approx(expected, abs=1e-6 * size)
+            assert filtered[inner] == pytest.approx(expected[inner], abs=1e-9 * size)
+        # Reflected points stay; a reflection is cut where 1e-6 of the response is left.
+        assert filtered[[0, -1]] == pytest.approx(columns[[0, -1]], abs=1e-6 * size)
+
+    @pytest.mark.parametrize("shape", WITHOUT_PHASE[1:], ids=str)
+    def test_both_ways_leaves_a_line_as_it_is(self, shape):
+        time = np.arange(500) / RATE
+        line = (3.0 - 2.0 * time)[:, None]
+        assert low_passed(time, line, BANDWIDTH, shape) == pytest.approx(line, abs=1e-12)
 
     def test_uneven_times_are_interpolated(self):
         time = np.arange(4000) / RATE
