@@ -34,7 +34,7 @@ ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
     "VELOCITIES": (("position", "measured"),),
     "PRESLIDING": ((1e-5, 1e-6, 3e-5, 1e-4, 3e-4, 1e-3),),
     "STRENGTHS": ((0.25, 1.0, 4.0), (4.0, 1.0, 0.25)),
-    "FOLDS": (5,),
+    "FOLDS": (3, 8),
     "SHORT": (0.0, 30.0),
 }
 """Other values of each default; of a sequence, the first is the one that others have to beat."""

@@ -242,7 +242,7 @@ def stored_model(folder: Path, reporter: Reporter) -> IdentifiedModel:
         results.verdict.line,
         results.verdict.good,
         f"from {folder / RESULTS} and {PARAMETERS_JSON}, identified by hil {program}; "
-        "--again identifies anew",
+        "--again identifies again",
     )
 
 

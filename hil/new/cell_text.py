@@ -309,7 +309,7 @@ def _joints_between(path: Path, text: str, base: str | None, tip: str | None) ->
     for option, link in (("--base", base), ("--tip", tip)):
         if link is not None and link not in links:
             similar = get_close_matches(link, links, n=3) or links
-            remedy = f"its links are {', '.join(similar[:_MOST_LISTED])}"
+            remedy = f"its links are {', '.join(similar[:_MOST_NAMES])}"
             raise InputError(path, f"has no link {link!r}", field=option, remedy=remedy)
     ends = [tip] if tip is not None else list(to_link)
     found: dict[str, None] = {}
@@ -329,7 +329,7 @@ def _joints_between(path: Path, text: str, base: str | None, tip: str | None) ->
 _GRIPPER: Final = re.compile(
     r"finger|gripper|hand_|_hand|thumb|knuckle|claw|jaw|pinky|palm", re.IGNORECASE
 )
-_MOST_LISTED: Final = 12
+_MOST_NAMES: Final = 12
 
 
 def _branches(chain: Chain) -> list[str]:
@@ -352,14 +352,14 @@ def _note_on_branches(text: str, chain: Chain) -> list[str]:
         if _GRIPPER.search(name) or _GRIPPER.search(links.get(name, ""))
     ]
     if fingers:
-        fixing = " ".join(f"--fix {name}" for name in fingers[:_MOST_LISTED])
+        fixing = " ".join(f"--fix {name}" for name in fingers[:_MOST_NAMES])
         notes.append(
             f"{', '.join(fingers)} look like joints of a gripper or hand by their names: fix those "
             f"that are not identified ({fixing}), or name the last link of the arm (--tip LINK)"
         )
     ends = [name for name in _branches(chain) if name not in fingers]
     if len(ends) > 1:
-        tips = ", ".join(links.get(name, name) for name in ends[:_MOST_LISTED])
+        tips = ", ".join(links.get(name, name) for name in ends[:_MOST_NAMES])
         notes.append(
             f"the joints form {len(ends)} branches, with the last moving links {tips}: choose one "
             "arm with --base LINK --tip LINK"

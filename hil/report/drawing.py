@@ -157,9 +157,9 @@ class Axes:
 
     def svg(self, clip: str) -> str:
         """Return the plot; `clip` is the id of its clipping path."""
-        drawn = [shape for shape in self._shapes if shape[0] != "bands" or "stroke" in shape[3]]
-        low, high = self.x_limits or padded(_joined(shape[1] for shape in drawn))
-        bottom, top = self.y_limits or padded(_joined(shape[2] for shape in drawn))
+        shapes = [shape for shape in self._shapes if shape[0] != "bands" or "stroke" in shape[3]]
+        low, high = self.x_limits or padded(_joined(shape[1] for shape in shapes))
+        bottom, top = self.y_limits or padded(_joined(shape[2] for shape in shapes))
         right, foot = self.left + self.width, self.top + self.height
 
         def across(x: Array) -> Array:
@@ -284,7 +284,7 @@ class Plot:
 def time_panel(time: Array, plots: Sequence[Plot], caption: Caption) -> Panel:
     """Draw plots over the same time (m,) [s], one above the other."""
     span = float(time[0]), max(float(time[-1]), float(time[0]) + 1e-9)
-    drawn, top = list[Axes](), _TOP
+    panels, top = list[Axes](), _TOP
     for k, plot in enumerate(plots):
         last = k == len(plots) - 1
         axes = Axes(
@@ -298,9 +298,9 @@ def time_panel(time: Array, plots: Sequence[Plot], caption: Caption) -> Panel:
         for trace in plot.traces:
             points = thinned(time, trace.values, _BINS)
             axes.line(*points, trace.colour, trace.width, dashed=trace.dashed)
-        drawn.append(axes)
+        panels.append(axes)
         top += plot.height + _GAP
-    return panel(drawn, caption)
+    return panel(panels, caption)
 
 
 def box_panel(

@@ -51,11 +51,15 @@ FOLDS: Final = 10
 RATE: Final = 125.0
 """Rate [Hz] to which recordings are averaged for choices: three times the widest bandwidth."""
 SHORT: Final = 15.0
-"""Time of motion [s] below which questions about details are not asked: ten segments of less than
-a second and a half show no period of an exciting motion."""
-IF_LONG: Final[frozenset[str]] = frozenset({"bandwidth", "presliding", "strength"})
+"""Time of motion [s] below which fewer questions are asked: ten segments of less than a second and
+a half show no period of an exciting motion."""
+IF_LONG: Final[frozenset[str]] = frozenset({"strength"})
 """Questions that are asked of long recordings only: their answers correct small errors, and a wrong
 one costs much on another motion."""
+DETAILS: Final[frozenset[str]] = frozenset({"bandwidth", "presliding"})
+"""Questions that a short recording must answer with `CERTAIN` standard errors. It is not asked for
+a narrower bandwidth: what is smoothed away is not predicted wrongly, but on another motion."""
+CERTAIN: Final = 3.0
 LOW_PASS: Final = "low-pass of the torque"
 DELAY: Final = "delay of the torque"
 LOAD: Final = "friction that grows with load"
@@ -469,11 +473,12 @@ class _Trial:
         by_joint: bool = False,
         rows: Literal["all", "fitted"] = "all",
         possible: Sequence[bool] | None = None,
+        certainty: float = 1.0,
     ) -> _Decision:
         """Return the first candidate, or the best one if it is clearly better.
 
         Better by a share (`WORTHWHILE`), and by more than the standard error of the difference over
-        the segments.
+        the segments times the certainty.
         """
         share = WORTHWHILE if share is None else share
         scores = [self.errors(each, rows) for each in candidates]
@@ -484,7 +489,7 @@ class _Trial:
             allowed = possible is None or possible[k]
             if not (allowed and mean < means[chosen] and mean < _MEANINGLESS):
                 continue
-            if _clearly_better(segments[k], segments[0], share):
+            if _clearly_better(segments[k], segments[0], share, certainty):
                 chosen = k
         words = _differences(candidates)
         return _Decision(candidates[chosen], Choice(name, words, tuple(means), chosen))
@@ -619,7 +624,7 @@ class _Trial:
         return self._tables[key]
 
 
-def _clearly_better(errors: Array, first: Array, share: float) -> bool:
+def _clearly_better(errors: Array, first: Array, share: float, certainty: float) -> bool:
     """Return whether errors of segments (k,) are lower than others by share and standard error."""
     if errors.shape != first.shape or not errors.size:
         return False
@@ -627,7 +632,7 @@ def _clearly_better(errors: Array, first: Array, share: float) -> bool:
         return bool(np.all(np.isfinite(errors)))
     change = np.log(errors / first)
     spread = float(change.std(ddof=1) / np.sqrt(len(change))) if len(change) > 1 else np.inf
-    return bool(change.mean() < min(math.log(1.0 - share), -spread))
+    return bool(change.mean() < min(math.log(1.0 - share), -certainty * spread))
 
 
 def _sweep(
@@ -635,12 +640,22 @@ def _sweep(
 ) -> tuple[Settings, list[Choice]]:
     """Decide interdependent settings in turn until nothing changes."""
     asked = [swept for swept in _SWEPT if swept.question in questions]
+    short = trial.duration(now) < SHORT
     choices: list[Choice] = []
     for _ in range(_MOST_SWEEPS):
         before = now
         choices = []
         for swept in asked:
-            decision = trial.decide(swept.name, swept.vary(now))
+            certainty = CERTAIN if short and swept.question in DETAILS else 1.0
+            candidates = swept.vary(now)
+            if short and swept.question == "bandwidth":
+                widths = [each.preprocessing.rigid_bandwidth for each in candidates]
+                candidates = [
+                    each
+                    for each, width in zip(candidates, widths, strict=True)
+                    if width >= widths[0]
+                ]
+            decision = trial.decide(swept.name, candidates, certainty=certainty)
             now, choices = decision.settings, [*choices, decision.choice]
         if now.key == before.key:
             break

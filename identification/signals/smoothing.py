@@ -381,14 +381,14 @@ def _filtered(columns: Array, cycles: float, shape: LowPassShape) -> Array:
     """Filter columns (m, c) at even times; the cut-off in cycles per sample."""
     cycles = min(cycles, _HIGHEST)
     if not shape.causal:
-        return _filtered_both_ways(columns, cycles, shape.order)
+        return _filtered_without_phase(columns, cycles, shape.order)
     sections = scipy.signal.butter(shape.order, cycles, fs=1.0, output="sos")
     # Initially at rest with the first sample.
     state = scipy.signal.sosfilt_zi(sections)[:, :, None] * columns[0]
     return np.asarray(scipy.signal.sosfilt(sections, columns, axis=0, zi=state)[0])
 
 
-def _filtered_both_ways(columns: Array, cycles: float, order: int) -> Array:
+def _filtered_without_phase(columns: Array, cycles: float, order: int) -> Array:
     """Filter columns (m, c), reflected about their end points, by a Butterworth filter twice.
 
     By its gain, of the bilinear transform. The line through the end points, which the filter leaves

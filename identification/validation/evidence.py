@@ -359,8 +359,10 @@ def gather(
 def _one_way(recordings: Sequence[Samples]) -> NDArray[np.bool_]:
     """Return which joints moved in one direction only (n,)."""
     velocities = [np.where(run.usable, run.motion.velocity, 0.0) for run in recordings]
-    ways = [[np.count_nonzero(sign * v > 0.0, axis=0) for v in velocities] for sign in (1.0, -1.0)]
-    forwards, backwards = np.array(ways).sum(axis=1)
+    directions = [
+        [np.count_nonzero(sign * v > 0.0, axis=0) for v in velocities] for sign in (1.0, -1.0)
+    ]
+    forwards, backwards = np.array(directions).sum(axis=1)
     fewer, moved = np.minimum(forwards, backwards), forwards + backwards
     return np.asarray((moved > 0) & (fewer < _OTHER_WAY * moved))
 

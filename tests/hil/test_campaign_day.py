@@ -192,7 +192,7 @@ def test_the_page_has_rehearsal_dry_run_warm_up_and_rejections(folder: CampaignF
     assert steps["repetitions"].details == [f"{name} rejected: it was held"]
 
 
-def test_the_conduct_has_a_killed_attempt_and_that_no_warm_up_was_wanted(
+def test_the_conduct_has_killed_attempts_and_no_wanted_warm_up(
     folder: CampaignFolder,
 ) -> None:
     """A killed program leaves an archive that is in no manifest."""

@@ -308,7 +308,7 @@ class TestReuse:
         assert "are not of one identification" in shown
 
 
-def test_dates_and_free_fields_reach_results_parameters_and_report(
+def test_dates_and_free_fields_reach_every_output(
     arm: IdentifiedArm, log: Path, tmp_path: Path
 ) -> None:
     """From the cell file over the archive's attachment."""

@@ -337,7 +337,7 @@ def test_a_live_view_that_cannot_be_served_is_refused(cell: Cell, tmp_path: Path
     assert not list(tmp_path.iterdir())
 
 
-def test_a_silent_archive_process_is_named_with_duration_cause_and_remedy() -> None:
+def test_a_silent_archive_process_is_named_with_cause_and_remedy() -> None:
     disk, busy = archive_silence(3.2), archive_silence(0.0)
     for text in (disk, busy):
         assert text.startswith(f"{NO_ARCHIVE}, for more than 0.5 s")

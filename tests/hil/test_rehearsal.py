@@ -153,7 +153,7 @@ def test_it_passes_at_any_cycle(tmp_path: Path, designed: Campaign, cycle_ms: in
     assert found.passed, found.failures
 
 
-def test_a_growing_oscillation_is_named_with_remedy_and_plot_command(
+def test_a_growing_oscillation_is_named_with_plot_command(
     tmp_path: Path, designed: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     oscillation = Oscillation(joint=1, frequency=110.0, growth=70.0, seconds=1.3)

@@ -130,7 +130,7 @@ class TestPicture:
         joints = [line.split() for line in lines if line.startswith("joint_")]
         assert joints == [[name, "-", "-", "-", "-"] for name in NAMES]
 
-    def test_after_a_silence_it_shows_why_the_run_waits_and_no_state_that_has_ended(self) -> None:
+    def test_after_a_silence_it_shows_why_the_run_waits(self) -> None:
         screen = screen_of(status())
         assert any("open" in line for line in screen_lines(80, 24, screen))
         screen._messages.append("waiting for the controller")

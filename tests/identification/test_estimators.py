@@ -545,7 +545,7 @@ class TestPosterior:
             assert result.design_effect < 2.0
 
     @pytest.mark.parametrize("effect", [1.0, 7.0])
-    def test_rows_that_count_less_are_the_textbook_with_less_information(self, effect):
+    def test_rows_that_count_less_are_less_information(self, effect):
         """At the weights of the joints' own residuals."""
         prior, factor = prior_of(KNOWN), Factor.by_time(MODEL, noisy())
         found = fit_posterior(MODEL, factor, prior, effect)
@@ -601,7 +601,7 @@ class TestDesignEffect:
         assert 1.0 <= self.effects(0.0).mean() < 1.2
 
     @pytest.mark.parametrize("correlation", [0.02, 0.05])
-    def test_coloured_ones_count_by_their_power_at_the_speed_of_the_motion(self, correlation):
+    def test_coloured_ones_count_by_their_power_in_the_motion(self, correlation):
         """That of a first-order process at low frequency is (1 + r) / (1 - r) of white's."""
         r = np.exp(-5e-3 / correlation)
         assert np.median(self.effects(correlation)) == pytest.approx((1.0 + r) / (1.0 - r), rel=0.3)

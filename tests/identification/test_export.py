@@ -691,7 +691,7 @@ class TestLoadFriction:
         np.testing.assert_allclose(beyond, [expected], rtol=1e-6)
         assert found.difference < AGREES
 
-    def test_a_joint_that_did_not_move_has_the_friction_of_its_description(self):
+    def test_a_joint_at_rest_has_the_friction_of_its_description(self):
         arm = an_arm(urdf_text(), friction=FrictionLaw(load=True))
         friction = arm.values[arm.model.friction_part]
         names = arm.model.parameter_names[arm.model.friction_part]

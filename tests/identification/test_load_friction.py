@@ -110,7 +110,7 @@ class TestSamples:
         assert np.abs(parts[0]).max() > 0.0
         np.testing.assert_allclose(np.add(*parts), samples.torque, rtol=1e-9, atol=1e-9)
 
-    def test_parts_of_a_filtered_recording_have_the_load_of_their_rows(self):
+    def test_parts_of_a_filtered_recording_have_their_load(self):
         whole = simulated(LOADED, VALUES, a_motion(), torque_bandwidth=np.full(2, 30.0))
         part = whole.between(300, 900).with_load(LOADED, VALUES)
         expected = whole.with_load(LOADED, VALUES).regressor(LOADED)
@@ -198,7 +198,7 @@ class TestFixedPoint:
         assert found.passes == 2
         assert not found.converged
 
-    def test_a_model_without_shares_is_fitted_once_to_the_same_samples(self):
+    def test_a_model_without_shares_is_fitted_once(self):
         samples = simulated(MODEL, truth(), a_motion(), NOISE, 8)
         found = fit_with_load(MODEL, [samples], lambda some: fit_least_squares(MODEL, list(some)))
         assert (found.passes, found.converged) == (1, True)

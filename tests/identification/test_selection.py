@@ -325,7 +325,7 @@ class TestChosenSettings:
         assert decision.errors[1] < 0.9 * decision.errors[0]
         assert not settings.model.friction.has_load
 
-    def test_the_prior_has_the_strength_of_the_residuals_without_cause(self):
+    def test_the_prior_keeps_the_strength_of_the_residuals(self):
         """White noise, and a description that is right: no candidate is clearly better."""
         settings, choices = chosen(a_recording(duration=LONG), {"estimator"})
         assert settings.strength.weight == 1.0

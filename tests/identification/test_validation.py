@@ -663,7 +663,7 @@ class TestStepsOfTheLog:
         found = position_steps(one, "log.mcap")
         assert found.logged and found.jumps == ()
 
-    def test_an_encoder_that_slips_while_its_value_freezes_has_jumped(self):
+    def test_an_encoder_that_slips_while_frozen_has_jumped(self):
         one = frozen(uneven(1000.0), slice(5000, 5030))
         found = position_steps(with_jump(one, 0.2, slice(5030, None)))
         assert [jump.joint for jump in found.jumps] == ["knee"]
