@@ -152,13 +152,12 @@ class UdpController:
             SessionError: no reply of a PC program came, or the controller had to be killed.
         """
         summary = self._end()
-        if not summary:
-            raise SessionError(f"the simulated controller of port {self.port} had to be killed")
-        if not summary["cycles"]:
+        if not summary.get("cycles"):
+            ended = "" if summary else "; it ended without a summary"
             raise SessionError(
-                f"no reply came to the packets that were sent to {self.host}:{self.port}; check "
-                "that the program under test listens on udp_controller.port, and start it before "
-                "finish()"
+                f"no reply came to the packets that the simulated controller sent to {self.host}:"
+                f"{self.port}{ended}; check that the program under test listens on "
+                "udp_controller.port, and start it before finish()"
             )
         return summary
 
