@@ -92,6 +92,8 @@ FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
 WORTHWHILE: Final = 0.01
 LOW_PASS_WORTHWHILE: Final = 0.05
 TERM_WORTHWHILE: Final = 0.02
+# Bodies that cannot exist are of no use in a simulator, so they must predict much better.
+IMPOSSIBLE_WORTHWHILE: Final = 0.05
 # An error above the torque itself chooses nothing.
 _MEANINGLESS: Final = 1.0
 # Speeds above this share of the largest are predicted from slower ones to try friction terms.
@@ -336,7 +338,7 @@ def choose_settings(
         now, choices = decision.settings, [*choices, decision.choice]
     if "consistency" in asked:
         possible = replace(now, strength=replace(now.strength, consistent=True))
-        decision = trial.decide(CONSISTENT, [possible, now])
+        decision = trial.decide(CONSISTENT, [possible, now], IMPOSSIBLE_WORTHWHILE)
         now, choices = decision.settings, [*choices, decision.choice]
     if not trial.errors(now).overall < _MEANINGLESS:
         return start, ()
