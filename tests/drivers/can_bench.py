@@ -240,8 +240,7 @@ class Run:
 class SlcanBus:
     """Two emulated serial adapters joined by a bus, served by a thread.
 
-    `ports` are the serial devices, `rates` the bit rate commands of each, `set_up` these and those
-    that open and close, `refused` the commands
+    `ports` are the serial devices, `rates` the bit rate commands of each, `refused` the commands
     that were answered with the bell.
     """
 
@@ -249,7 +248,6 @@ class SlcanBus:
         self._terminals = [pty.openpty() for _ in range(2)]
         self.ports = tuple(os.ttyname(slave) for _, slave in self._terminals)
         self.rates: tuple[list[str], list[str]] = ([], [])
-        self.set_up: tuple[list[str], list[str]] = ([], [])
         self.refused: list[str] = []
         self._open = [False, False]
         self._waiting = bytearray(), bytearray()
@@ -281,8 +279,6 @@ class SlcanBus:
 
     def _execute(self, side: int, line: str) -> None:
         answer = b"\r"
-        if line[:1] in ("O", "C", "S", "Y"):
-            self.set_up[side].append(line)
         if line in ("O", "C"):
             self._open[side] = line == "O"
         elif line[:1] in ("S", "Y"):

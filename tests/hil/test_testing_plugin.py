@@ -10,10 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from hil.cell import Cell
-from hil.testing import SessionError, UdpController, shortened
-from sim_fixtures.ns16 import CELL_PATH
-
 DOCUMENT = Path(__file__).parents[2] / "docs" / "testing.md"
 
 
@@ -96,11 +92,3 @@ def test_another_arm_a_wrong_script_and_a_fault_that_is_none(tmp_path: Path) -> 
     assert "test_the_arm_comes_home FAILED" in done.stdout
     assert "test_mine.py::test_typo ERROR" in done.stdout
     assert "'earthquake' is none of lose" in done.stdout
-
-
-def test_a_program_that_never_replied_is_named(tmp_path: Path) -> None:
-    cell = shortened(Cell.load(CELL_PATH))
-    with UdpController.started(cell, tmp_path) as controller:
-        with pytest.raises(SessionError, match="no reply came") as error:
-            controller.finish()
-        assert str(controller.port) in str(error.value)
