@@ -64,6 +64,7 @@ from identification.validation.finding import joined
 
 from .options import Estimator, Options
 from .prepared import Prepared, known_parameters, samples_of
+from .sources import Sources
 from .torque_scale import TorqueScale, torque_scale
 
 # Hz. A narrower smoother removes part of the motion from the regressor, a bias that instruments
@@ -147,12 +148,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
     """
     cell, name = prepared.sources.cell, options.estimator
     model, variance = cell.model, prepared.settings.delay_variance
-    for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
-        if not samples.usable.any():  # for example a truncated recording
-            lasts = f"it lasts {np.ptp(samples.motion.time):.3g} s"
-            raise ArchiveError(
-                Path(source.name), f"{no_rows_message(model)} ({lasts})", remedy="leave it out"
-            )
+    _require_usable_rows(prepared)
     with reporter.task("estimating", 4) as task:
         fitted = smoothed_for_instruments(model, prepared) if name == "iv" else prepared.fitted
         task.advance(1, name)
@@ -192,11 +188,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
             " parameters poorly (solved by QR)"
         )
     refit = refit_of(model, name, posterior)
-    scale = torque_scale(
-        cell,
-        [source.recording for source in prepared.sources.training],
-        simulated=prepared.sources.header.only_simulated,
-    )
+    scale = _scale_of(prepared.sources)
     precision = posterior.precision if name in _OF_PRIOR else None
     return Estimation(
         estimator=name,
@@ -209,6 +201,22 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         stated=with_uncertain_scale(pooled, result.factor, precision, scale),
         notes=(f"the intervals of the parameters are computed {scale.message}",),
     )
+
+
+def _require_usable_rows(prepared: Prepared) -> None:
+    """Raise ArchiveError for a recording without a usable row, for example a truncated one."""
+    model = prepared.sources.cell.model
+    for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
+        if not samples.usable.any():
+            lasts = f"it lasts {np.ptp(samples.motion.time):.3g} s"
+            raise ArchiveError(
+                Path(source.name), f"{no_rows_message(model)} ({lasts})", remedy="leave it out"
+            )
+
+
+def _scale_of(sources: Sources) -> TorqueScale:
+    recordings = [source.recording for source in sources.training]
+    return torque_scale(sources.cell, recordings, simulated=sources.header.only_simulated)
 
 
 def with_uncertain_scale(
