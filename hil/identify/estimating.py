@@ -152,9 +152,9 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
     with reporter.task("estimating", 4) as task:
         fitted = smoothed_for_instruments(model, prepared) if name == "iv" else prepared.fitted
         task.advance(1, name)
-        total = total_factor(model, fitted)
-        posterior = Posterior.of(cell, total, name, prepared.settings.strength)
-        posterior, unsolved = posterior.solvable(total)
+        scale = _scale_of(prepared.sources)
+        total, strength = total_factor(model, fitted), prepared.settings.strength
+        posterior, unsolved = Posterior.of(cell, total, name, strength).solvable(total)
         if name == "iv":
             result, warnings = _instrumental(model, prepared, fitted)
         elif name in _LOSSES:
@@ -188,7 +188,6 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
             " parameters poorly (solved by QR)"
         )
     refit = refit_of(model, name, posterior)
-    scale = _scale_of(prepared.sources)
     precision = posterior.precision if name in _OF_PRIOR else None
     return Estimation(
         estimator=name,

@@ -214,6 +214,25 @@ def _with_robot_entry(text: str, key: str, value: str) -> str:
         return f"{text}\n[robot]\n{key} = {value}\n"
 
 
+def _require_writable(output: Path, source: Sequence[Path], *, force: bool) -> None:
+    """Raise ArchiveWriteError for an output that is a recording, or exists without `force`."""
+    if any(output.resolve() == path.resolve() for path in source):
+        problem, remedy = "is the recording itself", "choose another name (-o)"
+        raise ArchiveWriteError(output, problem, remedy=remedy)
+    if not force and path_exists(output):
+        remedy = "choose another name (-o), or replace it with --force"
+        raise ArchiveWriteError(output, "exists already", remedy=remedy)
+
+
+def _require_joints(held_joints: Sequence[str], robot: Robot, source: Path) -> None:
+    """Raise SourceError for held joints that the robot does not have."""
+    unknown = [name for name in held_joints if name not in robot.joint_names]
+    if unknown:
+        problem = f"no joint is called {unknown[0]!r}"
+        remedy = f"the robot's joints are {', '.join(robot.joint_names)}"
+        raise SourceError(source, problem, field="held joints", remedy=remedy)
+
+
 def write_imported(
     output: str | PathLike[str],
     samples: Samples,
@@ -242,21 +261,12 @@ def write_imported(
         ArchiveWriteError: the archive exists or cannot be written.
     """
     output = Path(output)
-    if any(output.resolve() == path.resolve() for path in source):
-        problem, remedy = "is the recording itself", "choose another name (-o)"
-        raise ArchiveWriteError(output, problem, remedy=remedy)
-    if not force and path_exists(output):
-        remedy = "choose another name (-o), or replace it with --force"
-        raise ArchiveWriteError(output, "exists already", remedy=remedy)
+    _require_writable(output, source, force=force)
     _check(samples, source[0], robot.joint_names)
     check_clock(samples.stamp, clock or source[0])
     if not outside_limits:
         check_positions(samples.position, robot.joint_names, robot.urdf, source[0])
-    unknown = [name for name in held_joints if name not in robot.joint_names]
-    if unknown:
-        problem = f"no joint is called {unknown[0]!r}"
-        remedy = f"the robot's joints are {', '.join(robot.joint_names)}"
-        raise SourceError(source[0], problem, field="held joints", remedy=remedy)
+    _require_joints(held_joints, robot, source[0])
     findings = examine(
         samples,
         robot.joint_names,

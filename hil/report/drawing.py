@@ -157,9 +157,9 @@ class Axes:
 
     def svg(self, clip: str) -> str:
         """Return the plot; `clip` is the id of its clipping path."""
-        shapes = [shape for shape in self._shapes if shape[0] != "bands" or "stroke" in shape[3]]
-        low, high = self.x_limits or padded(_joined(shape[1] for shape in shapes))
-        bottom, top = self.y_limits or padded(_joined(shape[2] for shape in shapes))
+        visible = [shape for shape in self._shapes if shape[0] != "bands" or "stroke" in shape[3]]
+        low, high = self.x_limits or padded(_joined(shape[1] for shape in visible))
+        bottom, top = self.y_limits or padded(_joined(shape[2] for shape in visible))
         right, foot = self.left + self.width, self.top + self.height
 
         def across(x: Array) -> Array:
