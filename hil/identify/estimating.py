@@ -165,9 +165,9 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
             result, warnings = _by_factor(model, fitted, name)
         if prepared.sources.same_motion:
             result = result.with_scatter()
+        precision = posterior.precision if name in _OF_PRIOR else None
         if variance:
             products = np.asarray(sum(rate_products(model, samples) for samples in fitted))
-            precision = posterior.precision if name in _OF_PRIOR else None
             pooled = with_uncertain_delay(
                 result.pooled, result.factor, products, variance, precision
             )
@@ -187,15 +187,13 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
             f"the scaled condition number is {pooled.condition:.2g}: the motion separates some"
             " parameters poorly (solved by QR)"
         )
-    refit = refit_of(model, name, posterior)
-    precision = posterior.precision if name in _OF_PRIOR else None
     return Estimation(
         estimator=name,
         result=result,
         held_out=held_out,
         posterior=posterior,
         with_prior=beside,
-        refit=refit,
+        refit=refit_of(model, name, posterior),
         warnings=tuple(warnings),
         stated=with_uncertain_scale(pooled, result.factor, precision, scale),
         notes=(f"the intervals of the parameters are computed {scale.message}",),

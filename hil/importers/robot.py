@@ -267,13 +267,8 @@ def write_imported(
     if not outside_limits:
         check_positions(samples.position, robot.joint_names, robot.urdf, source[0])
     _require_joints(held_joints, robot, source[0])
-    findings = examine(
-        samples,
-        robot.joint_names,
-        robot.urdf,
-        locked=robot.locked,
-        nominal=robot.nominal_torque(),
-    )
+    nominal = robot.nominal_torque()
+    findings = examine(samples, robot.joint_names, robot.urdf, locked=robot.locked, nominal=nominal)
     entries = {
         **metadata,
         "source": json.dumps([path.name for path in source]),
@@ -284,13 +279,9 @@ def write_imported(
     }
 
     def write(path: Path) -> Path:
+        texts, names = robot.attachments(), robot.joint_names
         return write_samples(
-            path,
-            samples,
-            joint_names=robot.joint_names,
-            metadata=entries,
-            attachments=robot.attachments(),
-            period=period,
+            path, samples, joint_names=names, metadata=entries, attachments=texts, period=period
         )
 
     if not force:
