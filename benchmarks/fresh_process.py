@@ -1,6 +1,6 @@
 """Processor time and memory of a command in a process of its own.
 
-Run with ``python -m benchmarks.fresh_process COMMAND ...``: the command runs with its output kept
+Run with ``python -m benchmarks.fresh_process COMMAND ...``: the command runs with its output stored
 back, and a line of JSON has its status, what it wrote as errors, processor time and peak memory,
 those of its children included.
 

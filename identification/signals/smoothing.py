@@ -392,7 +392,7 @@ def _filtered_without_phase(columns: Array, cycles: float, order: int) -> Array:
     """Filter columns (m, c), reflected about their end points, by a Butterworth filter twice.
 
     By its gain, of the bilinear transform. The line through the end points, which the filter leaves
-    as it is, is kept apart: the reflected difference is periodic after two lengths, of which so
+    as it is, is apart: the reflected difference is periodic after two lengths, of which so
     much is transformed as reaches into the columns.
     """
     count = len(columns)

@@ -643,8 +643,8 @@ def slipping(one, rows):
 
 def without_rows(one, rows, rate):
     """Rows are missing, and the stamps do not show it."""
-    kept = one.rows(np.delete(np.arange(len(one.time)), rows))
-    return replace(kept, time=np.arange(len(kept.time)) / rate)
+    remaining = one.rows(np.delete(np.arange(len(one.time)), rows))
+    return replace(remaining, time=np.arange(len(remaining.time)) / rate)
 
 
 class TestStepsOfTheLog:
