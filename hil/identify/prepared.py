@@ -31,7 +31,13 @@ from identification.selection.inner_prediction import (
 from identification.selection.inner_prediction import Settings as Candidate
 from identification.signals.clock import time_base
 from identification.signals.recording import Recording
-from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, Samples, prepare
+from identification.signals.samples import (
+    RIGID_BANDWIDTH,
+    Preprocessing,
+    Samples,
+    Smoothed,
+    prepare,
+)
 from identification.validation.finding import Thresholds
 from planner.arrays import numbers
 
@@ -94,11 +100,16 @@ def stated_settings(cell: Cell, options: Options) -> Settings:
 
 
 def samples_of(
-    source: Source, cell: Cell, settings: Settings, model: RobotModel | None = None
+    source: Source,
+    cell: Cell,
+    settings: Settings,
+    model: RobotModel | None = None,
+    motions: dict[Preprocessing, Smoothed] | None = None,
 ) -> Samples:
     """Return the samples of a source, for a fit.
 
-    The friction law is that of the cell; `model` replaces the cell's.
+    The friction law is that of the cell; `model` replaces the cell's. `motions` keeps smoothed
+    motions of the source for several calls.
 
     Raises:
         RecordingError: the recording cannot be prepared.
@@ -113,6 +124,7 @@ def samples_of(
         options=settings.preprocessing,
         origin=source.origin,
         current_limit=np.array(cell.drive_table.current_limit) if driven else None,
+        motions=motions,
     )
     if source.context is None:
         return samples
@@ -292,10 +304,14 @@ def _chosen(
     some = sources.training[:1] if sources.same_motion else sources.training
     read = [averaged_source(source, RATE) for source in some]
     settings = averaged_noise(settings, some[0], read[0])
+    motions: list[dict[Preprocessing, Smoothed]] = [{} for _ in read]
 
     def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
         trial = replace(settings, preprocessing=how)
-        return [samples_of(source, cell, trial, model) for source in read]
+        return [
+            samples_of(source, cell, trial, model, kept)
+            for source, kept in zip(read, motions, strict=True)
+        ]
 
     def low_passes(model: RobotModel, how: Preprocessing) -> tuple[Preprocessing, ...]:
         return possible_low_passes(

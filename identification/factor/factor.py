@@ -175,11 +175,17 @@ class Factor:
         """Gram matrices (n, p + 1, p + 1), symmetric; of triangles with loss of digits."""
         width = self.n_parameters + 1
         whole = np.zeros((self.n_joints, width, width))
-        for joint, own in enumerate(self.matrices):
-            small = own if self.storage == "gram" else own.transpose(0, 2, 1) @ own
+        for joint, own in enumerate(self._sums):
             place = self._places(joint)
-            whole[joint][np.ix_(place, place)] = small.sum(axis=0)
+            whole[joint][np.ix_(place, place)] = own
         return whole
+
+    @cached_property
+    def _sums(self) -> tuple[Array, ...]:
+        """Gram matrices over the columns of each joint (c_j + 1, c_j + 1)."""
+        if self.storage == "gram":
+            return tuple(own.sum(axis=0) for own in self.matrices)
+        return tuple(np.einsum("bki,bkj->ij", own, own) for own in self.matrices)
 
     @property
     def words(self) -> str:
@@ -210,9 +216,11 @@ class Factor:
 
     def squared_errors(self, values: Array) -> Array:
         """Return the sum of squared torque errors of parameters (p,) per joint (n,)."""
-        augmented = np.append(-values, 1.0)
-        squares = np.einsum("i,jik,k->j", augmented, self.gram, augmented)
-        return np.asarray(np.maximum(squares, 0.0))
+        squares = np.zeros(self.n_joints)
+        for joint, used in enumerate(self.columns):
+            augmented = np.append(-values[used], 1.0)
+            squares[joint] = augmented @ self._sums[joint] @ augmented
+        return np.maximum(squares, 0.0)
 
     def relative_errors(self, values: Array) -> Array:
         """Return ||e|| / ||tau|| of parameters (p,) per joint (n,), NaN without torque."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -26,7 +27,14 @@ from identification.estimators.prior import (
     posterior_values,
     torque_scatter,
 )
-from identification.factor.factor import Factor, augmented_rows, count_by_block
+from identification.factor.factor import (
+    Factor,
+    add_grams,
+    augmented_rows,
+    count_by_block,
+    equal_runs,
+    total_factor,
+)
 from identification.model.elements import Element, TorqueRipple
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
@@ -237,41 +245,49 @@ class Folds:
 
         With speeds `fast` (n,), slower rows are fitted and faster ones are predicted.
         """
-        fitted, predicted = Factor.zero(model, FOLDS), Factor.zero(model, FOLDS)
+        fitted, beside = Factor.zero(model, FOLDS), Factor.zero(model, FOLDS)
         for samples in recordings:
-            usable = samples.usable
-            asked = np.ones_like(usable)
+            usable, others = samples.usable, ~samples.usable
             if fast is not None:
-                asked = np.abs(samples.motion.velocity) > fast
-                usable = usable & ~asked
-            m = len(samples.torque)
-            edges = np.linspace(0, m, FOLDS + 1).round().astype(int)
+                others = np.abs(samples.motion.velocity) > fast
+                usable = usable & ~others
+            edges = np.linspace(0, len(usable), FOLDS + 1).round().astype(int)
             index = np.repeat(np.arange(FOLDS), np.diff(edges))
-            predicted.counts[:] += count_by_block(index, asked)
             fitted.counts[:] += count_by_block(index, usable)
-            for part, rows in augmented_rows(model, replace(samples, usable=asked | usable)):
-                both = [table.copy() for table in rows]
-                for table, lost in zip(both, ~asked[part].T, strict=True):
-                    table[:, lost] = 0.0
-                predicted.add_rows(index[part], both)
-                for table, lost in zip(rows, ~usable[part].T, strict=True):
-                    table[:, lost] = 0.0
+            beside.counts[:] += count_by_block(index, others)
+            for part, rows in augmented_rows(model, replace(samples, usable=usable | others)):
+                for joint, table in enumerate(rows):
+                    # The fewer rows are those that are not fitted.
+                    some = np.flatnonzero(others[part, joint])
+                    add_grams(beside.matrices[joint], table[:, some], equal_runs(index[part][some]))
+                    table[:, ~usable[part, joint]] = 0.0
                 fitted.add_rows(index[part], rows)
-        return cls(fitted, predicted)
+        return cls(fitted, fitted + beside if fast is None else beside)
 
     def without(self, k: int) -> Factor:
         """Return the factor of all segments but k."""
-        return self.fitted.blocks(np.arange(FOLDS) != k)
+        segments = self.fitted
+        matrices = tuple(
+            total - own[k]
+            for total, own in zip(self._whole.matrices, segments.matrices, strict=True)
+        )
+        return replace(segments, matrices=matrices, counts=self._whole.counts - segments.counts[k])
+
+    @cached_property
+    def _whole(self) -> Factor:
+        return self.fitted.merged(FOLDS)
 
     def errors(
         self, estimate: Callable[[Factor], Array], rows: Literal["all", "fitted"] = "all"
     ) -> Errors:
         """Return prediction errors of ``estimate(factor without a segment)`` on its rows."""
         targets = self.predicted if rows == "all" else self.fitted
-        squares = np.zeros((FOLDS, targets.n_joints))
-        for k in range(FOLDS):
-            segment = targets.blocks(np.arange(FOLDS) == k)
-            squares[k] = segment.squared_errors(estimate(self.without(k)))
+        squares = np.array(
+            [
+                targets.blocks(np.arange(FOLDS) == k).squared_errors(estimate(self.without(k)))
+                for k in range(FOLDS)
+            ]
+        )
         return Errors(squares, np.array([table[:, -1, -1] for table in targets.matrices]).T)
 
 
@@ -319,6 +335,7 @@ def choose_settings(
     if trial.duration(now) < SHORT:
         asked -= IF_LONG
     first = now
+    trial.weigh(first)
     now, choices = _sweep(trial, first, asked)
     if "delay" in asked:
         first, now, choices = _compare_delays(trial, first, now, choices, asked, delays)
@@ -332,6 +349,7 @@ def choose_settings(
         rippled = [replace(now, model=now.model.with_elements(elements)) for elements in ripples]
         decision = trial.decide("torque ripple", [now, *rippled])
         now, choices = decision.settings, [*choices, decision.choice]
+    trial.weigh(now)
     if "strength" in asked:
         weights = [replace(now.strength, weight=weight) for weight in STRENGTHS]
         decision = trial.decide(STRENGTH, [replace(now, strength=weight) for weight in weights])
@@ -412,13 +430,20 @@ def _compare_low_passes(
 ) -> tuple[Settings, list[Choice]]:
     """Add a low-pass of the torque, or its delay alone, if that predicts better.
 
-    Starts from the `first` settings: a narrow bandwidth chosen `now` would replace a part of it.
+    Starts from the bandwidth of the `first` settings: a narrow one chosen `now` would replace a
+    part of it.
     """
-    possible = low_passes(first.model, first.preprocessing)
+    start = _with(now, rigid_bandwidth=first.preprocessing.rigid_bandwidth)
+    possible = low_passes(start.model, start.preprocessing)
     if not possible:
         return now, choices
-    candidates = [replace(first, preprocessing=how) for how in possible]
-    filtered, behind = _sweep(trial, trial.best(candidates), questions)
+    candidates = [replace(start, preprocessing=how) for how in possible]
+    likely = trial.decide(
+        LOW_PASS, [start, trial.best(candidates)], LOW_PASS_WORTHWHILE, by_joint=True
+    )
+    if not likely.choice.chosen:
+        return now, [*choices, likely.choice]
+    filtered, behind = _sweep(trial, likely.settings, questions)
     # Refined by prediction, as the residual's minimum is flat.
     filtered = trial.decide("", _nearby_bandwidths(filtered), share=0.0).settings
     # Compared by joint, as the channel is common to all.
@@ -453,9 +478,21 @@ class _Trial:
     def __init__(self, ready: Ready, known: Known | None) -> None:
         self._ready, self._known = ready, known
         self._samples: dict[Preprocessing, list[Samples]] = {}
+        self._directed: dict[tuple[Preprocessing, tuple[float, ...]], list[Samples]] = {}
         self._tables: dict[tuple[Columns, Preprocessing], _Reduced] = {}
         self._errors: dict[tuple[Columns, Preprocessing, Strength, str], Errors] = {}
-        self._effects: dict[tuple[Columns, Preprocessing], float] = {}
+        self._effect = 1.0
+
+    def weigh(self, settings: Settings) -> None:
+        """Set how many rows count as one by the correlation of the residuals of settings.
+
+        It is the same for all that are compared, so that none wins by a weaker prior.
+        """
+        model = settings.model
+        total = total_factor(model, self.samples(settings))
+        prior = self._reduced(settings).prior.gaussian
+        self._effect = design_effect_of(total, prior) if total.samples.any() else 1.0
+        self._errors.clear()
 
     def duration(self, settings: Settings) -> float:
         """Return the time of motion of the recordings [s], in which at least one joint moves."""
@@ -520,7 +557,7 @@ class _Trial:
             return unknown
 
     def _estimator(self, settings: Settings, prior: BodyPrior) -> Callable[[Factor], Array]:
-        effect = settings.strength.design_effect(self.effect(settings))
+        effect = settings.strength.design_effect(self._effect)
 
         def estimate(factor: Factor) -> Array:
             values, weights = posterior_values(factor, prior.gaussian, effect)
@@ -529,20 +566,6 @@ class _Trial:
             return values
 
         return estimate
-
-    def effect(self, settings: Settings) -> float:
-        """Return how many rows count as one by the correlation of the residuals.
-
-        Computed for the settings of the preprocessing: terms of friction change it little.
-        """
-        key = ((), ()), settings.preprocessing
-        if key not in self._effects:
-            samples = self.samples(settings)
-            model = settings.model
-            total = sum((Factor.by_time(model, each) for each in samples), Factor.zero(model))
-            prior = self._reduced(settings).prior.gaussian
-            self._effects[key] = design_effect_of(total, prior) if total.samples.any() else 1.0
-        return self._effects[key]
 
     def fast_error(self, settings: Settings) -> float:
         """Return the error of fast motion predicted from slower one; zero if there is none."""
@@ -603,13 +626,15 @@ class _Trial:
 
         The load is that of the estimate without friction that depends on it.
         """
-        if settings.preprocessing not in self._samples:
-            samples = self._ready(settings.model, settings.preprocessing)
-            self._samples[settings.preprocessing] = [*samples]
-        samples = [
-            each.with_friction_direction(settings.model)
-            for each in self._samples[settings.preprocessing]
-        ]
+        model, how = settings.model, settings.preprocessing
+        if how not in self._samples:
+            self._samples[how] = [*self._ready(model, how)]
+        key = how, tuple(law.presliding for law in model.friction.laws)
+        if key not in self._directed:
+            self._directed[key] = [
+                each.with_friction_direction(model) for each in self._samples[how]
+            ]
+        samples = self._directed[key]
         if not settings.model.friction.has_load:
             return samples
         without = _friction(settings, load=False)
@@ -674,6 +699,11 @@ class _Swept(NamedTuple):
 
 _SWEPT: Final = (
     _Swept(
+        "presliding",
+        "presliding displacement",
+        lambda now: [_friction(now, presliding=distance) for distance in PRESLIDING],
+    ),
+    _Swept(
         "rows",
         "rows that are left out",
         lambda now: [_with(now, left_out=rows) for rows in LEFT_OUT],
@@ -687,11 +717,6 @@ _SWEPT: Final = (
         "bandwidth",
         "bandwidth of the motion",
         lambda now: [_with(now, rigid_bandwidth=width) for width in BANDWIDTHS],
-    ),
-    _Swept(
-        "presliding",
-        "presliding displacement",
-        lambda now: [_friction(now, presliding=distance) for distance in PRESLIDING],
     ),
 )
 

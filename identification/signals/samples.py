@@ -30,6 +30,8 @@ RIGID_BANDWIDTH: Final = 40.0  # Hz
 _SHORTEST_SEGMENT: Final = 12  # samples, twice the minimum of a quintic spline
 
 VelocitySource = Literal["position", "measured"]
+Smoothed = tuple[Motion, Array]
+"""Motion and bandwidth of :func:`smooth`."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,13 @@ class Preprocessing:
     torque_shape: LowPassShape = SMOOTHER  #: of that low-pass; ignored with `smooth_torque`
     #: lag of the recorded torque behind the position [s], without that of a causal low-pass
     torque_delay: float = 0.0
+
+    @property
+    def of_motion(self) -> Preprocessing:
+        """The settings that change the smoothed motion, the others by default."""
+        return Preprocessing(
+            self.rigid_bandwidth, velocity=self.velocity, torque_delay=self.torque_delay
+        )
 
     def __post_init__(self) -> None:
         for name in ("rigid_bandwidth", "torque_bandwidth"):
@@ -183,7 +192,7 @@ def smooth(
     recording: Recording,
     noise_variance: Array | None = None,
     options: Preprocessing = Preprocessing(),
-) -> tuple[Motion, Array]:
+) -> Smoothed:
     """Return the smoothed motion at each time minus the delay, and the bandwidth (n,) [Hz].
 
     `noise_variance` of the measured positions (n,) [rad² or m²] is from standstill and at least
@@ -224,12 +233,14 @@ def prepare(
     options: Preprocessing = Preprocessing(),
     origin: float | None = None,
     current_limit: Array | None = None,
+    motions: dict[Preprocessing, Smoothed] | None = None,
 ) -> Samples:
     """Prepare a recording for a model; the torque of a known payload is subtracted.
 
     Variances of the positions and, for `options.smooth_torque`, of the torques (n,) are estimated
     if None, see :func:`smooth`. `origin` is the start of the planned motion [s], by default of the
-    command; rows at the `current_limit` of the motors (n,) [A] are excluded.
+    command; rows at the `current_limit` of the motors (n,) [A] are excluded. `motions` keeps the
+    motions of one recording by their settings, for several preparations.
 
     Raises:
         RecordingError: the recording is invalid or has no torque.
@@ -237,7 +248,10 @@ def prepare(
     recording.checked(model.joint_names)
     if recording.torque is None:
         raise RecordingError("the recording has no joint torque to fit")
-    motion, bandwidth = smooth(recording, noise_variance, options)
+    motions = {} if motions is None else motions
+    if options.of_motion not in motions:
+        motions[options.of_motion] = smooth(recording, noise_variance, options)
+    motion, bandwidth = motions[options.of_motion]
     segments = tuple(recording.segments())
     torque, torque_bandwidth = recording.torque, None
     if options.torque_bandwidth is not None:

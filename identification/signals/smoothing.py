@@ -138,6 +138,7 @@ ORDER: Final = DEGREE + 1  # non-zero basis functions per knot interval
 # normal equations.
 _LIGHTEST: Final = 1e-9
 _HEAVIEST: Final = 1e11
+_PENALTY: Final = 1e-2  # of its logarithm; 0.2 % of the bandwidth
 _KNOT_OF_CUTOFF: Final = 0.5  # radians of the cutoff frequency per knot
 
 
@@ -244,7 +245,7 @@ class _Problem:
             return float(np.exp(lightest))
         if excess(heaviest) <= 0.0:
             return float(np.exp(heaviest))
-        return float(np.exp(scipy.optimize.brentq(excess, lightest, heaviest, xtol=1e-4)))
+        return float(np.exp(scipy.optimize.brentq(excess, lightest, heaviest, xtol=_PENALTY)))
 
 
 @cache

@@ -5,19 +5,21 @@ the other corrected. The fault whose correction reduces the error most is named 
 significant and explains the error of the fit: what is left is near the noise, near the error of the
 other joints, or near that of separate parameters for the affected part. The search is repeated with
 it corrected. All but faults of positions are linear in the columns of one table per joint, whose
-Gram matrices are computed once.
+Gram matrices are computed once. A fault of positions is first tried on fewer rows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.factor.factor import Factor, joined
 from identification.model.motion import Motion
 from identification.model.regressor import LINK_SYMBOLS, RegressorPlan
 from identification.model.robot import RobotModel
@@ -61,6 +63,7 @@ _NEAR_SEPARATE: Final = 1.1  # error ratio to separate parameters
 _MOST_CAUSES: Final = 4
 # Rows and blocks of all recordings together.
 _MOST_ROWS: Final = 3000
+_FEW_ROWS: Final = 1000  # on which faults of positions are tried first
 _BLOCKS: Final = 10
 _FOLDS: Final = 5
 _FEWEST_ROWS: Final = 10
@@ -122,7 +125,7 @@ def find_causes(
     search = _Search(model, recordings, values, words, noise)
     found: list[Cause] = []
     while len(found) < _MOST_CAUSES and (trial := _best(search.trials())) is not None:
-        found.append(trial.cause)
+        found.append(search.resized(trial))
         if trial.cause.fault.kind == "changed arm":
             break  # with separate parameters nothing is left to compare
         search.correct(trial.cause.fault)
@@ -136,6 +139,7 @@ class _Trial(NamedTuple):
     highest: float  # upper limit of its ratio
     coefficients: int  # added coefficients
     left: float  # remaining relative error of the worst of its joints
+    values: Array  # parameters (p,) fitted with it
     explains: bool  # whether it explains the error of the fit
 
     @property
@@ -181,6 +185,7 @@ class _Search:
         travel = np.max([np.ptp(one.motion.position, axis=0) for one in recordings], axis=0)
         self._moved = np.flatnonzero(travel > STUCK_MOVEMENT)
         self._recordings = recordings
+        self._few = _Few.of(model, recordings)
         self._known: list[Fault] = []
         self._motion_tables: dict[Fault, _Tables] = {}  # cache: faults of the motion
 
@@ -188,25 +193,28 @@ class _Search:
         """Correct a fault in all following trials."""
         if fault.discrete:
             self._recordings = [_corrected(self._model, one, fault) for one in self._recordings]
+            self._few = _Few.of(self._model, self._recordings)
             self._motion_tables.clear()
         else:
             self._known.append(fault)
 
     def trials(self) -> list[_Trial]:
         """Try the correction of each fault."""
-        model, values, p = self._model, self._values, self._model.n_parameters
+        model, values = self._model, self._values
         tables = _Tables.of(model, self._recordings, values)
-        target = np.eye(model.n_joints, tables.width, tables.width - model.n_joints)
+        target = tables.torques
         none = np.zeros((*tables.gram.shape[:3], 0))
         known = [_columns_of(tables, model, values, one) for one in self._known]
         before = np.concatenate([none, *known], axis=3)
-        usual = _score(tables, p, before, target)
+        usual = _score(tables, before, target)
         noise = self._noise**2 * tables.rows.sum(axis=0)
         separate: dict[Part | None, _Score] = {}
         trials = []
         for fault in self._faults(tables):
             own, measured, seen, joints = none, target.copy(), tables, list(fault.joints)
             if fault.kind in _OF_MOTION:
+                if not self._few.improved_by(fault):
+                    continue
                 if fault not in self._motion_tables:
                     moved = [_corrected(model, one, fault) for one in self._recordings]
                     self._motion_tables[fault] = _Tables.of(model, moved, values)
@@ -219,11 +227,11 @@ class _Search:
                 own = _columns_of(tables, model, values, fault)
                 if not own.any():
                     continue  # such as friction of a frictionless joint
-            score = _score(seen, p, np.concatenate([own, before], axis=3), measured)
+            score = _score(seen, np.concatenate([own, before], axis=3), measured)
             if fault.part is not None and fault.part not in separate:
                 every = _columns_of(tables, model, values, Fault("changed arm", (), fault.part))
                 separate[fault.part] = _score(
-                    tables, p, np.concatenate([every, before], axis=3), target
+                    tables, np.concatenate([every, before], axis=3), target
                 )
             explains = score.explains(joints, usual, noise, separate.get(fault.part))
             ratio, highest = score.ratio_to(usual)
@@ -232,9 +240,30 @@ class _Search:
             if fault.kind == "load friction" and (size or 0.0) <= 0.0:
                 continue  # friction dissipates
             trials.append(
-                _Trial(Cause(fault, ratio, size, std), highest, own.shape[3], worst, explains)
+                _Trial(
+                    cause=Cause(fault, ratio, size, std),
+                    highest=highest,
+                    coefficients=own.shape[3],
+                    left=worst,
+                    values=score.values.mean(axis=0),
+                    explains=explains,
+                )
             )
         return trials
+
+    def resized(self, trial: _Trial) -> Cause:
+        """Return the cause of a trial; the load of friction is that of the parameters beside it."""
+        cause = trial.cause
+        if cause.fault.kind != "load friction":
+            return cause
+        tables = _Tables.of(self._model, self._recordings, trial.values)
+        columns = [
+            _columns_of(tables, self._model, trial.values, fault)
+            for fault in (cause.fault, *self._known)
+        ]
+        score = _score(tables, np.concatenate(columns, axis=3), tables.torques)
+        size, std = _size(cause.fault, score, tables, columns[0])
+        return cause._replace(size=size, std=std)
 
     def _faults(self, tables: _Tables) -> Iterator[Fault]:
         kinds: tuple[Kind, ...] = ("delay", "gain", "torque sign", "axis sign")
@@ -261,8 +290,7 @@ class _Search:
         for k in range(1, len(self._recordings)):
             own = Part(self._names[k], tuple((tables.recording == k).tolist()))
             columns.append(_columns_of(tables, model, self._values, alike._replace(part=own)))
-        target = np.eye(model.n_joints, tables.width, tables.width - model.n_joints)
-        score = _score(tables, model.n_parameters, np.concatenate(columns, axis=3), target)
+        score = _score(tables, np.concatenate(columns, axis=3), tables.torques)
         sizes = score.added.mean(axis=0).reshape(len(columns), -1)
         sizes = np.append(0.0, sizes[:, _MASS if alike.kind == "payload" else 0])
         order = np.argsort(sizes)
@@ -282,7 +310,8 @@ class _Search:
             yield Part(words, tuple((np.arange(blocks) >= first).tolist()))
 
 
-class _Tables(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Tables:
     """Sums of products of columns over the rows of B blocks, joint by joint.
 
     Columns: parameters (p), payload (10), rate of the predicted torque, friction in proportion to
@@ -293,31 +322,108 @@ class _Tables(NamedTuple):
     rows: NDArray[np.intp]  # usable rows (B, n)
     recording: NDArray[np.intp]  # index of the recording of each block (B,)
     start: Array  # start time of each since its recording began (B,) [s]
+    n_parameters: int  # p
 
     @property
     def width(self) -> int:
         """Number q of columns."""
         return int(self.gram.shape[-1])
 
+    @property
+    def torques(self) -> Array:
+        """The measured torque of each joint as a combination of the columns (n, q)."""
+        n = self.gram.shape[1]
+        return np.eye(n, self.width, self.width - n)
+
+    @cached_property
+    def of_parameters(self) -> Array:
+        """Sums over the columns of the parameters (B, n, p, p)."""
+        return np.ascontiguousarray(self.gram[..., : self.n_parameters, : self.n_parameters])
+
+    @cached_property
+    def by_fold(self) -> Array:
+        """The same of each fold (F, n, p, p)."""
+        return _folded(self.of_parameters)
+
     @classmethod
     def of(cls, model: RobotModel, recordings: Sequence[Samples], values: Array) -> _Tables:
         """Reduce some thousand rows."""
-        count = -(-_BLOCKS // len(recordings))
+        count, step = -(-_BLOCKS // len(recordings)), _step(recordings, _MOST_ROWS)
         grams, rows, starts = [], [], []
         for samples in recordings:
-            m = len(samples.torque)
-            step = max(1, m * len(recordings) // _MOST_ROWS)
-            some = np.arange(step // 2, m, step)
-            edges = np.linspace(0, len(some), count + 1).round().astype(int)
+            some = np.arange(step // 2, len(samples.torque), step)
             tables = _tables(model, samples, values, some)
+            edges = np.linspace(0, len(some), count + 1).round().astype(int)
             usable = samples.usable[some]
+            tables *= usable.T[:, :, None]
             for a, b in pairwise(edges):
-                own = np.where(usable[a:b].T[:, :, None], tables[:, a:b], 0.0)
+                own = tables[:, a:b]
                 grams.append(np.swapaxes(own, 1, 2) @ own)
                 rows.append(np.count_nonzero(usable[a:b], axis=0))
                 starts.append(samples.motion.time[some[a]] - samples.motion.time[0] if a else 0.0)
         recording = np.repeat(np.arange(len(recordings)), count)
-        return cls(np.array(grams), np.array(rows), recording, np.array(starts))
+        return cls(np.array(grams), np.array(rows), recording, np.array(starts), model.n_parameters)
+
+
+def _step(recordings: Sequence[Samples], rows: int) -> int:
+    """Return the step with which all recordings together have about these rows."""
+    return max(1, sum(len(samples.torque) for samples in recordings) // rows)
+
+
+@dataclass(frozen=True, eq=False)
+class _Few:
+    """Few rows of recordings, without a low-pass, on which faults of positions are tried."""
+
+    model: RobotModel
+    recordings: tuple[Samples, ...]
+    usual: _Score
+
+    @classmethod
+    def of(cls, model: RobotModel, recordings: Sequence[Samples]) -> _Few:
+        """Take some of the rows."""
+        step = _step(recordings, _FEW_ROWS)
+        few = []
+        for samples in recordings:
+            some = slice(step // 2, None, step)
+            few.append(
+                replace(
+                    samples,
+                    motion=samples.motion.rows(some),
+                    torque=samples.torque[some],
+                    usable=samples.usable[some],
+                    segments=(),
+                    mask=None,
+                    torque_bandwidth=None,
+                    parent=None,
+                )
+            )
+        return cls(model, tuple(few), cls._score(model, few))
+
+    def improved_by(self, fault: Fault) -> bool:
+        """Return whether the correction of a fault predicts parts of these rows better."""
+        corrected = [_corrected(self.model, samples, fault) for samples in self.recordings]
+        return self._score(self.model, corrected).ratio_to(self.usual)[0] < 1.0
+
+    @staticmethod
+    def _score(model: RobotModel, recordings: Sequence[Samples]) -> _Score:
+        count, p = -(-_BLOCKS // len(recordings)), model.n_parameters
+        parts = [
+            Factor.of(
+                model,
+                samples,
+                index=np.arange(len(samples.torque)) * count // max(1, len(samples.torque)),
+            )
+            for samples in recordings
+        ]
+        factor = joined(parts)
+        gram = np.zeros((len(factor), factor.n_joints, p + 1, p + 1))
+        for joint, own in enumerate(factor.matrices):
+            place = np.append(factor.columns[joint], p)
+            gram[:, joint, place[:, None], place] = own
+        blocks = np.arange(len(factor))
+        tables = _Tables(gram, factor.counts, blocks, blocks.astype(np.float64), p)
+        torque = np.eye(1, p + 1, p).repeat(factor.n_joints, axis=0)
+        return _score(tables, np.zeros((*gram.shape[:3], 0)), torque)
 
 
 def _tables(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.intp]) -> Array:
@@ -449,41 +555,62 @@ def _geometric_mean(ratios: Array) -> float:
     return float(np.exp(np.mean(np.log(np.maximum(ratios, 1e-12)))))
 
 
-def _score(tables: _Tables, p: int, added: Array, target: Array) -> _Score:
-    """Predict every fifth block from the others."""
+def _score(tables: _Tables, added: Array, target: Array) -> _Score:
+    """Predict every fifth block from the others.
+
+    Of the parameters with `added` columns (B, n, q, r), to the `target` of each joint (n, q), both
+    as combinations of the columns.
+    """
     blocks, n = tables.rows.shape
+    p = tables.n_parameters
     column = np.broadcast_to(target[:, :, None], (blocks, n, target.shape[1], 1))
     wide = np.concatenate([added, column], axis=3)
     moved = tables.gram @ wide
-    gram = np.block(
-        [
-            [tables.gram[..., :p, :p], moved[..., :p, :]],
-            [np.swapaxes(moved[..., :p, :], 2, 3), np.swapaxes(wide, 2, 3) @ moved],
-        ]
-    )
+    sums = _Sums(tables.of_parameters, moved[..., :p, :], np.swapaxes(wide, 2, 3) @ moved)
+    folds = _Sums(tables.by_fold, _folded(sums.mixed), _folded(sums.beside))
+    whole = _Sums(*(part.sum(axis=0) for part in folds))
     # Weighted by the inverse variances of an ordinary fit, limited by rounding.
-    whole = gram.sum(axis=0)
-    floor = 1e-12 * whole[:, -1, -1] + np.finfo(np.float64).tiny
-    usual = np.maximum(_squares(whole, _solved(whole.sum(axis=0))), floor)
+    torque = whole.beside[:, -1, -1]
+    floor = 1e-12 * torque + np.finfo(np.float64).tiny
+    usual = np.maximum(whole.squares(_solved(whole.weighted(np.ones(n)))), floor)
     weights = np.maximum(tables.rows.sum(axis=0), 1) / usual
-    weighted = np.einsum("j,bjst->bst", weights, gram)
-    total = weighted.sum(axis=0)
+    total = whole.weighted(weights)
     squares, coefficients = np.zeros((blocks, n)), []
     for k in range(_FOLDS):
         own = slice(k, None, _FOLDS)
-        values = _solved(total - weighted[own].sum(axis=0))
+        fold = _Sums(*(part[k] for part in folds))
+        values = _solved(total - fold.weighted(weights))
         coefficients.append(values)
-        squares[own] = _squares(gram[own], values)
+        squares[own] = _Sums(*(part[own] for part in sums)).squares(values)
     squares = np.where(tables.rows >= _FEWEST_ROWS, np.maximum(squares, floor / blocks), 0.0)
-    fitted = np.maximum(_squares(whole, _solved(total)), floor)
-    found = np.array(coefficients)
-    return _Score(squares, fitted, whole[:, -1, -1], found[:, :p], found[:, p:])
+    fitted = np.maximum(whole.squares(_solved(total)), floor)
+    of_folds = np.array(coefficients)
+    return _Score(squares, fitted, torque, of_folds[:, :p], of_folds[:, p:])
 
 
-def _squares(gram: Array, values: Array) -> Array:
-    """Return the sum of squared errors of coefficients (k,) on Grams (..., k + 1, k + 1)."""
-    augmented = np.append(-values, 1.0)
-    return np.asarray((gram @ augmented) @ augmented)
+class _Sums(NamedTuple):
+    """Sums of products of p parameters, r added columns and the torque, for each joint."""
+
+    parameters: Array  # (..., n, p, p)
+    mixed: Array  # parameters times the others (..., n, p, r + 1)
+    beside: Array  # the others, torque last (..., n, r + 1, r + 1)
+
+    def weighted(self, weights: Array) -> Array:
+        """Return the sum (p + r + 1, p + r + 1) over the joints with weights (n,)."""
+        parameters, mixed, beside = (np.tensordot(weights, part, axes=1) for part in self)
+        return np.block([[parameters, mixed], [mixed.T, beside]])
+
+    def squares(self, values: Array) -> Array:
+        """Return the sum of squared errors (..., n) of coefficients (p + r,)."""
+        p = self.parameters.shape[-1]
+        first, second = values[:p], np.append(-values[p:], 1.0)
+        of_parameters = (self.parameters @ first - 2.0 * (self.mixed @ second)) @ first
+        return np.asarray(of_parameters + (self.beside @ second) @ second)
+
+
+def _folded(blocks: Array) -> Array:
+    """Return the sum of every fifth block (F, ...) of B (B, ...)."""
+    return np.array([blocks[k::_FOLDS].sum(axis=0) for k in range(_FOLDS)])
 
 
 def _solved(gram: Array) -> Array:

@@ -424,8 +424,8 @@ _CAUSES: Final[dict[Kind, _CauseRow]] = {
     "load friction": _CauseRow(
         "friction over load", "friction grows with the load, by {size} of the transmitted torque"
         " (median axis)",
-        "predict only motions whose loads are like those of the fitted motion, or fit both: the"
-        " friction law lacks a term of the load"),
+        "fit it: add `load` to the terms of `--friction`, as in"
+        " `--friction coulomb,viscous,load,offset`"),
     "torque sign": _CauseRow(
         "direction of axes", "the torque of {joints} has probably the wrong sign",
         "check the sign of the torque of {joints} in the column map, or of its torque constant"),
