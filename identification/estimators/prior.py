@@ -175,11 +175,15 @@ class PosteriorEstimate:
 
 
 def posterior_values(
-    factor: Factor, prior: GaussianPrior, design_effect: float = 1.0
+    factor: Factor,
+    prior: GaussianPrior,
+    design_effect: float = 1.0,
+    start: Array | None = None,
 ) -> tuple[Array, Array]:
     """Return the posterior's parameters (p,) and the weights of the joints (n,).
 
-    The weights are the inverse variances of the joints' own residuals, iterated.
+    The weights are the inverse variances of the joints' own residuals, iterated from `start` (n,)
+    if given.
     """
     gram, rows = factor.gram, np.maximum(factor.samples, 1)
     variance = gram[:, -1, -1] / rows
@@ -187,6 +191,8 @@ def posterior_values(
     precision = design_effect * prior.information
     length = np.sqrt(np.maximum(np.diag(precision), np.finfo(np.float64).tiny))
     values, weights = prior.mean, np.zeros(factor.n_joints)
+    if start is not None:
+        variance = np.where(start > 0.0, 1.0 / np.where(start > 0.0, start, 1.0), variance)
     for _ in range(_ROUNDS):
         weights = np.where(factor.samples > 0, 1.0 / np.maximum(variance, floor), 0.0)
         equations = factor.weighted(weights)

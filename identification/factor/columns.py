@@ -149,9 +149,9 @@ def standard_factor(model: RobotModel, recordings: Sequence[Samples]) -> Factor:
 def under_gravity(factor: Factor, gravity: Array) -> Factor:
     """Return the part [W | y] of a :func:`standard_factor` under a gravity (3,) [m/s²]."""
     share, n, s = np.append(1.0, gravity), factor.n_joints, factor.n_parameters // 4
-    parts = factor.gram[:, :-1, :-1].reshape(n, 4, s, 4, s)
+    half = share @ factor.gram[:, :-1, :-1].reshape(n, 4, s * 4 * s)
     found = np.empty((n, s + 1, s + 1))
-    found[:, :s, :s] = np.einsum("a,jasbt,b->jst", share, parts, share, optimize=True)
+    found[:, :s, :s] = share @ half.reshape(n, s, 4, s)
     found[:, :s, s] = share @ factor.gram[:, :-1, -1].reshape(n, 4, s)
     found[:, s, :s] = found[:, :s, s]
     found[:, s, s] = factor.gram[:, -1, -1]

@@ -467,6 +467,19 @@ def solve(equations: NormalEquations, worst: float = WORST_CONDITION) -> Solutio
     return found._replace(values=found.root @ (found.root.T @ equations.b))
 
 
+def solve_with_ridge(gram: Array, cross: Array, ridge: float) -> Array:
+    """Solve ``G x = b`` (k, k), (k,), with a ridge as a share of each column's information.
+
+    Several times faster than :func:`solve`; columns of zeros have parameters of zero.
+    """
+    length = np.sqrt(np.diag(gram))
+    present = length > 0.0
+    scale = np.where(present, length, 1.0)
+    normal = gram / np.outer(scale, scale)
+    np.fill_diagonal(normal, np.where(present, 1.0 + ridge, 1.0))
+    return np.asarray(np.linalg.solve(normal, cross / scale) / scale)
+
+
 def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -> Solution:
     """Solve ``rows @ x = target`` (k, p), (k,) without squaring the condition.
 

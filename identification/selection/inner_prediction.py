@@ -269,12 +269,13 @@ class Folds:
         segments = self.fitted
         matrices = tuple(
             total - own[k]
-            for total, own in zip(self._whole.matrices, segments.matrices, strict=True)
+            for total, own in zip(self.whole.matrices, segments.matrices, strict=True)
         )
-        return replace(segments, matrices=matrices, counts=self._whole.counts - segments.counts[k])
+        return replace(segments, matrices=matrices, counts=self.whole.counts - segments.counts[k])
 
     @cached_property
-    def _whole(self) -> Factor:
+    def whole(self) -> Factor:
+        """The factor of all segments, one block."""
         return self.fitted.merged(FOLDS)
 
     def errors(
@@ -550,17 +551,18 @@ class _Trial:
         unknown = Errors(np.full((FOLDS, n), np.inf), np.ones((FOLDS, n)))
         if not all(reduced.folds.without(k).samples.any() for k in range(FOLDS)):
             return unknown
-        estimate = self._estimator(settings, reduced.prior)
+        estimate = self._estimator(settings, reduced)
         try:
             return reduced.folds.errors(estimate, rows)
         except (IdentificationError, np.linalg.LinAlgError):
             return unknown
 
-    def _estimator(self, settings: Settings, prior: BodyPrior) -> Callable[[Factor], Array]:
-        effect = settings.strength.design_effect(self._effect)
+    def _estimator(self, settings: Settings, reduced: _Reduced) -> Callable[[Factor], Array]:
+        effect, prior = settings.strength.design_effect(self._effect), reduced.prior
+        _, of_all = posterior_values(reduced.folds.whole, prior.gaussian, effect)
 
         def estimate(factor: Factor) -> Array:
-            values, weights = posterior_values(factor, prior.gaussian, effect)
+            values, weights = posterior_values(factor, prior.gaussian, effect, of_all)
             if settings.strength.consistent:
                 values = consistent_values(settings.model, factor, weights, values, prior, effect)
             return values
@@ -575,13 +577,13 @@ class _Trial:
         folds = Folds.of(settings.model, samples, fast)
         if not (folds.fitted.samples.any() and folds.predicted.samples.any()):
             return 0.0
-        estimate = self._estimator(settings, self._reduced(settings).prior)
+        estimate = self._estimator(settings, self._reduced(settings))
         return folds.predicted.relative_error(estimate(folds.fitted))
 
     def has_friction(self, settings: Settings) -> bool:
         """Return whether the fitted friction of every joint stays near Coulomb's at all speeds."""
         model, reduced = settings.model, self._reduced(settings)
-        values = self._estimator(settings, reduced.prior)(reduced.folds.fitted)
+        values = self._estimator(settings, reduced)(reduced.folds.fitted)
         table = model.friction.table(values[model.friction_part])
         fastest = np.max(
             [np.abs(each.motion.velocity).max(axis=0) for each in self.samples(settings)], axis=0
@@ -610,7 +612,7 @@ class _Trial:
         Weighted by the torque of their joints: that of a joint with hardly any torque is open.
         """
         reduced = self._reduced(settings)
-        values = self._estimator(settings, reduced.prior)(reduced.folds.fitted)
+        values = self._estimator(settings, reduced)(reduced.folds.fitted)
         power = reduced.folds.fitted.gram[:, -1, -1]
         terms = settings.model.friction.terms
         shares = [
@@ -639,7 +641,7 @@ class _Trial:
             return samples
         without = _friction(settings, load=False)
         reduced = self._reduced(without)
-        values = self._estimator(without, reduced.prior)(reduced.folds.fitted)
+        values = self._estimator(without, reduced)(reduced.folds.fitted)
         return [each.with_load(without.model, values) for each in samples]
 
     def _reduced(self, settings: Settings) -> _Reduced:

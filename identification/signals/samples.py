@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 # Default (see :mod:`identification.selection.inner_prediction`). Planned motion is below 10 Hz, the
 # first resonance of large arms at 10 to 30 Hz; on the simulated NS 16 20 to 60 Hz are equal.
 RIGID_BANDWIDTH: Final = 40.0  # Hz
+_MOST_PREDICTIONS: Final = 3  # that are kept: result, its friction, nominal model
 _SHORTEST_SEGMENT: Final = 12  # samples, twice the minimum of a quintic spline
 
 VelocitySource = Literal["position", "measured"]
@@ -88,6 +89,9 @@ class Samples:
     mask: RowMask | None = None  #: reasons against rows; None if unknown
     #: samples that these are part of, and which part, for a low-pass
     parent: tuple[Samples, slice] | None = None
+    _predictions: dict[bytes, tuple[RobotModel, Array]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     def between(self, start: int, stop: int) -> Samples:
         """Return samples start to stop (exclusive), filtered as part of these."""
@@ -168,12 +172,20 @@ class Samples:
         if self.parent is not None:
             samples, part = self.parent
             return samples.predicted_torque(model, values, chosen)[part]
-        load = None
-        if model.friction.has_load:
-            load = model.gear_torque(values, *self.motion[1:4])
-        if chosen is not None:
-            values = np.where(chosen, values, 0.0)
-        return self._filtered(model.torque(values, *self.motion[1:5], load))
+        used = values if chosen is None else np.where(chosen, values, 0.0)
+        key = values.tobytes() + used.tobytes()
+        of_model, torque = self._predictions.get(key, (None, np.empty(0)))
+        if of_model is not model:
+            load = None
+            if model.friction.has_load:
+                load = model.gear_torque(values, *self.motion[1:4])
+            torque = self._filtered(model.torque(used, *self.motion[1:5], load))
+            torque.flags.writeable = False
+            # The tests of a verdict ask for those of few estimates, again and again.
+            if len(self._predictions) >= _MOST_PREDICTIONS:
+                del self._predictions[next(iter(self._predictions))]
+            self._predictions[key] = model, torque
+        return torque
 
     def known_torque(self, model: RobotModel) -> Array:
         """Return the torque (m, n) of known payload and elements, filtered likewise."""

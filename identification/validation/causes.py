@@ -19,7 +19,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.factor.factor import Factor, joined
+from identification.factor.factor import Factor, joined, solve_with_ridge
 from identification.model.motion import Motion
 from identification.model.regressor import LINK_SYMBOLS, RegressorPlan
 from identification.model.robot import RobotModel
@@ -54,6 +54,8 @@ _EXPLAINED: Final = 0.5
 # 70 % of the squared error. True faults of simulated and real arms, without noise known: at most
 # 0.5, a payload in half of a recording 0.66; false ones: at least 0.9.
 _EXPLAINS: Final = 0.55
+# Relative error of each joint without which no axis or column has a wrong sign or place.
+_SMALL_ERROR: Final = 0.1
 _STANDS_OUT: Final = 0.7  # the same, if the joint then is as good as the others
 _SAME_PART: Final = 0.85  # the same, if separate parameters for the part do no better
 _NEAR_NOISE: Final = 2.0  # noise floors; those of coloured noise are underestimated by a third
@@ -63,7 +65,7 @@ _NEAR_SEPARATE: Final = 1.1  # error ratio to separate parameters
 _MOST_CAUSES: Final = 4
 # Rows and blocks of all recordings together.
 _MOST_ROWS: Final = 3000
-_FEW_ROWS: Final = 1000  # on which faults of positions are tried first
+_FEW_ROWS: Final = 600  # on which faults of positions are tried first
 _BLOCKS: Final = 10
 _FOLDS: Final = 5
 _FEWEST_ROWS: Final = 10
@@ -209,11 +211,20 @@ class _Search:
         usual = _score(tables, before, target)
         noise = self._noise**2 * tables.rows.sum(axis=0)
         separate: dict[Part | None, _Score] = {}
+        in_order = bool(np.all(usual.shares(usual.fitted) < _SMALL_ERROR**2))
         trials = []
         for fault in self._faults(tables):
             own, measured, seen, joints = none, target.copy(), tables, list(fault.joints)
+            if fault.part is not None:
+                if fault.part not in separate:
+                    every = _columns_of(tables, model, values, Fault("changed arm", (), fault.part))
+                    columns = np.concatenate([every, before], axis=3)
+                    separate[fault.part] = _score(tables, columns, target)
+                # All that may have changed is within separate parameters.
+                if separate[fault.part].fit_ratio_to(usual) > 1.0 - LEAST_GAIN:
+                    continue
             if fault.kind in _OF_MOTION:
-                if not self._few.improved_by(fault):
+                if in_order or not self._few.improved_by(fault):
                     continue
                 if fault not in self._motion_tables:
                     moved = [_corrected(model, one, fault) for one in self._recordings]
@@ -228,11 +239,6 @@ class _Search:
                 if not own.any():
                     continue  # such as friction of a frictionless joint
             score = _score(seen, np.concatenate([own, before], axis=3), measured)
-            if fault.part is not None and fault.part not in separate:
-                every = _columns_of(tables, model, values, Fault("changed arm", (), fault.part))
-                separate[fault.part] = _score(
-                    tables, np.concatenate([every, before], axis=3), target
-                )
             explains = score.explains(joints, usual, noise, separate.get(fault.part))
             ratio, highest = score.ratio_to(usual)
             size, std = _size(fault, score, tables, own)
@@ -531,6 +537,11 @@ class _Score(NamedTuple):
             _NEAR_SEPARATE
         )
 
+    def fit_ratio_to(self, other: _Score) -> float:
+        """Return the ratio of the errors of the fits, geometric mean over the joints."""
+        known = (self.fitted > 0.0) & (other.fitted > 0.0)
+        return _geometric_mean(np.sqrt(self.fitted[known] / other.fitted[known]))
+
     def ratio_to(self, other: _Score) -> tuple[float, float]:
         """Return the error ratio, geometric mean over the joints, and its upper limit by blocks."""
         tested = np.isfinite(self.squares) & np.isfinite(other.squares)
@@ -615,12 +626,7 @@ def _folded(blocks: Array) -> Array:
 
 def _solved(gram: Array) -> Array:
     """Solve a Gram matrix of [W | y] (k + 1, k + 1) for (k,), slightly regularised."""
-    length = np.sqrt(np.diag(gram)[:-1])
-    present = length > 0.0
-    scale = np.where(present, length, 1.0)
-    normal = gram[:-1, :-1] / np.outer(scale, scale)
-    np.fill_diagonal(normal, np.where(present, 1.0 + _RIDGE, 1.0))
-    return np.asarray(np.linalg.solve(normal, gram[:-1, -1] / scale) / scale)
+    return solve_with_ridge(gram[:-1, :-1], gram[:-1, -1], _RIDGE)
 
 
 def _size(fault: Fault, score: _Score, tables: _Tables, own: Array) -> tuple[float | None, float]:

@@ -15,7 +15,7 @@ from identification.estimators.delay import DelayEstimate
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.estimators.payload import Run, mass_difference
 from identification.factor.columns import standard_factor, under_gravity
-from identification.factor.factor import Estimate, Factor, solve
+from identification.factor.factor import Estimate, Factor, solve_with_ridge
 from identification.model.regressor import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -47,8 +47,9 @@ Array = NDArray[np.float64]
 SIGMAS: Final = 3.0
 _STANDARD: Final = 9.81  # m/s²
 _PASSES: Final = 2
-# Condition beyond which combinations of standard parameters count as undetermined.
-_WORST_CONDITION: Final = 10.0**4.5
+# Of each column's information: combinations of standard parameters of a condition above 10^4.5
+# count as undetermined.
+_RIDGE: Final = 1e-9
 _GROWN: Final = 4.0  # power ratio beyond which a joint's error exceeds that of the fit
 # Share of the rows in the rarer direction of motion below which friction and offset of a joint are
 # one column: with it their correlation is 0.98.
@@ -77,8 +78,9 @@ class GravityDirection:
 
 
 def _solved(factor: Factor, weights: Array) -> Array:
-    """Return standard parameters, of least norm where they are undetermined."""
-    return solve(factor.weighted(weights), _WORST_CONDITION).values
+    """Return standard parameters, of about least norm where they are undetermined."""
+    equations = factor.weighted(weights)
+    return solve_with_ridge(equations.A, equations.b, _RIDGE)
 
 
 def find_gravity(model: RobotModel, training: Factor, held_out: Factor) -> GravityDirection:
