@@ -664,7 +664,9 @@ class Estimator:
         require_rows(self.model, total)
         if self.name != "auto":
             return None, []
-        return Posterior.of(self.cell, total, self.name, self._strength).solvable(total)
+        prior = Posterior.of(self.cell, total, self.name, self._strength)
+        posterior, _, notes = prior.solved(total)
+        return posterior, notes
 
     def of_archive(self, summary: Summary, posterior: Posterior | None, share: float) -> Estimate:
         """Return the estimate from one archive, this share of those of the posterior.

@@ -153,14 +153,18 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         fitted = smoothed_for_instruments(model, prepared) if name == "iv" else prepared.fitted
         task.advance(1, name)
         scale = _scale_of(prepared.sources)
-        total, strength = total_factor(model, fitted), prepared.settings.strength
-        posterior, unsolved = Posterior.of(cell, total, name, strength).solvable(total)
+        factors = [Factor.by_time(model, samples) for samples in fitted]
+        total = sum(factors, Factor.zero(model))
+        posterior = Posterior.of(cell, total, name, prepared.settings.strength)
+        posterior, beside, unsolved = posterior.solved(total)
         if name == "iv":
             result, warnings = _instrumental(model, prepared, fitted)
         elif name in _LOSSES:
             result, warnings = _robust(model, fitted, name)
         elif name in _OF_PRIOR:
-            result, warnings = _posterior(model, fitted, posterior), unsolved
+            pooled = beside.estimate
+            result = _posterior(model, fitted, posterior, pooled, factors)
+            warnings = unsolved
         else:
             result, warnings = _by_factor(model, fitted, name)
         if prepared.sources.same_motion:
@@ -173,9 +177,10 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
             )
             result = replace(result, pooled=pooled)
         task.advance(1, "prior")
-        beside = posterior.fit(result.factor)
         if name in _OF_PRIOR:
             beside = replace(beside, estimate=result.pooled)
+        else:
+            beside = posterior.fit(result.factor)
         if name == "prior":
             warnings += _prior_contradictions(model, beside)
         task.advance(1, "held-out motion")
@@ -290,13 +295,13 @@ class Posterior:
             return values
         return consistent_values(self.model, factor, weights, values, self.prior, effect)
 
-    def solvable(self, factor: Factor) -> tuple[Posterior, list[str]]:
-        """Return the posterior without restriction to possible bodies if that fails, and why."""
+    def solved(self, factor: Factor) -> tuple[Posterior, PosteriorEstimate, list[str]]:
+        """Fit a factor, without restriction to possible bodies if that fails, and say why."""
         try:
-            self.values(factor)
+            return self, self.fit(factor), []
         except SolverError as error:
-            return replace(self, consistent=False), [f"all bodies were allowed because {error}"]
-        return self, []
+            free = replace(self, consistent=False)
+            return free, free.fit(factor), [f"all bodies were allowed because {error}"]
 
 
 # Estimators
@@ -333,15 +338,20 @@ _OF_PRIOR: Final = ("auto", "prior")
 
 
 def _posterior(
-    model: RobotModel, fitted: Sequence[Samples], posterior: Posterior
+    model: RobotModel,
+    fitted: Sequence[Samples],
+    posterior: Posterior,
+    pooled: Estimate,
+    factors: Sequence[Factor],
 ) -> RepeatedEstimate:
     share = 1.0 / len(fitted)
     return estimate_repetitions(
         model,
         fitted,
-        lambda _, factor: posterior.fit(factor).estimate,
+        lambda *_: pooled,
         # The prior counts for a part as for the whole, so that the scatter is that of the noise.
         each=lambda _, factor: posterior.fit(factor, share).estimate,
+        factors=factors,
     )
 
 

@@ -214,6 +214,7 @@ def identify_archives(
             context=cell_context_of(prepared, result.pooled),
             in_sample=sources.in_sample,
             names=[source.name for source in sources.training],
+            unseen=sum(estimation.held_out, Factor.zero(cell.model)),
         )
         implausible = evidence.implausible
         reasons = (*implausible.impossible, *impossible)

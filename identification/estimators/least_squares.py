@@ -134,10 +134,12 @@ def estimate_repetitions(
     fit: Fit | None = None,
     *,
     each: Fit | None = None,
+    factors: Sequence[Factor] = (),
 ) -> RepeatedEstimate:
     """Estimate from each repetition and from all, by default by weighted least squares (eq. 4).
 
-    `each` is the estimator of single repetitions, by default the same.
+    `each` is the estimator of single repetitions, by default the same; a single recording has the
+    estimate from all. `factors` are those of the recordings by time, if they are known.
 
     Raises:
         IdentificationError: a repetition without a usable row.
@@ -147,9 +149,13 @@ def estimate_repetitions(
         return fit_least_squares(model, some, factor=factor)
 
     fit = fit or weighted
-    total, repetitions = Factor.zero(model), []
-    for samples in recordings:
-        own = Factor.by_time(model, samples)
-        repetitions.append((each or fit)([samples], own))
-        total = total + own
-    return RepeatedEstimate.of(model, fit(recordings, total), repetitions, total)
+    factors = factors or [Factor.by_time(model, samples) for samples in recordings]
+    total = sum(factors, Factor.zero(model))
+    pooled = fit(recordings, total)
+    repetitions = [pooled]
+    if len(recordings) > 1:
+        repetitions = [
+            (each or fit)([samples], factor)
+            for samples, factor in zip(recordings, factors, strict=True)
+        ]
+    return RepeatedEstimate.of(model, pooled, repetitions, total)

@@ -15,7 +15,7 @@ from identification.estimators.delay import DelayEstimate
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.estimators.payload import Run, mass_difference
 from identification.factor.columns import standard_factor, under_gravity
-from identification.factor.factor import Estimate, Factor, solve_with_ridge
+from identification.factor.factor import Estimate, Factor, solve_with_ridge, total_factor
 from identification.model.regressor import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -286,16 +286,18 @@ def gather(
     context: CellContext = CellContext(),
     in_sample: bool = False,
     names: Sequence[str] = (),
+    unseen: Factor | None = None,
 ) -> Evidence:
     """Collect the evidence for a verdict; every recording is read a few times.
 
     With `same_motion` the training recordings, in the order of the result, repeat one motion, and
     noise is measured. `nominal` are parameters (p,); with `in_sample` the held-out motions are the
-    training.
+    training. `unseen` is the sum of the held-out factors, if known.
     """
     values = result.pooled.values
     velocity = np.concatenate([run.motion.velocity for run in held_out])
-    unseen = sum((Factor.of(model, run) for run in held_out), Factor.zero(model))
+    if unseen is None:
+        unseen = total_factor(model, held_out)
     error = pooled_error(prediction_error(model, values, held_out))
     few, unseen_few = training[:_MOST_RECORDINGS], held_out[:_MOST_RECORDINGS]
     standard = standard_factor(model, few), standard_factor(model, unseen_few)
