@@ -374,11 +374,10 @@ def _friction_terms(trial: _Trial, now: Settings) -> _Decision:
     stated = {"third": law.third, "stribeck": law.stribeck}
     terms = [stated, *(term for term in FRICTION_TERMS if term != stated)]
     candidates = [_friction(now, **term) for term in terms]
-    slow_error = trial.fast_error(candidates[0])
-    possible = [
-        k == 0 or (trial.fast_error(each) <= slow_error and trial.has_friction(each))
-        for k, each in enumerate(candidates)
-    ]
+
+    def possible(term: Settings) -> bool:
+        return trial.fast_error(term) <= trial.fast_error(now) and trial.has_friction(term)
+
     return trial.decide("friction at speed", candidates, TERM_WORTHWHILE, possible=possible)
 
 
@@ -389,8 +388,12 @@ def _load_friction(trial: _Trial, now: Settings) -> _Decision:
     """
     law = now.model.friction.laws[0]
     candidates = [_friction(now, load=load) for load in (law.load, not law.load)]
-    possible = [True, law.load or trial.has_load_shares(candidates[1])]
-    return trial.decide(LOAD, candidates, TERM_WORTHWHILE, possible=possible)
+    return trial.decide(
+        LOAD,
+        candidates,
+        TERM_WORTHWHILE,
+        possible=lambda each: law.load or trial.has_load_shares(each),
+    )
 
 
 def _compare_delays(
@@ -512,10 +515,10 @@ class _Trial:
         *,
         by_joint: bool = False,
         rows: Literal["all", "fitted"] = "all",
-        possible: Sequence[bool] | None = None,
+        possible: Callable[[Settings], bool] | None = None,
         certainty: float = 1.0,
     ) -> _Decision:
-        """Return the first candidate, or the best one if it is clearly better.
+        """Return the first candidate, or the best one if it is clearly better, and `possible`.
 
         Better by a share (`WORTHWHILE`), and by more than the standard error of the difference over
         the segments times the certainty.
@@ -526,13 +529,31 @@ class _Trial:
         means = [_mean(part) for part in segments]
         chosen = 0
         for k, mean in enumerate(means):
-            allowed = possible is None or possible[k]
-            if not (allowed and mean < means[chosen] and mean < _MEANINGLESS):
+            if not (mean < means[chosen] and mean < _MEANINGLESS):
                 continue
-            if _clearly_better(segments[k], segments[0], share, certainty):
+            better = _clearly_better(segments[k], segments[0], share, certainty)
+            if better and (possible is None or possible(candidates[k])):
                 chosen = k
         words = _differences(candidates)
         return _Decision(candidates[chosen], Choice(name, words, tuple(means), chosen))
+
+    def walk(self, candidates: Sequence[Settings], size: Callable[[Settings], float]) -> list[int]:
+        """Return the indices of the first candidate and, to both sides by size, of improvements.
+
+        And of the next ones, which are worse: no candidate beyond is tried.
+        """
+        order = sorted(range(len(candidates)), key=lambda k: size(candidates[k]))
+        start = order.index(0)
+        visited = [0]
+        for side in (order[:start][::-1], order[start + 1 :]):
+            least = self.errors(candidates[0]).overall
+            for k in side:
+                visited.append(k)
+                error = self.errors(candidates[k]).overall
+                if not error < least:
+                    break
+                least = error
+        return sorted(visited)
 
     def best(self, candidates: Sequence[Settings]) -> Settings:
         """Return the candidate with the least error by joint."""
@@ -684,6 +705,8 @@ def _sweep(
                     for each, width in zip(candidates, widths, strict=True)
                     if width >= widths[0]
                 ]
+            if swept.size is not None:
+                candidates = [candidates[k] for k in trial.walk(candidates, swept.size)]
             decision = trial.decide(swept.name, candidates, certainty=certainty)
             now, choices = decision.settings, [*choices, decision.choice]
         if now.key == before.key:
@@ -697,6 +720,7 @@ class _Swept(NamedTuple):
     question: Question
     name: str
     vary: Callable[[Settings], list[Settings]]  # settings with each candidate
+    size: Callable[[Settings], float] | None = None  # of the setting, if it is a number
 
 
 _SWEPT: Final = (
@@ -704,6 +728,7 @@ _SWEPT: Final = (
         "presliding",
         "presliding displacement",
         lambda now: [_friction(now, presliding=distance) for distance in PRESLIDING],
+        lambda now: now.model.friction.laws[0].presliding,
     ),
     _Swept(
         "rows",
@@ -719,6 +744,7 @@ _SWEPT: Final = (
         "bandwidth",
         "bandwidth of the motion",
         lambda now: [_with(now, rigid_bandwidth=width) for width in BANDWIDTHS],
+        lambda now: now.preprocessing.rigid_bandwidth,
     ),
 )
 
