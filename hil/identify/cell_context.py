@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.cell.text import urdf_limits
-from identification.estimators.prior import NOMINAL_SHARE
+from identification.estimators.prior import NOMINAL_SHARE, without_masses
 from identification.estimators.torque_channel import torque_noiseless_above
 from identification.factor.factor import Estimate
 from identification.model.friction import TERMS
@@ -271,13 +271,13 @@ class Nominal(NamedTuple):
 
 
 def nominal_of(cell: Cell) -> Nominal | None:
-    """Return the model of `[nominal]`, else of the URDF's inertias; None if there are none."""
+    """Return the model of `[nominal]`, else of the URDF's inertias; None without masses."""
     table, model = cell.file.nominal, cell.model
     if table is not None:
         known = bool(np.any(table.rotor_inertia))
         return Nominal(cell.nominal_values(), "the nominal values", known, table.uncertainty)
     standard = model.nominal
-    if not np.any(standard):
+    if without_masses(model):
         return None
     values = np.zeros(model.n_parameters)
     values[: model.base.rank] = model.base.grouping @ standard

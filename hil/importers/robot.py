@@ -137,13 +137,10 @@ class Robot:
         return cls(text, urdf, cell.joint_names, cell.file.robot.locked)
 
     def nominal_torque(self) -> NominalTorque | None:
-        """Return the torque of the nominal inertias; None if the URDF has no masses.
-
-        Several links with one and the same mass have placeholders, not masses.
-        """
+        """Return the torque of the nominal inertias; None if the URDF has no masses."""
         cell = Cell.from_texts(self.cell, self.urdf, Path("cell.toml"))
-        nominal, masses = nominal_of(cell), cell.model.chain.inertial[:, _MASS]
-        if nominal is None or (len(masses) > 1 and np.ptp(masses) == 0.0):
+        nominal = nominal_of(cell)
+        if nominal is None:
             return None
         return partial(cell.model.torque, nominal.values)
 

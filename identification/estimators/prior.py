@@ -472,14 +472,20 @@ def _torque_scale(model: RobotModel, factor: Factor, combinations: Array, std: A
     return float(np.exp(0.5 * np.mean(np.log(measured[both] / expected[both]))))
 
 
-def _placeholder(model: RobotModel, factor: Factor) -> str:
-    """Return why the nominal bodies say nothing about the arm, or nothing."""
-    inertial = model.nominal[model.layout.links]
-    masses = inertial[:, _MASS]
+def without_masses(model: RobotModel) -> str:
+    """Return why the bodies of the description have no masses of an arm, or nothing."""
+    masses = model.nominal[model.layout.links][:, _MASS]
     if not np.any(masses > 0.0):
         return "the description has no masses"
     if len(masses) > 1 and np.ptp(masses) <= 1e-6 * masses.max():
         return "all bodies of the description have the same mass"
+    return ""
+
+
+def _placeholder(model: RobotModel, factor: Factor) -> str:
+    """Return why the nominal bodies say nothing about the arm, or nothing."""
+    if reason := without_masses(model):
+        return reason
     scale, std = nominal_ratio(model, factor)
     clear = std < abs(scale) / _CLEAR or std < 1.0 / (_CLEAR * _NO_RELATION)
     if clear and not 1.0 / _NO_RELATION < scale < _NO_RELATION:

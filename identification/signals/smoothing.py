@@ -140,7 +140,8 @@ def _power(time: Array, signals: Array, segments: Sequence[slice]) -> tuple[Arra
         axis=0,
     )
     # Without the mean, and the line changed by removing it.
-    return np.fft.rfftfreq(length, interval)[1:], np.asarray(power)[1:]
+    frequency = np.asarray(np.fft.rfftfreq(length, interval), dtype=np.float64)
+    return frequency[1:], np.asarray(power)[1:]
 
 
 DEGREE: Final = 5

@@ -6,6 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
 Level = Literal["good", "information", "doubtful", "wrong"]
 Role = Literal["condition", "cause", "symptom"]
 
@@ -80,3 +84,16 @@ class Thresholds:
     #: accurate to 0.2 cycles
     delay: float = 0.6
     condition: float = 100.0  #: condition number with unit columns; designed NS 16 motions: 30
+
+
+def little_torque(
+    torque: Array,
+    slides: NDArray[np.bool_],
+    limit: Thresholds = Thresholds(),
+) -> NDArray[np.bool_]:
+    """Return the axes whose torque (n,) is too small against the others' to decide alone (n,).
+
+    Axes that slide are compared with each other, and those that turn.
+    """
+    power = np.where(slides[:, None] == slides, torque**2, 0.0).sum(axis=1)
+    return np.asarray(torque < limit.minor * np.sqrt(power))

@@ -30,7 +30,7 @@ from identification.model.pseudo_inertia import pseudo_inertia, reference_bodies
 from identification.model.robot import RobotModel
 from identification.signals.recording import GAP_STEPS, Recording
 from identification.signals.samples import Samples
-from identification.validation.finding import joined
+from identification.validation.finding import joined, little_torque
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,8 @@ def implausibilities(
 ) -> Implausible:
     """Return messages on what is physically impossible in an estimate.
 
-    The torque of wrong signs on a `motion` is compared with the error of its prediction (n,);
+    The torque of wrong signs on a `motion` is compared with the error of its prediction (n,), on
+    axes whose torque is not too small to decide;
     friction is evaluated up to the highest speeds (n,). Terms of friction of `added` symbols were
     chosen, not stated: they follow the friction within the fitted speeds and are no reason against
     a model.
@@ -66,6 +67,8 @@ def implausibilities(
     impossible: list[str] = []
     doubtful: list[str] = []
     chosen: list[str] = []
+    torque_rms = np.sqrt(motion.gram[:, -1, -1] / np.maximum(motion.samples, 1))
+    decides = ~little_torque(torque_rms, ~model.chain.revolute)
     for words, part, by_added in _wrong_signs(model, estimate, speed, added):
         if by_added:
             chosen.append(words)
@@ -73,7 +76,7 @@ def implausibilities(
         own = np.where(part, estimate.values, 0.0)
         squares = np.einsum("i,jik,k->j", own, motion.gram[:, :-1, :-1], own)
         torque = np.sqrt(np.maximum(squares, 0.0) / np.maximum(motion.samples, 1))
-        (impossible if np.any(torque > error_rms) else doubtful).append(words)
+        (impossible if np.any(decides & (torque > error_rms)) else doubtful).append(words)
     return Implausible(tuple(impossible), tuple(doubtful), tuple(chosen))
 
 
@@ -213,7 +216,7 @@ class ConsistencyCheck:
     consistent: ConsistentEstimate
     held_out: float  # relative torque error on held-out motion
     unconstrained_held_out: float  # that of the unconstrained estimate
-    held_out_rise: Array  # rise per joint (n,), NaN without rows
+    held_out_rise: Array  # rise per joint (n,), NaN without rows or with little torque
     # smallest second moment of each link over the nominal body's in the same direction (n,), zero
     # at the bound
     room: Array
@@ -299,6 +302,8 @@ def check_consistency(
     values, free = found.estimate.values, unconstrained.values
     shift, links = np.abs(found.shift), model.layout.links
     rise = held_out.relative_errors(values) - held_out.relative_errors(free)
+    torque = np.sqrt(held_out.gram[:, -1, -1] / np.maximum(held_out.samples, 1))
+    rise[little_torque(torque, ~model.chain.revolute)] = np.nan
     # In axes in which the reference's pseudo-inertia is the unit matrix.
     frames = reference_bodies(model.nominal[links], model.chain.translation).frames
     inner = np.linalg.solve(frames, pseudo_inertia(found.standard[links]))

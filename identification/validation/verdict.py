@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from identification.validation.causes import Kind
 from identification.validation.evidence import SIGMAS, Evidence
-from identification.validation.finding import Finding, Level, Role, Thresholds, joined
+from identification.validation.finding import (
+    Finding,
+    Level,
+    Role,
+    Thresholds,
+    joined,
+    little_torque,
+)
 from identification.validation.plausibility import ELEMENTS
 from identification.validation.prediction import FRICTION_CHANGE
 from identification.validation.residuals import Profile, ResidualChecks, Ripple
@@ -168,8 +175,7 @@ def _minor(evidence: Evidence, limit: Thresholds) -> NDArray[np.bool_]:
     error = evidence.held_out
     torque = error.torque_rms
     slides = np.isin(np.arange(len(torque)), evidence.prismatic)
-    power = np.where(slides[:, None] == slides, torque**2, 0.0).sum(axis=1)
-    minor = torque < limit.minor * np.sqrt(power)
+    minor = little_torque(torque, slides, limit)
     if evidence.noise_floor is not None:
         minor |= np.nan_to_num(evidence.noise_floor) > 0.5 * limit.axis * torque
     if (most := evidence.context.torque_limit) is not None:
