@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
@@ -114,10 +115,10 @@ def samples_of(
     Raises:
         RecordingError: the recording cannot be prepared.
     """
-    recording, start = source.context or (source.recording, 0)
+    start = source.context[1] if source.context else 0
     driven = cell.file.drive_train is not None
     samples = prepare(
-        recording,
+        source.whole,
         model or cell.model,
         noise_variance=_array(settings.noise_variance),
         torque_variance=_array(settings.torque_variance),
@@ -131,13 +132,19 @@ def samples_of(
     return samples.between(start, start + source.recording.n_samples)
 
 
-def validation_samples(source: Source, cell: Cell, settings: Settings) -> Samples:
+def validation_samples(
+    source: Source,
+    cell: Cell,
+    settings: Settings,
+    motions: dict[Preprocessing, Smoothed] | None = None,
+) -> Samples:
     """Return the samples of a source for a verdict: rows in motion, torque as recorded.
 
     Raises:
         RecordingError: the recording cannot be prepared.
     """
-    return samples_of(source, cell, settings.preprocessed(smooth_torque=False)).moving()
+    unsmoothed = settings.preprocessed(smooth_torque=False)
+    return samples_of(source, cell, unsmoothed, motions=motions).moving()
 
 
 def _array(figures: tuple[float, ...] | None) -> Array | None:
@@ -442,14 +449,16 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
     settings, cell = decided.settings, decided.settings.with_friction_law(sources.cell)
     sources = replace(sources, cell=cell)
     unseen = () if sources.in_sample else sources.held_out
+    # Parts of one recording share its arrays, and have its motion.
+    motions: defaultdict[int, dict[Preprocessing, Smoothed]] = defaultdict(dict)
     with reporter.task("smoothing recordings", len(sources.training) + len(unseen)) as task:
         fitted, held_out = [], []
         for source in sources.training:
-            fitted.append(samples_of(source, cell, settings))
+            fitted.append(samples_of(source, cell, settings, motions=motions[source.motion_key]))
             task.advance(1, source.name)
         _require_slow_rows(stated, fitted)
         for source in unseen:
-            held_out.append(validation_samples(source, cell, settings))
+            held_out.append(validation_samples(source, cell, settings, motions[source.motion_key]))
             task.advance(1, source.name)
     if settings.preprocessing.smooth_torque:
         training = [validation_samples(source, cell, settings) for source in sources.training]

@@ -52,6 +52,16 @@ class Source:
     #: of its first sample, so that filters see the motion beyond its ends
     context: tuple[Recording, int] | None = None
 
+    @property
+    def whole(self) -> Recording:
+        """The recording that is prepared: with its context, if it is a part."""
+        return self.recording if self.context is None else self.context[0]
+
+    @property
+    def motion_key(self) -> int:
+        """A number that parts of one recording have in common."""
+        return id(self.whole.position)
+
 
 @dataclass(frozen=True, eq=False)
 class Sources:

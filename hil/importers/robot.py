@@ -32,14 +32,12 @@ from hil.reading import path_exists, read_input
 from identification import FrictionLaw
 from identification.errors import ModelError
 from identification.model.kinematics import pinocchio_model
-from identification.model.regressor import LINK_SYMBOLS
 from planner.toml_text import toml_value
 
 Use = Literal["excitation", "validation", "standstill"]
 
 _MOST: Final = 1e12
 """Largest value of any quantity, in any unit; sums of its squares do not overflow."""
-_MASS: Final = LINK_SYMBOLS.index("m")
 STANDARD_GRAVITY: Final = (0.0, 0.0, -9.81)
 IMPORTED_LAW: Final = FrictionLaw(third=None, offset=True)
 """Default friction law of an imported robot. A term in v² or v³ that the motion does not need makes

@@ -62,6 +62,7 @@ _MODEL_ERROR: Final = 0.05  # difference of log variance up to which two minima 
 _REVERSAL_PERIODS: Final = 0.5  # periods of the smoothing's bandwidth beside a velocity reversal
 _FOLDS: Final = 5
 _BLOCKS: Final = 80  # blocks of time
+_ROWS_AT_ONCE: Final = 8192
 _CHANCE: Final = 0.005  # one-sided probability of a false delay
 
 
@@ -84,12 +85,20 @@ def predicted_rate(samples: Samples, torque: Array) -> Array:
 def rate_products(model: RobotModel, samples: Samples) -> Array:
     """Return sums ``W' d[W | t]/dt`` per joint (n, p, p + 1); t is of the known payload."""
     products = np.zeros((model.n_joints, model.n_parameters, model.n_parameters + 1))
-    load = samples.known_torque(model)
-    for joint, (block, columns) in enumerate(zip(*samples.regressor(model), strict=True)):
-        rows = samples.usable[:, joint]
-        rate = predicted_rate(samples, np.column_stack([block, load[:, joint]]))
-        places = np.ix_(columns, np.append(columns, model.n_parameters))
-        products[joint][places] = block[rows].T @ rate[rows]
+    m = len(samples.torque)
+    # A low-pass needs all rows at once; otherwise the regressor of a long recording is never whole.
+    length = m if samples.torque_bandwidth is not None else _ROWS_AT_ONCE
+    for start in range(0, m, max(1, length)):
+        stop = min(start + length, m)
+        first = max(start - 1, 0)  # a rate needs the rows beside
+        part = samples.between(first, min(stop + 1, m))
+        load = part.known_torque(model)
+        inside = slice(start - first, stop - first)
+        for joint, (block, columns) in enumerate(zip(*part.regressor(model), strict=True)):
+            rate = predicted_rate(part, np.column_stack([block, load[:, joint]]))[inside]
+            usable = part.usable[inside, joint]
+            places = np.ix_(columns, np.append(columns, model.n_parameters))
+            products[joint][places] += block[inside][usable].T @ rate[usable]
     return products
 
 

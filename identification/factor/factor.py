@@ -297,6 +297,16 @@ class Factor:
         matrices = tuple(own[which] for own in self.matrices)
         return replace(self, matrices=matrices, counts=self.counts[which])
 
+    def without(self, which: slice | NDArray[np.bool_]) -> Self:
+        """Return the sum of all blocks but some, by slice or mask (B,), as one block."""
+        assert self.storage == "gram"
+        matrices = tuple(
+            (total - own[which].sum(axis=0))[None]
+            for total, own in zip(self._sums, self.matrices, strict=True)
+        )
+        counts = self.samples - self.counts[which].sum(axis=0)
+        return replace(self, matrices=matrices, counts=counts[None])
+
     def occupied(self) -> Self:
         """Return the blocks with rows."""
         rows = np.asarray(self.counts.any(axis=1))
@@ -417,6 +427,8 @@ def merged(blocks: Blocks, length: int) -> Blocks:
 def _added(first: Blocks, second: Blocks) -> Blocks:
     """Add blocks (B, ...) of possibly different number."""
     longer, shorter = (first, second) if len(first) >= len(second) else (second, first)
+    if not len(shorter):
+        return longer
     total = longer.copy()
     total[: len(shorter)] += shorter
     return total

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -266,17 +265,7 @@ class Folds:
 
     def without(self, k: int) -> Factor:
         """Return the factor of all segments but k."""
-        segments = self.fitted
-        matrices = tuple(
-            total - own[k]
-            for total, own in zip(self.whole.matrices, segments.matrices, strict=True)
-        )
-        return replace(segments, matrices=matrices, counts=self.whole.counts - segments.counts[k])
-
-    @cached_property
-    def whole(self) -> Factor:
-        """The factor of all segments, one block."""
-        return self.fitted.merged(FOLDS)
+        return self.fitted.without(slice(k, k + 1))
 
     def errors(
         self, estimate: Callable[[Factor], Array], rows: Literal["all", "fitted"] = "all"
@@ -580,7 +569,7 @@ class _Trial:
 
     def _estimator(self, settings: Settings, reduced: _Reduced) -> Callable[[Factor], Array]:
         effect, prior = settings.strength.design_effect(self._effect), reduced.prior
-        _, of_all = posterior_values(reduced.folds.whole, prior.gaussian, effect)
+        _, of_all = posterior_values(reduced.folds.fitted, prior.gaussian, effect)
 
         def estimate(factor: Factor) -> Array:
             values, weights = posterior_values(factor, prior.gaussian, effect, of_all)

@@ -111,6 +111,20 @@ class Samples:
             parent=None if self.torque_bandwidth is None else (self, part),
         )
 
+    def thinned(self, step: int) -> Samples:
+        """Return every `step`-th row, as of a torque without a low-pass."""
+        rows = slice(step // 2, None, step)
+        return replace(
+            self,
+            motion=self.motion.rows(rows),
+            torque=self.torque[rows],
+            usable=self.usable[rows],
+            segments=(),
+            mask=None if self.mask is None else self.mask.rows(rows),
+            torque_bandwidth=None,
+            parent=None,
+        )
+
     def moving(self) -> Samples:
         """Return samples with the rows in sliding motion only."""
         return self if self.mask is None else replace(self, usable=self.mask.moving)

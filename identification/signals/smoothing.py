@@ -87,16 +87,21 @@ def difference_variance(time: Array, values: Array) -> Array:
 
 
 def _difference_variance(time: Array, values: Array, order: int) -> Array:
-    windows = np.lib.stride_tricks.sliding_window_view(time, order + 1)
-    scale = windows[:, -1:] - windows[:, :1]
-    apart = (windows[:, :, None] - windows[:, None, :]) / scale[:, :, None]
-    apart[:, np.arange(order + 1), np.arange(order + 1)] = 1.0
-    weights = 1.0 / apart.prod(axis=2)
-    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
-    stacked = np.lib.stride_tricks.sliding_window_view(values, order + 1, axis=0)
-    return np.asarray(np.mean(np.einsum("mck,mk->mc", stacked, weights) ** 2, axis=0))
+    total, count = np.zeros(values.shape[1]), len(time) - order
+    for start in range(0, count, _ROWS_AT_ONCE):
+        rows = slice(start, min(start + _ROWS_AT_ONCE, count) + order)
+        windows = np.lib.stride_tricks.sliding_window_view(time[rows], order + 1)
+        scale = windows[:, -1:] - windows[:, :1]
+        apart = (windows[:, :, None] - windows[:, None, :]) / scale[:, :, None]
+        apart[:, np.arange(order + 1), np.arange(order + 1)] = 1.0
+        weights = 1.0 / apart.prod(axis=2)
+        weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+        stacked = np.lib.stride_tricks.sliding_window_view(values[rows], order + 1, axis=0)
+        total += np.sum(np.einsum("mck,mk->mc", stacked, weights) ** 2, axis=0)
+    return np.asarray(total / count)
 
 
+_ROWS_AT_ONCE: Final = 8192
 _STRETCH: Final = 4.0  # s; resolution 0.25 Hz
 _FEWEST: Final = 32  # samples
 _HARRIS: Final = np.array([0.35875, -0.48829, 0.14128, -0.01168])  # of cosines

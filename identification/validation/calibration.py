@@ -145,7 +145,7 @@ def inner_errors(factor: Factor, means: TorqueMeans, refit: Refit) -> Array:
     fold = np.minimum(np.floor(FOLDS * before / rows.sum()).astype(np.intp), FOLDS - 1)
     found = np.full((len(means.block), factor.n_joints), np.nan)
     for k in range(FOLDS):
-        others = factor.blocks(np.repeat(fold != k, fine)[: len(factor)])
+        others = factor.without(np.repeat(fold == k, fine)[: len(factor)])
         inside = fold[means.block] == k
         errors = means.errors(refit(others))[inside]
         errors[:, others.samples == 0] = np.inf

@@ -388,21 +388,7 @@ class _Few:
     def of(cls, model: RobotModel, recordings: Sequence[Samples]) -> _Few:
         """Take some of the rows."""
         step = _step(recordings, _FEW_ROWS)
-        few = []
-        for samples in recordings:
-            some = slice(step // 2, None, step)
-            few.append(
-                replace(
-                    samples,
-                    motion=samples.motion.rows(some),
-                    torque=samples.torque[some],
-                    usable=samples.usable[some],
-                    segments=(),
-                    mask=None,
-                    torque_bandwidth=None,
-                    parent=None,
-                )
-            )
+        few = [samples.thinned(step) for samples in recordings]
         return cls(model, tuple(few), cls._score(model, few))
 
     def improved_by(self, fault: Fault) -> bool:

@@ -207,6 +207,7 @@ ELEMENTS: Final = "a spring, a balancer or a hydraulic counterweight"
 # inertia dominate.
 _LOADED: Final = 0.2
 _POSTURES: Final = 50
+_MOST_ROWS: Final = 20_000  # that are compared with the nominal torque
 
 
 @dataclass(frozen=True, eq=False)
@@ -419,6 +420,9 @@ def nominal_scale(
     `rotors_known`: the nominal parameters include rotor inertias; `share`: relative standard
     deviation of the nominal torque.
     """
+    if all(run.torque_bandwidth is None for run in runs):
+        step = max(1, sum(len(run.torque) for run in runs) // _MOST_ROWS)
+        runs = [run.thinned(step) for run in runs]
     found, regressors = [], [run.regressor(model) for run in runs]
     for joint in range(model.n_joints):
         columns, turning = regressors[0].columns[joint], [joint]

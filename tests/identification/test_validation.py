@@ -110,7 +110,7 @@ class TestPredictionError:
         samples = samples_with(np.zeros((2000, 2)))
         torque = samples.torque.copy()
         torque[~samples.usable] += 50.0  # stiction
-        stuck = Samples(**{**samples.__dict__, "torque": torque})
+        stuck = replace(samples, torque=torque)
         (error,) = prediction_error(MODEL, values, [stuck])
         assert error.overall < 1e-12
         (error,) = prediction_error(MODEL, values, [stuck], all_rows=True)
