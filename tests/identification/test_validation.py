@@ -20,7 +20,6 @@ from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import FOLDS
 from identification.signals.masks import EDGE, SATURATED, STANDSTILL, RowMask
 from identification.signals.recording import Recording
-from identification.signals.samples import Samples
 from identification.validation.calibration import TorqueMeans, calibrate, inner_errors
 from identification.validation.changes import find_changes
 from identification.validation.evidence import repetition_noise
