@@ -17,7 +17,7 @@ from typing import Any, Final, Literal, Self
 from pydantic import BaseModel, ConfigDict
 
 from hil.cli import imports
-from planner.toml_text import toml_value
+from hil.toml_text import to_text
 
 CONFIGURATIONS: Final = Path(__file__).parent / "recordings"
 FITTED_SHARE: Final = 0.7
@@ -140,8 +140,7 @@ class Published(_Table):
                 imports.rosbag2(source, output, urdf=urdf, locked=locked)
             else:
                 columns = Path(scratch) / "map.toml"
-                lines = [f"{key} = {toml_value(value)}\n" for key, value in self.map.items()]
-                columns.write_text("".join(lines), encoding="utf-8")
+                columns.write_text(to_text(self.map), encoding="utf-8")
                 imports.log(source, output, columns=columns, urdf=urdf, locked=locked)
         return output
 

@@ -17,7 +17,7 @@ from hil.archive import Archive, ArchiveSpec, open_archive
 from hil.campaign import Stop, VirtualLink
 from hil.campaign.intervals import START_TOLERANCE, player_of
 from hil.cell import Cell
-from hil.cell.text import replaced_value
+from hil.cell.text import with_values
 from hil.simulation import controller_settings, simulated_controller
 from planner import PiecewiseCubic, plan
 from sim_fixtures.faults import parse_fault, split_faults
@@ -101,7 +101,7 @@ def on_ns16(
 @pytest.fixture(scope="module")
 def cell() -> Cell:
     """The NS 16 in a cycle of 2 ms."""
-    text = replaced_value(CELL_PATH.read_text("utf-8"), "controller", "cycle_ms", "2")
+    text = with_values(CELL_PATH.read_text("utf-8"), {"controller.cycle_ms": 2})
     return Cell.from_texts(text, Cell.load(CELL_PATH).urdf, CELL_PATH)
 
 

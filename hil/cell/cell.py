@@ -290,7 +290,7 @@ class Cell:
 
         Raises:
             CellError: a value is invalid.
-            NoTableError: a table exists without a header line.
+            InputError: the layout of the file does not allow the change.
         """
         return Cell.from_texts(with_values(self.text, values), self.urdf, self.path)
 

@@ -1,70 +1,102 @@
-"""Changes of values in the text of a TOML file, and limits in a URDF."""
+"""Changes of entries in the text of a TOML file, and limits in a URDF."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import tomlkit
 from numpy.typing import NDArray
+from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import Array as List
+from tomlkit.items import Item, Table
 
 from hil.errors import InputError
 from hil.reading import parse_toml
+from hil.toml_text import inline
 from identification.model.urdf_text import urdf_tree
-from planner.toml_text import toml_value
-
-
-class NoTableError(InputError, ValueError):
-    """A table to change has no header line."""
-
-    def __init__(self, table: str) -> None:
-        super().__init__(
-            None,
-            f"the cell file has no header line [{table}]",
-            remedy=f"write [{table}] on a line of its own, and its entries below",
-        )
-
-
-def replaced_value(text: str, table: str, key: str, value: float | str) -> str:
-    """Set `key` of `[table]` to `value` in a TOML text; comments and order are preserved.
-
-    Raises:
-        NoTableError: there is no header line of the table.
-    """
-    header = rf"^[ \t]*\[[ \t]*{re.escape(table)}[ \t]*\][ \t]*(?:#[^\n]*)?$"
-    found = re.search(header, text, re.MULTILINE)
-    if found is None:
-        raise NoTableError(table)
-    start = found.end()
-    following = re.search(r"^[ \t]*\[", text[start:], re.MULTILINE)
-    end = start + following.start() if following else len(text)
-    # A list may span several lines, and contain lists.
-    a_list = r"\[(?:[^\[\]]|\[[^\[\]]*\])*\]"
-    setting = rf"(?m)^([ \t]*{key}[ \t]*=[ \t]*)(?:\"[^\"\n]*\"|{a_list}|[^\n#]*)"
-    body, count = re.subn(setting, lambda match: f"{match[1]}{value}", text[start:end], count=1)
-    if not count:
-        body = f"\n{key} = {value}{text[start:end]}"
-    return text[:start] + body + text[end:]
 
 
 def with_values(text: str, values: Mapping[str, Any]) -> str:
     """Set values in a TOML text, such as ``{"campaign.repetitions": 3}``; None changes nothing.
 
-    Comments and order are preserved; missing tables are added (NoTableError without a header line).
+    Comments, order and layout of all else are preserved, in a list of the same length also those
+    between its entries; missing tables and entries are added.
+
+    Raises:
+        TypeError: a value is of a type that TOML does not have.
+        InputError: the layout of the text is one that tomlkit does not preserve.
     """
+    given = {name: inline(value) for name, value in values.items() if value is not None}
+    try:
+        changed = _edited(text, given)
+        preserved = _others(changed, given) == _others(text, given)  # an arm's limits among them
+    except (TOMLKitError, ValueError):
+        preserved = False
+    if not preserved:
+        raise InputError(
+            None,
+            f"{', '.join(given)} cannot be changed in this text without changing other entries",
+            remedy="write each table once, below a header line [table] of its own",
+        )
+    return changed
+
+
+def _edited(text: str, values: Mapping[str, Item]) -> str:
+    document = tomlkit.parse(text)
     for name, value in values.items():
-        table, _, key = name.rpartition(".")
-        if value is None:
-            continue
-        there: Any = parse_toml(text)
-        for part in table.split("."):
-            there = there.get(part, {})
-        if not there and f"[{table}]" not in text:
-            text += f"\n[{table}]\n"
-        text = replaced_value(text, table, key, toml_value(value))
-    return text
+        *path, key = name.split(".")
+        table: Any = document
+        for part in path:
+            if part not in table:
+                table[part] = tomlkit.table()
+            table = table[part]
+        _set(table, key, value)
+    return tomlkit.dumps(document)
+
+
+def _set(table: Any, key: str, value: Item) -> None:
+    """Set an entry of a table of a parsed text."""
+    if key not in table:
+        _append(table, key, value)
+        return
+    present = table[key]
+    if isinstance(present, List) and isinstance(value, List) and len(present) == len(value):
+        for place, entry in enumerate(value):
+            present[place] = inline(entry)
+    else:
+        table[key] = value
+
+
+def _append(table: Any, key: str, value: Item) -> None:
+    """Add an entry in front of the comments at the end of a table: they belong to what follows."""
+    end = []
+    if isinstance(table, Table):
+        body = table.value.body
+        while body and body[-1][0] is None:
+            end.append(body.pop()[1])
+    table[key] = value
+    for item in reversed(end):
+        table.value.add(item)
+
+
+def _others(text: str, changed: Mapping[str, Any]) -> dict[str, str]:
+    """Return the entries of a text by dotted name, without those below a changed name."""
+    return {
+        name: entry
+        for name, entry in _entries(parse_toml(text), "")
+        if not any(f"{name}.".startswith(f"{other}.") for other in changed)
+    }
+
+
+def _entries(table: Mapping[str, Any], path: str) -> Iterator[tuple[str, str]]:
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _entries(value, f"{path}{name}.")
+        else:
+            yield f"{path}{name}", repr(value)
 
 
 Array = NDArray[np.float64]

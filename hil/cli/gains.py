@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Any
 
+import tomlkit
 import typer
 
 from hil.cli.arguments import JsonOption, QuietOption, print_json
@@ -15,6 +16,7 @@ from hil.errors import InputError
 from hil.identify.gain_run import GainsFound, find_gains
 from hil.identify.sources import archives_in
 from hil.progress import reporter as make_reporter
+from hil.toml_text import comment_lines, inline
 from identification.model.payload import Payload
 
 
@@ -107,23 +109,25 @@ def assumption(frame: str | None) -> str:
 def _as_toml(found: GainsFound, assumed: str | None) -> str:
     """Format constants and their uncertainty as TOML; what is not determined is nan."""
     side = "motor side" if found.motor_side else "joint side, gears included"
-    lines = [
-        f"    {one['torque_constant']:.6g},  # {one['name']} ± {one['half_interval']:.2g}"
-        if one["not_determined"] is None
-        else f"    nan,  # {one['name']}: not determined; {one['not_determined']}"
-        for one in _motors(found)
-    ]
-    spread = [f"{share:.2g}" for share in found.gains.relative_std]
-    return "\n".join(
-        [
-            *([f"# {assumed}"] if assumed else []),
-            f"# N·m/A ({side}), 95 % intervals",
-            "torque_constant = [",
-            *lines,
-            "]",
-            f"torque_uncertainty = [{', '.join(spread)}]  # relative standard deviations",
-        ]
-    )
+    constants = tomlkit.array()
+    for motor in _motors(found):
+        if motor["not_determined"] is None:
+            value = float(f"{motor['torque_constant']:.6g}")
+            comment = f"{motor['name']} ± {motor['half_interval']:.2g}"
+        else:
+            value = math.nan
+            comment = f"{motor['name']}: not determined; {motor['not_determined']}"
+        constants.add_line(value, comment=comment)
+    constants.add_line(indent="")
+    uncertainty = inline([float(f"{share:.2g}") for share in found.gains.relative_std])
+    uncertainty.comment("relative standard deviations")
+    document = tomlkit.document()
+    heads = ([assumed] if assumed else []) + [f"N·m/A ({side}), 95 % intervals"]
+    for line in comment_lines("\n".join(heads)):
+        document.add(line)
+    document.add("torque_constant", constants)
+    document.add("torque_uncertainty", uncertainty)
+    return tomlkit.dumps(document).rstrip("\n")
 
 
 def _motors(found: GainsFound) -> list[dict[str, Any]]:

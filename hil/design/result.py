@@ -15,6 +15,7 @@ from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import json_digest, write_atomically
 from hil.reading import read_text
+from hil.toml_text import Angles, from_text, to_text
 from hil.version import software
 from identification.excitation import (
     Criteria,
@@ -25,7 +26,6 @@ from identification.excitation import (
 )
 from planner import FourierSeries, PiecewiseCubic, PlanFile, PlannerError, in_child
 from planner.arrays import DAMAGED, Whole, numbers, strict
-from planner.toml_text import Angles, from_text, to_text
 
 from .settings import RESULT_FORMAT, DesignSettings, settings_of
 

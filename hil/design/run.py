@@ -15,8 +15,8 @@ from hil.files import convert_write_errors, lock_folder, write_atomically
 from hil.motion_checks import violation_text
 from hil.progress import Reporter
 from hil.reading import open_file
+from hil.toml_text import to_text
 from identification import excitation
-from planner.toml_text import to_text
 
 from .advice import criteria_text, infeasible_text, no_excitation
 from .problem import problem_of, search_settings

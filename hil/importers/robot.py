@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hil.archive import Samples, write_samples
 from hil.cell import Cell
-from hil.cell.text import replaced_value
+from hil.cell.text import with_values
 from hil.errors import ArchiveWriteError, SourceError
 from hil.files import file_digest, replace_file
 from hil.identify.cell_context import nominal_of
@@ -29,10 +29,10 @@ from hil.importers.findings import (
     limits_of,
 )
 from hil.reading import path_exists, read_input
+from hil.toml_text import to_text
 from identification import FrictionLaw
 from identification.errors import ModelError
 from identification.model.kinematics import pinocchio_model
-from planner.toml_text import toml_value
 
 Use = Literal["excitation", "validation", "standstill"]
 
@@ -112,9 +112,9 @@ class Robot:
         text = cell.text
         held = _held(cell.urdf, {**cell.file.robot.locked, **(locked or {})}, recorded, path)
         if held != cell.file.robot.locked:
-            text = _with_robot_entry(text, "locked", _inline(held))
+            text = with_values(text, {"robot.locked": _writable_names(held)})
         if gravity is not None:
-            text = _with_robot_entry(text, "gravity", _vector(gravity))
+            text = with_values(text, {"robot.gravity": [float(value) for value in gravity]})
         return cls._checked(text, cell.urdf, path)
 
     def with_coupling(self, motor_from_joint: NDArray[np.float64]) -> Robot:
@@ -125,8 +125,9 @@ class Robot:
         path = Path("cell.toml")
         if Cell.from_texts(self.cell, self.urdf, path).file.robot.coupling is not None:
             return self
-        rows = toml_value(motor_from_joint.tolist())
-        text = f"{self.cell}\n[robot.coupling]\nmotor_from_joint = {rows}\n"
+        text = with_values(
+            self.cell, {"robot.coupling.motor_from_joint": motor_from_joint.tolist()}
+        )
         return self._checked(text, self.urdf, path)
 
     @classmethod
@@ -151,20 +152,15 @@ def _cell_text(
     name: str, friction: FrictionLaw, gravity: Sequence[float], locked: Mapping[str, float]
 ) -> str:
     """Return a minimal cell file: the robot, without limits, drive train or controller."""
-    lines = [
-        "[cell]",
-        f"name = {toml_value(_writable(name)[:80] or 'robot')}",
-        'urdf = "robot.urdf"',
-        "",
-        "[robot]",
-        f"gravity = {_vector(gravity)}",
-        "rotor_inertia = true",
-        *([f"locked = {_inline(locked)}"] if locked else []),
-        "",
-        "[robot.friction]",
-        *(f"{key} = {toml_value(value)}" for key, value in friction.table().items()),
-    ]
-    return "\n".join(lines) + "\n"
+    robot = {
+        "gravity": [float(value) for value in gravity],
+        "rotor_inertia": True,
+        "locked": _writable_names(locked) or None,
+        "friction": friction.table(),
+    }
+    return to_text(
+        {"cell": {"name": _writable(name)[:80] or "robot", "urdf": "robot.urdf"}, "robot": robot}
+    )
 
 
 def _held(
@@ -189,24 +185,13 @@ def _held(
     return {name: at for name, at in rest.items() if name not in recorded} | {**locked}
 
 
-def _vector(values: Sequence[float]) -> str:
-    return toml_value([float(value) for value in values])
-
-
-def _inline(table: Mapping[str, float]) -> str:
-    return toml_value({_writable(name): float(position) for name, position in table.items()})
-
-
 def _writable(name: str) -> str:
     """Return a file name with characters that UTF-8 cannot hold replaced."""
     return name.encode("utf-8", "replace").decode("utf-8")
 
 
-def _with_robot_entry(text: str, key: str, value: str) -> str:
-    try:
-        return replaced_value(text, "robot", key, value)
-    except ValueError:
-        return f"{text}\n[robot]\n{key} = {value}\n"
+def _writable_names(positions: Mapping[str, float]) -> dict[str, float]:
+    return {_writable(name): float(position) for name, position in positions.items()}
 
 
 def _require_writable(output: Path, source: Sequence[Path], *, force: bool) -> None:

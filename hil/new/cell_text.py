@@ -15,9 +15,11 @@ from pathlib import Path
 from typing import Any, Final, get_origin
 
 import numpy as np
+import tomlkit
 from numpy.typing import NDArray
 from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
+from tomlkit.items import Table
 
 from drivers.drive_train import WRIST_AXES
 from hil.cell.errors import UNKNOWN, WHERE, models_of
@@ -26,10 +28,10 @@ from hil.cell.text import urdf_limits
 from hil.errors import InputError
 from hil.importers import Convention, urdf_of_dh
 from hil.reading import read_input, read_text
+from hil.toml_text import comment_lines, inline
 from identification.errors import ModelError
 from identification.model.kinematics import Chain, chain_from_urdf
 from identification.model.urdf_text import urdf_tree
-from planner.toml_text import toml_key, toml_value
 
 from .known import ASSUMED, Known, assumed_for_design, clear_home, from_urdf
 
@@ -116,16 +118,16 @@ _DEFAULTS: Final[Mapping[str, Any]] = {
 }
 """Values of a new cell file, unless known; others are unknown (`WHERE`) or not written."""
 _HEAD: Final = """\
-# {name}: cell file made by `hil new`. {sources}
-#
-# "?" is an unknown value. A file with a "?" is refused, with a list of all of them and where to
-# find each. List values that are assumed, not measured, in `assumed`: results that depend on them
-# report it. An arrow (->) names the source of a value.
-#
-# Lists have one entry per joint, in this order:
-#   {joints}
-# Units are SI, except where a name says degrees (_deg) or milliseconds (_ms), or a comment
-# revolutions.
+{name}: cell file made by `hil new`. {sources}
+
+"?" is an unknown value. A file with a "?" is refused, with a list of all of them and where to
+find each. List values that are assumed, not measured, in `assumed`: results that depend on them
+report it. An arrow (->) names the source of a value.
+
+Lists have one entry per joint, in this order:
+  {joints}
+Units are SI, except where a name says degrees (_deg) or milliseconds (_ms), or a comment
+revolutions.
 """
 _ASSUMED: Final = ("nominal.uncertainty", "controller.current_delay_cycles")
 """Fields whose default is written as an assumption."""
@@ -160,36 +162,56 @@ class NewCell:
             **({} if folders is None else {"cell.mesh_folders": folders}),
             **self.known.values,
         }
+        document, unknown = self._head(), list[str]()
+        without = ("drive_train", "controller") if self.design_only else ()
+        tables = [*CellFile.model_fields, *(name.partition(".")[0] for name in values)]
+        for name in dict.fromkeys(tables):
+            if name not in without:
+                table, not_known = self._table(name, values)
+                unknown += not_known
+                if table:
+                    document.append(name, table)
+        return tomlkit.dumps(document), tuple(unknown)
+
+    def _head(self) -> tomlkit.TOMLDocument:
+        """Return a document with the comments at the top of the file."""
         origins = ", ".join(dict.fromkeys(self.known.origin.values()))
         head = _HEAD.format(
             name=self.name,
             sources=f"Its values are {origins}." if origins else "",
             joints=", ".join(f"{k} {name}" for k, name in enumerate(self.joint_names, 1)),
         )
-        notes = [line for note in self.known.notes for line in _comment(f"Note: {note}", "# ")]
-        lines, unknown = [head, *notes], list[str]()
-        without = ("drive_train", "controller") if self.design_only else ()
-        tables = [*CellFile.model_fields, *(name.partition(".")[0] for name in values)]
-        for table in (one for one in dict.fromkeys(tables) if one not in without):
-            fields = _fields_of(table)
-            others = (name for name in values if name.startswith(f"{table}."))
-            names = [one for one in dict.fromkeys([*fields, *others]) if one in values | _UNKNOWN]
-            lines += [f"\n[{table}]"] if names else []
-            for name in names:
-                value = values.get(name)
-                if value is None:
-                    value = UNKNOWN
-                    if _is_one_each(fields[name]):
-                        value = [UNKNOWN] * len(self.joint_names)
-                if name in fields:
-                    lines += _comment(fields[name].description or "", "# ")
-                if value == UNKNOWN or (isinstance(value, list) and UNKNOWN in value):
-                    unknown.append(name)
-                    lines += _comment(WHERE.get(name, ""), "# -> ")
-                origin = self.known.origin.get(name)
-                comment = f"  # {origin}" if origin else ""
-                lines.append(f"{toml_key(name.partition('.')[2])} = {toml_value(value)}{comment}")
-        return "\n".join(lines) + "\n", tuple(unknown)
+        notes = [_wrapped(f"Note: {note}") for note in self.known.notes]
+        document = tomlkit.document()
+        for line in comment_lines("\n".join([head, *notes])):
+            document.add(line)
+        return document
+
+    def _table(self, table: str, values: Mapping[str, Any]) -> tuple[Table, list[str]]:
+        """Return a commented table of the file, and its unknown fields."""
+        fields = _fields_of(table)
+        others = (name for name in values if name.startswith(f"{table}."))
+        written, unknown = tomlkit.table(), list[str]()
+        for name in dict.fromkeys([*fields, *others]):
+            if name not in values and name not in _UNKNOWN:
+                continue
+            value = values.get(name)
+            if value is None:
+                value = UNKNOWN
+                if _is_one_each(fields[name]):
+                    value = [UNKNOWN] * len(self.joint_names)
+            comments = _wrapped(fields[name].description or "") if name in fields else ""
+            if value == UNKNOWN or (isinstance(value, list) and UNKNOWN in value):
+                unknown.append(name)
+                comments += "\n" + _wrapped(WHERE.get(name, ""), mark="-> ")
+            for line in comment_lines(comments):
+                written.add(line)
+            item = inline(value)
+            origin = self.known.origin.get(name)
+            if origin:
+                item.comment(origin)
+            written.append(name.partition(".")[2], item)
+        return written, unknown
 
     def _assumed(self) -> list[str]:
         """Return the names of assumed fields."""
@@ -246,10 +268,9 @@ def _is_one_each(field: FieldInfo) -> bool:
     return get_origin(field.annotation) is list and not any(models_of(field.annotation))
 
 
-def _comment(text: str, mark: str) -> list[str]:
-    """Return lines of a comment."""
-    rest = "# " if mark == "# " else "#    "
-    return textwrap.wrap(text, 98, initial_indent=mark, subsequent_indent=rest)
+def _wrapped(text: str, mark: str = "") -> str:
+    """Return lines of a comment, the first behind a mark."""
+    return textwrap.fill(text, 96, initial_indent=mark, subsequent_indent=" " * len(mark))
 
 
 def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -> NewCell:

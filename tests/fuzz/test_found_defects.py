@@ -22,10 +22,10 @@ from hil.errors import ArchiveError, InputError, SourceError
 from hil.importers import ColumnMap, import_log, import_rosbag2
 from hil.new import from_archive
 from hil.plots.archive_view import view_of
+from hil.toml_text import from_text
 from identification.errors import ModelError
 from identification.model.kinematics import chain_from_urdf
 from identification.model.payload import Payload
-from planner.toml_text import from_text
 from tests.fault_matrix.small_cell import URDF
 from tests.fuzz.targets import documents, importers
 from tests.hil.fast_cell import CELL

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from hil.cell.text import with_values
-from planner.toml_text import toml_value
 
 TWO_JOINTS = """<?xml version="1.0"?>
 <robot name="two">
@@ -86,5 +85,4 @@ def filled_in(path: Path, n: int, **values: object) -> str:
     planted = {"seed": 1, "initial_deg": figures["campaign.home_deg"], "third": [0.0] * n}
     planted |= {key: figures[f"nominal.{key}"] for key in ("rotor_inertia", "coulomb", "viscous")}
     planted |= {"current_noise": 0.02, "current_resolution": 0.005}
-    lines = "\n".join(f"{key} = {toml_value(value)}" for key, value in planted.items())
-    return f"{text}\n[simulation]\n{lines}\n"
+    return with_values(text, {f"simulation.{key}": value for key, value in planted.items()})

@@ -19,7 +19,7 @@ from hil.campaign.folder import MESH, MISSING, checksums
 from hil.cell import AngleFrame, Cell, CellError
 from hil.cell.errors import models_of
 from hil.cell.schema import CanTable, CellFile
-from hil.cell.text import replaced_value, urdf_limits
+from hil.cell.text import urdf_limits
 from hil.design import preset, problem_of
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 from sim_fixtures.plant import build_model
@@ -190,25 +190,6 @@ def test_a_cell_is_moved_and_changed_in_its_text_too(folder: Path, ns16: Cell) -
     cell = ns16.with_campaign(repetitions=7, simulation_seed=5)
     again = Cell.from_texts(cell.text, cell.urdf, cell.path)
     assert (again.campaign.repetitions, again.simulation.seed, again.campaign.seed) == (7, 5, 1)
-
-
-@pytest.mark.parametrize(
-    ("text", "table", "key", "value", "changed"),
-    [
-        ("[a]\nx = 1 # one\n[b] # b\nx = 2\n", "b", "x", 7, "[a]\nx = 1 # one\n[b] # b\nx = 7\n"),
-        ("[a]\nx = 1\n[b]\n", "a", "y", 3, "[a]\ny = 3\nx = 1\n[b]\n"),
-        ("[ a ]\n  x = 1", "a", "x", '"\\u00e1"', '[ a ]\n  x = "\\u00e1"'),
-        ("[a]\n", "c", "x", 7, None),
-    ],
-)
-def test_a_value_is_replaced_in_its_table(
-    text: str, table: str, key: str, value: float | str, changed: str | None
-) -> None:
-    if changed is None:
-        with pytest.raises(ValueError, match="no header line"):
-            replaced_value(text, table, key, value)
-    else:
-        assert replaced_value(text, table, key, value) == changed
 
 
 def test_link_and_session_are_as_the_cell_describes_them(ns16: Cell) -> None:

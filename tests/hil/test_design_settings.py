@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import re
-import tomllib
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hil.cell import AngleFrame, Cell
 from hil.design import METHODS, load_settings, preset, problem_of, search_settings
 from hil.design.advice import NoExcitationError, no_excitation
 from hil.design.settings import SettingsError, preset_text, settings_of
+from hil.toml_text import to_text
 from identification.excitation import NoFeasibleMotionError, Violation
-from planner.toml_text import Angles, from_text, to_text
 from sim_fixtures.ns16 import CELL_PATH
 
 
@@ -106,31 +103,6 @@ def test_invalid_settings_name_file_field_value_and_remedy(text, words, tmp_path
         assert word not in text
     with pytest.raises(SettingsError, match=r"none\.toml: cannot be read.*name a TOML file"):
         load_settings(tmp_path / "none.toml")
-
-
-@given(
-    angles=st.lists(st.floats(-1e3, 1e3), max_size=8),
-    numbers=st.lists(st.floats(allow_nan=False), max_size=4),
-    words=st.text(st.characters(exclude_categories=["Cs"]), max_size=12),
-    key=st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=6).filter(
-        lambda name: not name.endswith("_deg")
-    ),
-)
-def test_text_restores_every_bit(angles, numbers, words, key):
-    data = {
-        "turn": Angles(angles),
-        "rows": Angles([angles, angles]),
-        "numbers": numbers,
-        "inner": {key: words, "below": {"yes": True, "count": 3}},
-        "many": [{"angle": Angles(angle), "name": words} for angle in angles],
-    }
-    text = to_text(data, {"inner": "what it is"})
-    tomllib.loads(text)
-    back = from_text(text)
-    assert repr(back["turn"]) == repr(angles) and repr(back["rows"]) == repr([angles, angles])
-    assert repr(back["numbers"]) == repr(numbers)
-    assert back["inner"] == data["inner"]
-    assert [row["name"] for row in back["many"]] == [words] * len(angles)
 
 
 def test_motions_through_via_points_are_closed_by_default(cell):

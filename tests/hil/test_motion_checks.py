@@ -10,7 +10,7 @@ import pytest
 
 from hil.campaign.intervals import rest
 from hil.cell import AngleFrame, Cell, CellError
-from hil.cell.text import replaced_value
+from hil.cell.text import with_values
 from hil.design import preset, problem_of
 from hil.design.advice import NoExcitationError
 from hil.motion_checks import MotionChecks, always_so, collision_checker, violation_text
@@ -135,7 +135,7 @@ def test_a_missing_mesh_gets_file_mesh_and_remedy(tmp_path: Path) -> None:
     ]
     solid = "".join(f"{facet} endloop endfacet\n" for facet in facets)
     (folder / "a.stl").write_text(f"solid a\n{solid}endsolid a\n", "utf-8")
-    text = replaced_value(BARE_CELL, "cell", "mesh_folders", '["meshes"]')
+    text = with_values(BARE_CELL, {"cell.mesh_folders": ["meshes"]})
     path.write_text(text, "utf-8")
     found = Cell.load(path)
     assert ("a", "c") in collision_checker(found).pairs

@@ -350,7 +350,7 @@ def test_a_vertical_axis_in_slow_motion_has_no_constant(tmp_path: Path) -> None:
         archive_of_currents(tmp_path, name, replace(slow, torque=slow.torque + noise))
     status, text = run(tmp_path, "empty.mcap", *BOTH, "-q", command="gains")
     assert status == 5
-    assert "nan,  # shoulder_pan_joint: not determined; " in text
+    assert "nan, # shoulder_pan_joint: not determined; " in text
     assert "shoulder_lift_joint ±" in text
     pasted = tomllib.loads(text)["torque_constant"]
     assert len(pasted) == len(CONSTANTS)

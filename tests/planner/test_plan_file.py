@@ -1,10 +1,7 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from dataclasses import replace
-from datetime import UTC
-from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -15,7 +12,6 @@ from planner import InvalidSetting, JointLimits, plan, to_csv
 from planner.errors import InvalidPlanFile
 from planner.moves import Move, Overrides, plan_moves
 from planner.plan_file import PlanFile
-from planner.toml_text import degrees_text, from_text, radians_of, toml_key, toml_value
 from tests.motion_table import MotionTable
 from tests.planner.six_axes import SIX_AXES, random_points
 from tests.planner.test_moves import problems
@@ -39,29 +35,6 @@ def files(draw):
 def test_json_restores_every_bit(file):
     data = json.dumps(file.to_dict())  # distinguishes -0.0 from 0.0
     assert json.dumps(PlanFile.from_dict(json.loads(data)).to_dict()) == data
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("a = 1.0\na_deg = 2.0", "both 'a' and 'a_deg'"),
-        ("a_deg = [1.0, true]", "a_deg: True is not a number of degrees"),
-        ("a_deg = 1e9999999999999999999", "out of range"),
-        ("a = " + "[" * 5000 + "]" * 5000, "nested too deep"),
-    ],
-)
-def test_other_texts_are_no_degrees(text, words):
-    with pytest.raises(ValueError, match=words):
-        from_text(text)
-
-
-@given(st.floats(allow_nan=False, allow_infinity=False, min_value=-1e6, max_value=1e6))
-@settings(max_examples=1000)
-def test_degrees_restore_every_bit(angle):
-    text = degrees_text(angle)
-    back = radians_of(Decimal(text))
-    assert np.float64(back).tobytes() == np.float64(angle).tobytes()
-    assert isinstance(tomllib.loads(f"x = {text}")["x"], float)
 
 
 @pytest.fixture
@@ -243,30 +216,3 @@ class TestMotionAsCsv:
     def test_an_impossible_rate_or_duration_is_refused(self, points, rate, name):
         with pytest.raises(InvalidSetting, match=name):
             to_csv(plan(points, SIX_AXES), rate, self.JOINTS)
-
-
-texts = st.text(st.characters(codec="utf-8"))
-single = (
-    st.booleans()
-    | st.integers(-(2**63), 2**63 - 1)
-    | st.floats(allow_nan=False)
-    | texts
-    | st.dates()
-    | st.times()
-    | st.datetimes()
-    | st.datetimes(timezones=st.just(UTC))
-)
-values = st.recursive(
-    single, lambda inner: st.lists(inner) | st.dictionaries(texts, inner), max_leaves=12
-)
-
-
-@given(name=texts, value=values)
-def test_every_type_of_toml_is_restored(name: str, value: object) -> None:
-    assert tomllib.loads(f"{toml_key(name)} = {toml_value(value)}") == {name: value}
-
-
-@pytest.mark.parametrize("value", [None, object(), {"inner": [None]}])
-def test_a_value_without_a_type_in_toml_is_refused(value: object) -> None:
-    with pytest.raises(TypeError, match="TOML has no type for"):
-        toml_value(value)

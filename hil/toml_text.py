@@ -1,20 +1,21 @@
-"""TOML text from data and back, with angles in degrees that restore the same bits.
+"""TOML text of data, and data of such a text, with angles in degrees that restore the same bits.
 
-A field of `Angles` has a name that ends in `_deg` in the text. (The standard library reads TOML and
-does not write it.)
+A field of `Angles` has a name that ends in `_deg` in the text. tomlkit writes the text; the
+standard library, which only reads, reads it.
 """
 
 from __future__ import annotations
 
-import json
-import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import date, time
 from decimal import Context, Decimal, InvalidOperation, localcontext
 from math import degrees, pi
 from typing import Any
+
+import tomlkit
+from tomlkit.container import Container
+from tomlkit.items import AoT, Comment, Item, Table, Trivia
 
 _EXACT = Context(prec=60)
 _PI = Decimal("3.14159265358979323846264338327950288419716939937510")
@@ -30,12 +31,17 @@ class Angles:
     values: Any
 
 
-def to_text(data: Mapping[str, Any], comments: Mapping[str, str]) -> str:
+def to_text(data: Mapping[str, Any], comments: Mapping[str, str] | None = None) -> str:
     """Return tables, lists of tables, lists, numbers and texts as TOML; None is left out.
 
-    `comments` are lines before the table of each (dotted) name; "" for the first table.
+    `comments` are lines below the header of each (dotted) table; "" for the top of the text.
+
+    Raises:
+        TypeError: a value is of a type that TOML does not have.
     """
-    return "\n".join(_table("", data, comments))
+    document = tomlkit.document()
+    _fill(document, "", data, comments or {})
+    return tomlkit.dumps(document)
 
 
 def from_text(text: str) -> dict[str, Any]:
@@ -53,35 +59,58 @@ def from_text(text: str) -> dict[str, Any]:
         raise ValueError("a number is out of range") from error
 
 
-def _table(path: str, data: Mapping[str, Any], comments: Mapping[str, str]) -> list[str]:
-    """Return the blocks of a table: its fields, then the tables in it."""
-    own = {name: value for name, value in data.items() if not _is_table(value)}
-    head = "".join(f"# {line}\n" for line in comments.get(path, "").splitlines())
-    fields = "".join(_field(name, value) for name, value in own.items() if value is not None)
-    blocks = []
-    if fields or head or not data:
-        blocks.append(f"{head}[{path}]\n{fields}" if path else head + fields)
-    for name, value in data.items():
-        below = f"{path}.{toml_key(name)}" if path else toml_key(name)
+def inline(value: Any) -> Item:
+    """Return a value as TOML without header lines: a table is written between braces."""
+    if isinstance(value, Mapping):
+        table = tomlkit.inline_table()
+        table.update({name: inline(entry) for name, entry in value.items()})
+        return table
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        array = tomlkit.array()
+        array.extend(inline(entry) for entry in value)
+        return array
+    item: Item = tomlkit.item(value)
+    return item
+
+
+def comment_lines(text: str) -> list[Comment]:
+    """Return the lines of a text as comments."""
+    return [
+        Comment(Trivia(comment_ws="", comment=f"# {line}".rstrip())) for line in text.splitlines()
+    ]
+
+
+def _fill(
+    container: Container | Table, path: str, data: Mapping[str, Any], comments: Mapping[str, str]
+) -> None:
+    """Add comments and entries of a table, then the tables in it."""
+    for line in comment_lines(comments.get(path, "")):
+        container.add(line)
+    stated = {name: value for name, value in data.items() if value is not None}
+    tables = {name: value for name, value in stated.items() if _is_table(value)}
+    for name, value in stated.items():
+        if isinstance(value, Angles):
+            container.append(name + _SUFFIX, tomlkit.value(_degrees(value.values)))
+        elif name not in tables:
+            container.append(name, inline(value))
+    for name, value in tables.items():
+        below = f"{path}.{name}" if path else name
         if isinstance(value, Mapping):
-            blocks += _table(below, value, comments)
-        elif _is_table(value):
-            blocks += [
-                f"[[{below}]]\n{''.join(_field(*item) for item in row.items())}" for row in value
-            ]
-    return blocks
+            container.append(name, _table(below, value, comments))
+        else:
+            container.append(name, AoT([_table(below, row, {}) for row in value]))
+
+
+def _table(path: str, data: Mapping[str, Any], comments: Mapping[str, str]) -> Table:
+    table = tomlkit.table()
+    _fill(table, path, data, comments)
+    return table
 
 
 def _is_table(value: Any) -> bool:
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return len(value) > 0 and isinstance(value[0], Mapping)
+        return len(value) > 0 and all(isinstance(row, Mapping) for row in value)
     return isinstance(value, Mapping)
-
-
-def _field(name: str, value: Any) -> str:
-    if isinstance(value, Angles):
-        return f"{toml_key(name + _SUFFIX)} = {_degrees(value.values)}\n"
-    return f"{toml_key(name)} = {toml_value(value)}\n"
 
 
 def _degrees(values: Any) -> str:
@@ -95,47 +124,13 @@ def _read(value: Any) -> Any:
         return [_read(entry) for entry in value]
     if not isinstance(value, Mapping):
         return float(value) if isinstance(value, Decimal) else value
-    found: dict[str, Any] = {}
+    table: dict[str, Any] = {}
     for name, entry in value.items():
         stem = name.removesuffix(_SUFFIX)
         if stem != name and stem in value:
             raise ValueError(f"both {stem!r} and {name!r} are given")
-        found[stem] = _read(entry) if stem == name else _radians(name, entry)
-    return found
-
-
-def toml_key(name: str) -> str:
-    """Return a key, quoted if necessary."""
-    bare = name and all(c.isascii() and (c.isalnum() or c in "_-") for c in name)
-    return name if bare else toml_text(name)
-
-
-def toml_text(value: str) -> str:
-    """Return a quoted string."""
-    # As in JSON, but without surrogate pairs and with DEL escaped.
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def toml_value(value: Any) -> str:
-    """Return a number, string, boolean, date, time, list or (inline) table of these.
-
-    Raises:
-        TypeError: it is of another type.
-    """
-    if isinstance(value, float):
-        return repr(float(value)) if math.isfinite(value) else str(float(value))  # inf, -inf, nan
-    if isinstance(value, str):
-        return toml_text(value)
-    if isinstance(value, Mapping):
-        entries = (f"{toml_key(name)} = {toml_value(entry)}" for name, entry in value.items())
-        return f"{{ {', '.join(entries)} }}"
-    if isinstance(value, Sequence):
-        return f"[{', '.join(toml_value(entry) for entry in value)}]"
-    if isinstance(value, date | time):
-        return value.isoformat()
-    if isinstance(value, int):  # also bool
-        return json.dumps(value)
-    raise TypeError(f"TOML has no type for {value!r}")
+        table[stem] = _read(entry) if stem == name else _radians(name, entry)
+    return table
 
 
 def radians_of(angle: Decimal | int) -> float:
