@@ -1,8 +1,10 @@
 """Writer of MCAP files that adds whole batches of messages at a time.
 
-It writes the bytes of `mcap.writer.Writer`, and the records are the library's. The library adds
-messages singly, at some microseconds each, too slow for three messages a millisecond, and its level
-of compression is fixed; here a batch of messages of constant size is one structured array.
+It writes the bytes of `mcap.writer.Writer`, and the records are the library's. The library's writer
+is not used: it adds messages singly, six times the time of a cycle (`benchmarks.archive_writing`),
+its level of compression is fixed, and it accepts no chunk that is compressed already, which is how
+`hil.archive.repair` restores an archive to the byte. Here a batch of messages of constant size is
+one structured array.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ _COMMENTS: Final = {
     "cell": "Name of the cell, and digests of its parts.",
     "plan": "The motion: it is planned from these moves.",
     "sines": "The motion: offset + ramp x sum of amplitude x sin(frequency x t), rad/s.",
-    "seal": "Digest of the lines above, and positions of the motion at equal intervals.",
+    "seal": "Digest of the tables above, and positions of the motion at equal intervals.",
 }
 
 
