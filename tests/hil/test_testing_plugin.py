@@ -92,3 +92,16 @@ def test_another_arm_a_wrong_script_and_a_fault_that_is_none(tmp_path: Path) -> 
     assert "test_the_arm_comes_home FAILED" in done.stdout
     assert "test_mine.py::test_typo ERROR" in done.stdout
     assert "'earthquake' is none of lose" in done.stdout
+
+
+def test_a_project_that_does_not_use_it_pays_for_five_small_modules() -> None:
+    """Its own are those of the names of errors; all others are Python's."""
+    code = (
+        "import sys, pytest; before = set(sys.modules); import hil.testing.plugin;"
+        "print(*sorted(set(sys.modules) - before))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    modules = set(done.stdout.split())
+    ours = {name for name in modules if name.partition(".")[0] == "hil"}
+    assert ours == {"hil", "hil.errors", "hil.terminal_text", "hil.testing", "hil.testing.plugin"}
+    assert {name.partition(".")[0] for name in modules - ours} <= sys.stdlib_module_names
