@@ -78,25 +78,23 @@ def test_cell_from_an_invalid_archive_is_refused(
     assert raised.value.remedy
 
 
-@pytest.mark.parametrize(
-    ("written", "remedy"),
-    [
-        (
-            'controller = { transport = "simulated", cycle_ms = 2 }',
-            r"write \[controller\] on a line of its own",
-        ),
-        ("", r"controller\.cycle_ms: is missing; add it"),
-    ],
-)
-def test_cell_whose_link_cannot_be_changed_is_refused(
-    tmp_path: Path, written: str, remedy: str
-) -> None:
+def with_controller(folder: Path, written: str) -> Cell:
     begin, _, rest = CELL.partition("[controller]")
-    path = tmp_path / "cell.toml"
-    (tmp_path / "fast.urdf").write_text(CELLS_URDF)
+    path = folder / "cell.toml"
+    (folder / "fast.urdf").write_text(CELLS_URDF)
     path.write_text(f"{written}\n{begin}{rest[rest.index('[campaign]') :]}")
-    with pytest.raises(InputError, match=remedy):
-        Cell.load(path).with_link(transport="udp")
+    return Cell.load(path)
+
+
+def test_cell_without_the_cycle_of_its_link_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"controller\.cycle_ms: is missing; add it"):
+        with_controller(tmp_path, "").with_link(transport="udp")
+
+
+def test_cell_whose_link_is_an_inline_table_is_changed(tmp_path: Path) -> None:
+    cell = with_controller(tmp_path, 'controller = { transport = "simulated", cycle_ms = 2 }')
+    changed = cell.with_link(transport="udp", host="127.0.0.1", port=4000)
+    assert (changed.controller.transport, changed.controller.cycle_ms) == ("udp", 2)
 
 
 def log(path: Path, value: float = 0.0, kind: str = "f8", last: float = 6e-3) -> None:
