@@ -56,7 +56,7 @@ def test_the_citation_is_of_this_version_and_names_the_paper() -> None:
     assert paper["authors"][0]["family-names"] == "Villagrossi" and paper["year"] == 2014
 
 
-def test_ci_runs_the_script_of_the_repository_on_every_supported_python() -> None:
+def test_ci_runs_the_script_on_every_supported_python() -> None:
     (job,) = yaml.safe_load(text(".github/workflows/ci.yml"))["jobs"].values()
     assert job["strategy"]["matrix"]["python"] == ["3.11", "3.12", "3.13"]
     assert [step["run"] for step in job["steps"] if "run" in step] == [".ci/run"]

@@ -94,7 +94,7 @@ def test_another_arm_a_wrong_script_and_a_fault_that_is_none(tmp_path: Path) -> 
     assert "'earthquake' is none of lose" in done.stdout
 
 
-def test_a_project_that_does_not_use_it_pays_for_five_small_modules() -> None:
+def test_a_project_without_it_pays_for_five_small_modules() -> None:
     """Its own are those of the names of errors; all others are Python's."""
     code = (
         "import sys, pytest; before = set(sys.modules); import hil.testing.plugin;"
