@@ -516,10 +516,12 @@ def _require_torques(sources: Sources) -> None:
 def _require_slow_rows(stated: RobotModel, fitted: Sequence[Samples]) -> None:
     """Raise InputError if the fitted rows are too fast for a stated Stribeck term.
 
-    Its coefficient would be arbitrary. At twice its speed the term has fallen to 2 %.
+    Its coefficient would be arbitrary. At twice its speed the term has fallen to 2 %. A joint that
+    stands while another moves has none.
     """
+    sliding = [samples.moving() for samples in fitted]
     for joint, law in enumerate(stated.friction.laws):
-        speeds = [np.abs(one.motion.velocity[one.usable[:, joint], joint]) for one in fitted]
+        speeds = [np.abs(one.motion.velocity[one.usable[:, joint], joint]) for one in sliding]
         slow = np.concatenate(speeds) < 2.0 * (law.stribeck or math.inf)
         if slow.size and slow.mean() < 0.01:
             problem = (
