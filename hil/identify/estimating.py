@@ -171,11 +171,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
             result = result.with_scatter()
         precision = posterior.precision if name in _OF_PRIOR else None
         if variance:
-            products = np.asarray(sum(rate_products(model, samples) for samples in fitted))
-            pooled = with_uncertain_delay(
-                result.pooled, result.factor, products, variance, precision
-            )
-            result = replace(result, pooled=pooled)
+            result = _with_uncertain_delay(model, result, fitted, variance, precision)
         task.advance(1, "prior")
         if name in _OF_PRIOR:
             beside = replace(beside, estimate=result.pooled)
@@ -203,6 +199,18 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         stated=with_uncertain_scale(pooled, result.factor, precision, scale),
         notes=(f"the intervals of the parameters are computed {scale.message}",),
     )
+
+
+def _with_uncertain_delay(
+    model: RobotModel,
+    result: RepeatedEstimate,
+    fitted: Sequence[Samples],
+    variance: float,
+    precision: Array | None,
+) -> RepeatedEstimate:
+    products = np.asarray(sum(rate_products(model, samples) for samples in fitted))
+    pooled = with_uncertain_delay(result.pooled, result.factor, products, variance, precision)
+    return replace(result, pooled=pooled)
 
 
 def _require_usable_rows(prepared: Prepared) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
@@ -316,8 +316,8 @@ def _chosen(
     def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
         trial = replace(settings, preprocessing=how)
         return [
-            samples_of(source, cell, trial, model, kept)
-            for source, kept in zip(read, motions, strict=True)
+            samples_of(source, cell, trial, model, smoothed)
+            for source, smoothed in zip(read, motions, strict=True)
         ]
 
     def low_passes(model: RobotModel, how: Preprocessing) -> tuple[Preprocessing, ...]:
@@ -341,7 +341,19 @@ def _chosen(
             known_parameters(cell),
         )
         task.advance(1)
-    law, friction = best.model.friction.laws[0], dict(settings.friction)
+    return replace(
+        stated,
+        preprocessing=best.preprocessing,
+        friction=dict(settings.friction) | _friction_of(best, questions),
+        strength=best.strength,
+        choices=choices,
+    )
+
+
+def _friction_of(best: Candidate, questions: Collection[Question]) -> dict[str, Any]:
+    """Return the friction law that was chosen, as far as it was asked for."""
+    law = best.model.friction.laws[0]
+    friction: dict[str, Any] = {}
     if "presliding" in questions:
         friction |= {"presliding": law.presliding}
     if "friction" in questions:
@@ -352,13 +364,7 @@ def _chosen(
         }
     if "ripple" in questions and best.ripple:
         friction |= {"ripple": [*best.ripple]}
-    return replace(
-        stated,
-        preprocessing=best.preprocessing,
-        friction=friction,
-        strength=best.strength,
-        choices=choices,
-    )
+    return friction
 
 
 def _ripples(cell: Cell) -> list[list[TorqueRipple]]:

@@ -274,10 +274,7 @@ def prepare(
     recording.checked(model.joint_names)
     if recording.torque is None:
         raise RecordingError("the recording has no joint torque to fit")
-    motions = {} if motions is None else motions
-    if options.of_motion not in motions:
-        motions[options.of_motion] = smooth(recording, noise_variance, options)
-    motion, bandwidth = motions[options.of_motion]
+    motion, bandwidth = _smoothed(recording, noise_variance, options, motions)
     segments = tuple(recording.segments())
     torque, torque_bandwidth = recording.torque, None
     if options.torque_bandwidth is not None:
@@ -311,6 +308,19 @@ def prepare(
     if not model.has_load:
         return samples
     return replace(samples, torque=samples.torque - samples.known_torque(model))
+
+
+def _smoothed(
+    recording: Recording,
+    noise_variance: Array | None,
+    options: Preprocessing,
+    motions: dict[Preprocessing, Smoothed] | None,
+) -> Smoothed:
+    """Return the smoothed motion, by `motions` if it is there."""
+    motions = {} if motions is None else motions
+    if options.of_motion not in motions:
+        motions[options.of_motion] = smooth(recording, noise_variance, options)
+    return motions[options.of_motion]
 
 
 def _noise_bandwidth(
