@@ -290,7 +290,7 @@ def test_an_inertia_that_is_not_determined_is_not_typed_in(tmp_path: Path) -> No
     time = np.arange(0.0, 60.0, 2e-2)
     load = pin.Inertia(MASS, CENTRE, TENSOR)
     for seed, (name, body) in enumerate({"empty": None, "full": load}.items(), 1):
-        slow = simulate("ur5_robot.urdf", time, seed=seed, pace=0.1, load=body)
+        slow = simulate("ur5_robot.urdf", time, seed=seed, pace=0.03, load=body)
         noise = 0.1 * np.random.default_rng(seed).standard_normal(slow.torque.shape)  # N·m
         archived(tmp_path / f"{name}.mcap", replace(slow, torque=slow.torque + noise))
     status, text = run(tmp_path, "empty.mcap", "--loaded", "full.mcap", "--json")
@@ -345,7 +345,7 @@ def test_a_vertical_axis_in_slow_motion_has_no_constant(tmp_path: Path) -> None:
     time = np.arange(0.0, 150.0, 2e-2)
     load = pin.Inertia(MASS, np.array(CENTRE), np.zeros((3, 3)))
     for seed, (name, body) in enumerate({"empty": None, "full": load}.items()):
-        slow = simulate("ur5_robot.urdf", time, seed=seed, pace=0.1, load=body)
+        slow = simulate("ur5_robot.urdf", time, seed=seed, pace=0.03, load=body)
         noise = 0.1 * np.random.default_rng(seed).standard_normal(slow.torque.shape)  # N·m
         archive_of_currents(tmp_path, name, replace(slow, torque=slow.torque + noise))
     status, text = run(tmp_path, "empty.mcap", *BOTH, "-q", command="gains")
