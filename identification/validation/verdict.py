@@ -111,7 +111,10 @@ def _measure(names: Sequence[str], evidence: Evidence) -> str:
         f" axes, {error.relative[worst]:.1%} at worst ({names[worst]})"
     )
     if floor := evidence.floor:
-        text += f"; {error.overall / floor:.1f} times the noise floor of {floor:.1%}"
+        times = error.overall / floor
+        # The floor is an estimate, from the fast part of the residual.
+        ratio = f"{times:.1f} times the" if times >= 1.05 else "within the estimated"
+        text += f"; {ratio} noise floor of {floor:.1%}"
     return text
 
 
