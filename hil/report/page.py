@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from hil.report import figures
-from hil.report.figures import ReportSeries
+from hil.report.series import ReportSeries
 from hil.report.rendering import environment, page_bytes
 from hil.results import Results, outside_mark
 from identification.excitation import CRITERIA, METHODS
