@@ -7,8 +7,10 @@ from typing import Final
 import numpy as np
 
 from hil.report import figures
+from hil.report.drawing import chart_panel
+from hil.report.interactive import chart_data, library
+from hil.report.rendering import environment, page_bytes, template_text
 from hil.report.series import ReportSeries
-from hil.report.rendering import environment, page_bytes
 from hil.results import Results, outside_mark
 from identification.excitation import CRITERIA, METHODS
 from identification.selection.inner_prediction import Choice
@@ -33,6 +35,13 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
     """
     series = series.checked_for(len(results.joint_names))
     joints, runs = figures.joints_of(results), results.validation
+    charts = {
+        "torques": figures.torque_charts(series, joints),
+        "parts": figures.part_charts(series, joints),
+        "spectra": figures.spectrum_charts(series, joints),
+        "friction": figures.friction_charts(series, joints),
+        "excitation": figures.excitation_charts(series, joints),
+    }
     errors = np.array([[r.overall_relative_error, r.all_rows_relative_error] for r in runs])
     context = {
         "results": results,
@@ -50,13 +59,15 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
         "unseen": np.median(errors, axis=0).tolist() if runs else None,
         "worst": max(runs, key=lambda run: run.overall_relative_error) if runs else None,
         "every_row_errors": every_row_errors(results),
-        "excitation_panels": figures.excitation_panels(series, joints),
         "correlation": figures.correlation_matrix(results),
-        "torque_panels": figures.torque_panels(series, joints),
-        "friction_panels": figures.friction_panels(series, joints),
+        "legend": figures.LEGENDS,
+        "part_legends": figures.known_parts(series),
         **figures.residual_panels(results),
+        **{name: [chart_panel(chart) for chart in group] for name, group in charts.items()},
+        "chart_data": chart_data(charts, results.joint_names),
     }
-    return page_bytes(environment().get_template("report.html.j2").render(**context))
+    scripts = (*library(), template_text("charts.js"))
+    return page_bytes(environment(*scripts).get_template("report.html.j2").render(**context))
 
 
 def grouped_warnings(results: Results) -> dict[str, list[str]]:

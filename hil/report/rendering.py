@@ -6,6 +6,7 @@ import base64
 import hashlib
 import itertools
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -28,8 +29,11 @@ _STEERING: Final = re.compile(
 """Control characters, and those that change the text direction (Unicode Annex 9)."""
 
 
-def environment() -> Environment:
-    """Return the template environment, with the formats of :mod:`hil.report.numbers` as filters."""
+def environment(*scripts: str) -> Environment:
+    """Return the template environment, with the formats of :mod:`hil.report.numbers` as filters.
+
+    A page runs these scripts in their order, and then its own.
+    """
     # Autoescape always: names come from archives, which may be untrusted.
     found = Environment(
         loader=FileSystemLoader(_TEMPLATES),
@@ -39,8 +43,12 @@ def environment() -> Environment:
         lstrip_blocks=True,
         finalize=_shown,
     )
-    style, script = ((_TEMPLATES / name).read_text("utf-8") for name in (_STYLE, _SCRIPT))
-    found.globals |= {"style": Markup(style), "script": Markup(script), "policy": policy(script)}
+    every = [*scripts, template_text(_SCRIPT)]
+    found.globals |= {
+        "style": Markup(template_text(_STYLE)),
+        "scripts": [Markup(script) for script in every],
+        "policy": policy(every),
+    }
     # Figures and tables are numbered in the order of the page.
     figures, tables = itertools.count(1), itertools.count(1)
     numbering = {"figure": lambda: next(figures), "table": lambda: next(tables)}
@@ -57,11 +65,20 @@ def _shown(value: object) -> object:
     return _STEERING.sub(lambda found: escape(found[0]), value)
 
 
-def policy(script: str) -> str:
-    """Return the content security policy: no external resource, and this script only."""
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+def template_text(name: str) -> str:
+    """Return a style sheet or a script beside the templates."""
+    return (_TEMPLATES / name).read_text("utf-8")
+
+
+def policy(scripts: Iterable[str]) -> str:
+    """Return the content security policy: no external resource, and these scripts only."""
+    digests = (
+        base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+        for script in scripts
+    )
+    sources = " ".join(f"'sha256-{digest}'" for digest in digests)
     return (
-        f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; "
+        f"default-src 'none'; script-src {sources}; style-src 'unsafe-inline'; "
         "img-src data:; base-uri 'none'; form-action 'none'"
     )
 
