@@ -6,7 +6,7 @@
   var source = document.getElementById("chart-data");
   if (!source || !window.Bokeh || !window.Bokeh.Plotting) return;
   var data = JSON.parse(source.textContent);
-  var Bokeh = window.Bokeh, Models = Bokeh, Plotting = Bokeh.Plotting;
+  var Bokeh = window.Bokeh, Plotting = Bokeh.Plotting;
   Bokeh.set_log_level("error");
   var LOOSE = 1.0; /* A loose line adds at most the length of the range on each side. */
   var MARGIN = 0.05;
@@ -36,29 +36,45 @@
     this.views = [];
     this.drag = coarse ? null : "zoom";
     this.built = false;
+    this.roots = [];
+    this.holders = [];
   }
 
-  /* Time axes are linked over all groups; speeds and frequencies within their chart or group. */
-  var ranges = {};
-  function rangeOf(group, chart) {
-    var key = chart.foot.indexOf("time") === 0 ? (group.name === "excitation" ? "excitation" : "time")
-      : chart.log ? "frequency" : chart.key;
-    if (!ranges[key]) {
-      var range = new Models.Range1d({ start: chart.range[0], end: chart.range[1] });
-      ranges[key] = { range: range, views: [], first: chart.range.slice(), pending: false };
-      var shared = ranges[key];
-      var follow = function () {
-        if (shared.pending) return;
-        shared.pending = true;
-        window.requestAnimationFrame(function () {
-          shared.pending = false;
-          shared.views.forEach(fitHeight);
+  /* Axes of time are linked over all figures but the excitation's, those of frequency within one,
+     and those of speed within a chart. A document of Bokeh's has models of its own, so the axes
+     of two figures follow each other here. */
+  var axes = [];
+
+  function axisOf(group, chart) {
+    var link = chart.foot.indexOf("time") === 0 && group.name !== "excitation" ? "time" : group.name;
+    var key = group.name + (chart.plots[0].origin ? chart.key : "");
+    var axis = axes.find(function (other) { return other.key === key; });
+    if (axis) return axis;
+    var range = new Bokeh.Range1d({ start: chart.range[0], end: chart.range[1] });
+    axis = { key: key, link: link, range: range, views: [], first: chart.range.slice(), pending: false };
+    axis.cursor = new Bokeh.Span({ dimension: "height", line_width: 1, line_dash: [3, 3] });
+    axes.push(axis);
+    axes.forEach(function (other) {
+      if (other.link === link && link === "time") range.setv({ start: other.range.start, end: other.range.end });
+    });
+    var follow = function () {
+      if (axis.pending) return;
+      axis.pending = true;
+      window.requestAnimationFrame(function () {
+        axis.pending = false;
+        axis.views.forEach(fitHeight);
+        axes.forEach(function (other) {
+          if (other !== axis && link === "time" && other.link === link) moveTo(other, range.start, range.end);
         });
-      };
-      range.properties.start.change.connect(follow);
-      range.properties.end.change.connect(follow);
-    }
-    return ranges[key];
+      });
+    };
+    range.properties.start.change.connect(follow);
+    range.properties.end.change.connect(follow);
+    return axis;
+  }
+
+  function moveTo(axis, start, end) {
+    if (axis.range.start !== start || axis.range.end !== end) axis.range.setv({ start: start, end: end });
   }
 
   function whole(shared) {
@@ -115,14 +131,14 @@
       background_fill_color: colour("--paper"), border_fill_color: colour("--paper"),
       outline_line_color: null
     });
-    figure.xaxis.concat(figure.yaxis).forEach(function (axis) {
+    figure.axis.each(function (axis) {
       axis.setv({
         axis_line_color: muted, major_tick_line_color: muted, minor_tick_line_color: null,
         major_label_text_color: ink, axis_label_text_color: muted, axis_label_text_font_style: "normal",
         axis_label_text_font_size: "11px", major_label_text_font_size: "11px", axis_label_standoff: 4
       });
     });
-    figure.xgrid.concat(figure.ygrid).forEach(function (lines) { lines.grid_line_color = grid; });
+    figure.grid.each(function (lines) { lines.grid_line_color = grid; });
     view.lines.forEach(function (line) {
       var shade = colour(line.trace.colour), glyph = line.glyph.glyph;
       if (line.trace.dots) glyph.setv({ fill_color: shade, line_color: null });
@@ -134,10 +150,10 @@
   }
 
   function build(group, chart, place) {
-    var shared = rangeOf(group, chart), sharedX = decoded(chart.x);
+    var shared = axisOf(group, chart), sharedX = decoded(chart.x);
     chart.plots.forEach(function (plot, k) {
       var last = k === chart.plots.length - 1;
-      var y = new Models.Range1d({ start: plot.limits[0], end: plot.limits[1] });
+      var y = new Bokeh.Range1d({ start: plot.limits[0], end: plot.limits[1] });
       var figure = new Plotting.figure({
         x_range: shared.range, y_range: y, height: Math.round(plot.height * 1.25) + (last ? 52 : 26),
         sizing_mode: "stretch_width", tools: [], toolbar_location: null,
@@ -152,7 +168,7 @@
         figure: figure, plot: plot, chart: chart, shared: shared, y: y, limits: plot.limits,
         lines: [], strips: [], zeros: [], group: group, name: chart.key + "-" + k
       };
-      if (!last) figure.xaxis.forEach(function (axis) { axis.major_label_text_font_size = "0px"; axis.visible = false; });
+      if (!last) figure.xaxis.each(function (axis) { axis.visible = false; });
       if (plot.shaded.length) {
         view.strips.push(figure.vstrip({
           x0: plot.shaded.map(function (ends) { return ends[0]; }),
@@ -161,7 +177,7 @@
       }
       if (plot.origin) {
         ["width", "height"].forEach(function (dimension) {
-          var zero = new Models.Span({ location: 0, dimension: dimension, line_width: 1 });
+          var zero = new Bokeh.Span({ location: 0, dimension: dimension, line_width: 1 });
           figure.add_layout(zero);
           view.zeros.push(zero);
         });
@@ -169,7 +185,7 @@
       plot.traces.forEach(function (trace) {
         var x = trace.x ? decoded(trace.x) : sharedX, values = decoded(trace.y);
         if (chart.log) values = values.map(function (value) { return Math.pow(10, value); });
-        var columns = new Models.ColumnDataSource({ data: { x: x, y: values } });
+        var columns = new Bokeh.ColumnDataSource({ data: { x: x, y: values } });
         var settings = { source: columns, name: trace.name };
         var glyph;
         if (trace.dots) {
@@ -189,16 +205,14 @@
       var holder = document.createElement("div");
       holder.className = "plot-holder";
       place.appendChild(holder);
-      Plotting.show(figure, holder);
+      group.roots.push(figure);
+      group.holders.push(holder);
     });
   }
 
   /* One cursor of time in all charts that share it, and the values beside the pointer. */
   function addTools(view) {
     var shared = view.shared, unit = unitOf(view.plot.heading), figure = view.figure;
-    if (!shared.cursor) {
-      shared.cursor = new Models.Span({ dimension: "height", line_width: 1, line_dash: [3, 3] });
-    }
     view.cursor = shared.cursor;
     var axis = view.chart.foot.split(" [")[0], axisUnit = unitOf(view.chart.foot);
     var lines = view.lines.filter(function (line) { return !line.trace.dots; });
@@ -213,17 +227,17 @@
     });
     data.at = leader.y;
     var carrier = figure.line({ field: "x" }, { field: "at" }, {
-      source: new Models.ColumnDataSource({ data: data }), line_alpha: 0
+      source: new Bokeh.ColumnDataSource({ data: data }), line_alpha: 0
     });
     view.carrier = carrier;
-    view.hover = new Models.HoverTool({
+    view.hover = new Bokeh.HoverTool({
       renderers: [carrier], mode: "vline", tooltips: tips, line_policy: "nearest",
       point_policy: "follow_mouse", attachment: "horizontal"
     });
-    view.zoom = new Models.BoxZoomTool({ dimensions: view.chart.log || view.plot.origin ? "both" : "width" });
-    view.pan = new Models.PanTool({ dimensions: view.chart.log || view.plot.origin ? "both" : "width" });
-    var wheel = new Models.WheelZoomTool({ dimensions: "width", modifiers: { ctrl: true }, zoom_on_axis: false });
-    var crosshair = new Models.CrosshairTool({ overlay: [shared.cursor, null] });
+    view.zoom = new Bokeh.BoxZoomTool({ dimensions: view.chart.log || view.plot.origin ? "both" : "width" });
+    view.pan = new Bokeh.PanTool({ dimensions: view.chart.log || view.plot.origin ? "both" : "width" });
+    var wheel = new Bokeh.WheelZoomTool({ dimensions: "width", modifiers: { ctrl: true }, zoom_on_axis: false });
+    var crosshair = new Bokeh.CrosshairTool({ overlay: shared.cursor, dimensions: "height" });
     figure.add_tools(view.hover, view.zoom, view.pan, wheel, crosshair);
     figure.toolbar.active_scroll = wheel;
     setDrag(view, view.group.drag);
@@ -264,7 +278,7 @@
     });
     bar.appendChild(button("Whole range", null, function () {
       group.views.forEach(function (view) {
-        view.shared.range.setv({ start: view.shared.first[0], end: view.shared.first[1] });
+        moveTo(view.shared, view.shared.first[0], view.shared.first[1]);
         fitHeight(view);
       });
     }));
@@ -327,13 +341,15 @@
       place.setAttribute("role", "group");
       place.setAttribute("aria-label", chart.label);
       panel.appendChild(place);
-      try {
-        build(group, chart, place);
+      build(group, chart, place);
+    });
+    var page = new Bokeh.Document();
+    group.roots.forEach(function (root) { page.add_root(root); });
+    Bokeh.embed.add_document_standalone(page, group.figure, group.holders).then(function () {
+      group.figure.querySelectorAll(".panel:has(.live)").forEach(function (panel) {
         panel.classList.add("interactive");
-      } catch (error) {
-        place.remove();
-        console.error(error);
-      }
+      });
+      group.ready = true;
     });
   }
 
@@ -358,5 +374,5 @@
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", function () {
     groups.forEach(function (group) { group.views.forEach(style); });
   });
-  window.hilCharts = { groups: groups, ranges: ranges };
+  window.hilCharts = groups;
 })();
