@@ -51,6 +51,7 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
         "has_ids": any(p.table2_id is not None for p in results.parameters),
         "has_prior": any(p.data_share is not None for p in results.parameters),
         "warnings": grouped_warnings(results),
+        "ranked": [words for group in grouped_warnings(results).values() for words in group],
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
         "by_name": {parameter.name: parameter for parameter in results.parameters},
         "outside_mark": outside_mark,
@@ -73,8 +74,10 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
 def grouped_warnings(results: Results) -> dict[str, list[str]]:
     """Return the warnings of the verdict by what they are about, the most consequential first."""
     checks = {finding.words: finding.check for finding in results.judgement.findings}
+    ranks = {finding.words: k for k, finding in enumerate(results.judgement.worst_first)}
     groups: dict[str, list[str]] = {title: [] for title in (_OF_MODEL, _OF_RECORDING)}
-    for warning in results.verdict.warnings:
+    # Those that no check found are remarks about the sources, and last.
+    for warning in sorted(results.verdict.warnings, key=lambda words: ranks.get(words, len(ranks))):
         title = _OF_RECORDING if checks.get(warning) in _RECORDING_CHECKS else _OF_MODEL
         groups[title].append(warning)
     return groups if results.verdict.warnings else {}
