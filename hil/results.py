@@ -122,7 +122,8 @@ class JudgementResult(Frozen):
     @property
     def worst_first(self) -> list[Finding]:
         """Findings in descending order of severity: causes, then symptoms, then conditions."""
-        levels, roles = ("wrong", "doubtful", "information", "good"), ("cause", "symptom", "condition")
+        levels = ("wrong", "doubtful", "information", "good")
+        roles = ("cause", "symptom", "condition")
 
         def rank(finding: Finding) -> tuple[int, int]:
             return levels.index(finding.level), roles.index(finding.role)

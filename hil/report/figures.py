@@ -86,9 +86,9 @@ class Legend(NamedTuple):
 
 
 MEASURED = Legend("measured", "measured", "--wide", 4.0)
-PREDICTED = Legend("predicted", "predicted by the identified model", "--ink", 1.1)
-NOMINAL = Legend("nominal", "predicted by the nominal model", "--muted", 1.0, dashed=True)
-RESIDUAL = Legend("residual", "measured − predicted, identified", "--second", 0.9)
+PREDICTED = Legend("predicted", "identified model", "--ink", 1.1)
+NOMINAL = Legend("nominal", "nominal model", "--muted", 1.0, dashed=True)
+RESIDUAL = Legend("residual", "error of the identified model", "--second", 0.9)
 NOMINAL_RESIDUAL = NOMINAL._replace(key="nominal residual", width=0.8)
 POSITION = Legend("position", "position", "--first", 1.5)
 VELOCITY = Legend("velocity", "velocity", "--second", 1.5)
