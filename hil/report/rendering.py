@@ -5,14 +5,24 @@ from __future__ import annotations
 import base64
 import hashlib
 import itertools
+import os
 import re
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+import jinja2
+from jinja2 import (
+    BytecodeCache,
+    Environment,
+    FileSystemBytecodeCache,
+    FileSystemLoader,
+    StrictUndefined,
+)
 from markupsafe import Markup
 
+from hil.files import digest, user_cache
 from hil.report import numbers
 from hil.terminal_text import escape
 
@@ -21,7 +31,7 @@ _STYLE: Final = "report.css"
 _SCRIPT: Final = "page.js"
 _FORMATS: Final = (
     *("significant", "fixed", "beside", "percent", "with_std"),
-    *("unit_text", "capitalised"),
+    *("unit_text", "capitalised", "moments"),
 )
 _STEERING: Final = re.compile(
     r"[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]"
@@ -42,6 +52,7 @@ def environment(*scripts: str) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
         finalize=_shown,
+        bytecode_cache=_compiled_templates(),
     )
     every = [*scripts, template_text(_SCRIPT)]
     found.globals |= {
@@ -56,6 +67,23 @@ def environment(*scripts: str) -> Environment:
     for name in _FORMATS:
         found.filters[name] = getattr(numbers, name)
     return found
+
+
+def _compiled_templates() -> BytecodeCache | None:
+    """Return the cache of compiled templates, whose compilation takes longer than a page.
+
+    None if the user's cache folder cannot be written.
+    """
+    # Of this version of jinja2 and of these settings; jinja2 checks the text of each template.
+    key = digest(f"{jinja2.__version__} {sys.version} {Path(__file__).read_text('utf-8')}")
+    folder = user_cache() / f"templates-{key[:16]}"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if folder.stat().st_uid != os.getuid() or not os.access(folder, os.W_OK | os.X_OK):
+            return None
+    except (OSError, RuntimeError):  # no home
+        return None
+    return FileSystemBytecodeCache(str(folder))
 
 
 def _shown(value: object) -> object:
