@@ -221,14 +221,18 @@ def _path(kind: str, x: Array, y: Array, style: str) -> str:
         )
         return f'<path d="{d}" style="{style}"/>'
     there = np.isfinite(x) & np.isfinite(y)
-    points = list(map("{:.1f} {:.1f}".format, x[there].tolist(), y[there].tolist()))
+    places = np.round(np.stack([x, y], axis=1)[there], 1)
     if kind == "dots":
-        d = "".join(f"M{point}h0" for point in points)
+        d = "".join(f"M{across} {up}h0" for across, up in places.tolist())
     else:
-        # A line starts anew behind a gap.
+        # A line starts again behind a gap; its points need no letter.
         starts = there & np.concatenate([[True], ~there])[:-1]
-        first = starts[there].tolist()
-        d = "".join(("M" if start else "L") + p for start, p in zip(first, points, strict=True))
+        lines = np.split(places, np.flatnonzero(starts[there])[1:]) if len(places) else []
+        d = "".join(
+            f"M{line[0, 0]} {line[0, 1]}"
+            + (f"L{' '.join(map(str, line[1:].ravel().tolist()))}" if len(line) > 1 else "h0")
+            for line in lines
+        )
     return f'<path d="{d}" style="{style}"/>'
 
 

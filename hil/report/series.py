@@ -115,10 +115,11 @@ def with_torques(
     """
     shown = _rows_between(series, samples)
     time = samples.motion.time
+    parts = torque_parts(model, values, samples)
     torques = {
         "example_measured": samples.torque,
-        "example_predicted": samples.predicted_torque(model, values),
-        **{f"example_{name}": part for name, part in torque_parts(model, values, samples).items()},
+        "example_predicted": sum(parts.values(), np.zeros_like(samples.torque)),
+        **{f"example_{name}": part for name, part in parts.items()},
     }
     if nominal is not None:
         torques["example_nominal"] = samples.predicted_torque(model, nominal)
