@@ -175,7 +175,7 @@ def part_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart]:
         sizes = [float(np.sqrt(np.mean(values[:, j] ** 2))) for _, values in known]
         largest = known[int(np.argmax(sizes))][0]
         note = f"largest: {largest.key}, RMS {significant(max(sizes))} {unit}"
-        caption = Caption(f"p{j}", name, note, "predicted torque by part over time")
+        caption = Caption(f"d{j}", name, note, "predicted torque by part over time")
         plot = Plot(176.0, f"torque [{unit}]", traces)
         charts.append(Chart(caption, time, [plot], joint=j))
     return charts

@@ -18,6 +18,10 @@ from identification.selection.inner_prediction import Choice
 _MOST_CANDIDATES: Final = 6
 """Candidates shown of one choice: the first, and the best of the others."""
 
+_BINS: Final = 2000
+"""Intervals of all drawn lines of one kind, with two points in each; a page has at most 3 MB."""
+_FEWEST_BINS, _MOST_BINS = 80, 300  # of one line
+
 _OF_MODEL: Final = "About the model and its prediction"
 _OF_RECORDING: Final = "About the recording"
 _RECORDING_CHECKS: Final = frozenset(
@@ -35,6 +39,7 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
     """
     series = series.checked_for(len(results.joint_names))
     joints, runs = figures.joints_of(results), results.validation
+    bins = min(_MOST_BINS, max(_FEWEST_BINS, _BINS // len(joints)))
     charts = {
         "torques": figures.torque_charts(series, joints),
         "parts": figures.part_charts(series, joints),
@@ -64,7 +69,7 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
         "legend": figures.LEGENDS,
         "part_legends": figures.known_parts(series),
         **figures.residual_panels(results),
-        **{name: [chart_panel(chart) for chart in group] for name, group in charts.items()},
+        **{name: [chart_panel(chart, bins) for chart in group] for name, group in charts.items()},
         "chart_data": chart_data(charts, results.joint_names),
     }
     scripts = (*library(), template_text("charts.js"))

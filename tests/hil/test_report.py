@@ -31,6 +31,7 @@ from hil.report import (
     report_bytes,
 )
 from hil.report.drawing import chart_panel, round_ticks, single, thinned
+from hil.report.interactive import chart_data, encoded
 from hil.report.rendering import environment
 from hil.results import Results
 from identification.excitation import CRITERIA, METHODS
@@ -237,16 +238,18 @@ def assert_stands_alone(html):
     assert all(a in ({}, {"type": "application/json", "id": "chart-data"}) for a in attributes)
     links = [a[key] for _, a in page.tags for key in a if key in {"src", "href", "xlink:href"}]
     assert all((link or "").startswith(("#", "data:image/png;base64,")) for link in links)
+    scripts = re.findall(r"<script>(.*?)</script>", html, re.S)
+    ours = [script for script in scripts if "Bokeh Contributors" not in script]
+    for library in set(scripts) - set(ours):
+        html = html.replace(library, "")
     assert "@import" not in html
     assert all(target.startswith("#") for target in re.findall(r"url\(([^)]*)\)", html))
-    scripts = re.findall(r"<script>(.*?)</script>", html, re.S)
     policy = next(a["content"] or "" for t, a in page.tags if t == "meta" and "http-equiv" in a)
     digests = [base64.b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts]
     allowed = " ".join(f"'sha256-{digest}'" for digest in digests)
     assert policy.startswith("default-src 'none'") and f"script-src {allowed};" in policy
     assert "unsafe" not in policy.split("script-src")[1].split(";")[0]
     calls = r"eval\(|innerHTML|insertAdjacentHTML|https?:(?!//www\.w3\.org/2000/svg)"
-    ours = [script for script in scripts if "Bokeh Contributors" not in script]
     assert ours and not any(re.findall(calls, script) for script in ours)
     ids = [a["id"] for _, a in page.tags if "id" in a]
     assert len(ids) == len(set(ids))
@@ -299,6 +302,38 @@ def render(results, series=None):
     return report_bytes(results, series or make_series(samples=200)).decode()
 
 
+PARTS = ("inertia", "coriolis", "gravity", "friction", "elements")
+
+
+def rendered_of(results, series):
+    return report_bytes(results, series).decode()
+
+
+def legends_of(html):
+    return " ".join(re.findall(r'<ul class="legend">.*?</ul>', html, re.S))
+
+
+def torque_chart(series, results):
+    return figures.torque_charts(series, figures.joints_of(results))[0]
+
+
+def with_joints(results, n):
+    """The same results of an arm of n joints."""
+
+    def widened(value):
+        six = isinstance(value, list) and len(value) == N
+        return [value[k % N] for k in range(n)] if six else value
+
+    def section(part):
+        return {key: widened(value) for key, value in part.items()}
+
+    whole = section(results.model_dump())
+    whole["fitted"] = section(whole["fitted"])
+    whole["judgement"] = section(whole["judgement"])
+    whole["validation"] = [section(run) for run in whole["validation"]]
+    return Results.model_validate(whole)
+
+
 def rendered(results):
     return Page(render(results))
 
@@ -323,8 +358,8 @@ class TestPage:
     def test_has_the_verdict_first_and_details_folded(self, html):
         order = ["predicts unseen motion to 1.5 % of the torque", "SIMULATED", 'id="torque"',
                  'id="friction"', 'id="parameters"', 'id="judgement"',
-                 "Torque error over all joints", 'id="trust"', '<details id="appendix">', 'id="run"',
-                 'id="excitation"', 'id="estimation"', 'id="correlation"']  # fmt: skip
+                 "Torque error over all joints", 'id="trust"', '<details id="appendix">',
+                 'id="run"', 'id="excitation"', 'id="estimation"', 'id="correlation"']  # fmt: skip
         places = [html.index(mark) for mark in order]
         assert places == sorted(places)
         assert places[0] < html.index("Figure 1")
@@ -446,9 +481,38 @@ class TestPage:
         html = render(make_results(judgement=judgement, verdict=verdict))
         section = html[html.index('<section class="warnings"') :].split("</section>")[0]
         assert Page(section).text == (
-            "2 warnings About the model and its prediction friction drifts"
-            " About the recording few digits"
+            "2 warnings Ranked within each group: what explains an error of the model, then what"
+            " the error is, then conditions of the test. About the model and its prediction friction"
+            " drifts About the recording few digits"
         )
+
+    def test_ranks_warnings_causes_first_and_names_the_first_beside_the_verdict(self):
+        roles = {"few runs": "condition", "wrist off": "symptom", "negated": "cause"}
+        findings = [
+            {"check": "x", "level": "doubtful", "words": words, "role": role}
+            for words, role in roles.items()
+        ]
+        warnings = ["a note on the source", *roles]
+        verdict = {"good": True, "line": "Good.", "reasons": [], "warnings": warnings}
+        judgement = _judgement() | {"findings": findings}
+        page = render(make_results(judgement=judgement, verdict=verdict))
+        section = page[page.index('<section class="warnings"') :].split("</section>")[0]
+        assert re.findall(r"<li>(.*)</li>", section) == [*reversed(roles), "a note on the source"]
+        assert "4 warnings , by rank . First: negated." in Page(page).text
+
+    def test_explains_a_noise_floor_where_the_verdict_has_one(self):
+        line = "The model predicts well: 1.2% over all axes; 0.9 times the noise floor of 1.3%."
+        verdict = {"good": True, "line": line, "reasons": [], "warnings": []}
+        text = rendered(make_results(verdict=verdict)).text
+        assert "The noise floor is an estimate" in text
+        assert "noise floor" not in rendered(make_results()).text
+
+    def test_has_dates_to_the_minute_and_who_did_it(self):
+        occasion = {"recorded_from": "2026-11-02T08:15:30+00:00", "operator": "ada",
+                    "notes": "wet", "identified_at": "2026-11-26T12:30:04.25Z", "serial_number": "4711"}  # fmt: skip
+        text = rendered(make_results(occasion=occasion)).text
+        for words in ("2026-11-02 08:15 UTC", "2026-11-26 12:30 UTC", "ada", "4711", "wet"):
+            assert words in text
 
     def test_shows_steps_of_the_campaign_if_known(self, whole):
         for words in ("Execution", "6 of 6 criteria passed", "Accepted by ada", "2 late"):
@@ -531,6 +595,22 @@ class TestParameters:
         without = rendered(make_results()).text
         assert "Essential parameters" not in without and "Physical consistency" not in without
 
+    def test_essential_ones_beyond_two_sigma_say_whether_the_selection_moved_them(self):
+        parameters = [p.model_dump() for p in make_results().parameters]
+        estimates = {"selected": (1.05, 2.0), "off": (1.5, 2.0), "right": (1.0, 1.05)}
+        rows = []
+        for parameter, (name, (full, essential)) in zip(
+            parameters, estimates.items(), strict=False
+        ):
+            parameter |= {"name": name, "truth": 1.0, "std": 0.1, "estimate": full}
+            rows.append({"name": name, "unit": "kg m", "estimate": essential, "std": 0.1})
+        essential = ESSENTIAL | {"parameters": rows, "refused": []}
+        html = render(make_results(parameters=parameters, essential=essential))
+        table = Page(html[html.index('<section id="trust">') :]).table("With all parameters")
+        remarks = [row["Remark"].replace("\xa0", " ") for row in table]
+        assert remarks == ["beyond 3σ by the selection", "beyond 3σ, with all parameters, too", ""]
+        assert "has gone into the others" in Page(html).text
+
 
 class TestFigures:
     """A panel for each joint; rows that do not count are shaded."""
@@ -547,7 +627,42 @@ class TestFigures:
         ):
             panels = [chart_panel(chart) for chart in panels]
             assert [one.title for one in panels] == expected
-            assert all(one.svg.count("<path") > 4 for one in panels)
+            assert all(one.svg.count("<path") >= 4 for one in panels)
+            assert [one.joint for one in panels] == [JOINTS.index(name) for name in expected]
+
+    def test_show_the_nominal_model_where_it_is_known(self, results):
+        series = make_series(samples=200)
+        names = [[t.name for t in p.traces] for p in torque_chart(series, results).plots]
+        assert names == [["measured", "nominal", "predicted"], ["nominal residual", "residual"]]
+        without = replace(series, example_nominal=None)
+        names = [[t.name for t in p.traces] for p in torque_chart(without, results).plots]
+        assert names == [["measured", "predicted"], ["residual"]]
+        assert "nominal model" in legends_of(rendered_of(results, series))
+        assert "nominal model" not in legends_of(rendered_of(results, without))
+
+    def test_a_poor_nominal_model_leaves_the_plot_of_a_good_one_readable(self, results):
+        series = make_series(samples=200)
+        poor = replace(series, example_nominal=1e4 * series.example_predicted)
+        for good, other in zip(
+            torque_chart(replace(series, example_nominal=None), results).plots,
+            torque_chart(poor, results).plots,
+            strict=True,
+        ):
+            span = good.y_limits[1] - good.y_limits[0]
+            assert other.y_limits[1] - other.y_limits[0] <= 3.0001 * span
+
+    def test_of_a_file_of_an_earlier_version_have_no_tabs(self, results):
+        arrays = make_series(samples=200).arrays | {"example_archive": "v.mcap"}
+        needed = {k: v for k, v in arrays.items() if k[:8] != "spectrum" and k[8:] not in PARTS}
+        series = ReportSeries.from_arrays(needed)
+        page = Page(rendered_of(results, series))
+        assert "Spectrum of the error" not in page.text and "Torque by part" not in page.text
+        with pytest.raises(KeyError, match="law_speed"):
+            ReportSeries.from_arrays({k: v for k, v in needed.items() if k != "law_speed"})
+
+    def test_are_small_enough_for_one_file_of_fifteen_joints(self):
+        results, series = with_joints(make_results(), 15), make_series(samples=20_000, joints=15)
+        assert len(report_bytes(results, series)) < 3_000_000
 
     def test_shade_rows_to_midway_to_the_next(self):
         used = np.array([[0.0], [1.0], [1.0], [0.0], [1.0]])
@@ -567,6 +682,26 @@ class TestFigures:
             replace(make_series(), **{field: values})
         with pytest.raises(SeriesError):
             render(make_results(), make_series(joints=5))
+
+    @given(
+        st.lists(
+            st.one_of(st.floats(-1e6, 1e6), st.just(math.nan)), min_size=1, max_size=300
+        ).filter(lambda values: not np.all(np.isnan(values)))
+    )
+    def test_values_for_the_script_are_exact_to_a_65534th_of_their_range(self, values):
+        code = encoded(np.array(values))
+        numbers = np.frombuffer(base64.b64decode(code["codes"]), "<i2").astype(float)
+        read = np.where(numbers == -32768, np.nan, code["middle"] + code["step"] * numbers)
+        span = np.nanmax(values) - np.nanmin(values)
+        np.testing.assert_allclose(read, values, rtol=1e-12, atol=span / 65534 + 1e-300)
+
+    def test_for_the_script_have_the_peaks_of_a_long_recording(self, results):
+        series = make_series(samples=60_000)
+        series.example_measured[777, 0] = 1e4
+        data = json.loads(chart_data({"torques": [torque_chart(series, results)]}, JOINTS))
+        trace = data["groups"]["torques"][0]["plots"][0]["traces"][0]
+        assert trace["y"]["middle"] + 32767 * trace["y"]["step"] == pytest.approx(1e4)
+        assert len(trace["y"]["codes"]) < 12_000
 
     @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=3000), st.integers(1, 200))
     def test_thinning_leaves_order_ends_and_every_peak(self, values, bins):
@@ -617,5 +752,8 @@ class TestDrawing:
         assert re.fullmatch(r"M[\d.]+ [\d.]+h0", dot)
 
     def test_of_a_report_loads_no_plotting_library(self):
-        code = "import sys, hil.report, hil.outcome; sys.exit('matplotlib' in sys.modules)"
+        code = (
+            "import sys, hil.report.interactive as i, hil.outcome; i.library();"
+            " sys.exit(bool({'matplotlib', 'bokeh'} & {*sys.modules}))"
+        )
         assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
