@@ -108,7 +108,8 @@ def rewrite_report(folder: Path) -> Results:
 def _series_bytes(series: ReportSeries) -> bytes:
     """Return the series of the figures as a `.npz` file."""
     content = BytesIO()
-    np.savez_compressed(content, example_archive=series.example_archive, **series.arrays)
+    arrays: dict[str, Any] = {"example_archive": series.example_archive, **series.arrays}
+    np.savez_compressed(content, **arrays)
     return content.getvalue()
 
 

@@ -32,9 +32,13 @@ _UNKNOWN: Final = -32768
 
 @cache
 def library() -> tuple[Markup, ...]:
-    """Return the scripts of BokehJS from the installed package, which is not imported."""
+    """Return the scripts of BokehJS from the installed package, which is not imported.
+
+    Empty without the package: the drawings of a page need no script.
+    """
     spec = find_spec("bokeh")
-    assert spec is not None and spec.submodule_search_locations
+    if spec is None or not spec.submodule_search_locations:
+        return ()
     folder = Path(spec.submodule_search_locations[0]) / "server" / "static" / "js"
     # Nothing in a page may refer to a map that is not there.
     texts = (

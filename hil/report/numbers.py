@@ -72,6 +72,11 @@ def unit_text(unit: str) -> str:
     return unit.replace(" ", "·")
 
 
+def prose(text: str) -> str:
+    """Separate the per cent signs of a message from their numbers, as in the tables of a page."""
+    return re.sub(r"(?<=\d)%", "\u00a0%", text)
+
+
 def moments(text: str) -> str:
     """Write times of ISO 8601 in a text to the minute: 2026-11-26 12:30 UTC."""
 

@@ -31,7 +31,7 @@ _STYLE: Final = "report.css"
 _SCRIPT: Final = "page.js"
 _FORMATS: Final = (
     *("significant", "fixed", "beside", "percent", "with_std"),
-    *("unit_text", "capitalised", "moments"),
+    *("unit_text", "capitalised", "moments", "prose"),
 )
 _STEERING: Final = re.compile(
     r"[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]"

@@ -124,7 +124,9 @@ def with_torques(
     if nominal is not None:
         torques["example_nominal"] = samples.predicted_torque(model, nominal)
     columns = for_figure(time, np.hstack([*torques.values()]))[shown]
-    low_passed = dict(zip(torques, np.split(columns, len(torques), axis=1), strict=True))
+    low_passed: dict[str, Any] = dict(
+        zip(torques, np.split(columns, len(torques), axis=1), strict=True)
+    )
     error = samples.torque - torques["example_predicted"]
     return replace(
         series,
@@ -185,7 +187,7 @@ def _rows_between(series: ReportSeries, samples: Samples) -> slice:
     return slice(first, last, step)
 
 
-def _spectra(samples: Samples, error: Array) -> dict[str, Array]:
+def _spectra(samples: Samples, error: Array) -> dict[str, Any]:
     """Return the spectra of the longest stretch without a gap; none of less than 16 rows."""
     part = max(samples.segments, key=lambda one: one.stop - one.start, default=slice(0, 0))
     rows = part.stop - part.start

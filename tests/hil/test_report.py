@@ -482,11 +482,11 @@ class TestPage:
         section = html[html.index('<section class="warnings"') :].split("</section>")[0]
         assert Page(section).text == (
             "2 warnings Ranked within each group: what explains an error of the model, then what"
-            " the error is, then conditions of the test. About the model and its prediction friction"
-            " drifts About the recording few digits"
+            " the error is, then conditions of the test. About the model and its prediction"
+            " friction drifts About the recording few digits"
         )
 
-    def test_ranks_warnings_causes_first_and_names_the_first_beside_the_verdict(self):
+    def test_ranks_warnings_and_names_the_first_beside_the_verdict(self):
         roles = {"few runs": "condition", "wrist off": "symptom", "negated": "cause"}
         findings = [
             {"check": "x", "level": "doubtful", "words": words, "role": role}
@@ -507,9 +507,19 @@ class TestPage:
         assert "The noise floor is an estimate" in text
         assert "noise floor" not in rendered(make_results()).text
 
+    def test_writes_shares_of_messages_as_those_of_tables(self):
+        verdict = {"good": False, "line": "off by 2.1% of 5%.", "reasons": ["a 3%"], "warnings": []}
+        text = rendered(make_results(verdict=verdict)).text.replace("\xa0", " ")
+        assert "off by 2.1 % of 5 %." in text and "a 3 %" in text
+
     def test_has_dates_to_the_minute_and_who_did_it(self):
-        occasion = {"recorded_from": "2026-11-02T08:15:30+00:00", "operator": "ada",
-                    "notes": "wet", "identified_at": "2026-11-26T12:30:04.25Z", "serial_number": "4711"}  # fmt: skip
+        occasion = {
+            "recorded_from": "2026-11-02T08:15:30+00:00",
+            "identified_at": "2026-11-26T12:30:04.25Z",
+            "operator": "ada",
+            "serial_number": "4711",
+            "notes": "wet",
+        }
         text = rendered(make_results(occasion=occasion)).text
         for words in ("2026-11-02 08:15 UTC", "2026-11-26 12:30 UTC", "ada", "4711", "wet"):
             assert words in text
@@ -517,7 +527,7 @@ class TestPage:
     def test_shows_steps_of_the_campaign_if_known(self, whole):
         for words in ("Execution", "6 of 6 criteria passed", "Accepted by ada", "2 late"):
             assert words in whole.text
-        assert "▲ Not warm" in whole.text and "still 1.3%" in whole.text
+        assert "▲ Not warm" in whole.text and "still 1.3 %" in whole.text
         assert "Execution" not in rendered(make_results()).text
 
 
@@ -595,7 +605,7 @@ class TestParameters:
         without = rendered(make_results()).text
         assert "Essential parameters" not in without and "Physical consistency" not in without
 
-    def test_essential_ones_beyond_two_sigma_say_whether_the_selection_moved_them(self):
+    def test_essential_ones_say_whether_the_selection_moved_them(self):
         parameters = [p.model_dump() for p in make_results().parameters]
         estimates = {"selected": (1.05, 2.0), "off": (1.5, 2.0), "right": (1.0, 1.05)}
         rows = []
@@ -640,7 +650,7 @@ class TestFigures:
         assert "nominal model" in legends_of(rendered_of(results, series))
         assert "nominal model" not in legends_of(rendered_of(results, without))
 
-    def test_a_poor_nominal_model_leaves_the_plot_of_a_good_one_readable(self, results):
+    def test_a_poor_nominal_model_leaves_the_plot_readable(self, results):
         series = make_series(samples=200)
         poor = replace(series, example_nominal=1e4 * series.example_predicted)
         for good, other in zip(
@@ -688,7 +698,7 @@ class TestFigures:
             st.one_of(st.floats(-1e6, 1e6), st.just(math.nan)), min_size=1, max_size=300
         ).filter(lambda values: not np.all(np.isnan(values)))
     )
-    def test_values_for_the_script_are_exact_to_a_65534th_of_their_range(self, values):
+    def test_values_for_the_script_are_exact_to_a_65534th(self, values):
         code = encoded(np.array(values))
         numbers = np.frombuffer(base64.b64decode(code["codes"]), "<i2").astype(float)
         read = np.where(numbers == -32768, np.nan, code["middle"] + code["step"] * numbers)

@@ -143,8 +143,7 @@ class TestCharts:
         page.locator('[data-chart="t1"] .plot-holder').first.hover()
         tooltip = page.locator(".bk-Tooltip").first
         tooltip.wait_for(timeout=5000)
-        text = tooltip.inner_text()
-        print(text)
+        text = tooltip.evaluate("tooltip => tooltip.shadowRoot.textContent")
         assert all(word in text for word in ("time", "measured", "nominal", "predicted", "N·m"))
 
     def test_hide_joints_and_lines(self, opened):
