@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -11,7 +13,7 @@ from hil.report.drawing import chart_panel
 from hil.report.interactive import chart_data, library
 from hil.report.rendering import environment, page_bytes, template_text
 from hil.report.series import ReportSeries
-from hil.results import Results, outside_mark
+from hil.results import ParameterResult, Results, outside_mark
 from identification.excitation import CRITERIA, METHODS
 from identification.selection.inner_prediction import Choice
 
@@ -58,6 +60,8 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
         "warnings": grouped_warnings(results),
         "ranked": [words for group in grouped_warnings(results).values() for words in group],
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
+        "by_id": by_id,
+        "joint_of": lambda parameter: joint_of(parameter, results.joint_names),
         "by_name": {parameter.name: parameter for parameter in results.parameters},
         "outside_mark": outside_mark,
         "criteria": CRITERIA,
@@ -86,6 +90,19 @@ def grouped_warnings(results: Results) -> dict[str, list[str]]:
         title = _OF_RECORDING if checks.get(warning) in _RECORDING_CHECKS else _OF_MODEL
         groups[title].append(warning)
     return groups if results.verdict.warnings else {}
+
+
+def by_id(parameters: Sequence[ParameterResult]) -> list[ParameterResult]:
+    """Return parameters in the order of the paper's Table 2, those without a number last."""
+    return sorted(parameters, key=lambda one: one.table2_id or len(parameters) + 1000)
+
+
+def joint_of(parameter: ParameterResult, joint_names: Sequence[str]) -> str:
+    """Return the joint of a friction parameter, from the number at the end of its name."""
+    number = re.fullmatch(r"f\w*_(\d+)", parameter.name)
+    if number is None or not 1 <= int(number[1]) <= len(joint_names):
+        return ""
+    return joint_names[int(number[1]) - 1]
 
 
 def every_row_errors(results: Results) -> list[float]:

@@ -548,6 +548,16 @@ class TestParameters:
             ):
                 assert float(row[column]) == pytest.approx(value, abs=error), column
 
+    def test_are_in_the_order_of_their_numbers_with_the_joint_of_friction(self):
+        parameters = [p.model_dump() for p in make_results().parameters]
+        base = parameters[:N_ESSENTIAL][::-1]
+        page = rendered(make_results(parameters=[*base, *parameters[N_ESSENTIAL:]]))
+        rows = page.table("Estimate")
+        ids = [int(row["Id"]) for row in rows]
+        assert ids[:N_ESSENTIAL] == sorted(ids[:N_ESSENTIAL])
+        joints = {row["Name"]: row["Expression"] for row in rows}
+        assert joints["f0_2"].strip() == "joint_2" and "joint_5" in joints["f1_5"]
+
     def test_that_are_off_or_not_significant_are_marked(self):
         cases = [
             (10.0, 8.1, ""), (10.0, 7.9, "▲ outside 2σ"), (10.0, 13.1, "■ outside 3σ"),
