@@ -548,7 +548,7 @@ class TestParameters:
             ):
                 assert float(row[column]) == pytest.approx(value, abs=error), column
 
-    def test_are_in_the_order_of_their_numbers_with_the_joint_of_friction(self):
+    def test_are_in_the_order_of_their_numbers(self):
         parameters = [p.model_dump() for p in make_results().parameters]
         base = parameters[:N_ESSENTIAL][::-1]
         page = rendered(make_results(parameters=[*base, *parameters[N_ESSENTIAL:]]))
