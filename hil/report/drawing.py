@@ -370,10 +370,17 @@ def _log10(values: Array) -> Array:
 
 
 def _decades(low: float, high: float) -> list[tuple[float, str]]:
-    """Return the powers of ten in a range of logarithms, at most six, with their texts."""
+    """Return the powers of ten in a range of logarithms, at most six, with their texts.
+
+    If there are fewer than two: their multiples, or the middle of a range without any.
+    """
     first, last = math.ceil(low), math.floor(high)
     step = max(1, -(-(last - first + 1) // 6))
-    return [(float(k), f"{10.0**k:g}") for k in range(first, last + 1, step)]
+    places = [float(k) for k in range(first, last + 1, step)]
+    if len(places) < 2:
+        multiples = [k + math.log10(m) for k in range(first - 1, last + 1) for m in (1.0, 2.0, 5.0)]
+        places = [place for place in multiples if low <= place <= high] or [0.5 * (low + high)]
+    return [(place, f"{10.0**place:.3g}") for place in places]
 
 
 def box_panel(

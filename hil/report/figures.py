@@ -229,7 +229,7 @@ def friction_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart
         speed, law = series.law_speed[:, j], series.law_torque[:, j]
         if not np.ptp(speed):
             continue
-        there = np.isfinite(series.friction_speed[:, j])
+        there = np.isfinite(series.friction_speed[:, j] + series.friction_torque[:, j])
         torque = series.friction_torque[there, j]
         ends = " to ".join(significant(float(end)) for end in law[[0, -1]])
         caption = Caption(f"k{j}", name, f"{ends} {unit}", "friction over velocity")

@@ -30,7 +30,7 @@ from hil.report import (
     page,
     report_bytes,
 )
-from hil.report.drawing import chart_panel, round_ticks, single, thinned
+from hil.report.drawing import _decades, chart_panel, round_ticks, single, thinned
 from hil.report.interactive import chart_data, encoded
 from hil.report.rendering import environment
 from hil.results import Results
@@ -671,6 +671,17 @@ class TestFigures:
             span = good.y_limits[1] - good.y_limits[0]
             assert other.y_limits[1] - other.y_limits[0] <= 3.0001 * span
 
+    def test_of_torques_of_zero_and_of_one_row_are_drawn(self, results):
+        series = make_series(samples=200)
+        examples = {k: v for k, v in series.arrays.items() if k.startswith("example_")}
+        nothing = {k: np.zeros_like(v) for k, v in series.arrays.items()
+                   if k.startswith(("example_", "spectrum_m", "spectrum_r"))}  # fmt: skip
+        nothing |= {"example_time": series.example_time}
+        nothing |= {"friction_torque": np.full_like(series.friction_torque, np.nan)}
+        for change in (nothing, {k: v[:1] for k, v in examples.items()},
+                       {k: v[:0] for k, v in examples.items()}):  # fmt: skip
+            assert "NaN" not in rendered_of(results, replace(series, **change)).split("<script")[0]
+
     def test_of_a_file_of_an_earlier_version_have_no_tabs(self, results):
         arrays = make_series(samples=200).arrays | {"example_archive": "v.mcap"}
         needed = {k: v for k, v in arrays.items() if k[:8] != "spectrum" and k[8:] not in PARTS}
@@ -761,6 +772,14 @@ class TestDrawing:
         assert all(low - 1e-6 * span <= tick <= high + 1e-6 * span for tick in ticks)
         read = [float(text.replace("−", "-")) for text in texts]
         np.testing.assert_allclose(read, ticks, rtol=1e-9, atol=1e-7 * span)
+
+    @given(st.floats(-9.0, 9.0), st.floats(0.01, 12.0))
+    def test_ticks_of_a_logarithmic_axis_are_in_its_range(self, low, span):
+        names = _decades(low, low + span)
+        assert 1 <= len(names) <= 7
+        for place, text in names:
+            assert low <= place <= low + span
+            assert float(text) == pytest.approx(10.0**place, rel=0.01)
 
     def test_a_line_is_interrupted_at_nan(self):
         axes = single(170.0, "torque", "time")
