@@ -15,7 +15,6 @@ from PIL import Image
 from playwright.sync_api import sync_playwright
 
 HERE: Final = Path(__file__).parent
-SIZE: Final = {"width": 1280, "height": 1010}
 DRAWN: Final = "() => hilCharts.find(group => group.name === 'torques')?.ready"
 CHART: Final = '[data-chart="t1"] .plot-holder'
 
@@ -43,7 +42,7 @@ def photograph(report: Path) -> None:
     with sync_playwright() as driver:
         program = shutil.which("chromium") or shutil.which("google-chrome")
         browser = driver.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        page = browser.new_page(viewport=SIZE, color_scheme="light")
+        page = browser.new_page(viewport={"width": 1280, "height": 1010}, color_scheme="light")
         page.goto(report.resolve().as_uri())
         page.wait_for_function(DRAWN)
         page.wait_for_timeout(800)
