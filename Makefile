@@ -28,10 +28,11 @@ demo: $(STAMP)  ## the whole way on the simulated NS 16; leaves runs/demo/report
 docs: $(STAMP)  ## build the documentation; leaves build/docs/index.html, which opens offline
 	$(BIN)/sphinx-build --quiet --fail-on-warning --jobs auto docs build/docs
 
-pictures: $(STAMP)  ## draw the pictures of the documentation: examples and screen
+pictures: $(STAMP) demo  ## draw the pictures of the documentation: examples, screen and report
 	for script in examples/0*.py; do $(BIN)/python $$script || exit 1; done
 	cp runs/examples/*.png examples/pictures/
 	$(BIN)/python docs/screen_picture.py
+	$(BIN)/python docs/report_picture.py
 
 test: $(STAMP)  ## lint, types, floors, declared dependencies and the quick tests
 	$(BIN)/ruff check .

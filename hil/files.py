@@ -31,6 +31,12 @@ def make_folder(path: Path) -> None:
         raise InputError(path, "cannot be written to", remedy="name another folder")
 
 
+def user_cache() -> Path:
+    """Return the folder of the user for what can be computed again, which need not exist."""
+    xdg = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (xdg if xdg.is_absolute() else Path.home() / ".cache") / "hil"
+
+
 @contextmanager
 def lock_folder(root: Path, work: str, option: str) -> Iterator[None]:
     """Create a folder and lock it against other processes with the same work, or raise InputError.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
@@ -19,9 +19,11 @@ from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import file_digest, write_files
 from hil.identify import Identification
+from hil.identify.cell_context import nominal_of
 from hil.progress import Reporter
 from hil.reading import open_file
 from hil.report import ReportSeries, report_bytes
+from hil.report.series import with_torques
 from hil.results import ExportResult, OccasionResult, Results
 from identification import Estimate, IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
@@ -50,11 +52,12 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
         load=median_load(found.cell.model, found.estimate.pooled.values, found.prepared.fitted),
     )
     results = found.results.model_copy(update={"exports": exports.result, "occasion": occasion})
+    series = _series_of(found)
     files = {
         **exports.contents,
         RESULTS: results.to_json(),
-        SERIES: _series_bytes(found.series),
-        REPORT: report_bytes(results, found.series),
+        SERIES: _series_bytes(series),
+        REPORT: report_bytes(results, series),
     }
     write_files(folder, files)
     for name, reason in exports.withheld.items():
@@ -62,6 +65,14 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
     reporter.say(f"written to {folder}: {RESULTS}, {', '.join(exports.result.written)}")
     reporter.say(f"report: {folder / REPORT}")
     return results
+
+
+def _series_of(found: Identification) -> ReportSeries:
+    """Return the series of the figures with the torque of the nominal model, parts and spectra."""
+    nominal, values = nominal_of(found.cell), found.estimate.pooled.values
+    nominal_values = None if nominal is None else nominal.values
+    example = found.prepared.held_out[0]
+    return with_torques(found.series, found.cell.model, values, nominal_values, example)
 
 
 def occasion_of(found: Identification) -> OccasionResult:
@@ -97,7 +108,8 @@ def rewrite_report(folder: Path) -> Results:
 def _series_bytes(series: ReportSeries) -> bytes:
     """Return the series of the figures as a `.npz` file."""
     content = BytesIO()
-    np.savez_compressed(content, **vars(series))
+    arrays: dict[str, Any] = {"example_archive": series.example_archive, **series.arrays}
+    np.savez_compressed(content, **arrays)
     return content.getvalue()
 
 
@@ -112,8 +124,7 @@ def _load_series(path: Path, n_joints: int) -> ReportSeries:
             with np.load(stream, allow_pickle=False) as found:
                 arrays: dict[str, Any] = {name: found[name] for name in found.files}
         arrays["example_archive"] = str(arrays["example_archive"])
-        series = ReportSeries(**{one.name: arrays[one.name] for one in fields(ReportSeries)})
-        return series.checked_for(n_joints)
+        return ReportSeries.from_arrays(arrays).checked_for(n_joints)
     except Exception as error:  # readers of a corrupt file may raise anything
         problem = f"does not contain the series of a report ({error})"
         remedy = "identify again from the archives (`hil identify`)"

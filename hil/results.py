@@ -121,9 +121,14 @@ class JudgementResult(Frozen):
 
     @property
     def worst_first(self) -> list[Finding]:
-        """Findings in descending order of severity."""
+        """Findings in descending order of severity: causes, then symptoms, then conditions."""
         levels = ("wrong", "doubtful", "information", "good")
-        return sorted(self.findings, key=lambda finding: levels.index(finding.level))
+        roles = ("cause", "symptom", "condition")
+
+        def rank(finding: Finding) -> tuple[int, int]:
+            return levels.index(finding.level), roles.index(finding.role)
+
+        return sorted(self.findings, key=rank)
 
     def any_joint(self, figure: str) -> bool:
         """Whether a field of :class:`JointJudgement` is known for any joint."""

@@ -52,6 +52,7 @@ LONG: Final = (
     "hil/test_record_command.py",
     "hil/test_rehearsal.py",
     "hil/test_report.py",
+    "hil/test_report_browser.py",
     "hil/test_screen.py",
     "hil/test_simulate.py",
     "hil/test_study.py",

@@ -25,7 +25,7 @@ import drivers
 import hil
 import identification
 from hil.errors import InputError
-from hil.files import digest, json_digest, replace_file
+from hil.files import digest, json_digest, replace_file, user_cache
 from hil.identify.prepared import Settings
 from hil.reading import open_file
 from identification.factor.factor import Estimate, Factor
@@ -77,9 +77,8 @@ class CacheLocation:
             usable = beside.is_dir() or not there
             if usable and os.access(beside if there else folder, os.W_OK | os.X_OK):
                 return beside
-        xdg = Path(os.environ.get("XDG_CACHE_HOME", ""))
-        own = (xdg if xdg.is_absolute() else Path.home() / ".cache") / "hil"
-        return (own if self.root is None else Path(self.root)) / digest(folder)[:16]
+        root = user_cache() if self.root is None else Path(self.root)
+        return root / digest(folder)[:16]
 
     def get(self, location: str, key: str, kind: type[T]) -> T | None:
         """Return the content of a key; None if there is no intact entry of this type."""

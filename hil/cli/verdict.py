@@ -72,16 +72,13 @@ def table(results: Results) -> list[str]:
 
 
 def sentences(results: Results, *, quiet: bool = False) -> list[str]:
-    """Format the findings, from good to wrong, and the next steps."""
+    """Format the findings, from good to wrong and the most consequential last, and next steps."""
     judgement = results.judgement
     if quiet:
         return [f"note: {warning}" for warning in results.verdict.warnings]
     findings = {finding.words for finding in judgement.findings}
     lines = [
-        f"{_LEVELS[level]}: {finding.words}"
-        for level in ("good", "information", "doubtful", "wrong")
-        for finding in judgement.findings
-        if finding.level == level
+        f"{_LEVELS[finding.level]}: {finding.words}" for finding in reversed(judgement.worst_first)
     ]
     lines += [f"note: {warning}" for warning in results.verdict.warnings if warning not in findings]
     return lines + [f"next: {step}" for step in judgement.next_steps]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hil.report.figures import ReportSeries, SeriesError
 from hil.report.page import report_bytes
+from hil.report.series import ReportSeries, SeriesError
 
 __all__ = ["report_bytes", "ReportSeries", "SeriesError"]

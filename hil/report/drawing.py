@@ -10,7 +10,7 @@ import base64
 import io
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -33,7 +33,7 @@ _FOOT: Final = 32.0  # from the axis down to the base line of its quantity, px
 _MARGIN: Final = 0.05  # free on both sides of the values, as a share of their range
 _LABEL_LENGTH: Final = 28
 _FEWEST_FOR_A_BOX: Final = 5  # values
-_BINS: Final = 400  # of a line over time, which has up to two points in each
+_BINS: Final = 300  # of a line over time, which has up to two points in each, some one per px
 _STEPS: Final = (1.0, 2.0, 5.0, 10.0)  # of round ticks, times a power of ten
 _MOST_DIGITS: Final = 1e6  # Ticks from here on have an exponent
 
@@ -54,6 +54,8 @@ class Panel:
     title: str
     note: str
     svg: Markup
+    key: str = ""  #: of its caption
+    joint: int | None = None  #: number of the joint of a chart, from 0
 
 
 def one_line(text: str) -> str:
@@ -127,6 +129,7 @@ class Axes:
     y_ticks: int = 4
     x_labelled: bool = True
     x_names: Sequence[tuple[float, str]] = ()  #: names at places instead of round ticks
+    y_names: Sequence[tuple[float, str]] = ()
     grid: Literal["both", "y"] = "both"
     _shapes: list[tuple[str, Array, Array, str]] = field(default_factory=list)
 
@@ -172,8 +175,8 @@ class Axes:
 
         names = self.x_names or list(zip(*round_ticks(low, high, self.x_ticks), strict=True))
         x_at = across(np.array([place for place, _ in names])).tolist()
-        ticks, texts = round_ticks(bottom, top, self.y_ticks)
-        y_at = up(np.array(ticks)).tolist()
+        heights = self.y_names or list(zip(*round_ticks(bottom, top, self.y_ticks), strict=True))
+        y_at = up(np.array([place for place, _ in heights])).tolist()
         rules = [f"M{self.left:g} {y:.1f}H{right:g}" for y in y_at]
         rules += [f"M{x:.1f} {self.top:g}V{foot:g}" for x in x_at if self.grid == "both"]
         frame = [f"M{self.left:g} {self.top:g}V{foot:g}H{right:g}"]
@@ -190,7 +193,7 @@ class Axes:
         parts.append(f'</g><path d="{"".join(frame)}" style="{thin}{MUTED}"/>')
         parts += [
             _text(text, self.left - _PAD, y + 0.38 * TICK_SIZE, INK, TICK_SIZE, "end")
-            for y, text in zip(y_at, texts, strict=True)
+            for y, (_, text) in zip(y_at, heights, strict=True)
         ]
         if self.x_labelled:
             parts += [
@@ -218,14 +221,18 @@ def _path(kind: str, x: Array, y: Array, style: str) -> str:
         )
         return f'<path d="{d}" style="{style}"/>'
     there = np.isfinite(x) & np.isfinite(y)
-    points = list(map("{:.1f} {:.1f}".format, x[there].tolist(), y[there].tolist()))
+    places = np.round(np.stack([x, y], axis=1)[there], 1)
     if kind == "dots":
-        d = "".join(f"M{point}h0" for point in points)
+        d = "".join(f"M{across} {up}h0" for across, up in places.tolist())
     else:
-        # A line starts anew behind a gap.
+        # A line starts again behind a gap; its points need no letter.
         starts = there & np.concatenate([[True], ~there])[:-1]
-        first = starts[there].tolist()
-        d = "".join(("M" if start else "L") + p for start, p in zip(first, points, strict=True))
+        lines = np.split(places, np.flatnonzero(starts[there])[1:]) if len(places) else []
+        d = "".join(
+            f"M{line[0, 0]} {line[0, 1]}"
+            + (f"L{' '.join(map(str, line[1:].ravel().tolist()))}" if len(line) > 1 else "h0")
+            for line in lines
+        )
     return f'<path d="{d}" style="{style}"/>'
 
 
@@ -242,7 +249,7 @@ def to_panel(width: float, height: float, content: str, caption: Caption) -> Pan
     alt = escape(one_line(f"{caption.title}: {caption.what}{note}."))
     size = f'viewBox="0 0 {width:g} {height:g}" style="max-width: {1.3 * width:.0f}px"'
     svg = f'<svg {size} role="img" aria-label="{alt}">{content}</svg>'
-    return Panel(caption.title, caption.note, Markup(svg))
+    return Panel(caption.title, caption.note, Markup(svg), caption.key)
 
 
 def panel(plots: Sequence[Axes], caption: Caption, width: float = _WIDTH) -> Panel:
@@ -260,47 +267,120 @@ def single(height: float, heading: str, foot: str, *, x_ticks: int = 5) -> Axes:
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """One line over time."""
+    """One line of a plot, or a set of dots."""
 
     values: Array  #: (m,)
     colour: str  #: of the palette
-    width: float  #: of the line [px]
+    width: float  #: of the line, or diameter of a dot [px]
     dashed: bool = False
+    name: str = ""  #: in the legend, and beside its value
+    x: Array | None = None  #: (m,) if not that of the chart
+    dots: bool = False
+    #: may leave the plot, as the error of a poor model beside that of a good one
+    loose: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """Axes of a panel with time to the right."""
+    """Axes of a chart."""
 
     height: float  #: [px]
     heading: str  #: quantity and unit
     traces: Sequence[Trace]  #: its lines, the lowest first
-    #: shaded intervals of time [s]
+    #: shaded intervals of x
     shaded: Sequence[tuple[float, float]] = ()
     #: largest value of a range about zero; the range of the lines if None
     reach: float | None = None
+    limits: tuple[float, float] | None = None  #: the range, if neither
+    origin: bool = False  #: whether lines are drawn through x = 0 and y = 0
+
+    @property
+    def y_limits(self) -> tuple[float, float]:
+        """Range of the vertical axis: that of the lines; a loose one adds at most its length."""
+        if self.reach is not None:
+            return -self.reach, self.reach
+        if self.limits is not None:
+            return self.limits
+        low, high = padded(_joined(t.values for t in self.traces if not t.loose))
+        span = high - low
+        loose = _joined(t.values for t in self.traces if t.loose)
+        if not np.isfinite(loose).any():
+            return low, high
+        least, most = padded(loose)
+        return min(low, max(least, low - span)), max(high, min(most, high + span))
 
 
-def time_panel(time: Array, plots: Sequence[Plot], caption: Caption) -> Panel:
-    """Draw plots over the same time (m,) [s], one above the other."""
-    span = float(time[0]), max(float(time[-1]), float(time[0]) + 1e-9)
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """Plots over the same quantity, one above the other: drawn as SVG, or by the page's script."""
+
+    caption: Caption
+    x: Array  #: (m,)
+    plots: Sequence[Plot]
+    foot: str = "time [s]"  #: quantity and unit of x
+    joint: int = 0  #: number of the joint, from 0
+    log: bool = False  #: whether both axes are logarithmic
+
+    @property
+    def x_limits(self) -> tuple[float, float]:
+        """Range of the horizontal axis."""
+        if any(trace.x is not None for plot in self.plots for trace in plot.traces):
+            return padded(_joined(t.x for p in self.plots for t in p.traces if t.x is not None))
+        return float(self.x[0]), max(float(self.x[-1]), float(self.x[0]) + 1e-9)
+
+
+def chart_panel(chart: Chart, bins: int = _BINS) -> Panel:
+    """Draw a chart; a line has at most two points in each of the `bins` of its x."""
     panels, top = list[Axes](), _TOP
-    for k, plot in enumerate(plots):
-        last = k == len(plots) - 1
+    scale = _log10 if chart.log else np.asarray
+    low, high = (float(scale(np.array(end))) for end in chart.x_limits)
+    for k, plot in enumerate(chart.plots):
+        last = k == len(chart.plots) - 1
+        bottom, upper = (float(scale(np.array(end))) for end in plot.y_limits)
         axes = Axes(
             _LEFT, top, _WIDTH - _LEFT - _RIGHT, plot.height, plot.heading,
-            "time [s]" if last else "", x_limits=span, x_ticks=6, x_labelled=last,
-            y_limits=None if plot.reach is None else (-plot.reach, plot.reach),
+            chart.foot if last else "", x_limits=(low, high), x_ticks=6, x_labelled=last,
+            y_limits=(bottom, upper), x_names=_decades(low, high) if chart.log else (),
+            y_names=_decades(bottom, upper) if chart.log else (),
         )  # fmt: skip
         if plot.shaded:
             infinite = np.full((len(plot.shaded), 1), np.inf)
             axes.bands(np.array(plot.shaded), np.hstack([-infinite, infinite]), BAND)
+        if plot.origin:
+            endless = np.array([-np.inf, np.inf])
+            axes.segments(
+                np.array([endless, [0.0, 0.0]]), np.array([[0.0, 0.0], endless]), MUTED, 0.8
+            )
         for trace in plot.traces:
-            points = thinned(time, trace.values, _BINS)
-            axes.line(*points, trace.colour, trace.width, dashed=trace.dashed)
+            x, values = scale(chart.x if trace.x is None else trace.x), scale(trace.values)
+            if trace.dots:
+                axes.dots(x, values, trace.colour, trace.width)
+            else:
+                points = thinned(x, values, bins)
+                axes.line(*points, trace.colour, trace.width, dashed=trace.dashed)
         panels.append(axes)
         top += plot.height + _GAP
-    return panel(panels, caption)
+    return replace(panel(panels, chart.caption), joint=chart.joint)
+
+
+def _log10(values: Array) -> Array:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logarithm = np.log10(values)
+    return np.where(np.isfinite(logarithm), logarithm, np.nan)
+
+
+def _decades(low: float, high: float) -> list[tuple[float, str]]:
+    """Return the powers of ten in a range of logarithms, at most six, with their texts.
+
+    If there are fewer than two: their multiples, or the middle of a range without any.
+    """
+    first, last = math.ceil(low), math.floor(high)
+    step = max(1, -(-(last - first + 1) // 6))
+    places = [float(k) for k in range(first, last + 1, step)]
+    if len(places) < 2:
+        multiples = [k + math.log10(m) for k in range(first - 1, last + 1) for m in (1.0, 2.0, 5.0)]
+        places = [place for place in multiples if low <= place <= high] or [0.5 * (low + high)]
+    return [(place, f"{10.0**place:.3g}") for place in places]
 
 
 def box_panel(

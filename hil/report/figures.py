@@ -1,9 +1,9 @@
-"""Figures of the report, one panel for each joint, and the time series in them."""
+"""Figures of the report, one panel for each joint."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from hil.report.drawing import (
     BAND,
     FIRST,
-    INK,
     MUTED,
-    SECOND,
-    WIDE,
     Caption,
+    Chart,
     Panel,
     Plot,
     Trace,
@@ -24,9 +22,9 @@ from hil.report.drawing import (
     padded,
     panel,
     single,
-    time_panel,
 )
 from hil.report.numbers import fixed, percent, significant
+from hil.report.series import ReportSeries
 from hil.results import FittedResult, Results, ValidationResult
 
 Array = NDArray[np.float64]
@@ -34,64 +32,6 @@ Array = NDArray[np.float64]
 _INTERVAL: Final = 1.96  # Half a 95 % interval, in standard errors
 # Percentiles of the torque inside the axes; outliers may lie outside.
 _SHOWN: Final = (0.5, 99.5)
-_TOO_LARGE: Final = 1e100
-
-
-class SeriesError(ValueError):
-    """A series has a wrong shape or values that cannot be drawn."""
-
-
-@dataclass(frozen=True, eq=False)
-class ReportSeries:
-    """Motion of the excitation, one validation run, and friction; n joints.
-
-    Units are s, rad, N·m; of prismatic joints m, N.
-
-    Raises:
-        SeriesError: shapes are inconsistent.
-    """
-
-    excitation_time: Array  #: (m,)
-    excitation_position: Array  #: (m, n)
-    excitation_velocity: Array  #: (m, n)
-    excitation_fitted: Array  #: 1 for fitted rows, else 0 (m, n)
-    example_archive: str  #: name of the archive the example was read from
-    example_time: Array  #: (k,)
-    example_measured: Array  #: low-passed for display (k, n)
-    example_predicted: Array  #: low-passed for display (k, n)
-    example_used: Array  #: 1 for rows used for the error of the verdict, else 0 (k, n)
-    #: measured torque of fitted rows minus prediction without friction (c, n), padded with NaN
-    friction_torque: Array
-    friction_speed: Array  #: speeds of these (c, n)
-    law_torque: Array  #: friction law without presliding (s, n)
-    law_speed: Array  #: speeds of these (s, n)
-
-    def __post_init__(self) -> None:
-        n = self.excitation_position.shape[-1]
-        lengths = {
-            "excitation": len(self.excitation_time),
-            "example": len(self.example_time),
-            "friction": len(self.friction_torque),
-            "law": len(self.law_torque),
-        }
-        for name, found in vars(self).items():
-            if isinstance(found, str):
-                continue
-            length = lengths[name.partition("_")[0]]
-            shape = (length,) if name.endswith("_time") else (length, n)
-            numbers = found.dtype == np.float64 and not np.any(np.abs(found) >= _TOO_LARGE)
-            if found.shape != shape or not numbers:
-                raise SeriesError(
-                    f"{name} has shape {found.shape} (expected {shape}), or values that cannot be"
-                    " drawn"
-                )
-
-    def checked_for(self, n_joints: int) -> ReportSeries:
-        """Return the series, or raise SeriesError unless they have `n_joints`."""
-        found = self.excitation_position.shape[1]
-        if found != n_joints:
-            raise SeriesError(f"excitation_position has {found} columns, not {n_joints}")
-        return self
 
 
 class Joint(NamedTuple):
@@ -129,42 +69,143 @@ def joints_of(results: Results) -> list[Joint]:
     ]
 
 
-def excitation_panels(series: ReportSeries, joints: Sequence[Joint]) -> list[Panel]:
-    """Draw position and velocity of each joint (paper, Fig. 1)."""
+class Legend(NamedTuple):
+    """Colour and width of the lines of a chart, by the key and the text of their legend."""
+
+    key: str
+    text: str
+    colour: str
+    width: float
+    dashed: bool = False
+
+    def trace(self, values: Array, *, loose: bool = False, width: float = 0.0) -> Trace:
+        """Return the line of these values."""
+        return Trace(
+            values, f"var({self.colour})", width or self.width, self.dashed, self.key, loose=loose
+        )
+
+
+MEASURED = Legend("measured", "measured", "--wide", 4.0)
+PREDICTED = Legend("predicted", "identified model", "--ink", 1.1)
+NOMINAL = Legend("nominal", "nominal model", "--muted", 1.0, dashed=True)
+RESIDUAL = Legend("residual", "error of the identified model", "--second", 0.9)
+NOMINAL_RESIDUAL = NOMINAL._replace(key="nominal residual", width=0.8)
+POSITION = Legend("position", "position", "--first", 1.5)
+VELOCITY = Legend("velocity", "velocity", "--second", 1.5)
+PARTS = (
+    Legend("inertia", "inertia: of acceleration", "--first", 1.2),
+    Legend("coriolis", "Coriolis and centrifugal", "--route-3", 1.2),
+    Legend("gravity", "gravity", "--good", 1.2),
+    Legend("friction", "friction and offset", "--second", 1.2),
+    Legend("elements", "ripple, springs and balancers", "--outside-3", 1.2),
+)
+SPECTRUM_MEASURED = Legend("measured", "measured torque", "--wide", 2.4)
+SPECTRUM_RESIDUAL = RESIDUAL._replace(width=1.4)
+LEGENDS = {
+    "measured": MEASURED,
+    "predicted": PREDICTED,
+    "nominal": NOMINAL,
+    "residual": RESIDUAL,
+    "spectrum_measured": SPECTRUM_MEASURED,
+    "spectrum_residual": SPECTRUM_RESIDUAL,
+}
+"""Entries of legends by their names in the templates."""
+
+
+def excitation_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart]:
+    """Return position and velocity of each joint (paper, Fig. 1)."""
     time = series.excitation_time - series.excitation_time[0]
-    panels = []
+    charts = []
     for joint in joints:
         j, unit = joint.number, joint.angle
         position, velocity = series.excitation_position[:, j], series.excitation_velocity[:, j]
         note = f"{fixed(float(position.min()), 2)} to {fixed(float(position.max()), 2)} {unit}"
         shaded = _left_out(time, series.excitation_fitted, j)
         plots = (
-            Plot(78.0, f"position [{unit}]", [Trace(position, FIRST, 1.5)], shaded),
-            Plot(78.0, f"velocity [{unit}/s]", [Trace(velocity, SECOND, 1.5)], shaded),
+            Plot(78.0, f"position [{unit}]", [POSITION.trace(position)], shaded),
+            Plot(78.0, f"velocity [{unit}/s]", [VELOCITY.trace(velocity)], shaded),
         )
         caption = Caption(f"x{j}", joint.name, note, "position and velocity over time")
-        panels.append(time_panel(time, plots, caption))
-    return panels
+        charts.append(Chart(caption, time, plots, joint=j))
+    return charts
 
 
-def torque_panels(series: ReportSeries, joints: Sequence[Joint]) -> list[Panel]:
-    """Draw measured and predicted torque of each joint, and their difference (paper, Fig. 4)."""
+def torque_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart]:
+    """Return measured and predicted torque of each joint, and their difference (paper, Fig. 4)."""
     if series.example_time.size == 0:
         return []
     time = series.example_time - series.example_time[0]
-    panels = []
+    charts = []
     for j, name, unit, error in joints:
         measured, predicted = series.example_measured[:, j], series.example_predicted[:, j]
-        both = [Trace(measured, WIDE, 4.0), Trace(predicted, INK, 1.1)]
-        difference = [Trace(measured - predicted, SECOND, 0.9)]
+        torques = [MEASURED.trace(measured), PREDICTED.trace(predicted)]
+        errors = [RESIDUAL.trace(measured - predicted)]
+        what = "measured and predicted torque over time, and their difference"
+        if series.example_nominal is not None:
+            nominal = series.example_nominal[:, j]
+            torques.insert(1, NOMINAL.trace(nominal, loose=True))
+            errors.insert(0, NOMINAL_RESIDUAL.trace(measured - nominal, loose=True))
+            what += ", of the identified and of the nominal model"
         shaded = _left_out(time, series.example_used, j)
         plots = (
-            Plot(128.0, f"torque [{unit}]", both, shaded),
-            Plot(50.0, f"measured − predicted [{unit}]", difference, shaded),
+            Plot(118.0, f"torque [{unit}]", torques, shaded),
+            Plot(58.0, f"measured − predicted [{unit}]", errors, shaded),
         )
-        caption = Caption(f"t{j}", name, error, "measured and predicted torque over time")
-        panels.append(time_panel(time, plots, caption))
-    return panels
+        charts.append(Chart(Caption(f"t{j}", name, error, what), time, plots, joint=j))
+    return charts
+
+
+def known_parts(series: ReportSeries) -> list[Legend]:
+    """Return the parts of the torque that the series contain."""
+    return [part for part in PARTS if getattr(series, f"example_{part.key}") is not None]
+
+
+def part_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart]:
+    """Return the predicted torque of each joint and what it consists of."""
+    known = [(part, getattr(series, f"example_{part.key}")) for part in known_parts(series)]
+    if not known or series.example_time.size == 0:
+        return []
+    time = series.example_time - series.example_time[0]
+    charts = []
+    for j, name, unit, _ in joints:
+        traces = [
+            PREDICTED._replace(colour="--wide", width=3.0).trace(series.example_predicted[:, j])
+        ]
+        traces += [part.trace(values[:, j]) for part, values in known]
+        sizes = [float(np.sqrt(np.mean(values[:, j] ** 2))) for _, values in known]
+        largest = known[int(np.argmax(sizes))][0]
+        note = f"largest: {largest.key}, RMS {significant(max(sizes))} {unit}"
+        caption = Caption(f"d{j}", name, note, "predicted torque by part over time")
+        plot = Plot(176.0, f"torque [{unit}]", traces)
+        charts.append(Chart(caption, time, [plot], joint=j))
+    return charts
+
+
+def spectrum_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart]:
+    """Return the spectra of the measured torque and of the residual of each joint."""
+    frequency, measured = series.spectrum_frequency, series.spectrum_measured
+    residual = series.spectrum_residual
+    if frequency is None or measured is None or residual is None or not len(frequency):
+        return []
+    charts = []
+    for j, name, unit, _ in joints:
+        traces = [
+            SPECTRUM_MEASURED.trace(measured[:, j]),
+            SPECTRUM_RESIDUAL.trace(residual[:, j]),
+        ]
+        every = np.concatenate([measured[:, j], residual[:, j]])
+        positive = every[every > 0.0]
+        if not positive.size:
+            continue
+        top = float(positive.max())
+        limits = max(0.7 * float(positive.min()), 1e-6 * top), 1.4 * top
+        weighed = residual[:, j] * np.sqrt(frequency)  # on a logarithmic axis of frequency
+        note = f"most of the residual at {significant(float(frequency[np.argmax(weighed)]), 2)} Hz"
+        what = "amplitude spectral density of measured torque and residual over frequency"
+        plot = Plot(176.0, f"torque [{unit}/√Hz]", traces, limits=limits)
+        caption = Caption(f"f{j}", name, note, what)
+        charts.append(Chart(caption, frequency, [plot], "frequency [Hz]", joint=j, log=True))
+    return charts
 
 
 def _left_out(time: Array, used: Array, joint: int) -> Sequence[tuple[float, float]]:
@@ -175,31 +216,37 @@ def _left_out(time: Array, used: Array, joint: int) -> Sequence[tuple[float, flo
     return tuple(zip(changes[::2], changes[1::2], strict=True))
 
 
-def friction_panels(series: ReportSeries, joints: Sequence[Joint]) -> list[Panel]:
-    """Draw the friction law of each joint that moved, with the fitted rows."""
-    panels: list[Panel] = []
+MEASURED_FRICTION = Legend(
+    "measured", "measured torque − predicted torque without friction", "--wide", 2.2
+)
+FRICTION_LAW = Legend("law", "friction law, as identified", "--second", 1.8)
+
+
+def friction_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart]:
+    """Return the friction law of each joint that moved, with the fitted rows."""
+    charts: list[Chart] = []
     for j, name, unit, _ in joints:
         speed, law = series.law_speed[:, j], series.law_torque[:, j]
         if not np.ptp(speed):
             continue
-        there = np.isfinite(series.friction_speed[:, j])
+        there = np.isfinite(series.friction_speed[:, j] + series.friction_torque[:, j])
         torque = series.friction_torque[there, j]
         ends = " to ".join(significant(float(end)) for end in law[[0, -1]])
         caption = Caption(f"k{j}", name, f"{ends} {unit}", "friction over velocity")
-        foot = f"speed [{joints[j].angle}/s]"
-        axes = single(210.0, f"friction [{unit}]", foot)
-        endless = np.array([-np.inf, np.inf])
         shown = np.percentile(torque, _SHOWN) if torque.size else np.empty(0)
         values = np.concatenate([shown, law, [0.0]])
         room = 0.08 * float(np.ptp(values)) or 1.0
-        axes.y_limits = float(values.min()) - room, float(values.max()) + room
-        speeds = np.concatenate([series.friction_speed[there, j], speed])
-        axes.x_limits = padded(speeds)
-        axes.segments(np.array([endless, [0.0, 0.0]]), np.array([[0.0, 0.0], endless]), MUTED, 0.8)
-        axes.dots(series.friction_speed[there, j], torque, WIDE, 2.2)
-        axes.line(speed, law, SECOND, 1.8)
-        panels.append(panel([axes], caption))
-    return panels
+        dots = replace(
+            MEASURED_FRICTION.trace(torque), x=series.friction_speed[there, j], dots=True
+        )
+        traces = [dots, replace(FRICTION_LAW.trace(law), x=speed)]
+        plot = Plot(
+            150.0, f"friction [{unit}]", traces,
+            limits=(float(values.min()) - room, float(values.max()) + room), origin=True,
+        )  # fmt: skip
+        foot = f"speed [{joints[j].angle}/s]"
+        charts.append(Chart(caption, speed, [plot], foot, joint=j))
+    return charts
 
 
 def residual_panels(results: Results) -> dict[str, list[Panel]]:

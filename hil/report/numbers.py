@@ -11,6 +11,7 @@ import re
 MISSING = "–"
 _SMALLEST_DECIMAL, _LARGEST_DECIMAL = 1e-4, 1e6
 _MOST_DECIMALS = 6
+_MOMENT = re.compile(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d)(?::[\d.]+)?(Z|[+-]\d\d:\d\d|)")
 
 
 def significant(value: float | None, digits: int = 3) -> str:
@@ -69,6 +70,21 @@ def with_std(value: float | None, std: float | None) -> str:
 def unit_text(unit: str) -> str:
     """Replace blanks of a unit: N·m for `N m`."""
     return unit.replace(" ", "·")
+
+
+def prose(text: str) -> str:
+    """Separate the per cent signs of a message from their numbers, as in the tables of a page."""
+    return re.sub(r"(?<=\d)%", "\u00a0%", text)
+
+
+def moments(text: str) -> str:
+    """Write times of ISO 8601 in a text to the minute: 2026-11-26 12:30 UTC."""
+
+    def readable(found: re.Match[str]) -> str:
+        zone = {"": "", "Z": " UTC", "+00:00": " UTC"}.get(found[3], f" {found[3]}")
+        return f"{found[1]} {found[2]}{zone}"
+
+    return _MOMENT.sub(readable, text)
 
 
 def capitalised(text: str) -> str:

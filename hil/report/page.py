@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 
 from hil.report import figures
-from hil.report.figures import ReportSeries
-from hil.report.rendering import environment, page_bytes
-from hil.results import Results, outside_mark
+from hil.report.drawing import chart_panel
+from hil.report.interactive import chart_data, library
+from hil.report.rendering import environment, page_bytes, template_text
+from hil.report.series import ReportSeries
+from hil.results import ParameterResult, Results, outside_mark
 from identification.excitation import CRITERIA, METHODS
 from identification.selection.inner_prediction import Choice
 
 _MOST_CANDIDATES: Final = 6
 """Candidates shown of one choice: the first, and the best of the others."""
+
+_BINS: Final = 2000
+"""Intervals of all drawn lines of one kind, with two points in each; a page has at most 3 MB."""
+_FEWEST_BINS, _MOST_BINS = 80, 300  # of one line
 
 _OF_MODEL: Final = "About the model and its prediction"
 _OF_RECORDING: Final = "About the recording"
@@ -33,6 +41,14 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
     """
     series = series.checked_for(len(results.joint_names))
     joints, runs = figures.joints_of(results), results.validation
+    bins = min(_MOST_BINS, max(_FEWEST_BINS, _BINS // len(joints)))
+    charts = {
+        "torques": figures.torque_charts(series, joints),
+        "parts": figures.part_charts(series, joints),
+        "spectra": figures.spectrum_charts(series, joints),
+        "friction": figures.friction_charts(series, joints),
+        "excitation": figures.excitation_charts(series, joints),
+    }
     errors = np.array([[r.overall_relative_error, r.all_rows_relative_error] for r in runs])
     context = {
         "results": results,
@@ -42,7 +58,10 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
         "has_ids": any(p.table2_id is not None for p in results.parameters),
         "has_prior": any(p.data_share is not None for p in results.parameters),
         "warnings": grouped_warnings(results),
+        "ranked": [words for group in grouped_warnings(results).values() for words in group],
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
+        "by_id": by_id,
+        "joint_of": lambda parameter: joint_of(parameter, results.joint_names),
         "by_name": {parameter.name: parameter for parameter in results.parameters},
         "outside_mark": outside_mark,
         "criteria": CRITERIA,
@@ -50,23 +69,40 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
         "unseen": np.median(errors, axis=0).tolist() if runs else None,
         "worst": max(runs, key=lambda run: run.overall_relative_error) if runs else None,
         "every_row_errors": every_row_errors(results),
-        "excitation_panels": figures.excitation_panels(series, joints),
         "correlation": figures.correlation_matrix(results),
-        "torque_panels": figures.torque_panels(series, joints),
-        "friction_panels": figures.friction_panels(series, joints),
+        "legend": figures.LEGENDS,
+        "part_legends": figures.known_parts(series),
         **figures.residual_panels(results),
+        **{name: [chart_panel(chart, bins) for chart in group] for name, group in charts.items()},
+        "chart_data": chart_data(charts, results.joint_names),
     }
-    return page_bytes(environment().get_template("report.html.j2").render(**context))
+    scripts = (*library(), template_text("charts.js"))
+    return page_bytes(environment(*scripts).get_template("report.html.j2").render(**context))
 
 
 def grouped_warnings(results: Results) -> dict[str, list[str]]:
     """Return the warnings of the verdict by what they are about, the most consequential first."""
     checks = {finding.words: finding.check for finding in results.judgement.findings}
+    ranks = {finding.words: k for k, finding in enumerate(results.judgement.worst_first)}
     groups: dict[str, list[str]] = {title: [] for title in (_OF_MODEL, _OF_RECORDING)}
-    for warning in results.verdict.warnings:
+    # Those that no check found are remarks about the sources, and last.
+    for warning in sorted(results.verdict.warnings, key=lambda words: ranks.get(words, len(ranks))):
         title = _OF_RECORDING if checks.get(warning) in _RECORDING_CHECKS else _OF_MODEL
         groups[title].append(warning)
     return groups if results.verdict.warnings else {}
+
+
+def by_id(parameters: Sequence[ParameterResult]) -> list[ParameterResult]:
+    """Return parameters in the order of the paper's Table 2, those without a number last."""
+    return sorted(parameters, key=lambda one: one.table2_id or len(parameters) + 1000)
+
+
+def joint_of(parameter: ParameterResult, joint_names: Sequence[str]) -> str:
+    """Return the joint of a friction parameter, from the number at the end of its name."""
+    number = re.fullmatch(r"f\w*_(\d+)", parameter.name)
+    if number is None or not 1 <= int(number[1]) <= len(joint_names):
+        return ""
+    return joint_names[int(number[1]) - 1]
 
 
 def every_row_errors(results: Results) -> list[float]:

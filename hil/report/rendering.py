@@ -5,13 +5,24 @@ from __future__ import annotations
 import base64
 import hashlib
 import itertools
+import os
 import re
+import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+import jinja2
+from jinja2 import (
+    BytecodeCache,
+    Environment,
+    FileSystemBytecodeCache,
+    FileSystemLoader,
+    StrictUndefined,
+)
 from markupsafe import Markup
 
+from hil.files import digest, user_cache
 from hil.report import numbers
 from hil.terminal_text import escape
 
@@ -20,7 +31,7 @@ _STYLE: Final = "report.css"
 _SCRIPT: Final = "page.js"
 _FORMATS: Final = (
     *("significant", "fixed", "beside", "percent", "with_std"),
-    *("unit_text", "capitalised"),
+    *("unit_text", "capitalised", "moments", "prose"),
 )
 _STEERING: Final = re.compile(
     r"[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]"
@@ -28,8 +39,11 @@ _STEERING: Final = re.compile(
 """Control characters, and those that change the text direction (Unicode Annex 9)."""
 
 
-def environment() -> Environment:
-    """Return the template environment, with the formats of :mod:`hil.report.numbers` as filters."""
+def environment(*scripts: str) -> Environment:
+    """Return the template environment, with the formats of :mod:`hil.report.numbers` as filters.
+
+    A page runs these scripts in their order, and then its own.
+    """
     # Autoescape always: names come from archives, which may be untrusted.
     found = Environment(
         loader=FileSystemLoader(_TEMPLATES),
@@ -38,9 +52,14 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
         finalize=_shown,
+        bytecode_cache=_compiled_templates(),
     )
-    style, script = ((_TEMPLATES / name).read_text("utf-8") for name in (_STYLE, _SCRIPT))
-    found.globals |= {"style": Markup(style), "script": Markup(script), "policy": policy(script)}
+    every = [*scripts, template_text(_SCRIPT)]
+    found.globals |= {
+        "style": Markup(template_text(_STYLE)),
+        "scripts": [Markup(script) for script in every],
+        "policy": policy(every),
+    }
     # Figures and tables are numbered in the order of the page.
     figures, tables = itertools.count(1), itertools.count(1)
     numbering = {"figure": lambda: next(figures), "table": lambda: next(tables)}
@@ -50,6 +69,23 @@ def environment() -> Environment:
     return found
 
 
+def _compiled_templates() -> BytecodeCache | None:
+    """Return the cache of compiled templates, whose compilation takes longer than a page.
+
+    None if the user's cache folder cannot be written.
+    """
+    # Of this version of jinja2 and of these settings; jinja2 checks the text of each template.
+    key = digest(f"{jinja2.__version__} {sys.version} {Path(__file__).read_text('utf-8')}")
+    folder = user_cache() / f"templates-{key[:16]}"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if folder.stat().st_uid != os.getuid() or not os.access(folder, os.W_OK | os.X_OK):
+            return None
+    except (OSError, RuntimeError):  # no home
+        return None
+    return FileSystemBytecodeCache(str(folder))
+
+
 def _shown(value: object) -> object:
     """Escape control and direction characters of a text."""
     if isinstance(value, Markup) or not isinstance(value, str):
@@ -57,11 +93,20 @@ def _shown(value: object) -> object:
     return _STEERING.sub(lambda found: escape(found[0]), value)
 
 
-def policy(script: str) -> str:
-    """Return the content security policy: no external resource, and this script only."""
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+def template_text(name: str) -> str:
+    """Return a style sheet or a script beside the templates."""
+    return (_TEMPLATES / name).read_text("utf-8")
+
+
+def policy(scripts: Iterable[str]) -> str:
+    """Return the content security policy: no external resource, and these scripts only."""
+    digests = (
+        base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+        for script in scripts
+    )
+    sources = " ".join(f"'sha256-{digest}'" for digest in digests)
     return (
-        f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; "
+        f"default-src 'none'; script-src {sources}; style-src 'unsafe-inline'; "
         "img-src data:; base-uri 'none'; form-action 'none'"
     )
 

@@ -202,5 +202,5 @@ def _examples(condition: ConditionResult, joint_names: list[str]) -> list[drawin
             rms.append(f"{which} {significant(float(np.sqrt(np.mean(error**2))))}")
         note, what = f"RMS error {', '.join(rms)} N·m", "measured and predicted torque"
         caption = drawing.Caption(f"e{condition.key}{j}", name, note, what)
-        panels.append(drawing.time_panel(time, plots, caption))
+        panels.append(drawing.chart_panel(drawing.Chart(caption, time, plots)))
     return panels

@@ -1,0 +1,233 @@
+"""Time series and curves in the figures of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification import RobotModel
+from identification.signals.samples import Samples
+from identification.validation.prediction import for_figure
+
+Array = NDArray[np.float64]
+
+_TOO_LARGE: Final = 1e100
+_ROWS: Final = 30_000
+"""Most rows of the example that a file holds."""
+_RATE: Final = 125.0
+"""Rows per second of torques that are low-passed at 30 Hz for a figure, at least."""
+_SPECTRUM_TIME: Final = 4.0  # of one periodogram, s
+_FREQUENCIES: Final = 160  # of a spectrum
+
+
+class SeriesError(ValueError):
+    """A series has a wrong shape or values that cannot be drawn."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReportSeries:
+    """Motion of the excitation, one validation run, and friction; n joints.
+
+    Units are s, rad, N·m; of prismatic joints m, N. What may be None is unknown, for example in
+    files of earlier versions.
+
+    Raises:
+        SeriesError: shapes are inconsistent.
+    """
+
+    excitation_time: Array  #: (m,)
+    excitation_position: Array  #: (m, n)
+    excitation_velocity: Array  #: (m, n)
+    excitation_fitted: Array  #: 1 for fitted rows, else 0 (m, n)
+    example_archive: str  #: name of the archive the example was read from
+    example_time: Array  #: (k,)
+    example_measured: Array  #: low-passed for display (k, n)
+    example_predicted: Array  #: low-passed for display (k, n)
+    example_used: Array  #: 1 for rows used for the error of the verdict, else 0 (k, n)
+    #: measured torque of fitted rows minus prediction without friction (c, n), padded with NaN
+    friction_torque: Array
+    friction_speed: Array  #: speeds of these (c, n)
+    law_torque: Array  #: friction law without presliding (s, n)
+    law_speed: Array  #: speeds of these (s, n)
+    example_nominal: Array | None = None  #: of the nominal model, as the prediction (k, n)
+    example_inertia: Array | None = None  #: part of the prediction that acceleration causes (k, n)
+    example_coriolis: Array | None = None  #: Coriolis and centrifugal part (k, n)
+    example_gravity: Array | None = None  #: (k, n)
+    example_friction: Array | None = None  #: with offset (k, n)
+    example_elements: Array | None = None  #: ripple, identified springs and balancers (k, n)
+    spectrum_frequency: Array | None = None  #: (f,) [Hz]
+    #: amplitude spectral density of the measured torque of the example (f, n) [N·m/√Hz]
+    spectrum_measured: Array | None = None
+    spectrum_residual: Array | None = None  #: of measured minus predicted torque (f, n)
+
+    def __post_init__(self) -> None:
+        n = self.excitation_position.shape[-1]
+        lengths = {
+            "excitation": len(self.excitation_time),
+            "example": len(self.example_time),
+            "friction": len(self.friction_torque),
+            "law": len(self.law_torque),
+            "spectrum": 0 if self.spectrum_frequency is None else len(self.spectrum_frequency),
+        }
+        for name, found in self.arrays.items():
+            length = lengths[name.partition("_")[0]]
+            alone = name.endswith(("_time", "_frequency"))
+            shape = (length,) if alone else (length, n)
+            numbers = found.dtype == np.float64 and not np.any(np.abs(found) >= _TOO_LARGE)
+            if found.shape != shape or not numbers:
+                raise SeriesError(
+                    f"{name} has shape {found.shape} (expected {shape}), or values that cannot be"
+                    " drawn"
+                )
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Any]) -> ReportSeries:
+        """Build the series from the arrays of a file; KeyError if a needed one is missing."""
+        names = [one.name for one in fields(cls) if one.name in arrays or one.name not in _OPTIONAL]
+        return cls(**{name: arrays[name] for name in names})
+
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """All arrays that are known, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+
+    def checked_for(self, n_joints: int) -> ReportSeries:
+        """Return the series, or raise SeriesError unless they have `n_joints`."""
+        found = self.excitation_position.shape[1]
+        if found != n_joints:
+            raise SeriesError(f"excitation_position has {found} columns, not {n_joints}")
+        return self
+
+
+_OPTIONAL: Final = tuple(one.name for one in fields(ReportSeries) if one.default is None)
+
+
+def with_torques(
+    series: ReportSeries, model: RobotModel, values: Array, nominal: Array | None, samples: Samples
+) -> ReportSeries:
+    """Return the series with the example's torque by part, of the nominal model, and spectra.
+
+    `values` are the identified parameters (p,), `nominal` those of the nominal model (p,), and
+    `samples` the held-out recording of the example.
+    """
+    shown = _rows_between(series, samples)
+    time = samples.motion.time
+    parts = torque_parts(model, values, samples)
+    torques = {
+        "example_measured": samples.torque,
+        "example_predicted": sum(parts.values(), np.zeros_like(samples.torque)),
+        **{f"example_{name}": part for name, part in parts.items()},
+    }
+    if nominal is not None:
+        torques["example_nominal"] = samples.predicted_torque(model, nominal)
+    columns = for_figure(time, np.hstack([*torques.values()]))[shown]
+    low_passed: dict[str, Any] = dict(
+        zip(torques, np.split(columns, len(torques), axis=1), strict=True)
+    )
+    error = samples.torque - torques["example_predicted"]
+    absent: dict[str, Any] = dict.fromkeys(_OPTIONAL)
+    return replace(
+        series,
+        **(absent | low_passed | _spectra(samples, error)),
+        example_time=time[shown] - samples.origin,
+        example_used=samples.usable[shown].astype(np.float64),
+    )
+
+
+def torque_parts(model: RobotModel, values: Array, samples: Samples) -> dict[str, Array]:
+    """Return the predicted torque by its causes, (m, n) each; their sum is the prediction."""
+    friction = np.zeros(model.n_parameters, np.bool_)
+    friction[model.friction_part] = True
+    elements = np.zeros_like(friction)
+    elements[model.element_part] = True
+    bodies = ~(friction | elements)
+    whole = samples.predicted_torque(model, values, bodies)
+    at_rest = _with_motion(samples, velocity=False, acceleration=False)
+    without_velocity = _with_motion(samples, velocity=False, acceleration=True)
+    gravity = at_rest.predicted_torque(model, values, bodies)
+    inertia = without_velocity.predicted_torque(model, values, bodies) - gravity
+    parts = {
+        "inertia": inertia,
+        "coriolis": whole - inertia - gravity,
+        "gravity": gravity,
+        "friction": samples.predicted_torque(model, values, friction),
+    }
+    if elements.any():
+        parts["elements"] = samples.predicted_torque(model, values, elements)
+    return parts
+
+
+def _with_motion(samples: Samples, *, velocity: bool, acceleration: bool) -> Samples:
+    """Return samples at the same positions, with velocity or acceleration or zero."""
+    motion = samples.motion
+    moving = motion._replace(
+        velocity=motion.velocity if velocity else np.zeros_like(motion.velocity),
+        acceleration=motion.acceleration if acceleration else np.zeros_like(motion.acceleration),
+    )
+    if samples.parent is None:
+        return replace(samples, motion=moving)
+    parent, part = samples.parent
+    parent = _with_motion(parent, velocity=velocity, acceleration=acceleration)
+    return replace(samples, motion=moving, parent=(parent, part))
+
+
+def _rows_between(series: ReportSeries, samples: Samples) -> slice:
+    """Return the rows of the example's time, often enough for the low-pass of the figures."""
+    time = samples.motion.time - samples.origin
+    if not len(series.example_time):
+        return slice(0, 0)
+    first = int(np.searchsorted(time, series.example_time[0] - 1e-9))
+    last = int(np.searchsorted(time, series.example_time[-1] + 1e-9, side="right"))
+    rows = last - first
+    duration = max(float(time[last - 1] - time[first]), 1e-9)
+    step = max(int(rows / duration / _RATE), -(-rows // _ROWS), 1)
+    return slice(first, last, step)
+
+
+def _spectra(samples: Samples, error: Array) -> dict[str, Any]:
+    """Return the spectra of the longest stretch without a gap; none of less than 16 rows."""
+    part = max(samples.segments, key=lambda one: one.stop - one.start, default=slice(0, 0))
+    rows = part.stop - part.start
+    if rows < 16:
+        return {}
+    rate = 1.0 / float(np.median(np.diff(samples.motion.time[part])))
+    both = np.hstack([samples.torque[part], error[part]])
+    frequency, power = power_density(both, rate, min(rows, max(16, round(_SPECTRUM_TIME * rate))))
+    frequency, density = _by_ratio(frequency, power)
+    measured, residual = np.split(np.sqrt(density), 2, axis=1)
+    return {
+        "spectrum_frequency": frequency,
+        "spectrum_measured": measured,
+        "spectrum_residual": residual,
+    }
+
+
+def power_density(signals: Array, rate: float, length: int) -> tuple[Array, Array]:
+    """Return frequencies (f,) [Hz] and one-sided power densities (f, c) of signals (m, c) [1/Hz].
+
+    Welch (1967): mean over parts of `length` rows that overlap by half, with a Hann window; without
+    mean and highest frequency. Written here since importing `scipy.signal` takes longer.
+    """
+    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
+    starts = range(0, len(signals) - length + 1, max(1, length // 2))
+    power = np.zeros((length // 2 + 1, signals.shape[1]))
+    for first in starts:
+        part = signals[first : first + length]
+        power += np.abs(np.fft.rfft(window[:, None] * (part - part.mean(axis=0)), axis=0)) ** 2
+    density = 2.0 * power / (len(starts) * rate * float(np.sum(window**2)))
+    frequency = np.asarray(np.fft.rfftfreq(length, 1.0 / rate), np.float64)
+    return frequency[1:-1], density[1:-1]
+
+
+def _by_ratio(frequency: Array, power: Array) -> tuple[Array, Array]:
+    """Return the mean power (f, c) in bins of equal ratio of frequency (f,), empty ones omitted."""
+    edges = np.geomspace(frequency[0], frequency[-1] * (1.0 + 1e-9), _FREQUENCIES + 1)
+    bins = np.clip(np.searchsorted(edges, frequency, side="right") - 1, 0, _FREQUENCIES - 1)
+    starts = np.flatnonzero(np.diff(bins, prepend=-1))
+    counts = np.diff(np.append(starts, len(frequency)))
+    mean_frequency = np.add.reduceat(frequency, starts) / counts
+    return mean_frequency, np.add.reduceat(power, starts, axis=0) / counts[:, None]

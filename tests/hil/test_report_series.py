@@ -1,0 +1,87 @@
+"""Torques of a report's figures: parts add up, spectra have the power of their signals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from hil.report.series import power_density, torque_parts, with_torques
+from tests.hil.test_report import make_series
+from tests.identification.two_link import MODEL, NOISE, a_motion, recording, truth
+
+
+@pytest.fixture
+def samples():
+    motion = a_motion()
+    noise = np.random.default_rng(3).standard_normal((len(motion.time), 2))
+    return recording(NOISE * noise, motion)
+
+
+def low_passed(samples):
+    """The last part of a recording whose torque was filtered, as of a split."""
+    filtered = replace(samples, torque_bandwidth=np.array([6.0, 3.0]))
+    return filtered.between(len(samples.motion.time) // 2, len(samples.motion.time))
+
+
+class TestParts:
+    @pytest.mark.parametrize("change", [lambda samples: samples, low_passed])
+    def test_add_up_to_the_prediction(self, samples, change):
+        samples = change(samples)
+        parts = torque_parts(MODEL, truth(), samples)
+        assert [*parts] == ["inertia", "coriolis", "gravity", "friction"]
+        whole = samples.predicted_torque(MODEL, truth())
+        np.testing.assert_allclose(sum(parts.values()), whole, atol=1e-9)
+        assert all(np.ptp(part, axis=0).max() > 0.1 for part in parts.values())
+
+    def test_grow_as_their_causes_do(self, samples):
+        parts, motion = torque_parts(MODEL, truth(), samples), samples.motion
+        faster = motion._replace(
+            velocity=2.0 * motion.velocity, acceleration=3.0 * motion.acceleration
+        )
+        others = torque_parts(MODEL, truth(), replace(samples, motion=faster))
+        for name, factor in {"inertia": 3.0, "coriolis": 4.0, "gravity": 1.0}.items():
+            np.testing.assert_allclose(others[name], factor * parts[name], atol=1e-9)
+
+
+class TestSeries:
+    def test_have_the_nominal_model_and_rows_often_enough(self, samples):
+        time = samples.motion.time
+        older = make_series(samples=2000, joints=2)
+        shown = slice(0, len(time), 9)
+        older = replace(
+            older, example_time=time[shown],
+            **{name: np.zeros((len(time[shown]), 2)) for name in older.arrays
+               if name.startswith("example_") and name != "example_time"},
+        )  # fmt: skip
+        series = with_torques(older, MODEL, truth(), 0.5 * truth(), samples)
+        assert 110.0 < 1.0 / np.diff(series.example_time).mean() < 260.0
+        error = series.example_measured - series.example_predicted
+        assert np.all(np.std(error, axis=0) < NOISE), "low-passed"
+        np.testing.assert_allclose(series.example_nominal, 0.5 * series.example_predicted)
+        parts = series.example_inertia + series.example_coriolis + series.example_gravity
+        np.testing.assert_allclose(parts + series.example_friction, series.example_predicted)
+        assert series.example_elements is None
+        # White noise has the same density at all frequencies.
+        white = NOISE * np.sqrt(2.0 * 0.005)
+        middle = np.median(series.spectrum_residual, axis=0)
+        np.testing.assert_allclose(middle, white, rtol=0.2)
+        assert with_torques(older, MODEL, truth(), None, samples).example_nominal is None
+
+    def test_have_no_spectrum_of_a_few_rows(self, samples):
+        few = samples.between(0, 10)
+        older = make_series(samples=20, joints=2)
+        older = replace(older, example_time=few.motion.time)
+        older = replace(older, spectrum_frequency=None, spectrum_measured=None,
+                        spectrum_residual=None)  # fmt: skip
+        assert with_torques(older, MODEL, truth(), None, few).spectrum_frequency is None
+
+
+def test_power_density_is_that_of_scipy():
+    signals = np.random.default_rng(0).standard_normal((5000, 3)).cumsum(axis=0)
+    frequency, density = power_density(signals, 250.0, 1000)
+    expected = scipy.signal.welch(signals, 250.0, nperseg=1000, axis=0)
+    np.testing.assert_allclose(frequency, expected[0][1:-1])
+    np.testing.assert_allclose(density, expected[1][1:-1], rtol=1e-9)
