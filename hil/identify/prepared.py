@@ -363,7 +363,7 @@ def _friction_of(best: Candidate, questions: Collection[Question]) -> dict[str, 
             "load": law.load,
         }
     if "ripple" in questions and best.ripple:
-        friction |= {"ripple": [*best.ripple]}
+        friction |= {"ripple": best.ripple}
     return friction
 
 
