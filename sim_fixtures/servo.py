@@ -1,6 +1,7 @@
 """Servo of the simulated controller: position, velocity and current loops of each axis.
 
-All loops are on the motor side, once per cycle, with encoder positions:
+All loops are on the motor side, once per cycle of up to 2 ms, with encoder
+positions, and each millisecond of a longer one:
 
     demanded speed  = target speed + position gain * (target - measured)
     target current  = model current + velocity gain * (speed error + its integral)
@@ -8,12 +9,16 @@ All loops are on the motor side, once per cycle, with encoder positions:
 In some modes the PC adds to the demanded speed and the target current. The model current is that of
 the dynamic model for the target motion of the cycle. The actual current follows the target current
 with a lag and noise (`CurrentLoop`).
+
+The cycle in which the PC sends targets may be longer (`CycleServo`): as in a real drive, the loops
+do not get slower with it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import exp, inf, pi
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -25,6 +30,13 @@ from sim_fixtures.settings import ServoSettings
 
 Array = NDArray[np.float64]
 
+LONGEST_LOOP = 0.002
+"""Longest cycle in which the loops run once, s."""
+LOOP_PERIOD = 0.001
+"""Period of the loops in a longer cycle, s."""
+ROTOR_GAIN = 0.4
+"""Largest bandwidth with the rotor alone times the period of the loops: beyond some hundred rad/s
+the dead time of one period makes resonances of elastic gears grow."""
 COULOMB_SPEED = 0.02  # width of the sign change of the model's Coulomb torque [rad/s]
 
 
@@ -69,12 +81,27 @@ class NominalModel:
         return diagonal
 
 
+class CycleDemand(NamedTuple):
+    """Input of the servo for one cycle of the controller, motor side, (n,) each.
+
+    Position [rev], its change [rev per cycle], and what is added to the demanded speed [rev per
+    cycle] and to the target current [A].
+    """
+
+    target: list[float]
+    delta: list[float]
+    speed: list[float]
+    current: list[float]
+
+
 _TURN = 2.0 * pi
 INERTIA_CYCLES = 8  # cycles between two evaluations of the inertia, which changes slowly
 
 
 class Servo:
     """Position and velocity loops; per-axis values are lists (n,), motor side.
+
+    A cycle is one of the loops, of `period` [s].
 
     Attributes:
         target, delta: demanded position of the present cycle [motor rev] and its speed [per cycle].
@@ -101,7 +128,7 @@ class Servo:
         self._resolution = current_resolution
         self._deadband = settings.deadband_counts / drive.encoder_counts
         self._rotor_gain = [
-            settings.rotor_bandwidth * inertia if inertia > 0.0 else inf
+            min(settings.rotor_bandwidth, ROTOR_GAIN / period) * inertia if inertia > 0.0 else inf
             for inertia in model.rotor_inertia.tolist()
         ]
         self._gear_squared = [ratio * ratio for ratio in drive.gear_ratio]
@@ -229,6 +256,130 @@ def _within(limit: float, value: float) -> float:
     if value < limit:
         return value if value > -limit else -limit
     return limit
+
+
+class CycleServo:
+    """The loops over the cycles of the controller; per-axis values are lists (n,), motor side.
+
+    Between two targets the set-points of the loops are cubic in time, with the speeds of both.
+
+    Attributes:
+        target, delta: demanded position at the end of the cycle [motor rev], its speed [per cycle].
+        measured, measured_delta: encoder position and difference to the previous cycle [motor rev].
+        current: mean target current of the last cycle [A].
+        model_current: the dynamic model's share of it [A].
+    """
+
+    def __init__(
+        self,
+        drive: SimulatedDrive,
+        model: NominalModel,
+        settings: ServoSettings,
+        *,
+        period: float,
+        current_resolution: float = 0.0,
+    ) -> None:
+        self._n_loops = loops_per_cycle(period)
+        self._loops = Servo(
+            drive,
+            model,
+            settings,
+            period=period / self._n_loops,
+            current_resolution=current_resolution,
+        )
+        self.measured_delta = [0.0] * drive.n_axes
+        self._take_state()
+
+    def _take_state(self) -> None:
+        """Set the values of the cycle to those of released loops."""
+        loops = self._loops
+        self.target, self.delta = list(loops.target), list(loops.delta)
+        self.measured = list(loops.measured)
+        self.current, self.model_current = list(loops.current), list(loops.model_current)
+
+    @property
+    def inertia(self) -> list[float]:
+        """Diagonal of the model's inertia matrix on the joint side (n,) [kg m2]."""
+        return self._loops.inertia
+
+    def release(self) -> None:
+        """Reset: no current, zero integrals, targets at the measured positions."""
+        self._loops.release()
+        self.measured_delta = [0.0] * len(self.measured)
+        self._take_state()
+
+    def start_at(self, revolutions: Sequence[float]) -> None:
+        """Set the encoder positions of the first cycle."""
+        self._loops.start_at(revolutions)
+        self.release()
+
+    def measure(self, revolutions: Sequence[float]) -> None:
+        """Set the encoder positions of a cycle with the drive off."""
+        self._loops.measure(revolutions)
+        self._end_cycle()
+
+    def following_error(self) -> list[float]:
+        """Return target minus measured [motor rev]."""
+        return self._loops.following_error()
+
+    def run_cycle(
+        self,
+        demand: CycleDemand,
+        drive_arm: Callable[[Sequence[float]], Sequence[float]],
+    ) -> None:
+        """Run all loops of a cycle.
+
+        `drive_arm` applies target currents (n,) [A] for one period of the loops and returns the
+        encoder positions (n,) [motor rev] after it.
+        """
+        loops, n = self._loops, self._n_loops
+        loops.feed([speed / n for speed in demand.speed], demand.current)
+        currents, model_currents = [], []
+        for target, delta in self._set_points(demand):
+            currents.append(loops.advance(target, delta))
+            model_currents.append(loops.model_current)
+            loops.measure(drive_arm(loops.current))
+        self.target, self.delta = list(demand.target), list(demand.delta)
+        self.current, self.model_current = _means(currents), _means(model_currents)
+        self._end_cycle()
+
+    def _end_cycle(self) -> None:
+        """Take the encoder positions of the loops as those of the cycle."""
+        measured = list(self._loops.measured)
+        self.measured_delta = [p - q for p, q in zip(measured, self.measured, strict=True)]
+        self.measured = measured
+
+    def _set_points(self, demand: CycleDemand) -> list[tuple[list[float], list[float]]]:
+        """Return position [motor rev] and speed [per loop] of each loop of a cycle."""
+        n = self._n_loops
+        points = []
+        for loop in range(1, n):
+            s = loop / n
+            position, speed = [], []
+            for start, end, v, w in zip(
+                self.target, demand.target, self.delta, demand.delta, strict=True
+            ):
+                way = end - start
+                quadratic, cubic = 3.0 * way - 2.0 * v - w, v + w - 2.0 * way
+                position.append(start + s * (v + s * (quadratic + s * cubic)))
+                speed.append((v + s * (2.0 * quadratic + 3.0 * s * cubic)) / n)
+            points.append((position, speed))
+        points.append((list(demand.target), [w / n for w in demand.delta]))
+        return points
+
+
+def loops_per_cycle(period: float) -> int:
+    """Return the number of servo loops in a cycle of `period` [s]."""
+    return round(period / LOOP_PERIOD) if period > 1.001 * LONGEST_LOOP else 1
+
+
+def _means(rows: Sequence[list[float]]) -> list[float]:
+    """Return the means over rows of equal length."""
+    return (
+        rows[0]
+        if len(rows) == 1
+        else [sum(column) / len(rows) for column in zip(*rows, strict=True)]
+    )
 
 
 class CurrentLoop:
