@@ -10,7 +10,7 @@ Cycle k begins at t_k, with period T:
     after t_k       the reply has the target for t_(k+1); the servo computes its current
     t_k .. t_(k+1)  the plant moves under that current, which follows with a lag of tau
 
-In a cycle longer than 2 ms the loops of the servo run each millisecond, with set-points in between
+In a cycle longer than 1 ms the loops of the servo run each millisecond, with set-points in between
 and encoder positions of their own; the current of the packet is their mean.
 
 The current in packet k acted from t_(k-1) to t_k, on average at t_k - T/2 + tau. So the current

@@ -1,7 +1,6 @@
 """Servo of the simulated controller: position, velocity and current loops of each axis.
 
-All loops are on the motor side, once per cycle of up to 2 ms, with encoder
-positions, and each millisecond of a longer one:
+All loops are on the motor side, once per `LOOP_PERIOD`, with encoder positions:
 
     demanded speed  = target speed + position gain * (target - measured)
     target current  = model current + velocity gain * (speed error + its integral)
@@ -11,7 +10,7 @@ the dynamic model for the target motion of the cycle. The actual current follows
 with a lag and noise (`CurrentLoop`).
 
 The cycle in which the PC sends targets may be longer (`CycleServo`): as in a real drive, the loops
-do not get slower with it.
+do not get slower with it. At 2 ms they would excite the resonances of elastic gears.
 """
 
 from __future__ import annotations
@@ -30,13 +29,8 @@ from sim_fixtures.settings import ServoSettings
 
 Array = NDArray[np.float64]
 
-LONGEST_LOOP = 0.002
-"""Longest cycle in which the loops run once, s."""
 LOOP_PERIOD = 0.001
-"""Period of the loops in a longer cycle, s."""
-ROTOR_GAIN = 0.4
-"""Largest bandwidth with the rotor alone times the period of the loops: beyond some hundred rad/s
-the dead time of one period makes resonances of elastic gears grow."""
+"""Period of the loops, s; a cycle of the controller has a whole number of them."""
 COULOMB_SPEED = 0.02  # width of the sign change of the model's Coulomb torque [rad/s]
 
 
@@ -128,7 +122,7 @@ class Servo:
         self._resolution = current_resolution
         self._deadband = settings.deadband_counts / drive.encoder_counts
         self._rotor_gain = [
-            min(settings.rotor_bandwidth, ROTOR_GAIN / period) * inertia if inertia > 0.0 else inf
+            settings.rotor_bandwidth * inertia if inertia > 0.0 else inf
             for inertia in model.rotor_inertia.tolist()
         ]
         self._gear_squared = [ratio * ratio for ratio in drive.gear_ratio]
@@ -261,10 +255,12 @@ def _within(limit: float, value: float) -> float:
 class CycleServo:
     """The loops over the cycles of the controller; per-axis values are lists (n,), motor side.
 
-    Between two targets the set-points of the loops are cubic in time, with the speeds of both.
+    Between two targets the set-points of the loops are cubic in time. The speed of a target is the
+    step to it, the mean speed of a cycle; that at its end is extrapolated from the last two steps.
+    With the step itself, torque would lag the recorded position by half a cycle.
 
     Attributes:
-        target, delta: demanded position at the end of the cycle [motor rev], its speed [per cycle].
+        target, delta: demanded position at the end of the cycle, and the step to it [motor rev].
         measured, measured_delta: encoder position and difference to the previous cycle [motor rev].
         current: mean target current of the last cycle [A].
         model_current: the dynamic model's share of it [A].
@@ -294,6 +290,7 @@ class CycleServo:
         """Set the values of the cycle to those of released loops."""
         loops = self._loops
         self.target, self.delta = list(loops.target), list(loops.delta)
+        self._speed = list(loops.delta)
         self.measured = list(loops.measured)
         self.current, self.model_current = list(loops.current), list(loops.model_current)
 
@@ -352,25 +349,38 @@ class CycleServo:
     def _set_points(self, demand: CycleDemand) -> list[tuple[list[float], list[float]]]:
         """Return position [motor rev] and speed [per loop] of each loop of a cycle."""
         n = self._n_loops
+        if n == 1:
+            return [(demand.target, demand.delta)]
+        ends = [
+            _end_speed(step, before) for step, before in zip(demand.delta, self.delta, strict=True)
+        ]
         points = []
         for loop in range(1, n):
             s = loop / n
             position, speed = [], []
-            for start, end, v, w in zip(
-                self.target, demand.target, self.delta, demand.delta, strict=True
-            ):
+            for start, end, v, w in zip(self.target, demand.target, self._speed, ends, strict=True):
                 way = end - start
                 quadratic, cubic = 3.0 * way - 2.0 * v - w, v + w - 2.0 * way
                 position.append(start + s * (v + s * (quadratic + s * cubic)))
                 speed.append((v + s * (2.0 * quadratic + 3.0 * s * cubic)) / n)
             points.append((position, speed))
-        points.append((list(demand.target), [w / n for w in demand.delta]))
+        points.append((list(demand.target), [w / n for w in ends]))
+        self._speed = ends
         return points
+
+
+def _end_speed(step: float, before: float) -> float:
+    """Return the speed at the end of a cycle from its step and that before; all per cycle.
+
+    It has the sign of the step, so that a target that stays is not passed.
+    """
+    speed = step + 0.5 * (step - before)
+    return max(0.0, min(speed, 2.0 * step)) if step >= 0.0 else min(0.0, max(speed, 2.0 * step))
 
 
 def loops_per_cycle(period: float) -> int:
     """Return the number of servo loops in a cycle of `period` [s]."""
-    return round(period / LOOP_PERIOD) if period > 1.001 * LONGEST_LOOP else 1
+    return max(1, round(period / LOOP_PERIOD))
 
 
 def _means(rows: Sequence[list[float]]) -> list[float]:
