@@ -255,9 +255,11 @@ def _within(limit: float, value: float) -> float:
 class CycleServo:
     """The loops over the cycles of the controller; per-axis values are lists (n,), motor side.
 
-    Between two targets the set-points of the loops are cubic in time. The speed of a target is the
-    step to it, the mean speed of a cycle; that at its end is extrapolated from the last two steps.
-    With the step itself, torque would lag the recorded position by half a cycle.
+    Between two targets the speed of the loops is linear in time. What the PC sends as the speed of
+    a target is the step to it, the mean speed of a cycle; the speed at its end is extrapolated from
+    the last two steps. With the step itself, torque would lag the recorded position by half a
+    cycle. A target that does not agree with its speed, as after a lost reply, moves the position of
+    the loops alone, not their speed.
 
     Attributes:
         target, delta: demanded position at the end of the cycle, and the step to it [motor rev].
@@ -359,10 +361,9 @@ class CycleServo:
             s = loop / n
             position, speed = [], []
             for start, end, v, w in zip(self.target, demand.target, self._speed, ends, strict=True):
-                way = end - start
-                quadratic, cubic = 3.0 * way - 2.0 * v - w, v + w - 2.0 * way
-                position.append(start + s * (v + s * (quadratic + s * cubic)))
-                speed.append((v + s * (2.0 * quadratic + 3.0 * s * cubic)) / n)
+                # Linear for the part of the step that is not in the speeds, as after a lost reply.
+                position.append(start + s * (end - start - 0.5 * (1.0 - s) * (w - v)))
+                speed.append((v + s * (w - v)) / n)
             points.append((position, speed))
         points.append((list(demand.target), [w / n for w in ends]))
         self._speed = ends

@@ -19,6 +19,7 @@ import pinocchio
 from numpy.typing import NDArray
 from pydantic import StrictBool, model_validator
 
+from drivers.open_mode import LEAP_FRACTION
 from drivers.transports.simulated import Delay, Duplicate, Fault, Lose, SimulatedTransport
 from hil.archive import open_archive
 from hil.cell import Cell
@@ -183,6 +184,8 @@ class Twin:
                 "campaign.repetitions": min(repetitions, cell.campaign.repetitions),
             }
         )
+        if (sentence := too_far_without_a_packet(twin)) is not None:
+            assumed.append(sentence)
         return cls(twin, planted_values(twin), tuple(assumed), seed)
 
     def link(self, seconds: float, *, effects: bool) -> VirtualLink:
@@ -217,11 +220,12 @@ class Twin:
 
 
 def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
-    """Return single packets lost (if `max_gap` allows), doubled or late within `seconds`."""
+    """Return single packets doubled, late or, where a motion survives it, lost within `seconds`."""
     rng = np.random.default_rng([seed, 7])
     cycles = round(seconds / cell.period)
     count = max(1, round(seconds / FAULT_EVERY))
-    kinds = ["delay", "duplicate", *(["lose"] if cell.controller.max_gap else [])]
+    survived = cell.controller.max_gap > 0 and too_far_without_a_packet(cell) is None
+    kinds = ["delay", "duplicate", *(["lose"] if survived else [])]
     faults: list[Fault] = []
     # Not in the packets of the start.
     for cycle in sorted(rng.integers(1000, max(1001, cycles), count).tolist()):
@@ -233,6 +237,29 @@ def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
             case _:
                 faults.append(Lose(cycle))
     return tuple(faults)
+
+
+def too_far_without_a_packet(cell: Cell) -> str | None:
+    """Return why a lost packet ends a motion at full speed; None where the motion survives it.
+
+    A controller that extrapolates is then one step ahead of the set-point sent last.
+    """
+    if not cell.controller.max_gap:
+        return None
+    share = LEAP_FRACTION * np.array(cell.drive_table.following_error)
+    speeds = np.diag(cell.joint_limits.velocity)
+    turns = cell.drive_train.motor_revolutions_per_cycle(speeds, cell.period)
+    steps = np.abs(turns).sum(axis=0)
+    motor = int(np.argmax(steps / share))
+    if steps[motor] <= share[motor]:
+        return None
+    return (
+        f"no packet is lost: at full speed the motor of {cell.joint_names[motor]} turns by "
+        f"{steps[motor]:.2g} revolutions in a cycle of {cell.controller.cycle_ms} ms; the guard "
+        f"allows {share[motor]:.2g} ({LEAP_FRACTION:.0%} of following_error in [drive_train]), so "
+        "that a packet lost at that speed ends the motion on the real arm; a shorter cycle or a "
+        "lower velocity_deg in [limits] avoids this"
+    )
 
 
 def _varied(cell: Cell, rng: np.random.Generator) -> dict[str, list[float]]:
