@@ -81,6 +81,29 @@ class TestLostMotion:
         rig.cycle(5)
         assert source.advances == advances
 
+    @pytest.mark.parametrize("length", [12, 260, 732])
+    def test_sync_packets_in_mid_motion_are_said_to_be_a_restart(self, length):
+        """They get no reply before silence has ended the session; then they are followed."""
+        rig, _ = moving()
+        for _ in range(3):
+            assert rig.sync(1, length) is None
+        rig.session.tick(rig.now + 1.0)
+        rig.events += rig.session.events()
+        assert rig.ended.outcome == "lost"
+        assert rig.ended.reason == "the controller restarted: it sent sync packets"
+        assert rig.sync(1) is not None
+        assert rig.state is State.SYNC
+
+    def test_a_late_sync_packet_is_no_restart(self):
+        rig, source = moving()
+        advances = source.advances
+        assert rig.sync(1) is None
+        rig.cycle()
+        rig.session.tick(rig.now + 1.0)
+        rig.events += rig.session.events()
+        assert source.advances == advances + 1
+        assert rig.ended.reason == "nothing was received from the controller"
+
     @pytest.mark.parametrize(
         ("waits", "change", "reason"),
         [
