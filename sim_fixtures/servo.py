@@ -373,10 +373,9 @@ class CycleServo:
 def _end_speed(step: float, before: float) -> float:
     """Return the speed at the end of a cycle from its step and that before; all per cycle.
 
-    It has the sign of the step, so that a target that stays is not passed.
+    It is extrapolated, except to and from a target that is held.
     """
-    speed = step + 0.5 * (step - before)
-    return max(0.0, min(speed, 2.0 * step)) if step >= 0.0 else min(0.0, max(speed, 2.0 * step))
+    return step + 0.5 * (step - before) if step and before else step
 
 
 def loops_per_cycle(period: float) -> int:

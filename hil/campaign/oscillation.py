@@ -14,6 +14,9 @@ SMOOTHED: Final = 0.05  # Moving mean that is subtracted from the following erro
 WINDOW: Final = 0.1  # Windows whose rms is compared, s
 SHORTEST: Final = 5  # Fewest windows of uninterrupted growth
 GROWTH: Final = 10.0  # Least growth of the rms
+SLOWEST: Final = 40.0
+"""Lowest frequency, Hz: slower parts of the following error are those of the motion, which the
+moving mean does not remove, and grow where it begins."""
 NARROW: Final = 0.5  # Least share of the power within two bins of the dominant frequency
 
 
@@ -55,7 +58,7 @@ def growing_oscillation(error: Array, period: float) -> Oscillation | None:
         if end - start < SHORTEST or growth < GROWTH:
             continue
         frequency, share = _dominant(fast[(end - 1) * length : (end + 1) * length], period)
-        if share >= NARROW:
+        if frequency >= SLOWEST and share >= NARROW:
             seconds = (end - start) * length * period
             candidates.append(Oscillation(joint, frequency, float(growth), seconds))
     return max(candidates, key=lambda each: each.growth, default=None)
