@@ -40,3 +40,10 @@ def test_what_does_not_grow_is_none(error: dict[str, float]) -> None:
 
 def test_a_short_motion_is_not_judged() -> None:
     assert growing_oscillation(following_error(growing=1.5)[:100], PERIOD) is None
+
+
+@pytest.mark.parametrize("frequency", [3.0, 25.0])
+def test_what_grows_slowly_where_a_motion_begins_is_none(frequency: float) -> None:
+    time = np.arange(0.0, 2.0, PERIOD)
+    slow = 1e-6 * np.exp(5.0 * time) * np.sin(2.0 * np.pi * frequency * time)
+    assert growing_oscillation(slow[:, np.newaxis], PERIOD) is None
