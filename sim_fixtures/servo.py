@@ -257,7 +257,7 @@ class CycleServo:
 
     Between two targets the speed of the loops is linear in time. What the PC sends as the speed of
     a target is the step to it, the mean speed of a cycle; the speed at its end is extrapolated from
-    the last two steps. With the step itself, torque would lag the recorded position by half a
+    the last two steps. With the step itself, the feed-forward would lag by half a
     cycle. A target that does not agree with its speed, as after a lost reply, moves the position of
     the loops alone, not their speed.
 
