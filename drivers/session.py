@@ -219,6 +219,7 @@ class Session(StateMachine):
         self._last_packet = b""
         self._last_reply = b""
         self._without_reply = 0
+        self._sync_packets = 0  # of a controller that restarted, since the last reply
         # Number and last reason of packets without a reply, by kind, since the last drain.
         self._unreported: dict[str, tuple[int, str]] = {}
 
@@ -282,8 +283,15 @@ class Session(StateMachine):
         self._events.append(LinkLost(silence, self.state, self._without_reply))
         self.deadline = math.inf
         self._sequence.broken = True
-        stale = f"only packets that do not follow the last one came ({self._without_reply})"
-        self.apply(Input.SILENCE, stale if self._without_reply else "")
+        self.apply(Input.SILENCE, self._cause_of_silence())
+
+    def _cause_of_silence(self) -> str:
+        """Return what came instead of packets that get a reply; "" if nothing did."""
+        if self._sync_packets:
+            return "the controller restarted: it sent sync packets"
+        if self._without_reply:
+            return f"only packets that do not follow the last one came ({self._without_reply})"
+        return ""
 
     def reply(self, packet: bytes, now: float, ages: Ages | None = None) -> bytes | None:
         """Return the reply to a packet, or None if it gets none.
@@ -309,6 +317,9 @@ class Session(StateMachine):
                 powered = DRIVE_ON in packet[4 : 4 + N_ARMS]
                 if self._expects_sync(number, powered):
                     return self._sync(packet, number, now, powered)
+                if number < INIT_NUMBER and not powered and self._sequence.is_stale(number):
+                    # It gets a reply once silence has ended the session before.
+                    self._sync_packets += 1
                 return self._cyclic(packet, number, now, ages)
         except PacketError as error:
             self.counters.malformed += 1
@@ -409,6 +420,7 @@ class Session(StateMachine):
 
     def _finish(self, packet: bytes, reply: bytes, now: float) -> bytes:
         self.counters.replied += 1
+        self._sync_packets = 0
         self._last_packet = packet
         self._last_reply = reply
         self._arrived_at = now

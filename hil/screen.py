@@ -204,23 +204,29 @@ def _motion_rows(names: Sequence[str], motion: MotionProgress) -> list[Renderabl
     progress.add_row(ProgressBar(total, done), _times(motion))
     lost = motion.missed or motion.late or motion.not_accepted
     packets = Text(f"cycles {motion.cycles}, {_packets(motion)}", "bold yellow" if lost else "")
-    if motion.following_error is None or motion.current is None:
+    if motion.position is None and motion.following_error is None:
         return [progress, packets]
-    assert motion.following_share is not None
-    assert motion.current_share is not None
     joints = Table(box=None, pad_edge=False, expand=True)
     joints.add_column("joint", no_wrap=True)
     for title in ("following error", "of its threshold", "current", "of its limit"):
         joints.add_column(title, justify="right", no_wrap=True)
     for index, name in enumerate(names):
-        joints.add_row(
-            Text(name),
-            f"{np.degrees(motion.following_error[index]):.3f}°",
-            _share(motion.following_share[index]),
-            f"{motion.current[index]:.2f} A",
-            _share(motion.current_share[index]),
-        )
+        joints.add_row(Text(name), *_joint_cells(motion, index))
     return [progress, packets, joints]
+
+
+def _joint_cells(motion: MotionProgress, joint: int) -> tuple[str | Text, ...]:
+    """Return following error and current of a joint, "-" while its drive is off."""
+    error, error_share = motion.following_error, motion.following_share
+    current, current_share = motion.current, motion.current_share
+    if error is None or error_share is None or current is None or current_share is None:
+        return ("-",) * 4
+    return (
+        f"{np.degrees(error[joint]):.3f}°",
+        _share(error_share[joint]),
+        f"{current[joint]:.2f} A",
+        _share(current_share[joint]),
+    )
 
 
 def _share(share: float) -> Text:
@@ -438,7 +444,10 @@ class Screen:
             word, colour = ("STOPPING", "red") if stopping else ("HELD", "yellow")
             state.append(f" {word} ", style=f"bold {colour} reverse").append("  ")
         if status is not None and self.age > STALE:
-            state.append(f"no news for {self.age:.0f} s  ", style="bold red")
+            # What was shown last is over; the newest message is why the run waits.
+            reason = f": {self._messages[-1]}" if self._messages else ""
+            state.append(printable(f"no news for {self.age:.0f} s{reason}  "), style="bold red")
+            motion = None
         state.append(f"override {request.override if motion is None else motion.override:.0%}")
         if motion is not None and motion.rate is not None:
             state.append(f", now {motion.rate:.0%}")

@@ -22,9 +22,12 @@ from sim_fixtures import (
     UnmodelledEffects,
 )
 from sim_fixtures.faults import ControllerFault
+from sim_fixtures.servo import loops_per_cycle
 
 Array = NDArray[np.float64]
 
+STEP = 0.0005
+"""Step of a simulated arm with effects that the model leaves out, s."""
 _CHECKED = 100
 """Postures checked on each path of the controller's own motion."""
 _POSTURES = 12
@@ -104,9 +107,9 @@ def controller_settings(cell: Cell, *, effects: bool = False) -> ControllerSetti
     return ControllerSettings(
         period=cell.period,
         open_mode=cell.controller.mode,
-        # Elastic gears and a delay of half a cycle need steps shorter than the cycle; rigid gears
-        # are integrated to second order under a constant current.
-        substeps=2 if effects else 1,
+        # Elastic gears and a delay of 0.5 ms need steps of 0.5 ms; rigid gears are integrated to
+        # second order under a constant current.
+        substeps=round(cell.period / loops_per_cycle(cell.period) / STEP) if effects else 1,
         current_noise=cell.simulation.current_noise,
         current_resolution=cell.simulation.current_resolution,
     )

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.plant import ElasticPlant, Plant, PlantTruth
-from sim_fixtures.servo import CurrentLoop
+from sim_fixtures.servo import CurrentLoop, loops_per_cycle
 from sim_fixtures.settings import ControllerSettings
 
 Array = NDArray[np.float64]
@@ -189,7 +189,8 @@ class SimulatedArm:
         self._drive = drive
         self._period = settings.period
         self._substeps = settings.substeps
-        self._substep = settings.period / settings.substeps
+        self._loops = loops_per_cycle(settings.period)
+        self._substep = settings.period / (self._loops * settings.substeps)
         # closed brakes hold the largest torques of the motors
         holding = [abs(t) for t in drive.joint_torques(drive.current_limit)]
         if any(effects.elasticity):
@@ -212,6 +213,7 @@ class SimulatedArm:
             delay_substeps=round(effects.delay / self._substep),
         )
         self.currents = [0.0] * n
+        self._load: Array | None = None
         self.disturbances = Disturbances(holding)
         self._ripple: TorqueRipple | None = None
         if effects.torque_ripple > 0.0:
@@ -224,30 +226,51 @@ class SimulatedArm:
         """Return the motor positions [rev] in whole encoder counts."""
         return self._drive.encoder(self._motors(), self._encoder_noise.draw())
 
-    def run_cycle(self, target_currents: Sequence[float] | None, *, braked: bool) -> None:
-        """Simulate one period under target currents (n,) [A]; None for a drive that is off."""
+    def begin_cycle(self, *, braked: bool) -> None:
+        """Begin a cycle of the controller with closed or open brakes."""
         plant = self.plant
         plant.close_brakes(braked)
         disturbances = self.disturbances
         if disturbances.changed:
             plant.jam(disturbances.jam)
-        load = None if braked else disturbances.load
+        self._load = None if braked else disturbances.load
         if self._drift is not None:
             plant.scale_friction(self._drift.scale(plant.velocity, self._period))
+
+    def run(self, target_currents: Sequence[float]) -> list[float]:
+        """Simulate one period of the servo loops; return the encoder positions [motor rev].
+
+        `target_currents` are (n,) [A].
+        """
         noise = self._current_noise.draw()
         for _ in range(self._substeps):
-            if target_currents is None:
+            self.currents = self._loop.substep(target_currents, noise)
+            self._step()
+        return self.encoders()
+
+    def end_cycle(self) -> None:
+        """End the cycle."""
+        self.disturbances.advance()
+
+    def run_unpowered_cycle(self) -> None:
+        """Simulate a cycle with the drive off and closed brakes."""
+        self.begin_cycle(braked=True)
+        for _ in range(self._loops):
+            self._current_noise.draw()
+            for _ in range(self._substeps):
                 self._loop.cut()
                 self.currents = [0.0] * len(self.currents)
-            else:
-                self.currents = self._loop.substep(target_currents, noise)
-            torque = np.array(self._drive.joint_torques(self.currents))
-            if self._ripple is not None:
-                torque += self._ripple.torque(self._motors())
-            if load is not None:
-                torque += load
-            plant.step(torque, self._substep)
-        disturbances.advance()
+                self._step()
+        self.end_cycle()
+
+    def _step(self) -> None:
+        """Simulate one sub-step under the present currents."""
+        torque = np.array(self._drive.joint_torques(self.currents))
+        if self._ripple is not None:
+            torque += self._ripple.torque(self._motors())
+        if self._load is not None:
+            torque += self._load
+        self.plant.step(torque, self._substep)
 
     def _motors(self) -> list[float]:
         position: list[float] = self.plant.motor_position.tolist()

@@ -10,6 +10,9 @@ Cycle k begins at t_k, with period T:
     after t_k       the reply has the target for t_(k+1); the servo computes its current
     t_k .. t_(k+1)  the plant moves under that current, which follows with a lag of tau
 
+In a cycle longer than 1 ms the loops of the servo run each millisecond, with set-points in between
+and encoder positions of their own; the current of the packet is their mean.
+
 The current in packet k acted from t_(k-1) to t_k, on average at t_k - T/2 + tau. So the current
 that belongs to the position of packet k is recorded `current_delay_cycles` = 1/2 - tau/T cycles
 later.
@@ -47,7 +50,7 @@ from sim_fixtures.arm import DisturbanceKind, SimulatedArm, UnmodelledEffects
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.faults import ControllerFault
 from sim_fixtures.plant import PlantTruth
-from sim_fixtures.servo import NominalModel, Servo
+from sim_fixtures.servo import CycleDemand, CycleServo, NominalModel
 from sim_fixtures.settings import AXES_PER_ARM, ControllerSettings, SettingError
 
 _PC_TARGETS = (1, 4, 5)
@@ -548,19 +551,6 @@ _ADDS_SPEED = (2, 8)
 _ADDS_CURRENT = (1, 2, 9)
 
 
-class Demand(NamedTuple):
-    """Input of the servo for one cycle, motor side, (n,) each.
-
-    Position [rev], its change [rev per cycle], and what is added to the demanded speed [rev per
-    cycle] and to the target current [A].
-    """
-
-    target: list[float]
-    delta: list[float]
-    speed: list[float]
-    current: list[float]
-
-
 class Targets:
     """Computes the demand of each cycle from the own program and the replies.
 
@@ -587,7 +577,7 @@ class Targets:
         """Whether the own motion is finished, or there is none."""
         return self._motion is None or self._motion.finished
 
-    def release(self, servo: Servo) -> None:
+    def release(self, servo: CycleServo) -> None:
         """With the drive off, set targets to the motor positions and abort the own motion."""
         self.own, self.own_delta = list(servo.target), list(servo.delta)
         self._offset = [0.0] * len(self.own)
@@ -603,7 +593,7 @@ class Targets:
         if self._motion is not None:
             self._motion.end()
 
-    def advance(self, servo: Servo, program: LoopProgram, wanted: Wanted) -> Demand:
+    def advance(self, servo: CycleServo, program: LoopProgram, wanted: Wanted) -> CycleDemand:
         """Return the demand of the cycle that begins, with the PC's reply `wanted` (n,)."""
         demand = self._own_demand(servo, program)
         if self._settings.corrected and program.listening:
@@ -616,18 +606,18 @@ class Targets:
             self._offset = [0.0] * len(self.own)
         return demand
 
-    def _own_demand(self, servo: Servo, program: LoopProgram) -> Demand:
+    def _own_demand(self, servo: CycleServo, program: LoopProgram) -> CycleDemand:
         """Return the demand without a reply."""
         n = self._drive.n_axes
         zero = [0.0] * n
         corrected = self._settings.corrected and program.listening
         if self._moves_itself(program):
-            return Demand(*self._own_move(), zero, list(zero))
+            return CycleDemand(*self._own_move(), zero, list(zero))
         if not program.powered:
             self._break_off()
         self._moving = False
         if corrected:
-            return Demand(list(self.own), list(zero), zero, list(zero))
+            return CycleDemand(list(self.own), list(zero), zero, list(zero))
         continues = self._settings.while_silent == "continue"
         target, delta = list(servo.target), [0.0] * n
         for i, before in enumerate(servo.delta):
@@ -636,7 +626,7 @@ class Targets:
                 continue
             delta[i] = self._slow_down(i, before, program)
             target[i] += 0.5 * (before + delta[i])
-        return Demand(target, delta, zero, list(zero))
+        return CycleDemand(target, delta, zero, list(zero))
 
     def _slow_down(self, axis: int, before: float, program: LoopProgram) -> float:
         """Return the speed after `before` of an axis without a target in this cycle."""
@@ -663,7 +653,7 @@ class Targets:
         target = self._drive.motor_revolutions(position.tolist())
         return target, [period * v for v in self._drive.motor_speeds(velocity.tolist())]
 
-    def _follow(self, demand: Demand, wanted: Wanted) -> None:
+    def _follow(self, demand: CycleDemand, wanted: Wanted) -> None:
         """Replace the controller's targets by those of the PC."""
         feeds = self._settings.open_mode == 1
         for i, fields in enumerate(wanted):
@@ -675,7 +665,7 @@ class Targets:
                 demand.speed[i] = fields[3] - fields[1]
                 demand.current[i] = fields[4]
 
-    def _correct(self, demand: Demand, wanted: Wanted) -> None:
+    def _correct(self, demand: CycleDemand, wanted: Wanted) -> None:
         """Apply the PC's corrections to the controller's targets."""
         mode = self._settings.open_mode
         for i, fields in enumerate(wanted):
@@ -751,7 +741,7 @@ class SimulatedController:
         self.plant = self._arm.plant
         gains, resolution = settings.servo, settings.current_resolution
         model = NominalModel(urdf, truth, gravity=gravity, error=gains.model_error, rng=model_rng)
-        self.servo = Servo(
+        self.servo = CycleServo(
             drive, model, gains, period=settings.period, current_resolution=resolution
         )
         self.servo.start_at(self._arm.encoders())
@@ -855,7 +845,7 @@ class SimulatedController:
         self._awaiting = False
         if self._silent:
             self._silent -= 1
-            self._run(Demand([], [], [], []))
+            self._run(CycleDemand([], [], [], []))
             return
         requests, wanted = self._read(reply) if reply is not None else (MISSING, self._nothing)
         demand = self._targets.advance(self.servo, self.program, wanted)
@@ -866,17 +856,16 @@ class SimulatedController:
         self._run(demand)
         self._number = next_number(self._number)
 
-    def _run(self, demand: Demand) -> None:
+    def _run(self, demand: CycleDemand) -> None:
         """Simulate the arm for one period and read its encoders."""
         servo, program = self.servo, self.program
         if program.powered:
-            servo.feed(demand.speed, demand.current)
-            currents = servo.advance(demand.target, demand.delta)
-            self._arm.run_cycle(currents, braked=program.braked)
-            servo.measure(self._arm.encoders())
+            self._arm.begin_cycle(braked=program.braked)
+            servo.run_cycle(demand, self._arm.run)
+            self._arm.end_cycle()
             self._check_following_error()
         else:
-            self._arm.run_cycle(None, braked=True)
+            self._arm.run_unpowered_cycle()
             servo.measure(self._arm.encoders())
             servo.release()
             self._targets.release(servo)

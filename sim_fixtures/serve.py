@@ -239,8 +239,9 @@ def serve(
     called once per cycle with the counts so far.
 
     A cycle without a reply is extended by up to `stretch` s. Real controllers do not extend
-    cycles; this is for PCs with occasional delays. After `END`, a PC that did not reply within an
-    extension is not waited for until it replies again.
+    cycles; this is for PCs with occasional delays. A PC from which nothing came within an extension
+    is gone: it is not waited for again before something comes from it, so that a program that has
+    ended costs one extension. After `END`, only a valid reply counts.
     """
     server = _Server(peer, link, request, watch, clock, patience, stretch)
     if server.await_pc():
@@ -263,6 +264,7 @@ class _Server:
     due: float = 0.0
     finish_by: float | None = None
     without_reply: bool = False
+    gone: bool = False  # nothing came from the PC within the last extension
 
     def await_pc(self) -> bool:
         """Repeat the first packet until it gets a reply; False if the end is requested before."""
@@ -316,8 +318,9 @@ class _Server:
         self.link.send(packet)
         reply = self._reply(packet, sent + self.peer.period)
         ending = self.finish_by is not None
-        if reply is None and self.stretch and not (self.without_reply and ending):
+        if reply is None and self.stretch and not self.gone and not (self.without_reply and ending):
             until = sent + self.peer.period
+            self.gone = True
             reply = self._reply(packet, until + self.stretch)
             self.counts.stretched += 1
             extended = self.clock.monotonic() - until
@@ -367,6 +370,7 @@ class _Server:
             reply = self.link.receive(max(0.0, until - self.clock.monotonic()))
             if reply is None:
                 return None
+            self.gone = False
             number = _number(reply)
             if number == wanted:
                 return reply

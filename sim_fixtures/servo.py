@@ -1,6 +1,6 @@
 """Servo of the simulated controller: position, velocity and current loops of each axis.
 
-All loops are on the motor side, once per cycle, with encoder positions:
+All loops are on the motor side, once per `LOOP_PERIOD`, with encoder positions:
 
     demanded speed  = target speed + position gain * (target - measured)
     target current  = model current + velocity gain * (speed error + its integral)
@@ -8,12 +8,16 @@ All loops are on the motor side, once per cycle, with encoder positions:
 In some modes the PC adds to the demanded speed and the target current. The model current is that of
 the dynamic model for the target motion of the cycle. The actual current follows the target current
 with a lag and noise (`CurrentLoop`).
+
+The cycle in which the PC sends targets may be longer (`CycleServo`): as in a real drive, the loops
+do not get slower with it. At 2 ms they would excite the resonances of elastic gears.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import exp, inf, pi
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -25,6 +29,8 @@ from sim_fixtures.settings import ServoSettings
 
 Array = NDArray[np.float64]
 
+LOOP_PERIOD = 0.001
+"""Period of the loops, s; a cycle of the controller has a whole number of them."""
 COULOMB_SPEED = 0.02  # width of the sign change of the model's Coulomb torque [rad/s]
 
 
@@ -69,12 +75,27 @@ class NominalModel:
         return diagonal
 
 
+class CycleDemand(NamedTuple):
+    """Input of the servo for one cycle of the controller, motor side, (n,) each.
+
+    Position [rev], its change [rev per cycle], and what is added to the demanded speed [rev per
+    cycle] and to the target current [A].
+    """
+
+    target: list[float]
+    delta: list[float]
+    speed: list[float]
+    current: list[float]
+
+
 _TURN = 2.0 * pi
 INERTIA_CYCLES = 8  # cycles between two evaluations of the inertia, which changes slowly
 
 
 class Servo:
     """Position and velocity loops; per-axis values are lists (n,), motor side.
+
+    A cycle is one of the loops, of `period` [s].
 
     Attributes:
         target, delta: demanded position of the present cycle [motor rev] and its speed [per cycle].
@@ -229,6 +250,146 @@ def _within(limit: float, value: float) -> float:
     if value < limit:
         return value if value > -limit else -limit
     return limit
+
+
+class CycleServo:
+    """The loops over the cycles of the controller; per-axis values are lists (n,), motor side.
+
+    Between two targets the speed of the loops is linear in time. What the PC sends as the speed of
+    a target is the step to it, the mean speed of a cycle; the speed at its end is extrapolated from
+    the last two steps. With the step itself, the feed-forward would lag by half a
+    cycle. A target that does not agree with its speed, as after a lost reply, moves the position of
+    the loops alone, not their speed.
+
+    Attributes:
+        target, delta: demanded position at the end of the cycle, and the step to it [motor rev].
+        measured, measured_delta: encoder position and difference to the previous cycle [motor rev].
+        current: mean target current of the last cycle [A].
+        model_current: the dynamic model's share of it [A].
+    """
+
+    def __init__(
+        self,
+        drive: SimulatedDrive,
+        model: NominalModel,
+        settings: ServoSettings,
+        *,
+        period: float,
+        current_resolution: float = 0.0,
+    ) -> None:
+        self._n_loops = loops_per_cycle(period)
+        self._loops = Servo(
+            drive,
+            model,
+            settings,
+            period=period / self._n_loops,
+            current_resolution=current_resolution,
+        )
+        self.measured_delta = [0.0] * drive.n_axes
+        self._take_state()
+
+    def _take_state(self) -> None:
+        """Set the values of the cycle to those of released loops."""
+        loops = self._loops
+        self.target, self.delta = list(loops.target), list(loops.delta)
+        self._speed = list(loops.delta)
+        self.measured = list(loops.measured)
+        self.current, self.model_current = list(loops.current), list(loops.model_current)
+
+    @property
+    def inertia(self) -> list[float]:
+        """Diagonal of the model's inertia matrix on the joint side (n,) [kg m2]."""
+        return self._loops.inertia
+
+    def release(self) -> None:
+        """Reset: no current, zero integrals, targets at the measured positions."""
+        self._loops.release()
+        self.measured_delta = [0.0] * len(self.measured)
+        self._take_state()
+
+    def start_at(self, revolutions: Sequence[float]) -> None:
+        """Set the encoder positions of the first cycle."""
+        self._loops.start_at(revolutions)
+        self.release()
+
+    def measure(self, revolutions: Sequence[float]) -> None:
+        """Set the encoder positions of a cycle with the drive off."""
+        self._loops.measure(revolutions)
+        self._end_cycle()
+
+    def following_error(self) -> list[float]:
+        """Return target minus measured [motor rev]."""
+        return self._loops.following_error()
+
+    def run_cycle(
+        self,
+        demand: CycleDemand,
+        drive_arm: Callable[[Sequence[float]], Sequence[float]],
+    ) -> None:
+        """Run all loops of a cycle.
+
+        `drive_arm` applies target currents (n,) [A] for one period of the loops and returns the
+        encoder positions (n,) [motor rev] after it.
+        """
+        loops, n = self._loops, self._n_loops
+        loops.feed([speed / n for speed in demand.speed], demand.current)
+        currents, model_currents = [], []
+        for target, delta in self._set_points(demand):
+            currents.append(loops.advance(target, delta))
+            model_currents.append(loops.model_current)
+            loops.measure(drive_arm(loops.current))
+        self.target, self.delta = list(demand.target), list(demand.delta)
+        self.current, self.model_current = _means(currents), _means(model_currents)
+        self._end_cycle()
+
+    def _end_cycle(self) -> None:
+        """Take the encoder positions of the loops as those of the cycle."""
+        measured = list(self._loops.measured)
+        self.measured_delta = [p - q for p, q in zip(measured, self.measured, strict=True)]
+        self.measured = measured
+
+    def _set_points(self, demand: CycleDemand) -> list[tuple[list[float], list[float]]]:
+        """Return position [motor rev] and speed [per loop] of each loop of a cycle."""
+        n = self._n_loops
+        if n == 1:
+            return [(demand.target, demand.delta)]
+        ends = [
+            _end_speed(step, before) for step, before in zip(demand.delta, self.delta, strict=True)
+        ]
+        points = []
+        for loop in range(1, n):
+            s = loop / n
+            position, speed = [], []
+            for start, end, v, w in zip(self.target, demand.target, self._speed, ends, strict=True):
+                # Linear for the part of the step that is not in the speeds, as after a lost reply.
+                position.append(start + s * (end - start - 0.5 * (1.0 - s) * (w - v)))
+                speed.append((v + s * (w - v)) / n)
+            points.append((position, speed))
+        points.append((list(demand.target), [w / n for w in ends]))
+        self._speed = ends
+        return points
+
+
+def _end_speed(step: float, before: float) -> float:
+    """Return the speed at the end of a cycle from its step and that before; all per cycle.
+
+    It is extrapolated, except to and from a target that is held.
+    """
+    return step + 0.5 * (step - before) if step and before else step
+
+
+def loops_per_cycle(period: float) -> int:
+    """Return the number of servo loops in a cycle of `period` [s]."""
+    return max(1, round(period / LOOP_PERIOD))
+
+
+def _means(rows: Sequence[list[float]]) -> list[float]:
+    """Return the means over rows of equal length."""
+    return (
+        rows[0]
+        if len(rows) == 1
+        else [sum(column) / len(rows) for column in zip(*rows, strict=True)]
+    )
 
 
 class CurrentLoop:

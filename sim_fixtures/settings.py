@@ -69,7 +69,7 @@ class ControllerSettings:
 
     period: float = 0.001  # s; an integer number of ms
     open_mode: int = 4  # 1, 2, 4, 5, 7, 8 or 9
-    substeps: int = 2  # integration steps of the plant per cycle
+    substeps: int = 2  # integration steps of the plant per period of the servo loops
     current_noise: float = 0.0  # standard deviation of the actual current, A; white
     current_resolution: float = 0.0  # step of the target current, A; 0 for none
     encoder_noise: float = 0.5  # standard deviation before rounding, encoder counts

@@ -26,7 +26,7 @@ from drivers.exchange.process import ExchangeProcess, WithdrawnError
 from drivers.guard import Guard
 from drivers.init_check import float32_text, is_narrower
 from drivers.motion_source import MotionSource, progress_of
-from drivers.packets import InitPacket
+from drivers.packets import DRIVE_ON, InitPacket
 from drivers.record import CycleRing
 from drivers.session import Session
 from drivers.states import HAS_SET_POINTS, State
@@ -170,15 +170,16 @@ class Steering:
         arrays: dict[str, Array] = {}
         if self._last is not None:
             last = self._last[0]
-            error = last["target_position"] - last["position"]
-            turns = np.abs(error @ drives.motor_from_joint.T) / TURN
-            arrays = {
-                "position": last["position"].copy(),
-                "following_error": error,
-                "following_share": turns / guard.following_error,
-                "current": last["target_current"].copy(),
-                "current_share": np.abs(last["target_current"]) / guard.current,
-            }
+            arrays = {"position": last["position"].copy()}
+            if last["status"] == DRIVE_ON:  # else the controller has neither target nor current
+                error = last["target_position"] - last["position"]
+                turns = np.abs(error @ drives.motor_from_joint.T) / TURN
+                arrays |= {
+                    "following_error": error,
+                    "following_share": turns / guard.following_error,
+                    "current": last["target_current"].copy(),
+                    "current_share": np.abs(last["target_current"]) / guard.current,
+                }
         self._watch.show(
             MotionProgress(
                 motion_time=None if math.isnan(motion_time) else motion_time,

@@ -29,7 +29,7 @@ from drivers.events import (
     PacketRejected,
     Refused,
 )
-from drivers.exchange.control import ControlBlock, HeartbeatMonitor
+from drivers.exchange.control import HEARTBEAT_TIMEOUT, ControlBlock, HeartbeatMonitor
 from drivers.exchange.event_log import (
     NO_ARCHIVE,
     EventsLost,
@@ -238,6 +238,21 @@ class ExchangeView:
         self.poll()
         message = f" ({self._last_message})" if self._last_message else ""
         return f"the exchange process {self.ended_for or 'ended' + message}"
+
+
+def archive_silence(disk_waited: float) -> str:
+    """Return why a motion was stopped without heartbeats of the archive process, with a remedy.
+
+    `disk_waited` is the longest time that it waited for its disk [s].
+    """
+    if disk_waited > SLOW_DISK:
+        cause = f"it waited for its disk for {disk_waited:.1f} s: check that disk"
+    else:
+        cause = (
+            "it was suspended, or this PC gave it no processor time: end other programs, and "
+            "check this PC with `hil doctor`"
+        )
+    return f"{NO_ARCHIVE}, for more than {HEARTBEAT_TIMEOUT:g} s ({cause})"
 
 
 @dataclass(eq=False)
@@ -621,9 +636,8 @@ class LiveLink(MotionLink):
                 f"{failure}; the controller gets no replies and acts by its own watchdog; "
                 f"the archive ({recorded.outcome}) is complete up to then"
             )
-        if ended.reason == NO_ARCHIVE and recorded.disk_waited > SLOW_DISK:
-            waited = f"it waited for its disk for {recorded.disk_waited:.1f} s"
-            return replace(ended, reason=f"{NO_ARCHIVE} ({waited}: check that disk)")
+        if ended.reason == NO_ARCHIVE:
+            return replace(ended, reason=archive_silence(recorded.disk_waited))
         return ended
 
     def _give_up(self, spec: ArchiveSpec, reason: str) -> MotionEnded:

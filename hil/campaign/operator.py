@@ -81,6 +81,8 @@ class OperatorRequest:
 class MotionProgress:
     """State of a motion. Joint arrays are (n,); None before the first record.
 
+    Following error and current are None while the drive is off, too.
+
     Attributes:
         motion_time, duration: s of the planned motion, done and in total; None if unknown.
         cycles, missed, late, not_accepted: packets of this motion that got a reply, never arrived,

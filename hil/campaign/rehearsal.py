@@ -7,6 +7,7 @@ without `[simulation]` gets one from `[nominal]` and the defaults below.
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -18,6 +19,7 @@ import pinocchio
 from numpy.typing import NDArray
 from pydantic import StrictBool, model_validator
 
+from drivers.open_mode import LEAP_FRACTION
 from drivers.transports.simulated import Delay, Duplicate, Fault, Lose, SimulatedTransport
 from hil.archive import open_archive
 from hil.cell import Cell
@@ -44,6 +46,7 @@ from .folder import CampaignFolder, load_record
 from .intervals import planned_intervals, require_runnable
 from .link import VirtualLink
 from .operator import Stop
+from .oscillation import growing_oscillation
 
 if TYPE_CHECKING:
     from .campaign import Campaign
@@ -143,7 +146,7 @@ LOOP_CYCLES: Final = 0.5
 RESONANCE: Final = 500.0
 """Resonance of a main axis, rotor against link, rad/s, where the cell has no elasticity."""
 FASTEST: Final = 800.0
-"""Highest resonance in any posture, rad/s: the simulated arm has steps of half a cycle."""
+"""Highest resonance in any posture, rad/s: the simulated arm has steps of 0.5 ms."""
 POSTURES: Final = 60  # Postures in which the resonances are computed
 MAIN_AXES: Final = 3
 SLOWEST_LOOP: Final = 0.002
@@ -181,6 +184,8 @@ class Twin:
                 "campaign.repetitions": min(repetitions, cell.campaign.repetitions),
             }
         )
+        if (sentence := too_far_without_a_packet(twin)) is not None:
+            assumed.append(sentence)
         return cls(twin, planted_values(twin), tuple(assumed), seed)
 
     def link(self, seconds: float, *, effects: bool) -> VirtualLink:
@@ -215,11 +220,12 @@ class Twin:
 
 
 def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
-    """Return single packets lost (if `max_gap` allows), doubled or late within `seconds`."""
+    """Return single packets doubled, late or, where a motion survives it, lost within `seconds`."""
     rng = np.random.default_rng([seed, 7])
     cycles = round(seconds / cell.period)
     count = max(1, round(seconds / FAULT_EVERY))
-    kinds = ["delay", "duplicate", *(["lose"] if cell.controller.max_gap else [])]
+    survived = cell.controller.max_gap > 0 and too_far_without_a_packet(cell) is None
+    kinds = ["delay", "duplicate", *(["lose"] if survived else [])]
     faults: list[Fault] = []
     # Not in the packets of the start.
     for cycle in sorted(rng.integers(1000, max(1001, cycles), count).tolist()):
@@ -231,6 +237,29 @@ def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
             case _:
                 faults.append(Lose(cycle))
     return tuple(faults)
+
+
+def too_far_without_a_packet(cell: Cell) -> str | None:
+    """Return why a lost packet ends a motion at full speed; None where the motion survives it.
+
+    A controller that extrapolates is then one step ahead of the set-point sent last.
+    """
+    if not cell.controller.max_gap:
+        return None
+    share = LEAP_FRACTION * np.array(cell.drive_table.following_error)
+    speeds = np.diag(cell.joint_limits.velocity)
+    turns = cell.drive_train.motor_revolutions_per_cycle(speeds, cell.period)
+    steps = np.abs(turns).sum(axis=0)
+    motor = int(np.argmax(steps / share))
+    if steps[motor] <= share[motor]:
+        return None
+    return (
+        f"no packet is lost: at full speed the motor of {cell.joint_names[motor]} turns by "
+        f"{steps[motor]:.2g} revolutions in a cycle of {cell.controller.cycle_ms} ms; the guard "
+        f"allows {share[motor]:.2g} ({LEAP_FRACTION:.0%} of following_error in [drive_train]), so "
+        "that a packet lost at that speed ends the motion on the real arm; a shorter cycle or a "
+        "lower velocity_deg in [limits] avoids this"
+    )
 
 
 def _varied(cell: Cell, rng: np.random.Generator) -> dict[str, list[float]]:
@@ -320,6 +349,8 @@ MOST_SIGMA: Final = 4.0
 """Largest deviation of an estimate from the simulated value, in standard deviations."""
 MOST_ERROR: Final = 1.2
 """Largest error on unseen motion, as a multiple of that of the simulated parameters."""
+MOST_SPEED: Final = 1.05
+"""Largest measured speed, as a share of the limit that a plan keeps; the rest is control error."""
 SATURATED: Final = 0.99  # Share of the current limit from which a motor is saturated
 
 
@@ -348,7 +379,87 @@ def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> 
         bound,
         f"{name}: the largest current is {worst:.0%} of its limit (motor of "
         f"{cell.joint_names[motor]}, {where}), at most {bound:.0%} is allowed",
+        _motion_remedy(
+            cell,
+            folder.archives / where,
+            motor,
+            "lower acceleration_deg in [limits] of the cell file, and design again",
+        ),
     )
+
+
+def of_motions(cell: Cell, folder: CampaignFolder, name: str, failure: str) -> Criterion:
+    """Judge whether all motions were completed (`failure` is ""), within the speed limits."""
+    entries = folder.manifest()
+    if failure:
+        place = folder.archives / entries[-1].name if entries else None
+        remedy = "" if place is None else _motion_remedy(cell, place, None, "correct the cell file")
+        text = f"{name}: {failure}"
+        return criterion(f"motions ({name})", 1.0, 0.0, text, remedy)
+    shares = [_speed_shares(cell, folder.archives / entry.name) for entry in entries]
+    fastest = int(np.argmax([share.max() for share in shares]))
+    joint = int(np.argmax(shares[fastest]))
+    share, where = float(shares[fastest][joint]), entries[fastest].name
+    if share <= MOST_SPEED:
+        text = f"{name}: every motion was completed, at up to {share:.0%} of a speed limit"
+        return criterion(f"motions ({name})", 0.0, 0.0, text)
+    return criterion(
+        f"motions ({name})",
+        1.0,
+        0.0,
+        f"{name}: {cell.joint_names[joint]} moved at {share:.0%} of its speed limit ({where}), at "
+        f"most {MOST_SPEED:.0%} is allowed",
+        _motion_remedy(
+            cell,
+            folder.archives / where,
+            joint,
+            "lower velocity_deg in [limits] of the cell file, and design again",
+        ),
+    )
+
+
+def _speed_shares(cell: Cell, path: Path) -> Array:
+    """Return the largest measured speed of each joint over its limit (n,).
+
+    Two encoder counts between two packets may be noise and do not count.
+    """
+    columns = open_archive(path).columns
+    drives = cell.drive_train
+    count = 2.0 * np.pi / cell.drive_table.encoder_counts_per_revolution
+    noise = 2.0 * count * np.abs(drives.joint_from_motor).sum(axis=1)
+    cycles = np.diff(columns["cycle"].astype(np.float64))[:, np.newaxis]
+    steps = np.maximum(np.abs(np.diff(columns["position"], axis=0)) - noise, 0.0)
+    speeds = np.divide(
+        steps,
+        cell.period * cycles,
+        out=np.zeros_like(steps),
+        where=np.isfinite(steps) & (cycles > 0),
+    )
+    shares: Array = speeds.max(axis=0, initial=0.0) / cell.joint_limits.velocity
+    return shares
+
+
+def _motion_remedy(cell: Cell, path: Path, joint: int | None, remedy: str) -> str:
+    """Return what to do about a motion, and the command that plots it.
+
+    An oscillation that grows has another cause than the motion: `remedy` does not apply to it.
+    """
+    columns = open_archive(path).columns
+    error = columns["commanded_position"] - columns["position"]
+    error = error[np.isfinite(error).all(axis=1)]
+    oscillation = growing_oscillation(error, cell.period)
+    if oscillation is not None:
+        joint = oscillation.joint
+        remedy = (
+            f"{oscillation.sentence(cell.joint_names)}: the control of the simulated arm is "
+            "unstable, the motion is not at fault; correct rotor_inertia in [nominal] and "
+            "current_delay_cycles in [controller] of the cell file"
+            + (", or elasticity in [simulation]" if cell.file.simulation is not None else "")
+        )
+    command = ["hil", "plot", str(path)]
+    if joint is not None:
+        command += ["--joint", cell.joint_names[joint]]
+    return f"{remedy}; see `{shlex.join(command)}`"
 
 
 def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[Criterion]:
@@ -464,14 +575,7 @@ def _rehearsed(
         link = twin.link(planned, effects=effects)
         failure = _failure(rehearsal, link, twin, reporter, stop)
         seconds += link.cycles * cell.period
-        criteria.append(
-            criterion(
-                f"motions ({name})",
-                float(bool(failure)),
-                0.0,
-                f"{name}: {failure or 'every motion was completed'}",
-            )
-        )
+        criteria.append(of_motions(twin.cell, rehearsal.folder, name, failure))
         if rehearsal.folder.manifest():
             bound = SATURATED if effects else PLANNED_CURRENT
             criteria.append(of_currents(twin.cell, rehearsal.folder, name, bound))

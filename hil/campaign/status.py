@@ -6,8 +6,10 @@ import shlex
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
+from hil.archive import ArchiveName
+from hil.cell import Cell
 from hil.errors import HilError
 from hil.reading import path_exists
 from hil.results import ConductResult, Results, StepResult
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from .campaign import Campaign
 
 State = Literal["done", "next", "blocked"]
+NOT_WANTED: Final = "none wanted (warmup_drift)"
 
 
 @dataclass(frozen=True)
@@ -183,7 +186,7 @@ def _gate(campaign: Campaign, found: Step, record: Path) -> Step:
 
 def _warmed(campaign: Campaign) -> Step:
     if not drift_wanted(campaign.cell):
-        return Step("done", "none wanted (warmup_drift)")
+        return Step("done", NOT_WANTED)
     warm = WarmUpRecord.load(campaign.folder.warmup, campaign.folder.plan_hash)
     if warm is None and _motions(campaign, "excitation", "repetitions").done:
         return Step("done", "left out")
@@ -199,6 +202,14 @@ def _warm_up(found: WarmUpRecord | None) -> Step:
     cold = found.outcome == "not warm" and bool(found.motions)
     state: State = "done" if found.outcome == "warm" else "next"
     return Step(state, words, "run {}", (found.sentence,) if cold else ())
+
+
+def _conducted_warm_up(folder: CampaignFolder) -> Step:
+    """Return the step for the report: done if the arm was warm, or no warm-up was wanted."""
+    warm = WarmUpRecord.load(folder.warmup, folder.plan_hash)
+    if warm is None and not drift_wanted(Cell.load(folder.cell)):
+        return Step("done", NOT_WANTED)
+    return _warm_up(warm)
 
 
 def _motions(campaign: Campaign, kind: str, words: str) -> Step:
@@ -238,7 +249,7 @@ def conduct_of(folder: CampaignFolder) -> ConductResult:
     steps = {
         "rehearsal": _step(lambda: _rehearsal(folder)),
         "dry run": _step(lambda: _accepted(DryRunRecord.load(folder))),
-        "warm-up": _step(lambda: _warm_up(WarmUpRecord.load(folder.warmup, folder.plan_hash))),
+        "warm-up": _step(lambda: _conducted_warm_up(folder)),
         "repetitions": _recorded(folder, "excitation"),
         "validation": _recorded(folder, "validation"),
     }
@@ -255,5 +266,11 @@ def _recorded(folder: CampaignFolder, kind: str) -> Step:
     own = [one for one in folder.manifest() if one.kind == kind]
     bad = tuple(f"{e.name} {e.outcome}: {e.reason}" for e in own if e.outcome != "completed")
     good = len(own) - len(bad)
+    entered = {entry.name for entry in own}
+    names = sorted(path.name for path in folder.archives.glob("*.mcap") if path.name not in entered)
+    for name in names:
+        parsed = ArchiveName.parse(name)
+        if parsed is not None and parsed.kind == kind:
+            bad += (f"{name} killed: it was never closed, for the program or the computer ended",)
     rejected = f"; {len(bad)} rejected or ended early" if bad else ""
     return Step("done" if good else "next", f"{good} complete{rejected}", details=bad)

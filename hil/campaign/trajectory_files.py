@@ -1,29 +1,66 @@
 """Designed motions as files for controllers that `hil` does not drive.
 
 Tables (CSV), ROS 2's `trajectory_msgs/JointTrajectory` and, for arms of six turning joints,
-URScript.
+URScript. Tables and ROS 2 files have a slow variant, `NAME_slow`; a URScript program has a variable
+for its speed, is slow at first, and asks before it moves.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hil.cell import Cell
 from hil.files import write_files
+from hil.version import software
 from identification.excitation import Excitation
 from planner import Trajectory, to_csv
 
 from .plan import CampaignPlan, plan_around
 
+Array = NDArray[np.float64]
+
 RATE: Final = 500.0  # Rate of the tables, Hz: the cycle of an e-Series controller
 ROS_RATE: Final = 100.0  # Rate of the points that a trajectory controller interpolates, Hz
 SCRIPT_RATE: Final = 125.0  # Rate of the set-points of a URScript program, Hz
 UR_JOINTS: Final = 6
+SLOW: Final = 0.2  # Speed of the slow variants, as a share of that of the motion
+README: Final = "README.txt"
+WARNING: Final = (
+    "The arm will move. Checked by the model only: limits, torques, floor, walls, self-collision.",
+    "Run the slow motion first, at the start posture, with a hand at the emergency stop.",
+)
+
+
+@dataclass(frozen=True)
+class SlowedMotion:
+    """A motion on the same path with its time stretched; `speed` is a share of its own speed."""
+
+    motion: Trajectory
+    speed: float
+
+    @property
+    def duration(self) -> float:
+        """Duration [s]."""
+        return self.motion.duration / self.speed
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints."""
+        return self.motion.n_joints
+
+    def sample(self, time: ArrayLike) -> tuple[Array, Array, Array]:
+        """Return positions, velocities and accelerations (m, n) at times (m,) [s]."""
+        q, qd, qdd = self.motion.sample(
+            np.minimum(np.asarray(time) * self.speed, self.motion.duration)
+        )
+        return q, self.speed * qd, self.speed**2 * qdd
 
 
 def write_trajectories(root: Path, cell: Cell, excitation: Excitation) -> tuple[str, ...]:
@@ -44,18 +81,38 @@ def trajectory_files(cell: Cell, plan: CampaignPlan) -> dict[str, str]:
     motions = {"excitation": plan.excitation.trajectory}
     motions |= {f"validation_{k:03d}": one.trajectory for k, one in enumerate(plan.validation)}
     scripted = len(cell.joint_names) == UR_JOINTS and bool(cell.model.chain.revolute.all())
-    files = {}
+    files, described = {}, []
     for name, motion in motions.items():
-        files[f"{name}.csv"] = to_csv(motion, RATE, cell.joint_names)
-        files[f"{name}.yaml"] = joint_trajectory(motion, cell.joint_names)
+        slowed = SlowedMotion(motion, SLOW)
+        for variant, moves in ((name, motion), (f"{name}_slow", slowed)):
+            header = header_of(cell.name, variant, moves)
+            described += [*header, ""]
+            files[f"{variant}.csv"] = to_csv(moves, RATE, cell.joint_names)
+            files[f"{variant}.yaml"] = joint_trajectory(moves, cell.joint_names, header)
         if scripted:
-            files[f"{name}.script"] = urscript(motion, name, cell.campaign.repetitions)
+            header = header_of(cell.name, name, motion)
+            files[f"{name}.script"] = urscript(motion, name, cell.campaign.repetitions, header)
+    files[README] = "\n".join([*described, *WARNING]) + "\n"
     return files
 
 
-def joint_trajectory(motion: Trajectory, joint_names: tuple[str, ...]) -> str:
+def header_of(arm: str, name: str, motion: Trajectory) -> tuple[str, ...]:
+    """Return arm, duration and origin of a motion, one line each."""
+    versions = software()
+    at = f" at {motion.speed:.0%} of the speed" if isinstance(motion, SlowedMotion) else ""
+    return (
+        f"{name}: a motion for {' '.join(arm.split())}",
+        f"duration: {motion.duration:.2f} s{at}",
+        f"made by: hil {versions['hil']}",
+    )
+
+
+def joint_trajectory(
+    motion: Trajectory, joint_names: tuple[str, ...], header: Sequence[str]
+) -> str:
     """Return a motion as YAML of a `trajectory_msgs/msg/JointTrajectory`."""
-    lines = ["header: {stamp: {sec: 0, nanosec: 0}, frame_id: ''}"]
+    lines = [f"# {line}" for line in (*header, *WARNING)]
+    lines += ["header: {stamp: {sec: 0, nanosec: 0}, frame_id: ''}"]
     lines += [f"joint_names: {json.dumps(list(joint_names))}", "points:"]
     times = _times(motion, ROS_RATE)
     for time, q, qd, qdd in zip(times, *motion.sample(times), strict=True):
@@ -69,18 +126,43 @@ def joint_trajectory(motion: Trajectory, joint_names: tuple[str, ...]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def urscript(motion: Trajectory, name: str, repetitions: int) -> str:
-    """Return a URScript program that repeats a motion of six joints, at rest in between."""
+def urscript(motion: Trajectory, name: str, repetitions: int, header: Sequence[str]) -> str:
+    """Return a URScript program that repeats a motion of six joints, at rest in between.
+
+    It divides the way between two set-points by the stretching of time, so that a slow motion has
+    as many set-points per second as a fast one.
+    """
     cycle, positions = 1.0 / SCRIPT_RATE, motion.sample(_times(motion, SCRIPT_RATE))[0]
     rows = [f"[{', '.join(f'{value:.9f}' for value in q)}]" for q in positions]
+    between = ", ".join(f"start[{j}] + share * (goal[{j}] - start[{j}])" for j in range(UR_JOINTS))
+    seconds = f"{motion.duration:.1f} s at full speed"
+    question = f"{name}, {repetitions} times, {seconds}; speed and repetitions are set at the top"
+    popup = f'"The arm will move: {question}. Continue?", "{name}", True, False, blocking=True'
     lines = [
+        *(f"# {line}" for line in (*header, *WARNING)),
+        "# speed scales time: 1.0 is the full speed of the motion. Raise it after a slow run.",
         f"def {name}():",
+        f"  speed = {SLOW:g}",
+        f"  repetitions = {repetitions}",
+        "  global stretch = ceil(1.0 / speed)",
+        f"  popup({popup})",
+        f"  global start = {rows[0]}",
+        "  def move_on(goal):",
+        "    step = 1",
+        "    while step <= stretch:",
+        "      share = step / stretch",
+        f"      servoj([{between}], 0, 0, {cycle:g}, 0.03, 500)",
+        "      step = step + 1",
+        "    end",
+        "    global start = goal",
+        "  end",
         f"  movej({rows[0]}, a=0.5, v=0.2)",
         "  repetition = 0",
-        f"  while repetition < {repetitions}:",
-        *(f"    servoj({row}, 0, 0, {cycle:g}, 0.03, 500)" for row in rows),
+        "  while repetition < repetitions:",
+        *(f"    move_on({row})" for row in rows),
         "    stopj(5.0)",
         f"    movej({rows[0]}, a=0.5, v=0.2)",
+        f"    global start = {rows[0]}",
         "    sleep(1.0)",
         "    repetition = repetition + 1",
         "  end",
@@ -89,7 +171,7 @@ def urscript(motion: Trajectory, name: str, repetitions: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _times(motion: Trajectory, rate: float) -> NDArray[np.float64]:
+def _times(motion: Trajectory, rate: float) -> Array:
     """Return times (m,) [s] from start to end; the last step may be shorter."""
     steps = np.arange(0.0, motion.duration - 0.5 / rate, 1.0 / rate)
     return np.append(steps, motion.duration)

@@ -375,7 +375,7 @@ class ControllerTable(Table):
     """`[controller]`: the link to the controller."""
 
     transport: Literal["simulated", "udp", "can"] = field('"simulated", "udp" or "can"')
-    cycle_ms: Literal[1, 2] = field("the controller's cycle, 1 or 2 ms")
+    cycle_ms: Literal[1, 2, 4] = field("the controller's cycle, 1, 2 or 4 ms")
     mode: Literal[4] = field("the open mode of campaigns: 4 (absolute position)", 4)
     host: str = field("address of the controller", "10.2.12.150")
     port: Whole = field("UDP port, 1 to 65535", 1000, gt=0, lt=65536)

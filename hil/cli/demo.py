@@ -67,6 +67,7 @@ def demo(
             remedy = "omit --excitation, or name another folder"
             raise InputError(excitation, problem, remedy=remedy)
         campaign = Campaign.open(output)
+        _require_same(campaign, repetitions=repetitions, validation=validation, seed=seed)
     else:
         _require_replaceable(output, force=force)
         cell = Cell.load(CELL_PATH).with_campaign(
@@ -82,6 +83,24 @@ def demo(
         campaign = Campaign.create(output, cell, plan)
     _run(campaign, reporter, effects=effects)
     finish(campaign.identify(reporter=reporter).results, json=json, quiet=quiet)
+
+
+def _require_same(
+    campaign: Campaign, *, repetitions: int | None, validation: int | None, seed: int | None
+) -> None:
+    """Refuse options that contradict the campaign that --resume continues."""
+    cell = campaign.cell
+    for option, given, begun in (
+        ("--repetitions", repetitions, cell.campaign.repetitions),
+        ("--validation", validation, cell.campaign.validation_runs),
+        ("--seed", seed, cell.simulation.seed),
+    ):
+        if given is not None and given != begun:
+            raise InputError(
+                campaign.folder.root,
+                f"its campaign was begun with {option} {begun}, not {given}",
+                remedy=f"omit {option} with --resume, or name another folder",
+            )
 
 
 def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
@@ -122,7 +141,9 @@ def _require_replaceable(output: Path, *, force: bool) -> None:
         raise CampaignFolderError(output, "is not a folder", "name a folder")
     found = {path.name for path in output.iterdir()}
     if found and not force:
-        remedy = "name another folder, or add --resume or --force"
+        remedy = (
+            "name another folder (--output), or add --resume to continue or --force to replace it"
+        )
         raise CampaignFolderError(output, "is not empty", remedy)
     foreign = sorted(found - _OURS)
     if foreign or (found and "manifest.json" not in found):

@@ -24,12 +24,12 @@ def doctor(
     quick: bool = False,
     json: JsonOption = False,
 ) -> None:
-    """Measure whether this PC can reply to a controller every 1 or 2 ms, and list what to change.
+    """Measure whether this PC can reply to a controller in time, and list what to change.
 
     Checks permissions, processor, load, route, port or CAN bus, and disk; then measures wake-up and
     turnaround latency in processes with the real-time settings of an exchange. Sends nothing to the
     controller, changes nothing and needs no root; run it as the user who will run hil. Each remedy
-    is a command. Without CELL the cycle is 1 ms.
+    is a command. Cycles of 1 and 2 ms are judged, and that of CELL; without CELL it is 1 ms.
 
     Exit status: 0 fit for the cycle; 5 not fit, or the link cannot work, or measured for less than
     60 s (provisional); 2 bad input.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final, Literal
@@ -20,7 +21,7 @@ from hil.simulation import controller_settings, own_postures, simulated_controll
 from hil.terminal_text import plural, printable
 from sim_fixtures import ControllerSettings, Phase, SimulatedController
 from sim_fixtures.faults import parse_fault, split_faults
-from sim_fixtures.serve import PATIENCE, Latencies, ServeCounts
+from sim_fixtures.serve import PATIENCE, Latencies, Request, ServeCounts
 
 WORDS: Final = {
     Phase.START: "starting: sync and init packets",
@@ -47,6 +48,8 @@ class Status:
         self._began = time.monotonic()
         self._phase: Phase | None = None
         self._cycles = -1
+        self._printed: Counter[str] = Counter()
+        self._hidden = 0
 
     def say(self, text: str) -> None:
         """Print a line, unless the terminal blocks."""
@@ -62,10 +65,34 @@ class Status:
             if phase is Phase.OPENING:
                 text += f" in mode {self._settings.open_mode}"
             text += f": {controller.reason}" if controller.reason else ""
-            self.say(f"{time.monotonic() - self._began:8.3f} s  {text}")
+            self._report(text)
         self._cycles = counts.cycles
 
+    def _report(self, text: str) -> None:
+        """Print a line, or count it if the same one was printed `SHOWN` times already."""
+        self._printed[text] += 1
+        if self._printed[text] > SHOWN:
+            if self._hidden == 0:
+                self.say(f"{self._elapsed()}  ... and so on; repeated lines are not printed")
+            self._hidden += 1
+            return
+        if self._hidden:
+            self.say(f"{self._elapsed()}  (lines not printed: {self._hidden})")
+            self._hidden = 0
+        self.say(f"{self._elapsed()}  {text}")
 
+    def next_session(self) -> None:
+        """Begin a session: its lines count anew."""
+        self._printed.clear()
+        self._hidden = 0
+        self._phase = None
+
+    def _elapsed(self) -> str:
+        return f"{time.monotonic() - self._began:8.3f} s"
+
+
+SHOWN: Final = 3
+"""Times that a line of a session is printed: openings may repeat every second."""
 OWN_MOVE: Final = 30.0
 """Longest time for a motion of the controller's own program to end, s."""
 LOST_OPENINGS: Final = 20
@@ -79,7 +106,7 @@ def simulate(
     udp: Annotated[str | None, typer.Option(metavar="HOST:PORT")] = None,
     can: Annotated[str | None, typer.Option(metavar="INTERFACE:CHANNEL[:fd|classic]")] = None,
     link: Annotated[str | None, typer.Option(metavar="NAME:ADDRESS")] = None,
-    cycle: Annotated[int | None, typer.Option(min=1, max=2)] = None,
+    cycle: Annotated[int | None, typer.Option(min=1, max=4)] = None,
     mode: int | None = None,
     stagger: Annotated[int, typer.Option(min=0)] = 3,
     only_axis: Annotated[int | None, typer.Option(min=1)] = None,
@@ -94,6 +121,7 @@ def simulate(
     fault: Annotated[list[str] | None, typer.Option(metavar="SPEC")] = None,
     seed: Annotated[int | None, typer.Option(min=0)] = None,
     duration: Annotated[float | None, typer.Option(min=0.0)] = None,
+    repeat: bool = False,
     priority: Annotated[int | None, typer.Option(min=1, max=99)] = None,
     json: JsonOption = False,
 ) -> None:
@@ -140,6 +168,8 @@ def simulate(
         fault: Fault of the controller to inject (repeatable).
         seed: Seed of noise and model errors.
         duration: Time after which the session is ended, s.
+        repeat: Serve one session after the other, each with a controller just switched on, until
+            Ctrl-C or --duration; --json prints one line for each.
         priority: Real-time priority (SCHED_FIFO) to request.
     """
     loaded = Cell.load(cell)
@@ -180,27 +210,41 @@ def simulate(
     )
     if patience:
         status.say(f"cycles are extended by up to {patience:g} s to wait for a reply")
+    sessions = 0
     try:
         with buttons(duration) as pressed, realtime_process(priority):
-            served = serve_session(
-                build,
-                end,
-                pressed,
-                # The controller's own program stops at the next posture only.
-                patience=OWN_MOVE if own_motion else PATIENCE,
-                stretch=patience,
-                watch=status.watch,
-            )
+            while True:
+                served = serve_session(
+                    build,
+                    end,
+                    pressed,
+                    # The controller's own program stops at the next posture only.
+                    patience=OWN_MOVE if own_motion else PATIENCE,
+                    stretch=patience,
+                    watch=status.watch,
+                )
+                over = pressed.request() is not Request.CONTINUE
+                if sessions and over and not served.summary.cycles:
+                    return  # the end was requested while the next program was waited for
+                _print_closing(served, as_json=json)
+                sessions += 1
+                if over or not repeat:
+                    break
+                status.next_session()
+                status.say("waiting for the next PC program; Ctrl-C ends")
     finally:
         end.close()
-    if json:
-        print_json(_figures(served))
-    else:
-        typer.echo(printable("\n".join(_sentences(served))))
     if not served.summary.ended and pressed.interrupted:
         raise typer.Exit(130)
     if served.controller.program.gave_up or not served.summary.ended:
         raise typer.Exit(4)
+
+
+def _print_closing(served: Served, *, as_json: bool) -> None:
+    if as_json:
+        print_json(_figures(served))
+    else:
+        typer.echo(printable("\n".join(_sentences(served))))
 
 
 def _postures(cell: Cell) -> tuple[tuple[float, ...], ...]:
@@ -237,8 +281,32 @@ def _sentences(served: Served) -> list[str]:
         sent = plural(summary.knocks, "time")
         return [f"no reply of a PC program; the first packet was sent {sent}"]
     end = "the session has ended (504)" if summary.ended else "the session was aborted"
-    figures = (f"{name} {value}" for name, value in _figures(served).items() if value != reason)
-    return [f"{end}{': ' if reason else ''}{reason}", ", ".join(figures)]
+    because = f": {reason}" if reason else ""
+    late = f"; {plural(summary.own_late, 'cycle')} started late by the simulation"
+    if summary.own_late:
+        late += f", {summary.slips} of them by a full cycle"
+    foreign = f", {served.foreign} from other addresses" if served.foreign else ""
+    again = f" after {plural(served.starts, 'start')}" if served.starts > 1 else ""
+    extended = (
+        f"; {plural(summary.stretched, 'cycle')} extended by up to "
+        f"{1e3 * summary.stretch_max:.1f} ms to wait for a reply"
+        if summary.stretched
+        else ""
+    )
+    return [
+        f"{end}{because}; open mode was reached {plural(served.intervals, 'time')}{again}",
+        f"{plural(summary.cycles, 'cycle')}, {summary.replies} replies, {summary.missed} missed, "
+        f"{summary.late} late, {summary.surplus} surplus, {summary.rejected} rejected"
+        f"{foreign}{extended}",
+        f"time to reply: {_times(summary.reply)}",
+        f"time to simulate a cycle: {_times(summary.cost)}{late}",
+    ]
+
+
+def _times(times: Latencies) -> str:
+    """Format median, 99 % quantile and maximum."""
+    median, most, largest = (round(1e6 * seconds) for seconds in _parts(times))
+    return f"{median} µs median, {most} µs 99 %, {largest} µs maximum"
 
 
 def _parts(times: Latencies) -> tuple[float, float, float]:

@@ -173,18 +173,18 @@ def run_probe(
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All results: verdicts on 1 and 2 ms, of which `cycle_ms` has to be fit."""
+    """All results: verdicts on 1 and 2 ms and on `cycle_ms`, which has to be fit."""
 
     checks: tuple[Check, ...]
     latencies: tuple[Latency, ...]
-    cycles: tuple[Fitness, Fitness]
+    cycles: tuple[Fitness, ...]
     cycle_ms: int
     seconds: float
 
     @property
     def cycle_fit(self) -> bool:
         """Whether the required cycle is fit."""
-        return self.cycles[CYCLES_MS.index(self.cycle_ms)].fit
+        return next(each.fit for each in self.cycles if each.cycle_ms == self.cycle_ms)
 
     @property
     def fit(self) -> bool:
@@ -203,7 +203,7 @@ class Diagnosis:
     @property
     def line(self) -> str:
         """The verdict in one or two sentences."""
-        one, two = (verdict.fit for verdict in self.cycles)
+        one, two = (verdict.fit for verdict in self.cycles[:2])
         text = "2 ms is fit; 1 ms is not." if two else "Neither 1 ms nor 2 ms is fit."
         if one:  # and then 2 ms is
             text = "1 ms is fit, and so is 2 ms."
@@ -242,8 +242,8 @@ def examine(
         if latency is None
     ]
     latencies = tuple(latency for latency in measured.values() if latency is not None)
-    one, two = (judge(latencies, cycle) for cycle in CYCLES_MS)
-    return Diagnosis(tuple(checks), latencies, (one, two), cycle_ms, seconds)
+    cycles = tuple(judge(latencies, cycle) for cycle in sorted({*CYCLES_MS, cycle_ms}))
+    return Diagnosis(tuple(checks), latencies, cycles, cycle_ms, seconds)
 
 
 _COLOUR = {Status.OK: "green", Status.WARN: "yellow", Status.BAD: "red", Status.UNKNOWN: "blue"}

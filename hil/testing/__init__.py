@@ -9,9 +9,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .faulty import UdpController, faulty_controller, faulty_link, run_campaign, shortened
+    from .faulty import (
+        SessionError,
+        UdpController,
+        faulty_controller,
+        faulty_link,
+        run_campaign,
+        shortened,
+    )
 
-__all__ = ["UdpController", "faulty_controller", "faulty_link", "run_campaign", "shortened"]
+__all__ = [
+    "SessionError",
+    "UdpController",
+    "faulty_controller",
+    "faulty_link",
+    "run_campaign",
+    "shortened",
+]
 
 
 def __getattr__(name: str) -> Any:

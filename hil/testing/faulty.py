@@ -7,12 +7,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from drivers.transports.simulated import SimulatedTransport
 from hil.campaign import Campaign, VirtualLink, design
 from hil.cell import Cell
 from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
+from hil.errors import HilError
 from hil.progress import Silent
 from hil.simulation import simulated_controller, simulated_link
 from sim_fixtures import SimulatedController
@@ -78,6 +79,12 @@ PATIENCE: Final = 0.5
 """Time that the controller waits for a reply, s; longer than a real one, for slow computers."""
 
 
+class SessionError(HilError):
+    """The session of a simulated controller has no summary."""
+
+    exit_code: ClassVar[int] = 4
+
+
 @dataclass(eq=False)
 class UdpController:
     """`hil simulate` in a child process; repeats its first packet every second until a reply.
@@ -121,7 +128,7 @@ class UdpController:
         try:
             yield controller
         finally:
-            controller.finish()
+            controller._end()
 
     @property
     def running(self) -> bool:
@@ -139,8 +146,23 @@ class UdpController:
     def finish(self) -> dict[str, Any]:
         """End the session: arm at rest, drive off, then mode 504.
 
-        Returns its summary, see `docs/simulate.md`; {} if it had to be killed.
+        Returns its summary, see `docs/simulate.md`.
+
+        Raises:
+            SessionError: no reply of a PC program came, or the controller had to be killed.
         """
+        summary = self._end()
+        if not summary.get("cycles"):
+            ended = "" if summary else "; it ended without a summary"
+            raise SessionError(
+                f"no reply came to the packets that the simulated controller sent to {self.host}:"
+                f"{self.port}{ended}; check that the program under test listens on "
+                "udp_controller.port, and start it before finish()"
+            )
+        return summary
+
+    def _end(self) -> dict[str, Any]:
+        """End the process; return its summary, {} if it had to be killed."""
         if self._summary is None:
             self._simulator.finish()
             self._summary = self._simulator.end()

@@ -24,7 +24,13 @@ TYPED_ELSEWHERE = {
     "campaign.md": "tests/hil/test_campaign_day.py",
     "payload.md": "tests/hil/test_payload_command.py",
     **dict.fromkeys(
-        ("bring-your-own-robot.md", "first-hour.md", "other-robots.md", "simulators.md"),
+        (
+            "bring-your-own-robot.md",
+            "first-hour.md",
+            "first-hour-simulated.md",
+            "other-robots.md",
+            "simulators.md",
+        ),
         "tests/docs/test_typed_pages.py",
     ),
 }  # Pages whose commands another test types, one after the other
@@ -48,7 +54,7 @@ NOT_TYPED = {
     "hil demo --effects": "minutes",
     "hil demo --resume": "resumes a stopped one; tests/hil/test_cli.py stops one",
     "hil demo --excitation": "the whole NS 16 campaign: minutes",
-    "hil demo --output runs/demo": "a campaign of the fixture stands in its place",
+    "hil demo --output runs/": "a campaign of the fixture stands in its place",
     "hil design cell.toml --method b -o runs/b": "half a minute; a short one needs other settings",
     "hil doctor cell.toml --duration 14400": "four hours",
     "hil simulate": "waits for a PC; tests/hil/test_simulate.py runs it",
@@ -102,6 +108,8 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def put_demo(workplace: Path, campaign: Campaign) -> None:
     """Leave what `hil demo` leaves, and what pages take from there."""
     shutil.copytree(campaign.folder.root, workplace / "runs" / "demo")
+    for name in ("tutorial", "simulators", "source"):  # pages have one each: none fails for another
+        (workplace / "runs" / name).symlink_to("demo")
     (workplace / "archives").symlink_to(workplace / "runs" / "demo" / "archives")
     for name, archive in zip("ab", campaign.folder.completed("excitation"), strict=False):
         shutil.copy(archive, workplace / f"{name}.mcap")
@@ -124,6 +132,16 @@ def put_two(workplace: Path, folder: Path, *names: str) -> None:
     """Leave both campaigns under the names that a page gives them."""
     for name, campaign in zip(names, sorted(folder.iterdir(), reverse=True), strict=False):
         shutil.copytree(campaign, workplace / "runs" / name)
+
+
+def test_no_page_makes_a_demo_in_the_folder_of_another() -> None:
+    """`hil demo` refuses a folder that is not empty, and `make demo` has filled one."""
+    folders = ["runs/demo"]
+    for page in sorted((ROOT / "docs").glob("*.md")):
+        made = re.findall(r"^hil demo --output (\S+)(?!.*--force)", page.read_text(), re.M)
+        folders += made
+    assert len(folders) == len({*folders}), folders
+    assert len(folders) > 2
 
 
 def reason_not_to(words: list[str]) -> str | None:

@@ -161,8 +161,8 @@ def test_simulators_run_what_was_exported(workplace: Path) -> None:
 
 
 class TestFirstHour:
-    TEXT = page("first-hour.md")
-    STEPS = commands(ROOT / "docs" / "first-hour.md")
+    TEXT = page("first-hour-simulated.md")
+    STEPS = commands(ROOT / "docs" / "first-hour-simulated.md")
 
     def edit(self, path: Path, **instead: int) -> None:
         """What the page asks to write into `[controller]` of the copy."""
@@ -206,9 +206,9 @@ class TestFirstHour:
             assert done.returncode == (5 if step[1] == "doctor" else 0), (step, printed)
             if step[1] == "new":
                 with pytest.raises(UnknownFieldsError) as unknown:
-                    Cell.load("cell.toml")
+                    Cell.load("new.toml")
                 assert len(unknown.value.fields) == 12
-                assert "twelve fields" in self.TEXT
+                assert "twelve other fields" in self.TEXT
         moves = [open_archive(path) for path in sorted(Path("moves").glob("*.mcap"))]
         assert [(move.kind, move.complete) for move in moves] == [("move", True)] * 2
         assert open_archive("archives/standstill_000_a1.mcap").complete

@@ -240,7 +240,8 @@ class Run:
 class SlcanBus:
     """Two emulated serial adapters joined by a bus, served by a thread.
 
-    `ports` are the serial devices, `rates` the bit rate commands of each, `refused` the commands
+    `ports` are the serial devices, `rates` the bit rate commands of each, `set_up` these and those
+    that open and close, `refused` the commands
     that were answered with the bell.
     """
 
@@ -248,6 +249,7 @@ class SlcanBus:
         self._terminals = [pty.openpty() for _ in range(2)]
         self.ports = tuple(os.ttyname(slave) for _, slave in self._terminals)
         self.rates: tuple[list[str], list[str]] = ([], [])
+        self.set_up: tuple[list[str], list[str]] = ([], [])
         self.refused: list[str] = []
         self._open = [False, False]
         self._waiting = bytearray(), bytearray()
@@ -279,6 +281,8 @@ class SlcanBus:
 
     def _execute(self, side: int, line: str) -> None:
         answer = b"\r"
+        if line[:1] in ("O", "C", "S", "Y"):
+            self.set_up[side].append(line)
         if line in ("O", "C"):
             self._open[side] = line == "O"
         elif line[:1] in ("S", "Y"):

@@ -114,7 +114,11 @@ class TestSlcan(CanContract):
         bus = SlcanBus()
         slcan(bus.ports[0], profile).open().close()
         bus.close()
-        assert bus.rates[0] == (["S8", "Y5"] if profile == "fd" else ["S8"])
+        rates = ["S8", "Y5"] if profile == "fd" else ["S8"]
+        assert bus.rates[0] == rates
+        # Before the adapter is on the bus: it would be there with the rates of its last use.
+        opened = bus.set_up[0].index("O")
+        assert [line for line in bus.set_up[0][:opened] if line != "C"] == rates
 
     def test_disconnected_adapter_is_a_closed_link(self):
         bus = SlcanBus()

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from drivers import GapSeen, Guard, InitReceived, Mode, MotionEnded, MotionStarted, State
-from drivers.errors import AxisNotInMode, Check
+from drivers.errors import AxisNotInMode, Check, ExitTimeout
 from drivers.events import RepliesLost
 from drivers.guard import LAG
 from drivers.open_mode import REPETITIONS, SentSetPoints
 from drivers.packets import LAST_NUMBER
+from drivers.reply_policy import EXIT_TIMEOUT
 from drivers.session import PacketSequence
 from planner import JointLimits, TrajectoryPlayer, plan
 from tests.drivers.rig import (
@@ -80,6 +81,29 @@ class TestLostMotion:
             assert rig.state is State.OPEN
         rig.cycle(5)
         assert source.advances == advances
+
+    @pytest.mark.parametrize("length", [12, 260, 732])
+    def test_sync_packets_in_mid_motion_are_said_to_be_a_restart(self, length):
+        """They get no reply before silence has ended the session; then they are followed."""
+        rig, _ = moving()
+        for _ in range(3):
+            assert rig.sync(1, length) is None
+        rig.session.tick(rig.now + 1.0)
+        rig.events += rig.session.events()
+        assert rig.ended.outcome == "lost"
+        assert rig.ended.reason == "the controller restarted: it sent sync packets"
+        assert rig.sync(1) is not None
+        assert rig.state is State.SYNC
+
+    def test_a_late_sync_packet_is_no_restart(self):
+        rig, source = moving()
+        advances = source.advances
+        assert rig.sync(1) is None
+        rig.cycle()
+        rig.session.tick(rig.now + 1.0)
+        rig.events += rig.session.events()
+        assert source.advances == advances + 1
+        assert rig.ended.reason == "nothing was received from the controller"
 
     @pytest.mark.parametrize(
         ("waits", "change", "reason"),
@@ -238,6 +262,33 @@ class TestLostReplies:
             rig.cycle(1 if lost > max_gap else pattern - 1)
         rig.run_to("stopped")
         assert rig.ended.reason == f"{max_gap + 1} replies were lost in 100 cycles"
+
+    def lose_slowing(self, lost: int) -> Rig:
+        """A motion whose target is held for some cycles, in each of which the arm loses 5 %."""
+        rig = running(planned(), 60, guard_limits=limits(**FAR))
+        follow, d = rig._follow, rig.axes["d"]
+        rig._follow = lambda answer: d.__setitem__((slice(None), [1, 3]), d[:, [1, 3]] * [0, 0.95])
+        rig.cycle(lost)
+        rig._follow = follow
+        return rig
+
+    @pytest.mark.parametrize(("lost", "rests"), [(3, False), (8, True), (60, True)])
+    def test_an_arm_that_slowed_down_does_not_speed_up_before_it_stops(self, lost, rests):
+        """It stays where the controller holds it; one still at speed stops on its path."""
+        rig = self.lose_slowing(lost)
+        held = rig.axes["d"][:, 0].copy()
+        rig.run_to("stopped")
+        assert rig.ended.reason == "3 replies were lost in 100 cycles"
+        if rests:
+            np.testing.assert_allclose(rig.axes["d"][:, 0], held, atol=1e-5)
+        else:
+            assert abs(rig.axes["d"][0, 0] - held[0]) > 0.1
+
+    def test_a_controller_that_accepts_no_reply_at_rest_is_refused(self):
+        rig = self.lose_slowing(8)
+        rig._follow = lambda answer: None
+        rig.cycle(round(EXIT_TIMEOUT / PERIOD) + 300)
+        assert isinstance(rig.refusal, ExitTimeout)
 
     def test_earlier_losses_do_not_count(self):
         rig = at_speed()

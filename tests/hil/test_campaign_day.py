@@ -23,7 +23,7 @@ from hil.campaign.campaign import campaign_of_design
 from hil.campaign.dry_run import Acceptance, DryRunRecord
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.intervals import at_limit, straight_move
-from hil.campaign.status import conduct_of
+from hil.campaign.status import conduct_of, status_of
 from hil.campaign.warmup import WarmMotion, WarmUpRecord
 from hil.cell import Cell
 from hil.cli import app
@@ -190,6 +190,21 @@ def test_the_page_has_rehearsal_dry_run_warm_up_and_rejections(folder: CampaignF
     assert "changes by 11.11% a motion after 3 motions, below 0.20%" in drifting
     assert "1 rejected" in steps["repetitions"].words
     assert steps["repetitions"].details == [f"{name} rejected: it was held"]
+
+
+def test_the_conduct_has_killed_attempts_and_no_wanted_warm_up(
+    folder: CampaignFolder,
+) -> None:
+    """A killed program leaves an archive that is in no manifest."""
+    name = "excitation_001_a9.mcap"
+    whole = (folder.archives / "excitation_001_a1.mcap").read_bytes()
+    (folder.archives / name).write_bytes(whole[: len(whole) // 2])
+    steps = {one.step: one for one in conduct_of(folder).steps}
+    assert steps["repetitions"].words == "2 complete; 1 rejected or ended early"
+    assert steps["repetitions"].details[0].startswith(f"{name} killed: ")
+    assert steps["validation"].details == []
+    assert steps["warm-up"].done
+    assert steps["warm-up"].words == status_of(Campaign.open(folder.root)).steps[3].sentence
 
 
 def test_steps_of_another_plan_or_unreadable_are_not_done(folder: CampaignFolder) -> None:

@@ -99,7 +99,7 @@ volume = 1e-3
 
 FAULTS = [
     # One value.
-    (r"^cycle_ms = 1", "cycle_ms = 3", "controller.cycle_ms = 3", "1 or 2 ms"),
+    (r"^cycle_ms = 1", "cycle_ms = 3", "controller.cycle_ms = 3", "1, 2 or 4 ms"),
     (r"^name = .*", "", "cell.name", "add it"),
     (r"^fly = 0.5", "flyby = 0.5", "campaign.flyby", "valid fields"),
     (r"^k54 = 0.03", "k54 = nan", "drive_train.k54 = nan", "axis 4 into motor 5"),

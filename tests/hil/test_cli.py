@@ -180,6 +180,16 @@ def test_a_stopped_demo_is_resumed(campaign: Campaign, tmp_path: Path) -> None:
     assert (folder / "report.html").exists()
 
 
+@pytest.mark.parametrize("option", ["--repetitions", "--validation", "--seed"])
+def test_a_resumed_demo_ignores_no_option(campaign: Campaign, tmp_path: Path, option: str) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(campaign.folder.root, folder)
+    words = ["demo", "--output", str(folder), "--resume", option, "77"]
+    refused = CliRunner().invoke(app, words)
+    assert f"was begun with {option} " in str(refused.exception)
+    assert f"omit {option} with --resume" in str(refused.exception)
+
+
 def test_force_removes_only_a_campaign(campaign: Campaign, tmp_path: Path) -> None:
     folder, link = tmp_path / "copy", tmp_path / "link"
     shutil.copytree(campaign.folder.root, folder)

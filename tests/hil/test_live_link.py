@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.exchange.event_log import NO_ARCHIVE
 from drivers.motion_source import MotionSource
 from drivers.packets import INIT_LENGTH
 from drivers.states import State
@@ -27,7 +28,7 @@ from hil.campaign import (
     Stop,
 )
 from hil.campaign.intervals import player_of
-from hil.campaign.live_link import LiveLink
+from hil.campaign.live_link import LiveLink, archive_silence
 from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.campaign.plan import design
 from hil.cell import Cell
@@ -334,3 +335,11 @@ def test_a_live_view_that_cannot_be_served_is_refused(cell: Cell, tmp_path: Path
     with pytest.raises(LiveViewError, match=r"--live nonsense is not HOST:PORT"):
         record(CELL_PATH, output=tmp_path, live="nonsense")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_silent_archive_process_is_named_with_cause_and_remedy() -> None:
+    disk, busy = archive_silence(3.2), archive_silence(0.0)
+    for text in (disk, busy):
+        assert text.startswith(f"{NO_ARCHIVE}, for more than 0.5 s")
+    assert "its disk for 3.2 s" in disk and "check that disk" in disk
+    assert "no processor time" in busy and "`hil doctor`" in busy

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,10 +14,23 @@ import pytest
 from typer.testing import CliRunner
 
 from drivers.drive_train import DriveTrain
+from drivers.transports.simulated import Lose
 from hil.archive import open_archive
-from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop
+from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop, rehearsal
+from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
-from hil.campaign.rehearsal import CRITERIA, FASTEST, SPREAD, Rehearsal, Twin
+from hil.campaign.oscillation import Oscillation
+from hil.campaign.rehearsal import (
+    CRITERIA,
+    FASTEST,
+    SPREAD,
+    Rehearsal,
+    Twin,
+    link_faults,
+    of_currents,
+    of_motions,
+    too_far_without_a_packet,
+)
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import OperatorStopError
@@ -108,7 +122,8 @@ def test_a_wrong_cell_or_plan_fails(
     cell, plan, expected = designed.cell, designed.plan, {"parameters"}
     match wrong:
         case "of the wrong sign on our side":
-            honest = DriveTrain.joint_torque
+            # The residuals are so large that the intervals of the parameters become wide.
+            expected, honest = {"unseen motion"}, DriveTrain.joint_torque
             monkeypatch.setattr(
                 DriveTrain, "joint_torque", lambda one, current: honest(one, current) * [1.0, -1.0]
             )
@@ -131,6 +146,64 @@ def test_a_wrong_cell_or_plan_fails(
         assert failed == expected
     with pytest.raises(NotRehearsedError, match="failed its rehearsal"):
         require_rehearsed(campaign.folder)
+
+
+@pytest.mark.parametrize("cycle_ms", [1, 4])
+def test_it_passes_at_any_cycle(tmp_path: Path, designed: Campaign, cycle_ms: int) -> None:
+    """At 2 ms: above."""
+    assert designed.cell.controller.cycle_ms == 2
+    cell = cell_of(tmp_path, CELL.replace("cycle_ms = 2", f"cycle_ms = {cycle_ms}"))
+    found = Campaign.create(tmp_path / "campaign", cell, designed.plan).rehearse()
+    assert found.passed, found.failures
+
+
+@pytest.mark.parametrize(
+    ("cycle_ms", "changes", "survives"),
+    [
+        (2, {}, True),  # 0.22 revolutions
+        (4, {}, False),  # 0.44
+        (4, {"drive_train.following_error": [2.0, 2.0]}, True),
+        (4, {"limits.velocity_deg": [200.0, 240.0]}, True),
+    ],
+)
+def test_packets_are_lost_where_the_guard_lets_a_motion_survive_it(
+    designed: Campaign, cycle_ms: int, changes: dict[str, list[float]], survives: bool
+) -> None:
+    cell = designed.cell.with_values({"controller.cycle_ms": cycle_ms, **changes})
+    lost = [each for each in link_faults(cell, 300.0, seed=1) if isinstance(each, Lose)]
+    assert bool(lost) is survives
+    sentence = too_far_without_a_packet(cell)
+    if survives:
+        assert sentence is None
+    else:
+        assert sentence is not None
+        assert "motor of shoulder turns by 0.44 revolutions in a cycle of 4 ms" in sentence
+        assert sentence in Twin.of(cell, seed=1, repetitions=3).assumed
+
+
+def test_a_growing_oscillation_is_named_with_plot_command(
+    tmp_path: Path, designed: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    oscillation = Oscillation(joint=1, frequency=110.0, growth=70.0, seconds=1.3)
+    monkeypatch.setattr(rehearsal, "growing_oscillation", lambda *_: oscillation)
+    plain = CampaignFolder(designed.folder.rehearsed / "plain")
+    sentence = of_currents(designed.cell, plain, "plain", 0.01).sentence
+    assert "elbow oscillates at 110 Hz, with an amplitude that grows 70 times" in sentence
+    assert "the motion is not at fault" in sentence
+    command = shlex.split(sentence.split("`")[-2])
+    assert command[:2] == ["hil", "plot"] and command[-2:] == ["--joint", "elbow"]
+    plotted = CliRunner().invoke(app, [*command[1:], "-o", str(tmp_path / "x.png")])
+    assert plotted.exit_code == 0
+
+
+def test_a_motion_beyond_a_speed_limit_is_no_completed_one(designed: Campaign) -> None:
+    plain = CampaignFolder(designed.folder.rehearsed / "plain")
+    assert of_motions(designed.cell, plain, "plain", "").passed
+    velocity = [0.7 * speed for speed in designed.cell.file.limits.velocity_deg]
+    slow = designed.cell.with_values({"limits.velocity_deg": velocity})
+    found = of_motions(slow, plain, "plain", "")
+    assert not found.passed
+    assert "of its speed limit" in found.sentence and "hil plot" in found.sentence
 
 
 def test_a_cell_of_hardware_is_rehearsed_from_nominal_figures(

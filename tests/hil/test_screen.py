@@ -123,6 +123,22 @@ class TestPicture:
         for screen, words in ((held, "HELD"), (stopping, "STOPPING"), (silent, "no news for 3")):
             assert words in screen_lines(80, 24, screen)[1]
 
+    def test_a_drive_that_is_off_has_no_following_error(self) -> None:
+        names = ("following_error", "following_share", "current", "current_share")
+        off = status(position=np.zeros(6), **dict.fromkeys(names))
+        lines = screen_lines(80, 24, screen_of(off))
+        joints = [line.split() for line in lines if line.startswith("joint_")]
+        assert joints == [[name, "-", "-", "-", "-"] for name in NAMES]
+
+    def test_after_a_silence_it_shows_why_the_run_waits(self) -> None:
+        screen = screen_of(status())
+        assert any("open" in line for line in screen_lines(80, 24, screen))
+        screen._messages.append("waiting for the controller")
+        screen._came -= 30.0
+        lines = screen_lines(80, 24, screen)
+        assert "no news for 30 s: waiting for the controller" in lines[1]
+        assert not any("open" in line or line.startswith("joint_") for line in lines[:-1])
+
     def test_names_the_controller(self) -> None:
         cell = Cell.load(CELL_PATH)
         can = CanTable(interface="socketcan", channel="can0")

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,16 +27,16 @@ from typer.testing import CliRunner
 
 from hil.cell import Cell, CellError
 from hil.cli import exit_code_of, main
-from hil.cli.simulate import WORDS, simulate
+from hil.cli.simulate import WORDS, Status, simulate
 from hil.demo_link import free_port
 from hil.errors import InputError
 from hil.motion_checks import MotionChecks
 from hil.progress import say_at_once
 from hil.serving import Buttons, open_controller_link
 from hil.simulation import controller_settings, own_postures, simulated_controller, simulated_link
-from sim_fixtures import Phase
+from sim_fixtures import ControllerSettings, Phase
 from sim_fixtures.ns16 import CELL_PATH
-from sim_fixtures.serve import Request
+from sim_fixtures.serve import Request, ServeCounts
 
 FOREIGN = [sys.executable, str(Path(__file__).with_name("foreign_pc.py"))]
 SLOW_MACHINE = ["--missed", "300"]
@@ -209,6 +212,46 @@ def test_a_missing_pc_and_an_interrupt_have_an_exit_status():
         next(line for line in cabinet.stdout if "starting" in line)
         cabinet.signal(signal.SIGINT)
         assert "no reply of a PC program" in cabinet.finish(130)
+
+
+def test_sessions_are_repeated_until_the_end_is_asked_for():
+    port = free_port()
+    options = ["--cycle", "2", "--intervals", "1", "--repeat", "--json", *PATIENT]
+    with cabinet_at(port, *options) as cabinet:
+        for _ in range(2):
+            with running(*FOREIGN, "--port", port) as program:
+                program.communicate(timeout=30)
+        cabinet.signal(signal.SIGTERM)
+        lines = cabinet.finish(0).strip().splitlines()
+    assert [json.loads(line)["intervals"] for line in lines] == [1, 1]
+
+
+def test_a_program_that_has_ended_costs_one_extension():
+    """Not one for each of the thousand cycles until the session is given up."""
+    port = free_port()
+    with cabinet_at(port, "--cycle", "2", "--patience", "1") as cabinet:
+        with running(*FOREIGN, "--port", port) as program:
+            wait_for([opened()], program.stdout)
+            program.kill()
+        began = time.monotonic()
+        output = cabinet.finish(0)
+    assert time.monotonic() - began < 15.0
+    assert output.count("axes opening") <= 3
+    assert "time to reply: " in output and " µs median" in output
+    assert re.search(r"cycles? extended by up to 1\d{3}\.\d ms", output), output
+    for key in ("knocks", "stretched", "_us"):
+        assert key not in output
+
+
+def test_lines_that_come_back_are_collapsed(capfd):
+    status = Status(ControllerSettings(), quiet=False)
+    phases = [Phase.CLOSED, Phase.OPENING] * 50 + [Phase.ENDED]
+    for cycle, phase in enumerate(phases):
+        status.watch(SimpleNamespace(phase=phase, reason=""), ServeCounts(cycles=cycle))
+    printed = capfd.readouterr().out
+    assert printed.count("axes opening") == 3
+    assert "lines not printed: 94" in printed
+    assert printed.strip().endswith("ended")
 
 
 def test_in_own_motion_the_arm_moves_while_its_axes_are_closed():

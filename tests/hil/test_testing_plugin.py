@@ -10,6 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from hil.cell import Cell
+from hil.testing import SessionError, UdpController, shortened
+from sim_fixtures.ns16 import CELL_PATH
+
 DOCUMENT = Path(__file__).parents[2] / "docs" / "testing.md"
 
 
@@ -105,3 +109,11 @@ def test_a_project_without_it_pays_for_five_small_modules() -> None:
     ours = {name for name in modules if name.partition(".")[0] == "hil"}
     assert ours == {"hil", "hil.errors", "hil.terminal_text", "hil.testing", "hil.testing.plugin"}
     assert {name.partition(".")[0] for name in modules - ours} <= sys.stdlib_module_names
+
+
+def test_a_program_that_never_replied_is_named(tmp_path: Path) -> None:
+    cell = shortened(Cell.load(CELL_PATH))
+    with UdpController.started(cell, tmp_path) as controller:
+        with pytest.raises(SessionError, match="no reply came") as error:
+            controller.finish()
+        assert str(controller.port) in str(error.value)

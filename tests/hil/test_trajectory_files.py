@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +14,7 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from hil.campaign.trajectory_files import SCRIPT_RATE, trajectory_files
+from hil.campaign.trajectory_files import SCRIPT_RATE, SLOW, trajectory_files
 from hil.cell import Cell
 from hil.cell.text import with_values
 from hil.cli import app
@@ -78,7 +79,9 @@ def test_each_file_is_the_motion_for_the_programs_that_read_it() -> None:
     cell = Cell.load(CELL_PATH)
     files = files_of(cell, cell.joint_limits)
     names = [f"{a}.{b}" for a in ("excitation", "validation_000") for b in ("csv", "yaml")]
-    assert {*files} == {*names, "excitation.script", "validation_000.script"}
+    names += [name.replace(".", "_slow.") for name in names]
+    scripts = ["excitation.script", "validation_000.script"]
+    assert {*files} == {*names, *scripts, "README.txt"}
     motion = MotionTable.of(files["excitation.csv"])
 
     read = YAML(typ="safe").load(files["excitation.yaml"])
@@ -93,15 +96,68 @@ def test_each_file_is_the_motion_for_the_programs_that_read_it() -> None:
     assert all(len(point["accelerations"]) == 6 for point in read["points"])
 
     text = files["excitation.script"]
-    assert f"while repetition < {cell.campaign.repetitions}:" in text
-    sent = np.array([json.loads(one) for one in re.findall(r"servoj\((\[.*?\])", text)])
+    assert f"  repetitions = {cell.campaign.repetitions}\n" in text
+    sent = np.array([json.loads(row) for row in re.findall(r"^    move_on\((.*)\)", text, re.M)])
     time = np.minimum(np.arange(len(sent)) / SCRIPT_RATE, motion.duration)
     np.testing.assert_allclose(sent, motion.sample(time)[0], atol=1e-4)
     opened = len(re.findall(r"^\s*(?:def|while)\b", text, re.MULTILINE))
     assert opened == len(re.findall(r"^\s*end$", text, re.MULTILINE))
 
     one = JointLimits(*np.array([[-1.0], [1.0], [1.0], [5.0], [50.0]]))
-    assert {*files_of(SimpleNamespace(joint_names=("one",)), one)} == {*names}, "no URScript"
+    small = SimpleNamespace(joint_names=("one",), name="small")
+    assert {*files_of(small, one)} == {*names, "README.txt"}, "no URScript"
+
+
+def test_each_file_is_slow_at_first_and_says_what_it_is() -> None:
+    cell = Cell.load(CELL_PATH)
+    files = files_of(cell, cell.joint_limits)
+    fast, slow = (MotionTable.of(files[f"excitation{end}.csv"]) for end in ("", "_slow"))
+    assert slow.duration == pytest.approx(fast.duration / SLOW)
+    time = np.linspace(0.0, fast.duration, 50)
+    for k, (quick, stretched) in enumerate(
+        zip(fast.sample(time), slow.sample(time / SLOW), strict=True)
+    ):
+        np.testing.assert_allclose(stretched, SLOW**k * quick, atol=2e-3)
+
+    for name in ("excitation.script", "excitation.yaml", "excitation_slow.yaml", "README.txt"):
+        text = files[name]
+        assert cell.name in text and "made by: hil" in text and "duration: " in text
+        assert "emergency stop" in text
+
+
+def test_the_program_asks_first_and_its_speed_scales_time() -> None:
+    """The few statements of the program, run as Python."""
+    cell = Cell.load(CELL_PATH)
+    text = files_of(cell, cell.joint_limits)["excitation.script"]
+    assert text.index("popup(") < text.index("movej(")
+    assert "blocking=True" in text
+    assert f"  speed = {SLOW:g}\n" in text
+
+    def commands(speed: float) -> list[tuple[str, Any]]:
+        """Names and targets of the commands that the program gives at a speed."""
+        kept = [line for line in text.splitlines() if line.strip() != "end"]
+        program = (
+            "\n".join(kept)
+            .replace("global ", "")
+            .replace("    start = goal", "    state['start'] = goal")
+        )
+        program = program.replace("while repetition < repetitions", "while repetition < 1")
+        program = re.sub(r"\bstart\b(?=\[|  *= \[)", "state['start']", program)
+        program = re.sub(r"speed = .*", f"speed = {speed}", program, count=1)
+        given: list[tuple[str, Any]] = []
+        names: dict[str, Any] = {"state": {}, "ceil": math.ceil, "True": True, "False": False}
+        for name in ("popup", "movej", "servoj", "stopj", "sleep"):
+            names[name] = lambda *values, name=name, **_: given.append((name, values[0]))
+        exec(program + "\nexcitation()", names)
+        return given
+
+    full, slow = commands(1.0), commands(0.2)
+    assert [name for name, _ in full[:2]] == ["popup", "movej"]
+    paths = [np.array([target for name, target in run if name == "servoj"]) for run in (full, slow)]
+    assert len(paths[1]) == 5 * len(paths[0])
+    np.testing.assert_allclose(paths[1][4::5], paths[0], atol=1e-12)
+    largest = [np.abs(np.diff(path, axis=0)).max() for path in paths]
+    assert largest[1] == pytest.approx(largest[0] / 5)
 
 
 def test_a_short_search_leaves_the_files(tmp_path: Path) -> None:

@@ -31,7 +31,15 @@ from sim_fixtures import (
 )
 from sim_fixtures.controller import MISSING, RUN_UP, LoopProgram, OwnMotion, Requests
 from tests.fault_matrix import small_cell
-from tests.sim_fixtures.bench import DRIVE, SMOOTH_Q, TRUTH, make_drive, motor_matrix, play
+from tests.sim_fixtures.bench import (
+    DRIVE,
+    SMOOTH_Q,
+    TRUTH,
+    MinimalPC,
+    make_drive,
+    motor_matrix,
+    play,
+)
 
 Array = NDArray[np.float64]
 Fields = dict[int, Any]
@@ -339,6 +347,46 @@ class TestCurrentsAreTorques:
         self, residuals: Callable[..., Array], flip: dict[str, Any]
     ) -> None:
         assert (residuals(make_drive(**flip)) / residuals()).max() > 50.0
+
+
+@pytest.mark.parametrize("cycle", [2, 4])
+def test_currents_of_longer_cycles_have_the_documented_delay(cycle: int) -> None:
+    """The loops run each millisecond; the PC sends the step of a cycle as the target's speed."""
+    drive = make_drive(encoder_counts=2**30)
+    controller = SimulatedController(
+        ns16.urdf_text(),
+        drive,
+        TRUTH,
+        ControllerSettings(period=0.001 * cycle, encoder_noise=0.0),
+        seed=7,
+        initial_position=SMOOTH_Q[0],
+    )
+    angles = SMOOTH_Q[::cycle] * drive.joint_sign + drive.joint_offset
+    targets = angles @ motor_matrix(drive).T + drive.calibration
+    steps = np.diff(targets, axis=0, prepend=targets[:1])
+    log = MinimalPC(controller, targets, steps).run()
+    current = log.axes["d"][:, :, 4].astype(np.float64)
+    qdd = (log.qd[2:] - log.qd[:-2]) / (0.002 * cycle)
+    model = pin.buildModelFromXML(ns16.urdf_text())
+    data = model.createData()
+    states = zip(log.q[1:-1], log.qd[1:-1], qdd, strict=True)
+    rigid = np.array([pin.rnea(model, data, *state) for state in states])
+    expected = rigid + TRUTH.rotor_inertia * qdd + TRUTH.friction(log.qd[1:-1])
+    motor = 2.0 * pi * motor_matrix(drive)
+    torque = (current * drive.torque_constant) @ motor * drive.joint_sign
+    cycles = np.arange(len(torque))
+    used = (np.abs(log.qd[1:-1]) > 0.05).all(axis=1)[10:-10]
+    scale = np.abs(expected).max(axis=0)
+
+    def residual(delay: float) -> float:
+        at = cycles[11:-11] + delay
+        shifted = np.column_stack([np.interp(at, cycles, column) for column in torque.T])
+        return float(np.sum((((shifted - expected[10:-10]) / scale)[used]) ** 2))
+
+    documented = controller.current_delay_cycles
+    delays = documented + np.linspace(-0.9, 0.9, 37)
+    a, b, _ = np.polyfit(delays, [residual(delay) for delay in delays], 2)
+    assert -b / (2.0 * a) == pytest.approx(documented, abs=0.02)
 
 
 class TestArms:

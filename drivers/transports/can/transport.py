@@ -17,6 +17,7 @@ from typing import Any, Final
 
 import can
 import numpy as np
+from can.interfaces.slcan import slcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
 from numpy.typing import NDArray
 
@@ -48,6 +49,10 @@ _REMEDIES = {
 }
 
 
+_CLOCK: Final = 80_000_000  # Hz
+_SAMPLE_POINT: Final = 80.0  # %
+
+
 def open_bus(
     interface: str, channel: str, rates: BusRates, options: Mapping[str, Any]
 ) -> can.BusABC:
@@ -59,16 +64,11 @@ def open_bus(
     Raises:
         TransportError: it cannot be opened.
     """
-    bus: can.BusABC | None = None
     try:
-        bus = can.Bus(**_arguments(interface, channel, rates), **options)
         if interface == "slcan":
-            fast = rates.data_bitrate if rates.profile == "fd" else None
-            bus.set_bitrate(rates.bitrate, fast)  # type: ignore[attr-defined]
+            return _SlcanBus(channel, **_slcan_rates(rates), **options)
+        return can.Bus(**_arguments(interface, channel, rates), **options)
     except (can.CanError, OSError, ValueError, TypeError, ImportError, RuntimeError) as error:
-        if bus is not None:
-            with contextlib.suppress(can.CanError, OSError):
-                bus.shutdown()
         remedy = _REMEDIES.get(interface, "see python-can's documentation of this interface")
         wanted = f"bitrate {rates.bitrate}"
         if rates.profile == "fd":
@@ -76,7 +76,36 @@ def open_bus(
         remedy = remedy.format(channel=channel, rates=wanted)
         link = f"CAN bus {interface}:{channel}"
         raise TransportError(link, str(error) or type(error).__name__, remedy) from error
-    return bus
+
+
+class _SlcanBus(slcanBus):
+    """An adapter whose port is closed if it cannot be opened."""
+
+    def __init__(self, channel: str, **options: Any) -> None:
+        try:
+            super().__init__(channel, **options)
+        except BaseException:
+            if (port := getattr(self, "serialPortOrig", None)) is not None:
+                port.close()
+            raise
+
+
+def _slcan_rates(rates: BusRates) -> dict[str, Any]:
+    """Return the arguments with which python-can sets the rates before it opens the adapter.
+
+    An adapter that is opened first is on the bus with the rates of its last use.
+    """
+    if rates.profile != "fd":
+        return {"bitrate": rates.bitrate}
+    # Only the rates are sent to the adapter, not the sample points.
+    timing = can.BitTimingFd.from_sample_point(
+        f_clock=_CLOCK,
+        nom_bitrate=rates.bitrate,
+        nom_sample_point=_SAMPLE_POINT,
+        data_bitrate=rates.data_bitrate,
+        data_sample_point=_SAMPLE_POINT,
+    )
+    return {"timing": timing}
 
 
 def _arguments(interface: str, channel: str, rates: BusRates) -> dict[str, Any]:
@@ -92,7 +121,7 @@ def _arguments(interface: str, channel: str, rates: BusRates) -> dict[str, Any]:
             arguments["port"] = int(port)
     elif interface == "socketcan":
         arguments["fd"] = fd
-    elif interface != "slcan":
+    else:
         arguments.update(bitrate=rates.bitrate, fd=fd)
         if fd:
             arguments["data_bitrate"] = rates.data_bitrate

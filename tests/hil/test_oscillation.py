@@ -1,0 +1,49 @@
+"""A growing oscillation in a following error is named with joint, frequency and growth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hil.campaign.oscillation import growing_oscillation
+
+PERIOD = 0.002
+
+
+def following_error(*, growing: float, noise: float = 1e-6) -> NDArray[np.float64]:
+    """Four seconds of two joints; the second oscillates at 110 Hz, growing by `growing` per s."""
+    time = np.arange(0.0, 4.0, PERIOD)
+    slow = 1e-3 * np.sin(2.0 * np.pi * 0.8 * time)
+    error = np.stack([slow, slow], axis=1)
+    error += noise * np.random.default_rng(1).standard_normal(error.shape)
+    error[:, 1] += 1e-5 * np.exp(growing * time) * np.sin(2.0 * np.pi * 110.0 * time)
+    return error
+
+
+def test_it_is_named() -> None:
+    found = growing_oscillation(following_error(growing=1.5), PERIOD)
+    assert found is not None
+    assert found.joint == 1
+    assert found.frequency == pytest.approx(110.0, abs=5.0)
+    assert found.growth > 100.0
+    text = found.sentence(("shoulder", "elbow"))
+    assert text.startswith("elbow oscillates at 110 Hz")
+
+
+@pytest.mark.parametrize(
+    "error", [{"growing": 0.0}, {"growing": -1.0}, {"growing": 0.0, "noise": 1e-3}]
+)
+def test_what_does_not_grow_is_none(error: dict[str, float]) -> None:
+    assert growing_oscillation(following_error(**error), PERIOD) is None
+
+
+def test_a_short_motion_is_not_judged() -> None:
+    assert growing_oscillation(following_error(growing=1.5)[:100], PERIOD) is None
+
+
+@pytest.mark.parametrize("frequency", [3.0, 25.0])
+def test_what_grows_slowly_where_a_motion_begins_is_none(frequency: float) -> None:
+    time = np.arange(0.0, 2.0, PERIOD)
+    slow = 1e-6 * np.exp(5.0 * time) * np.sin(2.0 * np.pi * frequency * time)
+    assert growing_oscillation(slow[:, np.newaxis], PERIOD) is None
