@@ -2,49 +2,31 @@
 
 from __future__ import annotations
 
-import atexit
 import math
-import re
-import resource
-import threading
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, Final, NamedTuple, ParamSpec, TypeVar
+from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
-from scipy.io import loadmat, whosmat
-from scipy.io.matlab import varmats_from_mat
 
 from hil.archive.cdr import LayoutError, MessageLayout, layout_of
 from hil.errors import SourceError
 from hil.importers import mcap_messages
 from hil.importers.column_map import Column
-from hil.reading import open_file, read_text
-from planner.errors import PlannerCrashed, PlanningTimedOut
-from planner.worker import WorkerProcess
+from hil.importers.matlab import NUMBERS, mat_array, mat_shapes, script_matrices
+from hil.reading import open_file
 
 Array = NDArray[np.float64]
-P = ParamSpec("P")
-T = TypeVar("T")
 
 MOST_NUMBERS: Final = 2**28
 """Elements of one array: 2 GiB of doubles, hours of an arm at 5 kHz."""
 
-_NUMBERS: Final = "fiubmM"
-_MATLAB_NUMBERS: Final = {"double", "single", "logical"} | {
-    f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
-}
-_MATLAB_NESTED: Final = ("struct", "cell", "object")
 _MOST_NAMED: Final = 30
-_ASSIGNED: Final = re.compile(r"\b([A-Za-z]\w*)\s*=\s*\[([^\[\]]*)\]")
-_COMMENT: Final = re.compile(r"[%#].*")
-_MEMORY: Final = 8 * 2**30  # bytes of the process that reads a .mat: the largest array and its copy
-_TIMEOUT: Final = 120.0  # s
 
 
 class Stored(NamedTuple):
@@ -169,7 +151,7 @@ class ArrayFile:
                 raise SourceError(self.path, problem, remedy="save the log in parts")
             with _readable(self.path):
                 array = stored.load()
-            if array.dtype.kind not in _NUMBERS or array.shape != stored.shape:
+            if array.dtype.kind not in NUMBERS or array.shape != stored.shape:
                 raise SourceError(self.path, f"array {name!r} does not hold real numbers")
             self._loaded[name] = array
         return self._loaded[name]
@@ -198,7 +180,7 @@ def _npz(path: Path) -> dict[str, Stored]:
     return {
         name.removesuffix(".npy"): Stored(head[0], partial(_member, path, name))
         for name, head in heads.items()
-        if head is not None and head[1].kind in _NUMBERS
+        if head is not None and head[1].kind in NUMBERS
     }
 
 
@@ -225,99 +207,10 @@ def _head(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
 
 
 def _mat(path: Path) -> dict[str, Stored]:
-    entries = [one for one in _in_child(_variables, str(path)) if not one[0].startswith("__")]
-    nested = [name for name, _, kind in entries if kind in _MATLAB_NESTED]
     return {
-        name: Stored(shape, partial(_matlab_variable, path, name))
-        for name, shape, kind in entries
-        if kind in _MATLAB_NUMBERS
-    } | _in_memory(_in_child(_struct_fields, str(path), nested) if nested else {})
-
-
-def _variables(path: str) -> list[tuple[str, tuple[int, ...], str]]:
-    """Return name, shape and class of the variables.
-
-    scipy lists none of them if one has no shape (tables, strings, time series of MATLAB); each is
-    then read by itself.
-    """
-    try:
-        return list(whosmat(path))
-    except TypeError:
-        found = []
-        with Path(path).open("rb") as file:
-            for _, alone in varmats_from_mat(file):
-                with suppress(TypeError):
-                    found += whosmat(alone)
-        return found
-
-
-def _struct_fields(path: str, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Return the arrays of numbers within structs and cells, by path: ``log.joint(2).q``."""
-    found: dict[str, NDArray[Any]] = {}
-
-    def walk(value: object, place: str) -> None:
-        if not isinstance(value, np.ndarray):
-            return
-        if value.dtype.kind in _NUMBERS:
-            found[place] = np.squeeze(value) if value.ndim > 2 else value
-        elif value.dtype.names or value.dtype.kind == "O":
-            one_struct = value.dtype.names and value.size == 1
-            for number, element in enumerate(value.ravel(order="F"), 1):
-                at = place if one_struct else f"{place}({number})"
-                if not value.dtype.names:
-                    walk(element, at)
-                for name in value.dtype.names or ():
-                    walk(element[name], f"{at}.{name}")
-
-    variables = loadmat(path, variable_names=names)
-    for name in names:
-        walk(variables[name], name)
-    if sum(array.size for array in found.values()) > MOST_NUMBERS:
-        raise ValueError("its structs are too large to be read at once")
-    return found
-
-
-def _matlab_variable(path: Path, name: str) -> NDArray[Any]:
-    return np.asarray(_in_child(loadmat, str(path), variable_names=[name])[name])
-
-
-def _in_child(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call scipy's reader in a child process: a damaged file can crash it."""
-    with _lock:
-        if not _readers:
-            _readers.append(WorkerProcess(timeout=_TIMEOUT))
-        try:
-            return _readers[0].call(_within_memory, partial(function, *args, **kwargs))
-        except PlannerCrashed as error:
-            raise ValueError("it is damaged") from error
-        except PlanningTimedOut as error:
-            raise ValueError(f"reading takes longer than {_TIMEOUT:g} s") from error
-
-
-def _within_memory(read: Callable[[], T]) -> T:
-    """Read with limited memory: sizes in a file are not trusted."""
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
-    return read()
-
-
-_lock = threading.Lock()
-_readers: list[WorkerProcess] = []
-
-
-@atexit.register
-def _close() -> None:
-    while _readers:
-        _readers.pop().close()
-
-
-def _matlab_text(path: Path) -> dict[str, Stored]:
-    """Matrices of a MATLAB or Octave script."""
-    text = _COMMENT.sub("", read_text(path).removeprefix("\ufeff")).replace("...", " ")
-    found = {}
-    for name, body in _ASSIGNED.findall(text):
-        rows = [row.replace(",", " ").split() for row in re.split(r"[;\n]", body)]
-        found[name] = np.array([[float(cell) for cell in row] for row in rows if row])
-    return _in_memory(found)
+        name: Stored(shape, partial(mat_array, path, name))
+        for name, shape in mat_shapes(path).items()
+    }
 
 
 def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
@@ -385,7 +278,7 @@ def _in_memory(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Stored]:
     return {
         name: Stored(array.shape, partial(np.asarray, array))
         for name, array in arrays.items()
-        if array.dtype.kind in _NUMBERS
+        if array.dtype.kind in NUMBERS
     }
 
 
@@ -393,7 +286,7 @@ READERS: Mapping[str, Callable[[Path], dict[str, Stored]]] = {
     ".npz": _npz,
     ".npy": _npy,
     ".mat": _mat,
-    ".m": _matlab_text,
+    ".m": lambda path: _in_memory(script_matrices(path)),
     ".mcap": lambda path: _in_memory(read_mcap(path)),
 }
 """Readers of files of arrays by suffix; every other file is text in columns."""
