@@ -60,6 +60,15 @@ class ArrayFile:
         self.names = tuple(self._stored)
         self._loaded: dict[str, NDArray[Any]] = {}
 
+    notes: tuple[str, ...] = ()
+
+    def has(self, name: str) -> bool:
+        """Return whether an array has this name."""
+        return name in self._stored
+
+    def unit(self, _column: Column) -> None:
+        """Return no unit: arrays do not state theirs."""
+
     def numbers(
         self, columns: Sequence[Column], field: str, array: str | None, *, rows: bool = False
     ) -> Array:

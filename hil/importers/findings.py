@@ -17,15 +17,13 @@ from scipy.optimize import linear_sum_assignment
 from hil.archive import Findings, Samples
 from hil.cell.text import UrdfLimits, urdf_limits
 from hil.errors import SourceError
+from hil.importers.stamps import FASTEST, SLOWEST
 from identification.model.urdf_text import urdf_tree
 from identification.signals.clock import time_base
 from identification.signals.recording import unwrap
 
 Array = NDArray[np.float64]
 
-_SLOWEST: Final = 20.0  # Hz; a robot's dynamics need faster sampling
-_FASTEST: Final = 20_000.0  # Hz
-_NO_MOTION: Final = 10.0  # Hz; 5 kHz in ms, read as s, are 5 Hz
 _TOLERANCE: Final = 0.05  # rad or m beyond a limit, for calibration and overshoot
 _LEAST_TRAVEL: Final = 0.1  # rad or m
 _SCALE_TOLERANCE: Final = 0.1  # of velocity over slope of the position, for filters
@@ -40,36 +38,6 @@ _SIGNIFICANT: Final = 0.01  # of the largest nominal torque
 
 NominalTorque = Callable[[Array, Array, Array], Array]
 """Torque of the nominal inertias by position, velocity and acceleration, each (m, n)."""
-
-
-def check_clock(stamp: NDArray[np.int64], path: Path) -> None:
-    """Check that stamps (m,) [ns] of a file can be those of a motion.
-
-    Raises:
-        SourceError: they run backwards, are all the same, or are too far apart.
-    """
-    steps = np.diff(stamp)
-    backward = np.flatnonzero(steps < 0)
-    if backward.size:
-        first = int(backward[0]) + 1
-        problem = (
-            f"sample {first} is {-1e-9 * steps[first - 1]:.3g} s older than the one before it "
-            f"({backward.size} such steps)"
-        )
-        remedy = "cut the recording where its clock runs backwards, or name another time column"
-        raise SourceError(path, problem, field="time", remedy=remedy)
-    if steps.size and not steps.any():
-        problem = f"all {len(stamp)} samples have the same time"
-        remedy = "name the column of the time, or give sample_rate instead"
-        raise SourceError(path, problem, field="time", remedy=remedy)
-    rate = 1e9 / float(np.median(steps[steps > 0])) if steps.size else np.inf
-    if rate < _NO_MOTION:
-        problem = f"has {rate:.2g} samples per second, too few for a motion"
-        remedy = (
-            "check its unit ([time] unit, or sample_rate in Hz): milliseconds read as seconds "
-            f"would give {1e3 * rate:.4g} samples per second; at least {_SLOWEST:g} are needed"
-        )
-        raise SourceError(path, problem, field="time", remedy=remedy)
 
 
 def examine(
@@ -96,7 +64,7 @@ def examine(
     lines = [f"time: {'; '.join(base.describe())}", *lines]
     lines += map(_range, joint_names, position.T, turning, limits.lower, limits.upper)
     warnings = []
-    if not _SLOWEST <= base.rate <= _FASTEST:
+    if not SLOWEST <= base.rate <= FASTEST:
         warnings += [f"{base.rate:.3g} samples per second are unusual: check the unit of the time"]
     warnings += _positions(time, position, joint_names, limits, turning)
     is_plausible = not warnings  # torques are compared with those of a plausible motion only
@@ -197,6 +165,33 @@ def check_positions(position: Array, names: Sequence[str], urdf: str, path: Path
     if outside is not None and outside.rows.all():
         remedy = f"{outside.remedy}; if the limits are wrong: --outside-limits"
         raise SourceError(path, outside.problem, field="position", remedy=remedy)
+
+
+def are_degrees(position: Array, converted: Array, names: Sequence[str], urdf: str) -> bool:
+    """Return whether positions (m, n) leave the limits of the URDF by far and are within converted.
+
+    `converted` are the same numbers [rad], read as degrees.
+    """
+    limits, turning = limits_of(urdf, names), _turning(urdf, names)
+    if not turning.all() or not len(position):
+        return False
+    finite = np.isfinite(position).all() and np.isfinite(converted).all()
+    beyond = ~np.diag(_fits(position, limits))
+    far = np.abs(position).max(axis=0) > 3.0 * np.maximum(-limits.lower, limits.upper)
+    fits = np.diag(_fits(converted, limits))
+    moves = np.ptp(converted, axis=0).max() >= _LEAST_TRAVEL
+    return bool(finite and (far & beyond).any() and fits.all() and moves)
+
+
+def has_degrees_per_second(time: Array, position: Array, velocity: Array) -> bool:
+    """Return whether velocities (m, n) are the slopes of positions [rad] in degrees per second."""
+    moving = np.ptp(position, axis=0) >= _LEAST_TRAVEL
+    if not moving.any():
+        return False
+    factor, correlation = _against_position(time, position[:, moving], velocity[:, moving])
+    per_degree = math.radians(1.0) * factor
+    itself = np.diag(correlation)
+    return bool((itself >= _CORRELATED).all() and (abs(per_degree - 1.0) < _SCALE_TOLERANCE).all())
 
 
 def _positions(

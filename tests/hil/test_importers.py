@@ -40,7 +40,8 @@ from hil.importers import arrays as array_files
 from hil.importers import matlab
 from hil.importers.arrays import ArrayFile
 from hil.importers.column_map import UNITS, Format, ready_map, ready_maps
-from hil.importers.findings import check_clock, examine
+from hil.importers.findings import examine
+from hil.importers.stamps import check_clock
 from hil.importers.robot import _cell_text
 from hil.importers.table import Table
 from hil.recordings import open_recording
