@@ -16,6 +16,7 @@ Stamps = NDArray[np.int64]
 
 SLOWEST: Final = 20.0  # Hz; a robot's dynamics need faster sampling
 FASTEST: Final = 20_000.0  # Hz
+_LARGEST: Final = 10**40  # ns; more is no time in any unit
 _NO_MOTION: Final = 10.0  # Hz; 5 kHz in ms, read as s, are 5 Hz
 _MOST_STEPS: Final = 10  # median steps that a counter may pass where it wraps
 _SWAPPED: Final = 0.02  # share of the messages of a recording that may have changed places
@@ -38,7 +39,7 @@ def concluded_unit(times: Sequence[int | None]) -> str:
     It is the longest that gives a rate of sampling at which robots are recorded: in seconds where
     none does, and for a column that only counts the samples.
     """
-    stamps = np.array([float(time) for time in times if time is not None]) * 1e-9
+    stamps = np.array([time / 1e9 for time in times if time is not None and abs(time) < _LARGEST])
     steps = np.diff(stamps)
     steps = steps[steps > 0.0]
     if not steps.size or (bool(np.all(np.abs(steps - 1.0) < 1e-9)) and stamps[0] in (0.0, 1.0)):

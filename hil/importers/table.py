@@ -148,7 +148,6 @@ class Table:
             frame = self._frame(
                 indices,
                 dtype=np.float64,
-                float_precision="round_trip",
                 decimal=self.dialect.decimal,
                 keep_default_na=False,
                 na_values=_SPELLINGS,

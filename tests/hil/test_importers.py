@@ -987,7 +987,7 @@ class TestReplacing:
     def command(self, panda: Simulated, tmp_path: Path) -> list[str]:
         np.savez(tmp_path / "log.npz", q=panda.position, d=np.degrees(panda.position), t=panda.time)
         for name in "qd":
-            text = f'[position]\ncolumns = "{name}"\n[time]\ncolumn = "t"\n'
+            text = f'[position]\ncolumns = "{name}"\nunit = "rad"\n[time]\ncolumn = "t"\n'
             (tmp_path / f"{name}.toml").write_text(
                 f"joints = {json.dumps(panda.joint_names)}\n{text}"
             )
@@ -1078,7 +1078,8 @@ class TestClock:
     def test_the_file_with_the_times_is_named(self, arm: Simulated, tmp_path: Path) -> None:
         np.savetxt(tmp_path / "q.txt", arm.position)
         np.savetxt(tmp_path / "t.txt", 1e3 * arm.time)
-        entries = {"time": {"column": 0, "file": "t.txt"}, "position": {"file": "q.txt"}}
+        time = {"column": 0, "file": "t.txt", "unit": "s"}
+        entries = {"time": time, "position": {"file": "q.txt"}}
         with pytest.raises(SourceError, match=r"t\.txt: time: has 0\.1 samples"):
             read(tmp_path, Robot.from_urdf(arm.urdf), **entries)
         assert not tmp_path.with_suffix(".mcap").exists()
@@ -1088,7 +1089,7 @@ class TestImportCommand:
     def test_findings_are_printed_and_archived(self, arm: Simulated, tmp_path: Path) -> None:
         np.savez(tmp_path / "log.npz", q=np.degrees(arm.position), t=arm.time)
         (tmp_path / "map.toml").write_text(
-            '[time]\ncolumn = "t"\n[position]\ncolumns = "q"\n'  # the unit is missing
+            '[time]\ncolumn = "t"\n[position]\ncolumns = "q"\nunit = "rad"\n'  # a wrong unit
         )
         arguments = ["import", "log", str(tmp_path / "log.npz"), "-o", str(tmp_path / "log.mcap")]
         arguments += ["--map", str(tmp_path / "map.toml"), "--urdf", str(arm.urdf)]
