@@ -14,11 +14,11 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from hil.archive.cdr import LayoutError, MessageLayout, layout_of
 from hil.errors import SourceError
 from hil.importers import mcap_messages
 from hil.importers.column_map import Column
 from hil.importers.matlab import NUMBERS, mat_array, mat_shapes, script_matrices
+from hil.importers.ros_messages import MessageError, columns_of, decoded, typestore_of
 from hil.reading import open_file
 
 Array = NDArray[np.float64]
@@ -232,55 +232,29 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
     """
     known, messages = mcap_messages.read(path, lambda _, topic: topic.is_ros2)
     refused = {name: f"{t} is not ROS 2" for name, t in known.items() if not t.is_ros2}
-    layouts: dict[str, MessageLayout] = {}
-    found: dict[str, list[tuple[int, bytes]]] = {}
+    by_topic: dict[str, list[tuple[int, bytes]]] = {}
     for name, stamp, data in messages:
-        if name in refused:
-            continue
-        try:
-            if name not in layouts:
-                definition = known[name].definition.decode(errors="replace")
-                layouts[name] = layout_of(known[name].kind, definition, data)
-            size = layouts[name].size
-            if len(data) - size not in range(4):  # a writer may pad the end to whole words
-                raise LayoutError("its messages differ in length")
-        except LayoutError as error:
-            refused[name] = str(error)
-            found.pop(name, None)
-            continue
-        found.setdefault(name, []).append((stamp, data[:size]))
+        by_topic.setdefault(name, []).append((stamp, data))
     arrays: dict[str, NDArray[Any]] = {}
-    for name, own in found.items():
+    for name, received in by_topic.items():
+        topic = known[name]
         try:
-            columns = _columns(layouts[name], own)
-        except LayoutError as error:
+            definition = topic.definition.decode(errors="replace")
+            store = typestore_of(topic.kind, definition, topic.schema_encoding)
+            content = [decoded(store, topic.kind, data) for _, data in received]
+            columns = columns_of([stamp for stamp, _ in received], content)
+        except MessageError as error:
             refused[name] = str(error)
         else:
             arrays |= {f"{name}/{field}": column for field, column in columns.items()}
     if not arrays:
         reasons = "; ".join(f"{name}: {why}" for name, why in refused.items()) or "it has no topic"
         problem = f"has no topic whose messages can be read as columns ({reasons})"
-        remedy = "record joint states and currents as ROS 2 messages of constant size"
+        remedy = (
+            "record joint states and currents as ROS 2 messages with constant names and lengths"
+        )
         raise SourceError(path, problem, remedy=remedy)
     return arrays
-
-
-def _columns(
-    layout: MessageLayout, messages: Sequence[tuple[int, bytes]]
-) -> dict[str, NDArray[Any]]:
-    """Return the fields of messages of one topic, given with log times [ns], and their stamps."""
-    joined = np.frombuffer(b"".join(data for _, data in messages), np.uint8)
-    data = joined.reshape(len(messages), layout.size)
-    if not layout.matches(data):
-        raise LayoutError("its messages differ in names or lengths of arrays")
-    rows = data.view(layout.dtype)[:, 0]
-    columns: dict[str, NDArray[Any]] = {
-        name: rows[name].copy() for name in layout.dtype.names or ()
-    }
-    seconds, rest = (columns.pop(f"header/stamp/{part}", None) for part in ("sec", "nanosec"))
-    if seconds is None or rest is None or not (seconds.any() or rest.any()):
-        return {"stamp": np.array([stamp for stamp, _ in messages], np.int64), **columns}
-    return {"stamp": np.asarray(seconds.astype(np.int64) * 10**9 + rest), **columns}
 
 
 def _in_memory(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Stored]:
