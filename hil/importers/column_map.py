@@ -36,8 +36,8 @@ class Quantity(_Table):
 
     Attributes:
         columns: one per joint, by name or by index from 0; or one name with ``{}`` in place of the
-            joint's number, from 1, or of its name. In files of arrays a name is that of an array. None: all
-            columns of the file, one per joint.
+            joint's number, from 1, or of its name. In files of arrays a name is that of an array.
+            None: all columns of the file, one per joint.
         array: in files of arrays, the matrix that `columns` are columns of.
         file: relative to the log; None for the log itself.
         files: one per joint instead, as a list or one name with ``{}``. `columns` is then the one

@@ -245,7 +245,7 @@ class _Log:
     def in_concluded_units(
         self, stamp: NDArray[np.int64], values: dict[str, Array], robot: Robot
     ) -> dict[str, Array]:
-        """Return quantities of the joint side; those without a stated unit in degrees, if that fits.
+        """Return quantities of the joint side, in degrees where no unit is stated and those fit.
 
         Positions are taken as degrees if as radians they leave the limits of the URDF by far and as
         degrees none does; velocities, if they are 57.3 times the slope of the positions.

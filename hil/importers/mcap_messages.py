@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,6 +23,7 @@ LARGEST_CHUNK: Final = 1 << 28
 """Bytes of records in one chunk; usually one to sixteen million."""
 MOST_BYTES: Final = 4 << 30
 """Bytes of messages that are read, all topics together."""
+_LATEST: Final = 2**63 - 1  # ns; later ones are wrong, and no signed number
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,11 @@ class Topic:
     def is_ros2(self) -> bool:
         """Whether the messages are those of ROS 2."""
         return self.encoding == "cdr" and self.schema_encoding in ("ros2msg", "ros2idl", "")
+
+    @property
+    def is_ros(self) -> bool:
+        """Whether the messages are those of ROS 1 or ROS 2."""
+        return self.is_ros2 or self.encoding == "ros1"
 
     def __str__(self) -> str:
         return self.kind if self.is_ros2 else f"{self.kind} in {self.encoding or 'no encoding'}"
@@ -69,7 +76,7 @@ def read(
             elif isinstance(record, Message):
                 name = names[record.channel_id]
                 if wanted(name, topics[name]):
-                    messages.append((name, record.log_time, record.data))
+                    messages.append((name, min(record.log_time, _LATEST), record.data))
                     size += len(record.data)
             if size > MOST_BYTES:
                 problem = (
@@ -101,6 +108,12 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
     """Open the file; convert all errors of reading to `SourceError`."""
     try:
         with open_file(path) as stream:
+            # The library would search zeros behind a truncated file to their end.
+            size = stream.seek(0, os.SEEK_END)
+            stream.seek(max(0, size - len(container.MAGIC)))
+            if stream.read() != container.MAGIC:
+                raise Damage(size, "it has no end")
+            stream.seek(0)
             yield stream
     except OSError as error:
         raise SourceError(path, f"cannot be read: {error.strerror or error}") from error

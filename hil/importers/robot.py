@@ -234,9 +234,9 @@ def write_imported(
     Findings on their plausibility (:mod:`hil.importers.findings`) are stored in its metadata.
     `period` is the sampling step [s] of a recording at a fixed rate, `clock` the file that the
     stamps come from, by default the first `source`; `clock_remedy` replaces the remedies for an
-    invalid clock of a log. `notes` are further lines of the findings. With `force` an existing archive is replaced
-    once the new one is complete; `outside_limits` accepts positions of which no row is within the
-    limits of the URDF.
+    invalid clock of a log. `notes` are further lines of the findings. With `force` an existing
+    archive is replaced once the new one is complete; `outside_limits` accepts positions of which no
+    row is within the limits of the URDF.
 
     Raises:
         SourceError: no sample, a value that is not finite or above 1e12, an invalid clock, or no

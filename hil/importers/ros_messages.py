@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import lru_cache
 from operator import attrgetter
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,7 +140,8 @@ def _fields_of(value: Any, path: str, read: _Read) -> Iterator[tuple[str, _Read]
         yield path, read
 
 
-class _Attribute(NamedTuple):
+@dataclass(frozen=True)
+class _Attribute:
     """Reads a field of what another reads."""
 
     outer: _Read
@@ -150,7 +151,8 @@ class _Attribute(NamedTuple):
         return getattr(self.outer(message), self.name)
 
 
-class _Element(NamedTuple):
+@dataclass(frozen=True)
+class _Element:
     """Reads an element of what another reads."""
 
     outer: _Read

@@ -35,14 +35,13 @@ from hil.cli import app
 from hil.errors import ArchiveWriteError, InputError, SourceError
 from hil.identify.cell_context import nominal_of
 from hil.identify.sources import cell_of
-from hil.importers import ColumnMap, Convention, Robot, import_log, urdf_of_dh
+from hil.importers import ColumnMap, Convention, Robot, import_log, matlab, urdf_of_dh
 from hil.importers import arrays as array_files
-from hil.importers import matlab
 from hil.importers.arrays import ArrayFile
 from hil.importers.column_map import UNITS, Format, ready_map, ready_maps
 from hil.importers.findings import examine
-from hil.importers.stamps import check_clock
 from hil.importers.robot import _cell_text
+from hil.importers.stamps import check_clock
 from hil.importers.table import Table
 from hil.recordings import open_recording
 from identification import FrictionLaw
@@ -460,7 +459,7 @@ class TestStructs:
 
 
 def save_73(path: Path, **values: object) -> Path:
-    """A .mat as MATLAB 7.3 writes it: HDF5 behind 512 bytes, arrays transposed, cells by reference."""
+    """A .mat as MATLAB 7.3 writes it: HDF5 behind 512 bytes, arrays transposed, cells as links."""
     with h5py.File(path, "w", userblock_size=512) as file:
         refs = file.create_group("#refs#")
 
@@ -499,7 +498,8 @@ class TestMatlab73:
 
     def test_a_file_without_contents_is_refused(self, tmp_path, robot):
         head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
-        (tmp_path / "a.mat").write_bytes(head.ljust(512, b"\0") + b"\x89HDF\r\n\x1a\n" + bytes(2000))
+        empty = b"\x89HDF\r\n\x1a\n" + bytes(2000)
+        (tmp_path / "a.mat").write_bytes(head.ljust(512, b"\0") + empty)
         with pytest.raises(SourceError, match=r"a\.mat: cannot be read .*save the arrays again"):
             read_arrays(tmp_path / "a.mat", robot)
 

@@ -26,11 +26,11 @@ from hil.errors import InputError, SourceError
 from hil.importers import (
     ColumnMap,
     Robot,
+    bags,
     import_log,
     import_rosbag2,
     mcap_messages,
     recorded_joints,
-    rosbag2,
 )
 from hil.importers.arrays import read_mcap
 from hil.importers.ros_messages import MessageError, decoded, typestore_of
@@ -226,8 +226,9 @@ class TestImport:
     def test_messages_without_these_joints_are_ignored(self, imported, tmp_path):
         messages = [state(5, [0.01], names=["finger"]), *states(3)]
         assert imported(messages).n_samples == 3
-        assert recorded_joints(tmp_path / "b.db3") == ("ankle", "hip")
-        assert recorded_joints(tmp_path / "b.db3", joint_names={"hip": "h"}) == ("ankle", "h")
+        assert recorded_joints(tmp_path / "b.db3") == ("finger", "ankle", "hip")
+        renamed = recorded_joints(tmp_path / "b.db3", joint_names={"hip": "h"})
+        assert renamed == ("finger", "ankle", "h")
         empty = bag(tmp_path / "e.db3", {"/js": (STATE, [])})
         with pytest.raises(SourceError, match="has no message with joints"):
             recorded_joints(empty)
@@ -252,7 +253,7 @@ BADLY_PACKED = [
 ]
 REFUSED: list[tuple[Any, dict[str, Any], str]] = [
     ({"/a": (STATE, []), "/b": (STATE, [])}, {}, r"2 topics carry .*/a \(sensor_m.*/b"),
-    ({"/a": (STATE, [])}, {"topic": "/joints"}, "topic: /joints is not a topic of .*: /a"),
+    ({"/a": (STATE, [])}, {"topic": "/joints"}, "topic: /joints is not a topic of .*: --topic /a"),
     ({"/a": (STATE, [])}, {}, "hip, ankle was recorded; recorded are none"),
     (states(), {"held_joints": ["knee"]}, "no joint is called 'knee'"),
     ([state(1, [1.0], names=["hip"])], {}, "ankle was not .*recorded are hip.*--lock-others"),
@@ -275,7 +276,7 @@ def test_unusable_messages_are_refused(tmp_path, robot, topics, options, sentenc
     [
         ("x.db3", r"x\.db3: is not a rosbag2 in sqlite3 storage"),
         ("y.db3", "No such file"),
-        ("empty", r"has no \.db3 and no \.mcap file"),
+        ("empty", r"has no \.db3, no \.mcap and no \.bag file"),
     ],
 )
 def test_files_other_than_bags_are_refused(tmp_path, robot, name, sentence):
@@ -532,7 +533,7 @@ ENDLESS = (
     [
         ([*LOOSE, "UPDATE messages SET timestamp = NULL"], "message . has no time or no data"),
         ([*LOOSE, "UPDATE messages SET data = NULL WHERE id = 3"], "has no time or no data"),
-        (ENDLESS, "no table messages"),
+        (ENDLESS, "missing tables"),
         ((), "damaged"),
     ],
 )
@@ -549,10 +550,10 @@ def test_damaged_databases_are_refused(tmp_path, robot, statements, sentence):
 
 
 def test_huge_packed_files_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(rosbag2, "_SLACK", 1000)
+    monkeypatch.setattr(bags, "_SLACK", 1000)
     path = tmp_path / "x.db3.zstd"
     path.write_bytes(zstandard.compress(bytes(1 << 26)))
-    with pytest.raises(SourceError, match="1000 times"), rosbag2.unpacked([path]):
+    with pytest.raises(SourceError, match="1000 times"), bags.open_bag(path):
         pass
 
 
