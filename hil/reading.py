@@ -120,13 +120,13 @@ def _decoded(data: bytes, encoding: str | None, *, or_latin: bool) -> str:
         except LookupError as error:
             name = declaration[2].decode()
             raise UnicodeDecodeError(name, data[:0], 0, 0, "no such encoding") from error
+    if or_latin and b"\0" in data[:_PROBED]:  # UTF-16 without its mark
+        return data.decode("utf-16-le" if data[1:2] == b"\0" else "utf-16-be")
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError:
         if not or_latin:
             raise
-    if b"\0" in data[:_PROBED]:  # UTF-16 without its mark; text in one byte has no zero
-        return data.decode("utf-16-le" if data[1] == 0 else "utf-16-be")
     return data.decode("cp1252")
 
 

@@ -252,7 +252,7 @@ class _States:
             if len(holders) > 1:
                 sets = " and ".join(f"({', '.join(part.joints)})" for part in holders)
                 problem = f"joint {joint} comes in messages of two kinds, {sets}"
-                remedy = "record one publisher on a topic of its own, and name it: --topic"
+                remedy = "record again with one publisher of each joint on the topic"
                 raise SourceError(self._source, problem, field="joints", remedy=remedy)
         return parts
 
@@ -333,26 +333,31 @@ class _States:
 
         Equal stamps one after another are a clock that stands still, else two publishers.
         """
-        same = np.diff(stamp) == 0
-        apart = np.abs(np.diff(position, axis=0)).max(axis=1)
-        worst = np.flatnonzero(same & (apart > _APART))
-        if not worst.size or self.clock == "bag":
+        if self.clock == "bag" or not len(stamp):
             return
-        first = int(worst[np.argmax(apart[worst])])
+        starts = np.flatnonzero(np.diff(stamp, prepend=stamp[0] - 1))
+        highest = np.maximum.reduceat(position, starts)
+        lowest = np.minimum.reduceat(position, starts)
+        apart = (highest - lowest).max(axis=1)
+        worst = np.flatnonzero(apart > _APART)
+        if not worst.size:
+            return
+        first = int(starts[worst[0]])
         run = np.flatnonzero(stamp == stamp[first])
-        if len(run) >= _STALLED:
+        steps = np.abs(np.diff(position[run], axis=0)).max()
+        if len(run) >= _STALLED and steps < 0.5 * apart[worst[0]]:
             elapsed = 1e-9 * float(received[run[-1]] - received[run[0]])
             problem = (
-                f"{len(run)} messages from message {numbers[run[0]]} have the same stamp, and were "
+                f"{len(run)} messages from message {numbers[first]} have the same stamp, and were "
                 f"received in {elapsed:.3g} s: the clock of the stamps stood still"
             )
             raise SourceError(self._source, problem, field="time", remedy=_BAG_CLOCK)
         problem = (
             f"messages {numbers[first]} and {numbers[first + 1]} have the same stamp and positions "
-            f"{apart[first]:.3g} rad or m apart ({worst.size} such pairs): two publishers of these "
-            "joints"
+            f"{apart[worst[0]]:.3g} rad or m apart ({worst.size} such stamps): two publishers of "
+            "these joints"
         )
-        remedy = "record one publisher on a topic of its own, and name it: --topic"
+        remedy = "record again with one publisher of these joints on the topic"
         raise SourceError(self._source, problem, field="position", remedy=remedy)
 
     def _merged(self, parts: Sequence[_Part], joined: Sequence[_Joined]) -> _Joined:

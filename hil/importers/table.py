@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _COMMENTS = ("#", "%", "//")
-# Tried in this order; a decimal comma only where the comma is not the delimiter.
+# Tried in this order; the last is that of numbers in quotation marks.
 _WRITTEN = (
     (",", "."), (";", "."), ("\t", "."), ("|", "."), (None, "."),
-    (";", ","), ("\t", ","), ("|", ","), (None, ","),
+    (";", ","), ("\t", ","), ("|", ","), (None, ","), (",", ","),
 )  # fmt: skip
 _ROSTOPIC = "%time,"  # of `rostopic echo -p`
 _PROBED: Final = 100  # lines
@@ -46,6 +46,9 @@ _MISSING: Final = frozenset(
 )
 """What loggers, spreadsheets and run-time libraries write where there is no number; lower case."""
 _SPELLINGS: Final = sorted({f(text) for text in _MISSING for f in (str, str.upper, str.title)})
+_DAY: Final = r"\d{1,4}([-./])(?:\d{1,2}|[A-Za-z]{3})\1\d{1,4}"
+_CLOCK: Final = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d+)?)?(?:\s*[AaPp][Mm])?\s*(?:Z|[+-]\d{2}:?\d{2})?"
+_DATE: Final = re.compile(rf"(?:{_DAY}(?:[ T]+{_CLOCK})?|{_CLOCK})")
 _QUOTES: Final = "\"'"
 
 
@@ -188,8 +191,15 @@ class Table:
             text = texts[unread[0]]
             shown = repr(text) if text else "nothing"
             problem = f"line {numbers[unread[0]]} has {shown} for the time"
-            raise SourceError(self.path, problem, field="time", remedy=HOLE)
+            raise SourceError(self.path, problem, field="time", remedy=self._remedy(text))
         return times
+
+    def _remedy(self, text: str) -> str:
+        """Return the remedy for a cell that is not a number."""
+        mark = _grouped(text, self.dialect)
+        if mark is None:
+            return HOLE
+        return f'if {mark!r} separates thousands: [format] thousands = "{mark}"; else {HOLE}'
 
     def _place(self, column: Column) -> int | None:
         """Return the index of a column, None if there is none; a name may lack its unit."""
@@ -216,7 +226,10 @@ class Table:
 
         text = "\n".join(self.lines)
         delimiter = self.dialect.delimiter
-        width = max(len(line.split(delimiter)) for line in self.lines)
+        width = max(
+            len(self.dialect.cells(line) if '"' in line else line.split(delimiter))
+            for line in self.lines
+        )
         return pd.read_csv(
             io.StringIO(text),
             sep=r"\s+" if delimiter is None else delimiter,
@@ -255,12 +268,7 @@ class Table:
         name = self.names[index] if index < len(self.names) else str(index)
         shown = repr(texts[row]) if texts[row] else "nothing"
         problem = f"line {self.numbered[row]} has {shown} in column {name}, not a number"
-        remedy = HOLE
-        if _grouped(texts[row], self.dialect) is not None:
-            remedy = (
-                "state which mark separates thousands and which decimals: [format] thousands = "
-                f'"{_grouped(texts[row], self.dialect)}", or decimal'
-            )
+        remedy = self._remedy(texts[row])
         raise SourceError(self.path, problem, field=field, remedy=remedy)
 
 
@@ -452,17 +460,10 @@ def _plain_numbers(texts: Sequence[str], dialect: Dialect) -> list[str]:
 
 def _is_written(cell: str, dialect: Dialect) -> bool:
     """Return whether a cell is a number in this dialect, a missing one, or a date stamp."""
-    if cell.lower() in _MISSING:
+    if cell.lower() in _MISSING or _DATE.fullmatch(cell):
         return True
     if dialect.decimal == "," and "." in cell:
         return _grouped(cell, dialect) is not None
     plain = cell.replace(dialect.decimal, ".")
     is_number = np.isfinite(_number(_FORTRAN.sub("e", plain))) or plain.lower() in ("inf", "-inf")
-    return bool(is_number) or _grouped(cell, dialect) is not None or _is_date(cell)
-
-
-def _is_date(cell: str) -> bool:
-    return bool(_DATE.search(cell))
-
-
-_DATE: Final = re.compile(r"\d{1,2}:\d{2}:\d{2}|^\d{1,4}[-./]\d{1,2}[-./]\d{1,4}")
+    return bool(is_number) or _grouped(cell, dialect) is not None
