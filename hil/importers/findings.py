@@ -29,7 +29,6 @@ _LEAST_TRAVEL: Final = 0.1  # rad or m
 _SCALE_TOLERANCE: Final = 0.1  # of velocity over slope of the position, for filters
 _CORRELATED: Final = 0.7
 _TOO_FAST: Final = 3.0  # times the URDF's limit, of speed and of torque
-_NO_LIMIT: Final = 1e4  # some URDFs have larger figures for "none"
 _OTHER_UNIT: Final = 30.0  # between the errors of a nominal torque and a factor of 1000
 _THOUSAND: Final = 1000.0
 _BLOCK: Final = 0.05  # s, over which signals are averaged before they are differentiated
@@ -54,7 +53,7 @@ def examine(
     torque of the nominal inertias, None if the URDF has none.
     """
     time, position = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9), unwrap(samples.position)
-    limits = limits_of(urdf, joint_names)
+    limits = urdf_limits(urdf, joint_names)
     turning = _turning(urdf, joint_names)
     held = [f"{name} at {place:.4g}" for name, place in (locked or {}).items()]
     lines = [f"locked, rad or m: {', '.join(held)}"] if held else []
@@ -74,17 +73,6 @@ def examine(
     if is_plausible:
         warnings += _torque_size(samples, joint_names, limits.effort, nominal)
     return Findings(lines=tuple(lines), warnings=tuple(warnings))
-
-
-def limits_of(urdf: str, names: Sequence[str]) -> UrdfLimits:
-    """Return limits of joints; infinite where the range is empty or a figure means no limit."""
-    lower, upper, velocity, effort = urdf_limits(urdf, names)
-    bounded = lower < upper
-    return UrdfLimits(
-        np.where(bounded, lower, -np.inf),
-        np.where(bounded, upper, np.inf),
-        *(np.where((one > 0.0) & (one < _NO_LIMIT), one, np.inf) for one in (velocity, effort)),
-    )
 
 
 def _turning(urdf: str, names: Sequence[str]) -> NDArray[np.bool_]:
@@ -161,7 +149,7 @@ def check_positions(position: Array, names: Sequence[str], urdf: str, path: Path
     Raises:
         SourceError: none is.
     """
-    outside = _outside(position, names, limits_of(urdf, names), _turning(urdf, names))
+    outside = _outside(position, names, urdf_limits(urdf, names), _turning(urdf, names))
     if outside is not None and outside.rows.all():
         remedy = f"{outside.remedy}; if the limits are wrong: --outside-limits"
         raise SourceError(path, outside.problem, field="position", remedy=remedy)
@@ -172,7 +160,7 @@ def are_degrees(position: Array, converted: Array, names: Sequence[str], urdf: s
 
     `converted` are the same numbers [rad], read as degrees.
     """
-    limits, turning = limits_of(urdf, names), _turning(urdf, names)
+    limits, turning = urdf_limits(urdf, names), _turning(urdf, names)
     if not turning.all() or not len(position):
         return False
     finite = np.isfinite(position).all() and np.isfinite(converted).all()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hil.archive import Findings, Samples, write_samples
 from hil.cell import Cell
-from hil.cell.text import with_values
+from hil.cell.text import urdf_limits, with_values
 from hil.errors import ArchiveWriteError, SourceError
 from hil.files import file_digest, replace_file
 from hil.identify.cell_context import nominal_of
@@ -25,7 +25,6 @@ from hil.importers.findings import (
     NominalTorque,
     check_positions,
     examine,
-    limits_of,
 )
 from hil.importers.stamps import check_clock
 from hil.reading import path_exists, read_input
@@ -177,7 +176,7 @@ def _held(
             "a log, --rename RECORDED=URDF of a bag)"
         )
         raise SourceError(path, problem, field="--lock-others", remedy=remedy)
-    limits = limits_of(urdf, names)
+    limits = urdf_limits(urdf, names)
     rest = {
         name: 0.0 if low <= 0.0 <= high else 0.5 * (low + high)
         for name, low, high in zip(names, limits.lower.tolist(), limits.upper.tolist(), strict=True)
