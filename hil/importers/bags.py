@@ -54,9 +54,9 @@ def bag_files(source: Path) -> list[Path]:
         raise SourceError(source, problem, remedy="name the folder of a bag")
     if source.is_dir():
         _require_parts(source, {_unpacked_name(file) for file in files})
-    plain = {file.name for file in files if file.suffix not in _PACKED}
+    unpacked = {file.name for file in files if file.suffix not in _PACKED}
     # A part beside its compressed copy is one part.
-    return [file for file in files if file.name in plain or _unpacked_name(file) not in plain]
+    return [file for file in files if file.name in unpacked or _unpacked_name(file) not in unpacked]
 
 
 def _require_parts(folder: Path, present: set[str]) -> None:

@@ -62,12 +62,9 @@ def import_log(
     clock = log.clock(len(values["position"]))
     _check_lengths({**values, "time": clock.stamp}, log.path, "quantities")
     metadata = {"importer": "log", "clock_origin_ns": str(clock.origin)}
-    complete = clock.valid
+    complete = log.complete_rows(clock, values)
     if columns.format.missing == "drop":
-        finite = [np.isfinite(array).all(axis=1) for array in values.values()]
-        complete = np.all([complete, *finite], axis=0)
         metadata["dropped_rows"] = str(np.count_nonzero(~complete))
-        log.note_dropped(complete)
     stamp = clock.stamp[complete]
     values = {name: array[complete] for name, array in values.items()}
     if columns.drive.geared:
@@ -78,8 +75,7 @@ def import_log(
     if (uncertainty := columns.drive.torque_uncertainty) is not None:
         each = np.broadcast_to(uncertainty, len(log.joints))[log.order]
         metadata["torque_uncertainty"] = json.dumps(each.tolist())
-    with np.errstate(over="ignore", invalid="ignore"):
-        joint_side = log.in_concluded_units(stamp, values, robot)
+    joint_side = log.in_concluded_units(stamp, values, robot)
     return write_imported(
         output,
         Samples(stamp, **joint_side),
@@ -193,7 +189,7 @@ class _Log:
             return stated
         unit = concluded_unit(file.times(time.column, TIMES["s"], time.array))
         if unit != "s":
-            self.notes.append(f"time: no unit is stated; taken as {unit}, which gives a usual rate")
+            self.notes.append(f"time: no unit is stated; read as {unit}, which gives a usual rate")
         return unit
 
     def _within_archive(
@@ -229,8 +225,16 @@ class _Log:
         remedy = 'give the unit of its time: [time] unit = "s", "ms", "us" or "ns"'
         raise SourceError(path, problem, field="time", remedy=remedy)
 
-    def note_dropped(self, complete: NDArray[np.bool_]) -> None:
-        """Note how many rows have a missing number; SourceError if all have."""
+    def complete_rows(self, clock: _Clock, values: Mapping[str, Array]) -> NDArray[np.bool_]:
+        """Return the rows with a time, and where the map drops others with all numbers (m,).
+
+        Raises:
+            SourceError: no row has all.
+        """
+        if self._map.format.missing != "drop":
+            return clock.valid
+        finite = [np.isfinite(array).all(axis=1) for array in values.values()]
+        complete = np.all([clock.valid, *finite], axis=0)
         dropped = np.flatnonzero(~complete)
         if len(dropped) == len(complete):
             problem = "has a missing number in every row"
@@ -241,7 +245,9 @@ class _Log:
                 f"{len(dropped)} of {len(complete)} rows have a missing number and were left out, "
                 f"the first after {dropped[0]} rows"
             )
+        return np.asarray(complete)
 
+    @np.errstate(over="ignore", invalid="ignore")  # such numbers are refused later
     def in_concluded_units(
         self, stamp: NDArray[np.int64], values: dict[str, Array], robot: Robot
     ) -> dict[str, Array]:
@@ -258,7 +264,7 @@ class _Log:
             if are_degrees(joint["position"], converted["position"], names, robot.urdf):
                 joint, values = converted, degrees
                 self.notes.append(
-                    "position: no unit is stated; taken as degrees, within the limits of the URDF, "
+                    "position: no unit is stated; read as degrees, within the limits of the URDF, "
                     "which radians leave by far"
                 )
         if "velocity" in self._unstated and len(stamp) > 1:
@@ -267,7 +273,7 @@ class _Log:
                 degrees = {**values, "velocity": values["velocity"] * degree}
                 joint = _joint_side(degrees, self._map, self)
                 self.notes.append(
-                    "velocity: no unit is stated; taken as degrees per second, the slope of the "
+                    "velocity: no unit is stated; read as degrees per second, the slope of the "
                     "positions"
                 )
         return joint

@@ -126,8 +126,7 @@ def _fields_of(value: Any, path: str, read: _Read) -> Iterator[tuple[str, _Read]
                 inner, place = getattr(value, field.name), f"{path}/{field.name}".lstrip("/")
                 # C code where only names lead to a number, as in most messages.
                 dotted = place.replace("/", ".")
-                plain = dotted.replace(".", "").isidentifier()
-                if plain and not any(part.isdigit() for part in place.split("/")):
+                if not any(part.isdigit() for part in place.split("/")):
                     yield from _fields_of(inner, place, attrgetter(dotted))
                 else:
                     yield from _fields_of(inner, place, _Attribute(read, field.name))

@@ -272,7 +272,7 @@ class _States:
             keep &= ~silent
             self.notes.append(
                 f"{np.count_nonzero(silent)} of {len(stamp)} messages have 0 for all positions "
-                "between others that do not: taken for a second publisher and left out"
+                "between others that do not: those of a second publisher, left out"
             )
         order = np.flatnonzero(keep)
         swapped = swapped_messages(stamp[order])

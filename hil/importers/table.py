@@ -181,8 +181,8 @@ class Table:
             numbers = [self.numbered[0]] * len(texts)
         else:
             texts, numbers = self._texts(index), list(self.numbered)
-        plain = _plain_numbers(texts, self.dialect)
-        times: list[int | None] = [_nanoseconds(text, decimals) for text in plain]
+        numerals = _normalised(texts, self.dialect)
+        times: list[int | None] = [_nanoseconds(text, decimals) for text in numerals]
         unread = [place for place, time in enumerate(times) if time is None]
         if len(unread) > len(times) / 2:
             times = nanoseconds_of_dates(texts)
@@ -256,8 +256,8 @@ class Table:
     def _cell_by_cell(self, index: int, field: str) -> Array:
         """Return a column as numbers, or raise the error that names the first invalid cell."""
         texts = self._texts(index)
-        plain = _plain_numbers(texts, self.dialect)
-        values = np.array([_number(text) for text in plain])
+        numerals = _normalised(texts, self.dialect)
+        values = np.array([_number(text) for text in numerals])
         if self.gaps:
             values[~np.isfinite(values)] = np.nan
             return values
@@ -438,7 +438,7 @@ def _groups(decimal: str) -> re.Pattern[str]:
     )
 
 
-def _plain_numbers(texts: Sequence[str], dialect: Dialect) -> list[str]:
+def _normalised(texts: Sequence[str], dialect: Dialect) -> list[str]:
     """Return cells of a column with a decimal point and without marks between thousands.
 
     Such marks are taken for what they are where the map states them, or where the column proves
@@ -464,6 +464,9 @@ def _is_written(cell: str, dialect: Dialect) -> bool:
         return True
     if dialect.decimal == "," and "." in cell:
         return _grouped(cell, dialect) is not None
-    plain = cell.replace(dialect.decimal, ".")
-    is_number = np.isfinite(_number(_FORTRAN.sub("e", plain))) or plain.lower() in ("inf", "-inf")
+    numeral = cell.replace(dialect.decimal, ".")
+    is_number = np.isfinite(_number(_FORTRAN.sub("e", numeral))) or numeral.lower() in (
+        "inf",
+        "-inf",
+    )
     return bool(is_number) or _grouped(cell, dialect) is not None

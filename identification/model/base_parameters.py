@@ -32,8 +32,8 @@ class BaseParameters:
     smallest_pivot: float
     largest_dropped: float  #: largest residual of a dependent column: zero except for rounding
     shares: Array  #: residual of each standard parameter's column, (s,)
-    #: terms (factor, name) of parameters counted in others without being grouped, by their name
-    counted: Mapping[str, Sequence[tuple[float, str]]] = field(default_factory=dict)
+    #: terms (factor, name) of parameters lumped into others without a group, by the other's name
+    lumped: Mapping[str, Sequence[tuple[float, str]]] = field(default_factory=dict)
 
     @property
     def rank(self) -> int:
@@ -68,9 +68,9 @@ class BaseParameters:
     def expression(
         self, name: str, others: Sequence[tuple[float, str]] = (), digits: int = 6
     ) -> str:
-        """Return a parameter as a formula: with other terms, and with those counted in it."""
+        """Return a parameter as a formula: with other terms, and with those lumped into it."""
         text = name
-        for value, other in (*others, *self.counted.get(name, ())):
+        for value, other in (*others, *self.lumped.get(name, ())):
             factor, sign = f"{abs(value):.{digits}g}", "+" if value > 0.0 else "-"
             text += f" {sign} {other}" if factor == "1" else f" {sign} {factor} {other}"
         return text

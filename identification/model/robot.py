@@ -473,7 +473,7 @@ def _without_carried_rotors(
     """Return the base parameters with each offset of friction independent of them.
 
     On a prismatic joint along gravity with a rotor inertia they are not: the weight M g of the
-    carried mass M and the offset are one constant force. Such a rotor inertia I is counted in the
+    carried mass M and the offset are one constant force. Such a rotor inertia I is lumped into the
     mass, M + I, and the offset is the rest of the force, fo - g I: both can have any value then.
     """
     n = friction.n_joints
@@ -484,17 +484,17 @@ def _without_carried_rotors(
     if not joints.size:
         return base
     rotors = [layout.names.index(f"I{joint + 1}m") for joint in joints]
-    kept = rows.copy()
-    kept[:, rotors] = 0.0
-    base = select_base(kept, layout.names, layout.units)
+    regressor = rows.copy()
+    regressor[:, rotors] = 0.0
+    base = select_base(regressor, layout.names, layout.units)
     names = [*base.names, *(f"{OFFSET.symbol}_{joint + 1}" for joint in joints)]
-    columns = np.column_stack([kept[:, base.pivots], offsets[:, joints]])
+    columns = np.column_stack([regressor[:, base.pivots], offsets[:, joints]])
     factors = np.linalg.lstsq(columns, rows[:, rotors], rcond=None)[0]
-    counted: dict[str, list[tuple[float, str]]] = {}
+    lumped: dict[str, list[tuple[float, str]]] = {}
     for row, column in zip(*np.nonzero(np.abs(factors) > TOLERANCE), strict=True):
         term = float(factors[row, column]), layout.names[rotors[column]]
-        counted.setdefault(names[row], []).append(term)
-    return replace(base, counted=counted)
+        lumped.setdefault(names[row], []).append(term)
+    return replace(base, lumped=lumped)
 
 
 def _require_separate_elements(

@@ -29,8 +29,16 @@ STAMPS = [START + PERIOD * k for k in range(COUNT)]
 Message = tuple[int, bytes]
 
 
-def message(k: int, *, stamp: int | None = None, joints: Sequence[int] = (0, 1, 2),
-            position=POSITION, velocity=SLOPE, effort=TORQUE, late: int = 0) -> Message:  # fmt: skip
+def message(
+    k: int,
+    *,
+    stamp: int | None = None,
+    joints: Sequence[int] = (0, 1, 2),
+    position=POSITION,
+    velocity=SLOPE,
+    effort=TORQUE,
+    late: int = 0,
+) -> Message:
     """Sample k of some joints; received 77 ns after its time, whatever its stamp is."""
     some = list(joints)
     _, data = state(
@@ -146,7 +154,7 @@ class TestPublishers:
         assert f"{COUNT} of {2 * COUNT} messages have 0 for all positions" in typed.message
         assert "second publisher" in typed.message
 
-    def test_samples_of_one_stamp_that_contradict_each_other_are_refused(self, urdf) -> None:
+    def test_contradicting_samples_of_one_stamp_are_refused(self, urdf) -> None:
         both = [one for k in range(COUNT)
                 for one in (message(k), message(k, position=POSITION + 1.0))]  # fmt: skip
         typed = Typed(urdf, both)
@@ -189,7 +197,7 @@ class TestClocks:
         assert_right(typed.archive)
         assert "2 messages that came before an older one: sorted by stamp" in typed.message
 
-    def test_a_clock_that_was_set_back_is_refused_unless_the_bag_has_one(self, urdf) -> None:
+    def test_a_clock_set_back_is_refused_unless_the_bag_has_one(self, urdf) -> None:
         back = [message(k, stamp=STAMPS[k] - (10**9 if k >= 200 else 0)) for k in range(COUNT)]
         typed = Typed(urdf, back)
         assert typed.refused

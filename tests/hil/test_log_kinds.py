@@ -229,8 +229,8 @@ class TestRead:
 
     def test_what_was_concluded_is_said(self, tmp_path: Path, urdf: Path) -> None:
         for kind, sentence in {
-            "degrees that nothing states": "position: no unit is stated; taken as degrees",
-            "milliseconds that nothing states": "time: no unit is stated; taken as ms",
+            "degrees that nothing states": "position: no unit is stated; read as degrees",
+            "milliseconds that nothing states": "time: no unit is stated; read as ms",
             "32 bits of microseconds": "a 32-bit counter of us wrapped once and was continued",
             "the head once more": "1 lines that repeat the header were left out",
             "a first stamp of zero": "the first 1 rows have the time 0: left out",

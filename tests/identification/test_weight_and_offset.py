@@ -52,7 +52,7 @@ def test_every_mass_rotor_and_offset_has_its_parameters() -> None:
 def test_elsewhere_the_offset_is_a_parameter_of_its_own(gravity, rotor_inertia) -> None:
     lift = model(gravity, rotor_inertia=rotor_inertia)
     assert "fo_1" in lift.parameter_names
-    assert not lift.base.counted
+    assert not lift.base.lumped
 
 
 def test_the_rotor_inertia_is_separate_without_an_offset() -> None:
