@@ -69,6 +69,14 @@ class ArrayFile:
     def unit(self, _column: Column) -> None:
         """Return no unit: arrays do not state theirs."""
 
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of an array."""
+        return self._stored[name].shape
+
+    def dtype(self, name: str) -> str:
+        """Return the type of an array, which is read for it."""
+        return self._array(name, "columns").dtype.name
+
     def numbers(
         self, columns: Sequence[Column], field: str, array: str | None, *, rows: bool = False
     ) -> Array:

@@ -18,7 +18,7 @@ from hil.errors import SourceError
 from hil.importers.arrays import READERS
 from hil.importers.column_map import HOLE, Column, Format
 from hil.importers.date_stamps import nanoseconds_of_dates
-from hil.importers.units import without_unit
+from hil.importers.units import unit_of, without_unit
 from hil.reading import read_text, remedy_for_missing
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ class Table:
             return None
         below = self.units[place] if place < len(self.units) else ""
         name = self.names[place] if place < len(self.names) else ""
-        return below.strip("[]() ") or without_unit(name)[1]
+        return unit_of(below.strip("[]() ")) or without_unit(name)[1]
 
     def has(self, name: str) -> bool:
         """Return whether a column has this name, with or without its unit."""
