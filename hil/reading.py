@@ -93,8 +93,8 @@ def read_text(
 ) -> str:
     """Return the text of a file, with line feeds as line ends.
 
-    It is in `encoding`, or in that of its byte-order mark or XML declaration, else in UTF-8; with
-    `or_latin` in Windows-1252 or UTF-16 where it cannot be UTF-8.
+    It is in `encoding`, or in that of its byte-order mark, or in UTF-8; where it cannot be, in that
+    of its XML declaration or, with `or_latin`, in Windows-1252 or UTF-16.
 
     OSError: as `open_file`, or more bytes than `longest`. UnicodeDecodeError: it is in none of
     these. LookupError: there is no such encoding.
@@ -113,18 +113,17 @@ def _decoded(data: bytes, encoding: str | None, *, or_latin: bool) -> str:
     for mark, name in _MARKS.items():
         if data.startswith(mark):
             return _declared_utf_8(data.decode(name))
-    declaration = _DECLARED.match(data)
-    if declaration:
-        try:
-            return _declared_utf_8(data.decode(declaration[2].decode()))
-        except LookupError as error:
-            name = declaration[2].decode()
-            raise UnicodeDecodeError(name, data[:0], 0, 0, "no such encoding") from error
     if or_latin and b"\0" in data[:_PROBED]:  # UTF-16 without its mark
         return data.decode("utf-16-le" if data[1:2] == b"\0" else "utf-16-be")
+    declaration = _DECLARED.match(data)
     try:
-        return data.decode("utf-8")
-    except UnicodeDecodeError:
+        return data.decode("utf-8")  # whatever it declares
+    except UnicodeDecodeError as error:
+        if declaration:
+            try:
+                return _declared_utf_8(data.decode(declaration[2].decode()))
+            except LookupError:
+                raise error from None
         if not or_latin:
             raise
     return data.decode("cp1252")

@@ -262,7 +262,8 @@ def _against_position(time: Array, position: Array, velocity: Array) -> tuple[Ar
     Rows are positions, columns velocities. Integrals are compared instead of slopes: less noise.
     """
     steps = np.diff(time)[:, None]
-    known = steps <= 5.0 * np.median(steps)  # the velocity in a gap is unknown
+    usual = np.median(steps[steps > 0.0]) if (steps > 0.0).any() else 0.0  # stamps may repeat
+    known = steps <= 5.0 * usual  # the velocity in a gap is unknown
     moved = np.where(known, 0.5 * (velocity[1:] + velocity[:-1]) * steps, 0.0).cumsum(axis=0)
     gone = np.where(known, np.diff(position, axis=0), 0.0).cumsum(axis=0)
     moved, gone = moved - moved.mean(axis=0), gone - gone.mean(axis=0)

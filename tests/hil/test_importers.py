@@ -929,6 +929,10 @@ class TestWarnings:
         expected = {arm.joint_names[1]: 3.0, arm.joint_names[5]: 0.2}
         assert factors(sentence) == pytest.approx(expected, rel=1e-2)
 
+    def test_repeated_stamps_do_not_question_the_order(self, arm: Simulated) -> None:
+        """Half of the messages have the stamp of the one before."""
+        assert warnings(replace(arm, time=np.repeat(arm.time[::2], 2))) == []
+
     def test_positions_in_degrees_order_or_zero(self, panda: Simulated) -> None:
         """The ranges of joints 4 and 6 of this arm exclude each other."""
         (sentence, *others) = warnings(panda, position=DEGREES, velocity=DEGREES)
