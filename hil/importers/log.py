@@ -198,7 +198,7 @@ class _Log:
         """Return times [ns] as stamps that an archive can hold, wraps continued."""
         zeros = next((row for row, time in enumerate(times) if time), 0)
         if zeros and abs(times[zeros] or 0) > YEAR:
-            self.notes.append(f"the first {zeros} rows have the time 0: left out")
+            self.notes.append(f"left out: rows at the start with the time 0 ({zeros})")
             valid = valid & (np.arange(len(times)) >= zeros)
         base = times[int(np.argmax(valid))] or 0
         # Differences are taken before numbers of any size become 64-bit ones.
@@ -242,8 +242,8 @@ class _Log:
             raise SourceError(self.path, problem, remedy=remedy)
         if dropped.size:
             self.notes.append(
-                f"{len(dropped)} of {len(complete)} rows have a missing number and were left out, "
-                f"the first after {dropped[0]} rows"
+                f"left out: rows in which a number is missing ({len(dropped)} of {len(complete)}, "
+                f"the first after {dropped[0]} rows)"
             )
         return np.asarray(complete)
 

@@ -245,7 +245,7 @@ class _States:
         if whole:
             others = sum(len(part.numbers) for part in parts) - len(whole[0].numbers)
             if others:
-                self.notes.append(f"{others} messages with some of the joints only were left out")
+                self.notes.append(f"left out: messages with some of the joints only ({others})")
             return whole
         for joint in self._joints:
             holders = [part for part in parts if joint in part.joints]
@@ -266,7 +266,7 @@ class _States:
         zeros = leading_zeros(stamp)
         if zeros:
             keep[:zeros] = False
-            self.notes.append(f"the first {zeros} messages have no stamp: left out")
+            self.notes.append(f"left out: messages at the start without a stamp ({zeros})")
         silent = self._second_publisher(values["position"])
         if silent.any():
             keep &= ~silent

@@ -122,7 +122,7 @@ class Table:
         if not names and form.header is None and comments:
             commented = dialect.cells(comments[-1].lstrip().lstrip("#%/"))
             names = tuple(commented) if len(commented) == width > 1 else ()
-        notes = (f"{repeated} lines that repeat the header were left out",) if repeated else ()
+        notes = (f"left out: lines that repeat the header ({repeated})",) if repeated else ()
         numbers, lines = [number for number, _ in rows], [line for _, line in rows]
         gaps = form.missing == "drop"
         return cls(path, names, units, width, lines, numbers, dialect, gaps, notes)
@@ -245,10 +245,12 @@ class Table:
 
     def _texts(self, index: int) -> list[str]:
         """Return the cells of a column as text; empty where a line is too short."""
-        frame = self._frame([index], dtype=str, na_filter=False)
-        texts = [text.strip() if isinstance(text, str) else "" for text in frame[index].tolist()]
-        if len(texts) == len(self.lines):
-            return texts
+        try:
+            cells = self._frame([index], dtype=str, na_filter=False)[index].tolist()
+        except ValueError:  # of a quotation mark
+            cells = []
+        if len(cells) == len(self.lines):
+            return [cell.strip() if isinstance(cell, str) else "" for cell in cells]
         odd = next((k for k, line in enumerate(self.lines) if line.count('"') % 2), 0)
         problem = f"line {self.numbered[odd]} has a quotation mark that is not closed"
         raise SourceError(self.path, problem, remedy="remove it")

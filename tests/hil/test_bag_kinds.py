@@ -209,7 +209,7 @@ class TestClocks:
         """Until the clock of a simulator is there; no gap of fifty years."""
         typed = Typed(urdf, [message(k, stamp=0 if k < 3 else None) for k in range(COUNT)])
         assert_right(typed.archive, rows=slice(3, None))
-        assert "the first 3 messages have no stamp: left out" in typed.message
+        assert "left out: messages at the start without a stamp (3)" in typed.message
 
     @pytest.mark.parametrize("first", [0, 100])
     def test_a_clock_that_stands_still_is_named(self, urdf, first: int) -> None:

@@ -232,8 +232,8 @@ class TestRead:
             "degrees that nothing states": "position: no unit is stated; read as degrees",
             "milliseconds that nothing states": "time: no unit is stated; read as ms",
             "32 bits of microseconds": "a 32-bit counter of us wrapped once and was continued",
-            "the head once more": "1 lines that repeat the header were left out",
-            "a first stamp of zero": "the first 1 rows have the time 0: left out",
+            "the head once more": "left out: lines that repeat the header (1)",
+            "a first stamp of zero": "left out: rows at the start with the time 0 (1)",
             "units in the second line that are not those of the SI": "position: in deg, as the fi",
         }.items():
             content, changes = READ[kind]
@@ -303,7 +303,10 @@ class TestRemedies:
         assert entries == {"format": {"missing": "drop"}}
         archive = imported(tmp_path / "log.csv", HOLES[kind], urdf, **entries)
         assert_right(archive, without=() if "note" in kind else (49,))
-        assert any("have a missing number" in line for line in archive.header.findings.lines)
+        assert any(
+            "rows in which a number is missing (1 of" in line
+            for line in archive.header.findings.lines
+        )
 
     @pytest.mark.parametrize("kind", ["an empty line", "thousands that are not certain"])
     def test_entries_of_the_map(self, tmp_path: Path, urdf: Path, kind: str) -> None:
@@ -338,6 +341,11 @@ class TestRemedies:
         content = text([[*row[:-1], "x"] for row in rows()])
         with pytest.raises(SourceError, match="has a missing number in every row"):
             imported(tmp_path / "log.csv", content, urdf, format={"missing": "drop"})
+
+    def test_a_quotation_mark_that_is_not_closed(self, tmp_path: Path, urdf: Path) -> None:
+        content = with_row(50, '0.196,"1,1,1,1,1,1')
+        with pytest.raises(SourceError, match="line 51 has a quotation mark that is not closed"):
+            imported(tmp_path / "log.csv", content, urdf)
 
     @pytest.mark.parametrize("content", [b"\x7fELF\0\0\1\2\3" * 50, b"", b"\n\n", b"a,b\n"])
     def test_what_is_no_table(self, tmp_path: Path, urdf: Path, content: bytes) -> None:
