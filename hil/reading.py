@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import codecs
 import errno
 import json
 import os
+import re
 import stat
 import tomllib
 from datetime import UTC, datetime
@@ -22,6 +24,16 @@ LARGEST_PORT: Final = 65535
 _MOST_DIGITS: Final = 18  # of a number that fits into 64 bits
 LONGEST_TEXT: Final = 1 << 28  # bytes of the longest text that is read
 _DEEPEST: Final = 32  # nesting of tables and lists
+_MARKS: Final = {  # those of UTF-32 begin as those of UTF-16
+    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF32_LE: "utf-32",
+    codecs.BOM_UTF32_BE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+}
+_DECLARATION: Final = re.compile(r"^(<\?xml[^>]*?encoding\s*=\s*[\"'])([\w.-]+)([\"'])")
+_DECLARED: Final = re.compile(_DECLARATION.pattern.encode())
+_PROBED: Final = 1000  # bytes
 _NO_FILE: Final = "it is a pipe or a device, not a file"
 _ABSENT: Final = frozenset(
     {
@@ -72,16 +84,54 @@ def open_file(path: Path) -> BufferedReader:
         raise
 
 
-def read_text(path: Path, longest: int = LONGEST_TEXT) -> str:
+def read_text(
+    path: Path,
+    longest: int = LONGEST_TEXT,
+    *,
+    encoding: str | None = None,
+    or_latin: bool = False,
+) -> str:
     """Return the text of a file, with line feeds as line ends.
 
-    OSError: as `open_file`, or more bytes than `longest`. UnicodeDecodeError: it is not UTF-8.
+    It is in `encoding`, or in that of its byte-order mark, or in UTF-8; where it cannot be, in that
+    of its XML declaration or, with `or_latin`, in Windows-1252 or UTF-16.
+
+    OSError: as `open_file`, or more bytes than `longest`. UnicodeDecodeError: it is in none of
+    these. LookupError: there is no such encoding.
     """
     with open_file(path) as stream:
         if os.fstat(stream.fileno()).st_size > longest:
             raise OSError(errno.EFBIG, f"it has more than {longest} bytes", str(path))
-        text = stream.read().decode("utf-8")
-    return text.replace("\r\n", "\n").replace("\r", "\n")
+        data = stream.read()
+    return _decoded(data, encoding, or_latin=or_latin).replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _decoded(data: bytes, encoding: str | None, *, or_latin: bool) -> str:
+    """Return the text of bytes without its byte-order mark; see `read_text`."""
+    if encoding is not None:
+        return data.decode(encoding).removeprefix("\ufeff")
+    for mark, name in _MARKS.items():
+        if data.startswith(mark):
+            return _declared_utf_8(data.decode(name))
+    if or_latin and b"\0" in data[:_PROBED]:  # UTF-16 without its mark
+        return data.decode("utf-16-le" if data[1:2] == b"\0" else "utf-16-be")
+    declaration = _DECLARED.match(data)
+    try:
+        return data.decode("utf-8")  # whatever it declares
+    except UnicodeDecodeError as error:
+        if declaration:
+            try:
+                return _declared_utf_8(data.decode(declaration[2].decode()))
+            except LookupError:
+                raise error from None
+        if not or_latin:
+            raise
+    return data.decode("cp1252")
+
+
+def _declared_utf_8(text: str) -> str:
+    """Return an XML text whose declaration names the encoding in which it is stored from now on."""
+    return _DECLARATION.sub(r"\1UTF-8\3", text, count=1)
 
 
 def is_not_a_file(error: OSError) -> bool:

@@ -8,10 +8,9 @@ messages of a channel have the same layout: encoding fills a structured array, d
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,10 +31,8 @@ _FIELD = re.compile(r"(?P<type>[\w/]+)(<=\d+)?(\[(?P<count>[^\]]*)\])?\s+(?P<nam
 _CONSTANT = re.compile(r"^\s*\w+(\[[^\]]*\])?\s+\w+\s*=")
 _SEPARATOR = re.compile(r"^=+\n", re.MULTILINE)
 _LARGEST = 4096  # elements; what is larger is an image or a cloud of points
-_MOST_PLACES = 10_000  # in one message where a type is laid out
-_DEEPEST = 32  # types within types
 _LONGEST_COUNT = 9  # digits
-_SEQUENCE = -1
+_HEADERS = ("std_msgs/Header", "std_msgs/msg/Header", "Header")
 
 
 class LayoutError(ValueError):
@@ -155,121 +152,29 @@ def joint_state_layout(
 def fixed_layout(definition: str) -> MessageLayout:
     """Return the layout of messages of numbers and fixed arrays, with or without a header.
 
-    The header's stamp has the fields ``sec`` and ``nanosec``. `LayoutError` where the size of a
-    field depends on the message, or its type is unknown.
+    `definition` is ros2msg text; of a header only the stamp is read, as fields ``sec`` and
+    ``nanosec``, and its text is empty. `LayoutError` where the size of a field depends on the
+    message, or its type is no number.
     """
-    layout = _laid_out("", definition, None)
-    names = layout.dtype.names or ()
-    layout.dtype.names = tuple(name.removeprefix("header/stamp/") for name in names)
-    return layout
-
-
-def layout_of(kind: str, definition: str, message: bytes) -> MessageLayout:
-    """Return the layout of messages like this little-endian one, fields named by their paths.
-
-    `definition` is ros2msg text with all dependencies. `LayoutError` if it is not supported, or the
-    message does not fit it.
-    """
-    if message[:4] != ENCAPSULATION:
-        raise LayoutError("its messages are not little-endian CDR")
-    return _laid_out(kind, definition, message)
-
-
-def _laid_out(kind: str, definition: str, message: bytes | None) -> MessageLayout:
-    """Build the layout of a message; without one, strings are empty, a sequence is an error."""
-    types, builder, places = _types(kind, definition), LayoutBuilder(), 0
-
-    def part(place: int, size: int) -> bytes:
-        found = b"" if message is None else message[place : place + size]
-        if message is not None and len(found) < size:
-            raise LayoutError("its messages end before their last field")
-        return found
-
-    def string() -> str:
-        place = builder.next_place(4)
-        text = part(place + 4, int.from_bytes(part(place, 4), "little"))
-        if message is not None and not text.endswith(b"\0"):
-            raise LayoutError("a string has no end")
-        try:
-            return text[:-1].decode()
-        except UnicodeDecodeError as error:
-            raise LayoutError("a string is not UTF-8") from error
-
-    def place_fields(kind: str, path: str, depth: int) -> None:
-        nonlocal places
-        if kind not in types:
-            raise LayoutError(f"its definition lacks {kind}")
-        places += 1  # types may contain themselves, or nothing
-        if depth > _DEEPEST or places > _MOST_PLACES:
-            raise LayoutError(f"its definition nests {kind} too deep or too often")
-        for field in types[kind]:
-            place_field(field, path + field.name, depth)
-
-    def place_field(field: _Field, path: str, depth: int) -> None:
-        count = field.length
-        if count == _SEQUENCE:
-            if message is None:
-                raise LayoutError("a sequence is not of constant size")
-            count = int.from_bytes(part(builder.next_place(4), 4), "little")
-            builder.count(count)
-        if field.kind in _PRIMITIVES:
-            if count is not None and count > _LARGEST:
-                raise LayoutError(f"{path} has {count} elements")
-            if count != 0:
-                size = _PRIMITIVES[field.kind].itemsize
-                part(builder.next_place(size), size * (count or 1))
-                builder.variable(path, field.kind, count)
-            return
-        for index in range(1 if count is None else count):
-            place = path if count is None else f"{path}/{index}"
-            if field.kind == "string":
-                builder.string(string())
-            else:
-                place_fields(field.kind, f"{place}/", depth + 1)
-
-    place_fields(_short(kind), "", 0)
+    builder = LayoutBuilder()
+    own = _SEPARATOR.split(definition)[0]
+    for line in (line.partition("#")[0].strip() for line in own.splitlines()):
+        if not line or _CONSTANT.match(line):
+            continue
+        match = _FIELD.match(" ".join(line.split()[:2]))  # a default value may follow the name
+        if match is None:
+            raise LayoutError(f"its definition has the line {line!r}")
+        kind, count = match["type"], match["count"]
+        if kind in _HEADERS and count is None:
+            builder.variable("sec", "int32")
+            builder.variable("nanosec", "uint32")
+            builder.string("")
+        elif kind not in _PRIMITIVES:
+            raise LayoutError(f"{match['name']} is of the type {kind}, no number")
+        elif count is None:
+            builder.variable(match["name"], kind)
+        elif not count.isdecimal() or len(count) > _LONGEST_COUNT or int(count) > _LARGEST:
+            raise LayoutError(f"{match['name']} is not of constant size, or too large")
+        elif int(count):
+            builder.variable(match["name"], kind, int(count))
     return builder.build()
-
-
-class _Field(NamedTuple):
-    """One line of a definition; `length` is None of a single value."""
-
-    kind: str
-    name: str
-    length: int | None
-
-
-def _short(kind: str) -> str:
-    """Return ``package/Type`` without ``msg``."""
-    return kind.replace("/msg/", "/")
-
-
-@lru_cache(maxsize=64)
-def _types(kind: str, definition: str) -> Mapping[str, Sequence[_Field]]:
-    """Return the fields by type of a definition with its dependencies."""
-    own, *others = _SEPARATOR.split(definition)
-    parts = [(kind, own)]
-    for part in others:
-        head, _, text = part.partition("\n")
-        parts.append((head.removeprefix("MSG:").strip(), text))
-    types = {}
-    for name, text in parts:
-        lines = (line.partition("#")[0].strip() for line in text.splitlines())
-        package = _short(name).partition("/")[0]
-        types[_short(name)] = [
-            _field(line, package) for line in lines if line and not _CONSTANT.match(line)
-        ]
-    return types
-
-
-def _field(line: str, package: str) -> _Field:
-    match = _FIELD.match(" ".join(line.split()[:2]))  # a default value may follow the name
-    if match is None:
-        raise LayoutError(f"its definition has the line {line!r}")
-    kind, count = match["type"], match["count"]
-    if kind not in _PRIMITIVES and kind != "string":
-        kind = _short(kind) if "/" in kind else f"{package}/{kind}"
-    if count is None:
-        return _Field(kind, match["name"], None)
-    fixed = int(count[:_LONGEST_COUNT]) if count.isdecimal() else _SEQUENCE
-    return _Field(kind, match["name"], fixed)

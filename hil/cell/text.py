@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import tomlkit
@@ -102,8 +102,11 @@ def _entries(table: Mapping[str, Any], path: str) -> Iterator[tuple[str, str]]:
 Array = NDArray[np.float64]
 
 
+_NO_LIMIT: Final = 1e4  # some URDFs have larger figures for "none"
+
+
 class UrdfLimits(NamedTuple):
-    """Limits per joint (n,), rad, rad/s and N·m; infinite if not stated."""
+    """Limits per joint (n,): rad or m, per second, and N·m or N; infinite if not stated."""
 
     lower: Array
     upper: Array
@@ -112,20 +115,26 @@ class UrdfLimits(NamedTuple):
 
 
 def urdf_limits(urdf: str, joint_names: Sequence[str]) -> UrdfLimits:
-    """Read the limits of joints; a speed or effort of 0 means not stated."""
+    """Read the limits of joints.
+
+    A range is not stated where it is absent or empty: lower and upper both 0, or exchanged. A speed
+    or effort is not stated where it is absent, 0, negative, or above 1e4.
+    """
     joints = {joint.get("name"): joint for joint in urdf_tree(urdf).findall("joint")}
     rows = []
     for name in joint_names:
         limit = joints[name].find("limit")
         stated = {} if limit is None else limit.attrib
-        turns = joints[name].get("type") == "continuous" or limit is None
-        rows.append(
-            (
-                -math.inf if turns else float(stated.get("lower", 0.0)),
-                math.inf if turns else float(stated.get("upper", 0.0)),
-                float(stated.get("velocity", 0.0)) or math.inf,
-                float(stated.get("effort", 0.0)) or math.inf,
-            )
+        turns = joints[name].get("type") == "continuous"
+        lower, upper, velocity, effort = (
+            float(stated.get(key, 0.0)) for key in ("lower", "upper", "velocity", "effort")
         )
-    lower, upper, velocity, effort = np.array(rows, dtype=np.float64).T
-    return UrdfLimits(lower, upper, velocity, effort)
+        if turns or not lower < upper:
+            lower, upper = -math.inf, math.inf
+        rows.append((lower, upper, _stated(velocity), _stated(effort)))
+    return UrdfLimits(*np.array(rows, dtype=np.float64).reshape(-1, 4).T)
+
+
+def _stated(figure: float) -> float:
+    """Return a limit of speed or effort, infinite if the figure is none."""
+    return figure if 0.0 < figure < _NO_LIMIT else math.inf

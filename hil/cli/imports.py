@@ -23,6 +23,7 @@ from hil.errors import InputError
 from hil.identify.options import FRICTION_TERMS, friction_from
 from hil.importers import (
     STANDARD_GRAVITY,
+    Clock,
     ColumnMap,
     Effort,
     Robot,
@@ -145,6 +146,7 @@ def rosbag2(
     arm: Described,
     topic: str | None = None,
     effort: Effort = "torque",
+    clock: Clock = "auto",
     rename: Annotated[list[str] | None, typer.Option(metavar="RECORDED=URDF")] = None,
     held: Held = None,
     kind: Kind = "excitation",
@@ -152,17 +154,20 @@ def rosbag2(
     outside_limits: OutsideOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Import sensor_msgs/JointState messages from a rosbag2 or MCAP file.
+    """Import sensor_msgs/JointState messages from a bag of ROS 1 or 2, or an MCAP file.
 
-    The source is a bag folder or its .db3 or .mcap file, compressed or not. Joints are matched by
-    name. For MCAP files with other message types use `hil import log` with a column map. If the
-    URDF has more joints than were recorded, --locked or --lock-others removes them from the model.
+    The source is a bag folder or its .db3, .mcap or .bag file, compressed or not. Joints are
+    matched by name. For MCAP files with other message types use `hil import log` with a column map.
+    If the URDF has more joints than were recorded, --locked or --lock-others removes them from the
+    model.
 
     **Example:** `hil import rosbag2 bag --urdf arm.urdf --lock-others --gravity 0 0 9.81 -o a.mcap`
 
     Options:
         topic: Topic of the joint states; needed if the bag has several.
         effort: Content of the effort field: torque (N·m), motor_current (A) or ignore.
+        clock: Stamps to use: header (of the messages), bag (time of receipt) or auto (header unless
+            empty).
         rename: Joint whose name in the bag differs from the URDF (repeatable).
     """
     names = _names(rename or [])
@@ -172,6 +177,7 @@ def rosbag2(
         robot=arm.robot(lambda: recorded_joints(source, topic, names)),
         topic=topic,
         effort=effort,
+        clock=clock,
         joint_names=names,
         held_joints=held or (),
         use=kind,

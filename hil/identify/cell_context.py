@@ -293,5 +293,5 @@ def torque_limits(cell: Cell) -> Array | None:
         gear = np.abs(np.diag(drives.motor_from_joint))
         return np.asarray(gear * drives.torque_constant * drives.current_limit)
     effort = urdf_limits(cell.urdf, cell.joint_names).effort
-    limits = np.where((effort > 0.0) & (effort < np.inf), effort, np.nan)
+    limits = np.where(np.isfinite(effort), effort, np.nan)
     return None if np.isnan(limits).all() else limits

@@ -505,7 +505,7 @@ def _parameters(
     is_ns16 = cell.urdf == URDF_PATH.read_text(encoding="utf-8")
     return results.ParameterResult.rows(
         name=model.parameter_names,
-        expression=[*model.base.expressions(), *model.parameter_names[len(model.base.names) :]],
+        expression=[*model.expressions()],
         unit=model.units,
         table2_id=[ids.get(name) for name in model.parameter_names] if is_ns16 else None,
         estimate=pooled.values,

@@ -4,11 +4,12 @@ from hil.importers.column_map import ColumnMap, Quantity, TimeColumn
 from hil.importers.dh import Convention, convention_of, urdf_of_dh
 from hil.importers.log import import_log
 from hil.importers.robot import IMPORTED_LAW, STANDARD_GRAVITY, Robot, Use
-from hil.importers.rosbag2 import Effort, import_rosbag2, recorded_joints
+from hil.importers.rosbag2 import Clock, Effort, import_rosbag2, recorded_joints
 
 __all__ = [
     "IMPORTED_LAW",
     "STANDARD_GRAVITY",
+    "Clock",
     "ColumnMap",
     "Convention",
     "Effort",

@@ -2,49 +2,31 @@
 
 from __future__ import annotations
 
-import atexit
 import math
-import re
-import resource
-import threading
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, Final, NamedTuple, ParamSpec, TypeVar
+from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
-from scipy.io import loadmat, whosmat
-from scipy.io.matlab import varmats_from_mat
 
-from hil.archive.cdr import LayoutError, MessageLayout, layout_of
 from hil.errors import SourceError
 from hil.importers import mcap_messages
 from hil.importers.column_map import Column
-from hil.reading import open_file, read_text
-from planner.errors import PlannerCrashed, PlanningTimedOut
-from planner.worker import WorkerProcess
+from hil.importers.matlab import NUMBERS, mat_array, mat_shapes, script_matrices
+from hil.importers.ros_messages import MessageError, columns_of, decoded, typestore_of
+from hil.reading import open_file
 
 Array = NDArray[np.float64]
-P = ParamSpec("P")
-T = TypeVar("T")
 
 MOST_NUMBERS: Final = 2**28
 """Elements of one array: 2 GiB of doubles, hours of an arm at 5 kHz."""
 
-_NUMBERS: Final = "fiubmM"
-_MATLAB_NUMBERS: Final = {"double", "single", "logical"} | {
-    f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
-}
-_MATLAB_NESTED: Final = ("struct", "cell", "object")
 _MOST_NAMED: Final = 30
-_ASSIGNED: Final = re.compile(r"\b([A-Za-z]\w*)\s*=\s*\[([^\[\]]*)\]")
-_COMMENT: Final = re.compile(r"[%#].*")
-_MEMORY: Final = 8 * 2**30  # bytes of the process that reads a .mat: the largest array and its copy
-_TIMEOUT: Final = 120.0  # s
 
 
 class Stored(NamedTuple):
@@ -77,6 +59,23 @@ class ArrayFile:
             raise SourceError(path, "has no array of numbers with one or two dimensions")
         self.names = tuple(self._stored)
         self._loaded: dict[str, NDArray[Any]] = {}
+
+    notes: tuple[str, ...] = ()
+
+    def has(self, name: str) -> bool:
+        """Return whether an array has this name."""
+        return name in self._stored
+
+    def unit(self, _column: Column) -> None:
+        """Return no unit: arrays do not state theirs."""
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of an array."""
+        return self._stored[name].shape
+
+    def dtype(self, name: str) -> str:
+        """Return the type of an array, which is read for it."""
+        return self._array(name, "columns").dtype.name
 
     def numbers(
         self, columns: Sequence[Column], field: str, array: str | None, *, rows: bool = False
@@ -169,7 +168,7 @@ class ArrayFile:
                 raise SourceError(self.path, problem, remedy="save the log in parts")
             with _readable(self.path):
                 array = stored.load()
-            if array.dtype.kind not in _NUMBERS or array.shape != stored.shape:
+            if array.dtype.kind not in NUMBERS or array.shape != stored.shape:
                 raise SourceError(self.path, f"array {name!r} does not hold real numbers")
             self._loaded[name] = array
         return self._loaded[name]
@@ -198,7 +197,7 @@ def _npz(path: Path) -> dict[str, Stored]:
     return {
         name.removesuffix(".npy"): Stored(head[0], partial(_member, path, name))
         for name, head in heads.items()
-        if head is not None and head[1].kind in _NUMBERS
+        if head is not None and head[1].kind in NUMBERS
     }
 
 
@@ -225,99 +224,10 @@ def _head(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
 
 
 def _mat(path: Path) -> dict[str, Stored]:
-    entries = [one for one in _in_child(_variables, str(path)) if not one[0].startswith("__")]
-    nested = [name for name, _, kind in entries if kind in _MATLAB_NESTED]
     return {
-        name: Stored(shape, partial(_matlab_variable, path, name))
-        for name, shape, kind in entries
-        if kind in _MATLAB_NUMBERS
-    } | _in_memory(_in_child(_struct_fields, str(path), nested) if nested else {})
-
-
-def _variables(path: str) -> list[tuple[str, tuple[int, ...], str]]:
-    """Return name, shape and class of the variables.
-
-    scipy lists none of them if one has no shape (tables, strings, time series of MATLAB); each is
-    then read by itself.
-    """
-    try:
-        return list(whosmat(path))
-    except TypeError:
-        found = []
-        with Path(path).open("rb") as file:
-            for _, alone in varmats_from_mat(file):
-                with suppress(TypeError):
-                    found += whosmat(alone)
-        return found
-
-
-def _struct_fields(path: str, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Return the arrays of numbers within structs and cells, by path: ``log.joint(2).q``."""
-    found: dict[str, NDArray[Any]] = {}
-
-    def walk(value: object, place: str) -> None:
-        if not isinstance(value, np.ndarray):
-            return
-        if value.dtype.kind in _NUMBERS:
-            found[place] = np.squeeze(value) if value.ndim > 2 else value
-        elif value.dtype.names or value.dtype.kind == "O":
-            one_struct = value.dtype.names and value.size == 1
-            for number, element in enumerate(value.ravel(order="F"), 1):
-                at = place if one_struct else f"{place}({number})"
-                if not value.dtype.names:
-                    walk(element, at)
-                for name in value.dtype.names or ():
-                    walk(element[name], f"{at}.{name}")
-
-    variables = loadmat(path, variable_names=names)
-    for name in names:
-        walk(variables[name], name)
-    if sum(array.size for array in found.values()) > MOST_NUMBERS:
-        raise ValueError("its structs are too large to be read at once")
-    return found
-
-
-def _matlab_variable(path: Path, name: str) -> NDArray[Any]:
-    return np.asarray(_in_child(loadmat, str(path), variable_names=[name])[name])
-
-
-def _in_child(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call scipy's reader in a child process: a damaged file can crash it."""
-    with _lock:
-        if not _readers:
-            _readers.append(WorkerProcess(timeout=_TIMEOUT))
-        try:
-            return _readers[0].call(_within_memory, partial(function, *args, **kwargs))
-        except PlannerCrashed as error:
-            raise ValueError("it is damaged") from error
-        except PlanningTimedOut as error:
-            raise ValueError(f"reading takes longer than {_TIMEOUT:g} s") from error
-
-
-def _within_memory(read: Callable[[], T]) -> T:
-    """Read with limited memory: sizes in a file are not trusted."""
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
-    return read()
-
-
-_lock = threading.Lock()
-_readers: list[WorkerProcess] = []
-
-
-@atexit.register
-def _close() -> None:
-    while _readers:
-        _readers.pop().close()
-
-
-def _matlab_text(path: Path) -> dict[str, Stored]:
-    """Matrices of a MATLAB or Octave script."""
-    text = _COMMENT.sub("", read_text(path).removeprefix("\ufeff")).replace("...", " ")
-    found = {}
-    for name, body in _ASSIGNED.findall(text):
-        rows = [row.replace(",", " ").split() for row in re.split(r"[;\n]", body)]
-        found[name] = np.array([[float(cell) for cell in row] for row in rows if row])
-    return _in_memory(found)
+        name: Stored(shape, partial(mat_array, path, name))
+        for name, shape in mat_shapes(path).items()
+    }
 
 
 def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
@@ -330,62 +240,36 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
     """
     known, messages = mcap_messages.read(path, lambda _, topic: topic.is_ros2)
     refused = {name: f"{t} is not ROS 2" for name, t in known.items() if not t.is_ros2}
-    layouts: dict[str, MessageLayout] = {}
-    found: dict[str, list[tuple[int, bytes]]] = {}
+    by_topic: dict[str, list[tuple[int, bytes]]] = {}
     for name, stamp, data in messages:
-        if name in refused:
-            continue
-        try:
-            if name not in layouts:
-                definition = known[name].definition.decode(errors="replace")
-                layouts[name] = layout_of(known[name].kind, definition, data)
-            size = layouts[name].size
-            if len(data) - size not in range(4):  # a writer may pad the end to whole words
-                raise LayoutError("its messages differ in length")
-        except LayoutError as error:
-            refused[name] = str(error)
-            found.pop(name, None)
-            continue
-        found.setdefault(name, []).append((stamp, data[:size]))
+        by_topic.setdefault(name, []).append((stamp, data))
     arrays: dict[str, NDArray[Any]] = {}
-    for name, own in found.items():
+    for name, received in by_topic.items():
+        topic = known[name]
         try:
-            columns = _columns(layouts[name], own)
-        except LayoutError as error:
+            definition = topic.definition.decode(errors="replace")
+            store = typestore_of(topic.kind, definition, topic.schema_encoding)
+            content = [decoded(store, topic.kind, data) for _, data in received]
+            columns = columns_of([stamp for stamp, _ in received], content)
+        except MessageError as error:
             refused[name] = str(error)
         else:
             arrays |= {f"{name}/{field}": column for field, column in columns.items()}
     if not arrays:
         reasons = "; ".join(f"{name}: {why}" for name, why in refused.items()) or "it has no topic"
         problem = f"has no topic whose messages can be read as columns ({reasons})"
-        remedy = "record joint states and currents as ROS 2 messages of constant size"
+        remedy = (
+            "record joint states and currents as ROS 2 messages with constant names and lengths"
+        )
         raise SourceError(path, problem, remedy=remedy)
     return arrays
-
-
-def _columns(
-    layout: MessageLayout, messages: Sequence[tuple[int, bytes]]
-) -> dict[str, NDArray[Any]]:
-    """Return the fields of messages of one topic, given with log times [ns], and their stamps."""
-    joined = np.frombuffer(b"".join(data for _, data in messages), np.uint8)
-    data = joined.reshape(len(messages), layout.size)
-    if not layout.matches(data):
-        raise LayoutError("its messages differ in names or lengths of arrays")
-    rows = data.view(layout.dtype)[:, 0]
-    columns: dict[str, NDArray[Any]] = {
-        name: rows[name].copy() for name in layout.dtype.names or ()
-    }
-    seconds, rest = (columns.pop(f"header/stamp/{part}", None) for part in ("sec", "nanosec"))
-    if seconds is None or rest is None or not (seconds.any() or rest.any()):
-        return {"stamp": np.array([stamp for stamp, _ in messages], np.int64), **columns}
-    return {"stamp": np.asarray(seconds.astype(np.int64) * 10**9 + rest), **columns}
 
 
 def _in_memory(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Stored]:
     return {
         name: Stored(array.shape, partial(np.asarray, array))
         for name, array in arrays.items()
-        if array.dtype.kind in _NUMBERS
+        if array.dtype.kind in NUMBERS
     }
 
 
@@ -393,7 +277,7 @@ READERS: Mapping[str, Callable[[Path], dict[str, Stored]]] = {
     ".npz": _npz,
     ".npy": _npy,
     ".mat": _mat,
-    ".m": _matlab_text,
+    ".m": lambda path: _in_memory(script_matrices(path)),
     ".mcap": lambda path: _in_memory(read_mcap(path)),
 }
 """Readers of files of arrays by suffix; every other file is text in columns."""

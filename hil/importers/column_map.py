@@ -15,28 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError,
 
 from hil.cell.errors import first_error
 from hil.errors import SourceError
+from hil.importers.units import PER_CENT, UNITS, names_of_units
 from hil.reading import parse_toml, path_exists, read_text, remedy_for_missing
-
-ANGLES = {
-    "rad": 1.0,
-    "mrad": 1e-3,
-    "deg": 0.017453292519943295,
-    "rev": 6.283185307179586,
-    "m": 1.0,
-    "mm": 1e-3,
-}
-RATES = {
-    "rad/s": 1.0,
-    "deg/s": ANGLES["deg"],
-    "rev/s": ANGLES["rev"],
-    "rpm": ANGLES["rev"] / 60.0,
-    "m/s": 1.0,
-    "mm/s": 1e-3,
-}
-TORQUES = {"N.m": 1.0, "N·m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "kN.m": 1e3, "N": 1.0}
-CURRENTS = {"A": 1.0, "mA": 1e-3}
-UNITS = {"position": ANGLES, "velocity": RATES, "torque": TORQUES, "motor_current": CURRENTS}
-TIMES = {"s": 0, "ms": 3, "us": 6, "ns": 9}  # decimal places to shift
 
 Vector = tuple[FiniteFloat, ...]
 Column = Annotated[int, Field(ge=0)] | str
@@ -56,14 +36,15 @@ class Quantity(_Table):
 
     Attributes:
         columns: one per joint, by name or by index from 0; or one name with ``{}`` in place of the
-            joint's number, from 1. In files of arrays a name is that of an array. None: all
-            columns of the file, one per joint.
+            joint's number, from 1, or of its name. In files of arrays a name is that of an array.
+            None: all columns of the file, one per joint.
         array: in files of arrays, the matrix that `columns` are columns of.
         file: relative to the log; None for the log itself.
         files: one per joint instead, as a list or one name with ``{}``. `columns` is then the one
             column or array of each; None if each has only one.
         joints_along: of a whole matrix; None: time is along the longer side.
-        unit: a unit of the quantity; None for the SI one.
+        unit: a unit of the quantity; None for the one that the file states, or else the SI one.
+        rated: value of each joint that is 100 %, in SI units, where the unit is per cent.
         offset: added to the recorded numbers, one for all joints or one each.
         scale: factor after that, one for all joints or one each.
         side: ``motor`` if it was measured before the gears.
@@ -80,6 +61,7 @@ class Quantity(_Table):
     )
     joints_along: Literal["columns", "rows"] | None = None
     unit: str | None = None
+    rated: FiniteFloat | Vector | None = Field(default=None, description=_ONE_OR_EACH)
     offset: FiniteFloat | Vector = Field(default=0.0, description=_ONE_OR_EACH)
     scale: FiniteFloat | Vector = Field(default=1.0, description=_ONE_OR_EACH)
     side: Literal["joint", "motor"] = "joint"
@@ -88,13 +70,16 @@ class Quantity(_Table):
 class TimeColumn(_Table):
     """The column of the time, in the file of the positions or in another `file`.
 
-    If there is a file of positions per joint, all must have the same times.
+    If there is a file of positions per joint, all must have the same times. No unit is the one that
+    the file states, or else the one that gives a rate at which robots are sampled.
     """
 
     column: Column = Field(default=0, description="a name or an index from 0")
     array: str | None = None
     file: str | None = None
-    unit: Literal["s", "ms", "us", "ns"] = "s"
+    unit: Literal["s", "ms", "us", "ns"] | None = Field(
+        default=None, description='"s", "ms", "us" or "ns"'
+    )
 
 
 class Drive(_Table):
@@ -142,6 +127,8 @@ class Format(_Table):
     """Format of the text; None is detected.
 
     Attributes:
+        thousands: the mark between groups of three digits, where the column does not prove it.
+        encoding: of the text, such as ``utf-16`` or ``cp1252``.
         skip_rows: lines before the header, or before the data.
         header: whether a line of column names comes first.
         transposed: whether the lines of the file are channels instead of samples.
@@ -154,6 +141,10 @@ class Format(_Table):
         default=None, description="a single character"
     )
     decimal: Literal[".", ","] | None = None
+    thousands: Annotated[str, Field(min_length=1, max_length=1)] | None = Field(
+        default=None, description="a single character"
+    )
+    encoding: str | None = None
     skip_rows: Annotated[int, Field(ge=0, description="a number of lines")] = 0
     header: bool | None = None
     transposed: bool = False
@@ -186,8 +177,10 @@ class ColumnMap(_Table):
             raise ValueError("give either a time column or sample_rate")
         for name, quantity in self.quantities().items():
             if quantity.unit not in (None, *UNITS[name]):
-                units = ", ".join(UNITS[name])
+                units = names_of_units(name)
                 raise ValueError(f"{quantity.unit!r} is not a unit of {name}; use {units}")
+            if quantity.unit == PER_CENT and quantity.rated is None:
+                raise ValueError(f"{name} is in per cent: give {name}.rated, the value of 100 %")
             if quantity.side == "motor" and name != "motor_current" and not self.drive.geared:
                 raise ValueError(f"{name} is of the motor side, so drive.gear_ratio is needed")
             if quantity.files is not None and (quantity.file or quantity.joints_along):

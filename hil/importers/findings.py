@@ -17,21 +17,18 @@ from scipy.optimize import linear_sum_assignment
 from hil.archive import Findings, Samples
 from hil.cell.text import UrdfLimits, urdf_limits
 from hil.errors import SourceError
+from hil.importers.stamps import FASTEST, SLOWEST
 from identification.model.urdf_text import urdf_tree
 from identification.signals.clock import time_base
 from identification.signals.recording import unwrap
 
 Array = NDArray[np.float64]
 
-_SLOWEST: Final = 20.0  # Hz; a robot's dynamics need faster sampling
-_FASTEST: Final = 20_000.0  # Hz
-_NO_MOTION: Final = 10.0  # Hz; 5 kHz in ms, read as s, are 5 Hz
 _TOLERANCE: Final = 0.05  # rad or m beyond a limit, for calibration and overshoot
 _LEAST_TRAVEL: Final = 0.1  # rad or m
 _SCALE_TOLERANCE: Final = 0.1  # of velocity over slope of the position, for filters
 _CORRELATED: Final = 0.7
 _TOO_FAST: Final = 3.0  # times the URDF's limit, of speed and of torque
-_NO_LIMIT: Final = 1e4  # some URDFs have larger figures for "none"
 _OTHER_UNIT: Final = 30.0  # between the errors of a nominal torque and a factor of 1000
 _THOUSAND: Final = 1000.0
 _BLOCK: Final = 0.05  # s, over which signals are averaged before they are differentiated
@@ -40,36 +37,6 @@ _SIGNIFICANT: Final = 0.01  # of the largest nominal torque
 
 NominalTorque = Callable[[Array, Array, Array], Array]
 """Torque of the nominal inertias by position, velocity and acceleration, each (m, n)."""
-
-
-def check_clock(stamp: NDArray[np.int64], path: Path) -> None:
-    """Check that stamps (m,) [ns] of a file can be those of a motion.
-
-    Raises:
-        SourceError: they run backwards, are all the same, or are too far apart.
-    """
-    steps = np.diff(stamp)
-    backward = np.flatnonzero(steps < 0)
-    if backward.size:
-        first = int(backward[0]) + 1
-        problem = (
-            f"sample {first} is {-1e-9 * steps[first - 1]:.3g} s older than the one before it "
-            f"({backward.size} such steps)"
-        )
-        remedy = "cut the recording where its clock runs backwards, or name another time column"
-        raise SourceError(path, problem, field="time", remedy=remedy)
-    if steps.size and not steps.any():
-        problem = f"all {len(stamp)} samples have the same time"
-        remedy = "name the column of the time, or give sample_rate instead"
-        raise SourceError(path, problem, field="time", remedy=remedy)
-    rate = 1e9 / float(np.median(steps[steps > 0])) if steps.size else np.inf
-    if rate < _NO_MOTION:
-        problem = f"has {rate:.2g} samples per second, too few for a motion"
-        remedy = (
-            "check its unit ([time] unit, or sample_rate in Hz): milliseconds read as seconds "
-            f"would give {1e3 * rate:.4g} samples per second; at least {_SLOWEST:g} are needed"
-        )
-        raise SourceError(path, problem, field="time", remedy=remedy)
 
 
 def examine(
@@ -86,7 +53,7 @@ def examine(
     torque of the nominal inertias, None if the URDF has none.
     """
     time, position = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9), unwrap(samples.position)
-    limits = limits_of(urdf, joint_names)
+    limits = urdf_limits(urdf, joint_names)
     turning = _turning(urdf, joint_names)
     held = [f"{name} at {place:.4g}" for name, place in (locked or {}).items()]
     lines = [f"locked, rad or m: {', '.join(held)}"] if held else []
@@ -96,7 +63,7 @@ def examine(
     lines = [f"time: {'; '.join(base.describe())}", *lines]
     lines += map(_range, joint_names, position.T, turning, limits.lower, limits.upper)
     warnings = []
-    if not _SLOWEST <= base.rate <= _FASTEST:
+    if not SLOWEST <= base.rate <= FASTEST:
         warnings += [f"{base.rate:.3g} samples per second are unusual: check the unit of the time"]
     warnings += _positions(time, position, joint_names, limits, turning)
     is_plausible = not warnings  # torques are compared with those of a plausible motion only
@@ -106,17 +73,6 @@ def examine(
     if is_plausible:
         warnings += _torque_size(samples, joint_names, limits.effort, nominal)
     return Findings(lines=tuple(lines), warnings=tuple(warnings))
-
-
-def limits_of(urdf: str, names: Sequence[str]) -> UrdfLimits:
-    """Return limits of joints; infinite where the range is empty or a figure means no limit."""
-    lower, upper, velocity, effort = urdf_limits(urdf, names)
-    bounded = lower < upper
-    return UrdfLimits(
-        np.where(bounded, lower, -np.inf),
-        np.where(bounded, upper, np.inf),
-        *(np.where((one > 0.0) & (one < _NO_LIMIT), one, np.inf) for one in (velocity, effort)),
-    )
 
 
 def _turning(urdf: str, names: Sequence[str]) -> NDArray[np.bool_]:
@@ -193,10 +149,37 @@ def check_positions(position: Array, names: Sequence[str], urdf: str, path: Path
     Raises:
         SourceError: none is.
     """
-    outside = _outside(position, names, limits_of(urdf, names), _turning(urdf, names))
+    outside = _outside(position, names, urdf_limits(urdf, names), _turning(urdf, names))
     if outside is not None and outside.rows.all():
         remedy = f"{outside.remedy}; if the limits are wrong: --outside-limits"
         raise SourceError(path, outside.problem, field="position", remedy=remedy)
+
+
+def are_degrees(position: Array, converted: Array, names: Sequence[str], urdf: str) -> bool:
+    """Return whether positions (m, n) leave the limits of the URDF by far and are within converted.
+
+    `converted` are the same numbers [rad], read as degrees.
+    """
+    limits, turning = urdf_limits(urdf, names), _turning(urdf, names)
+    if not turning.all() or not len(position):
+        return False
+    finite = np.isfinite(position).all() and np.isfinite(converted).all()
+    beyond = ~np.diag(_fits(position, limits))
+    far = np.abs(position).max(axis=0) > 3.0 * np.maximum(-limits.lower, limits.upper)
+    fits = np.diag(_fits(converted, limits))
+    moves = np.ptp(converted, axis=0).max() >= _LEAST_TRAVEL
+    return bool(finite and (far & beyond).any() and fits.all() and moves)
+
+
+def has_degrees_per_second(time: Array, position: Array, velocity: Array) -> bool:
+    """Return whether velocities (m, n) are the slopes of positions [rad] in degrees per second."""
+    moving = np.ptp(position, axis=0) >= _LEAST_TRAVEL
+    if not moving.any():
+        return False
+    factor, correlation = _against_position(time, position[:, moving], velocity[:, moving])
+    per_degree = math.radians(1.0) * factor
+    itself = np.diag(correlation)
+    return bool((itself >= _CORRELATED).all() and (abs(per_degree - 1.0) < _SCALE_TOLERANCE).all())
 
 
 def _positions(
@@ -279,7 +262,8 @@ def _against_position(time: Array, position: Array, velocity: Array) -> tuple[Ar
     Rows are positions, columns velocities. Integrals are compared instead of slopes: less noise.
     """
     steps = np.diff(time)[:, None]
-    known = steps <= 5.0 * np.median(steps)  # the velocity in a gap is unknown
+    usual = np.median(steps[steps > 0.0]) if (steps > 0.0).any() else 0.0  # stamps may repeat
+    known = steps <= 5.0 * usual  # the velocity in a gap is unknown
     moved = np.where(known, 0.5 * (velocity[1:] + velocity[:-1]) * steps, 0.0).cumsum(axis=0)
     gone = np.where(known, np.diff(position, axis=0), 0.0).cumsum(axis=0)
     moved, gone = moved - moved.mean(axis=0), gone - gone.mean(axis=0)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from decimal import Decimal
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,18 @@ from numpy.typing import NDArray
 from hil.archive import Samples
 from hil.errors import SourceError
 from hil.importers.arrays import READERS, ArrayFile
-from hil.importers.column_map import HOLE, TIMES, UNITS, ColumnMap, Quantity
+from hil.importers.column_map import HOLE, ColumnMap, Quantity, TimeColumn
+from hil.importers.findings import are_degrees, has_degrees_per_second
 from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
+from hil.importers.stamps import YEAR, concluded_unit, without_wraps
 from hil.importers.table import Table
+from hil.importers.units import PER_CENT, TIMES, UNITS, unit_of
 
 Array = NDArray[np.float64]
 
 _MORE: Final = 64  # columns or files beyond the joints that are tried
-_LATEST = 2**31 * 10**9  # ns, largest stamp of an archive
+_LATEST: Final = 2**31 * 10**9  # ns, largest stamp of an archive
+_FARTHEST: Final = 2**62  # ns between two times, 146 years
 
 
 def import_log(
@@ -55,14 +59,14 @@ def import_log(
     log = _Log(Path(source), columns, robot)
     with np.errstate(over="ignore", invalid="ignore"):  # such numbers are refused later
         values = {name: log.read(name) for name in columns.quantities()}
-    stamp, timed, origin, clock = log.stamps(len(values["position"]))
-    _check_lengths({**values, "time": stamp}, log.path, "quantities")
-    metadata = {"importer": "log", "clock_origin_ns": str(origin)}
+    clock = log.clock(len(values["position"]))
+    _check_lengths({**values, "time": clock.stamp}, log.path, "quantities")
+    metadata = {"importer": "log", "clock_origin_ns": str(clock.origin)}
+    complete = log.complete_rows(clock, values)
     if columns.format.missing == "drop":
-        known = [timed, *(np.isfinite(array).all(axis=1) for array in values.values())]
-        complete = np.all(known, axis=0)
         metadata["dropped_rows"] = str(np.count_nonzero(~complete))
-        stamp, values = stamp[complete], {name: array[complete] for name, array in values.items()}
+    stamp = clock.stamp[complete]
+    values = {name: array[complete] for name, array in values.items()}
     if columns.drive.geared:
         matrix = log.matrix[np.ix_(log.order, log.order)]
         metadata["motor_from_joint"] = json.dumps(matrix.tolist())
@@ -71,8 +75,7 @@ def import_log(
     if (uncertainty := columns.drive.torque_uncertainty) is not None:
         each = np.broadcast_to(uncertainty, len(log.joints))[log.order]
         metadata["torque_uncertainty"] = json.dumps(each.tolist())
-    with np.errstate(over="ignore", invalid="ignore"):
-        joint_side = _joint_side(values, columns, log)
+    joint_side = log.in_concluded_units(stamp, values, robot)
     return write_imported(
         output,
         Samples(stamp, **joint_side),
@@ -82,10 +85,20 @@ def import_log(
         held_joints=held_joints,
         period=None if columns.sample_rate is None else 1.0 / columns.sample_rate,
         use=use,
-        clock=clock,
+        clock=clock.path,
+        notes=[*log.notes, *(note for file in log.files.values() for note in file.notes)],
         force=force,
         outside_limits=outside_limits,
     )
+
+
+class _Clock(NamedTuple):
+    """Stamps of a log."""
+
+    stamp: NDArray[np.int64]  #: (m,) [ns], after the origin
+    valid: NDArray[np.bool_]  #: (m,) rows whose time is known
+    origin: int  #: [ns], was subtracted
+    path: Path  #: of the file that has them
 
 
 class _Log:
@@ -97,6 +110,7 @@ class _Log:
         joints: of the log, in its order.
         order: the log's column of each joint of the robot.
         matrix: motor angles per joint angle (k, k), in the log's order.
+        notes: what was concluded, where neither map nor file states it.
     """
 
     def __init__(self, path: Path, columns: ColumnMap, robot: Robot) -> None:
@@ -107,64 +121,188 @@ class _Log:
         self.joints = columns.joints or robot.joint_names
         self.order = self._joint_order(robot)
         self.matrix = self._motor_from_joint()
+        self.notes: list[str] = []
+        self._unstated: set[str] = set()  # quantities whose unit nothing states
 
     def read(self, name: str) -> Array:
         """Return a quantity in SI units, (m, k), columns in the log's joint order."""
         quantity = self._map.quantities()[name]
-        values = self._numbers(name, quantity)
-        factor = UNITS[name][quantity.unit] if quantity.unit else 1.0
-        for key, value in (("scale", quantity.scale), ("offset", quantity.offset)):
+        values, units = self._numbers(name, quantity)
+        scales = {"scale": quantity.scale, "offset": quantity.offset, "rated": quantity.rated}
+        for key, value in scales.items():
             if isinstance(value, tuple):
                 self._check_count(value, f"{name}.{key}")
+        factor = self._factor(name, quantity, [unit_of(unit or "", name) for unit in units])
         return np.asarray((values + quantity.offset) * np.multiply(factor, quantity.scale))
 
-    def stamps(self, count: int) -> tuple[NDArray[np.int64], NDArray[np.bool_], int, Path]:
-        """Return stamps [ns], which are known, the origin that was subtracted, and their file."""
+    def _factor(self, name: str, quantity: Quantity, stated: Sequence[str | None]) -> float | Array:
+        """Return the factors to SI units: of the map's unit, or of those that the file states."""
+        mapped = None if quantity.unit is None else unit_of(quantity.unit, name)
+        others = [unit for unit in stated if unit not in (None, mapped)]
+        if mapped is None and len(others) < len(stated):
+            self._unstated.add(name)
+            if not others:
+                return 1.0
+        if mapped is not None and others:
+            self.notes.append(
+                f"{name}: the map says {mapped}, the file {others[0]}; used: {mapped}"
+            )
+        elif mapped is None:
+            self.notes.append(f"{name}: in {others[0]}, as the file states")
+        units = [mapped or unit or next(iter(UNITS[name])) for unit in stated]
+        if PER_CENT in units and quantity.rated is None:
+            problem = "is in per cent of a rated value that the map does not state"
+            remedy = f"add to [{name}]: rated = [...], the value of each joint that is 100 %"
+            raise SourceError(self.path, problem, field=name, remedy=remedy)
+        factors = np.array([UNITS[name][unit] for unit in units])
+        rated = 1.0 if quantity.rated is None else np.asarray(quantity.rated)
+        return np.where(np.array(units) == PER_CENT, factors * rated, factors)
+
+    def clock(self, count: int) -> _Clock:
+        """Return the stamps of a log with this number of rows."""
         time, rate, position = self._map.time, self._map.sample_rate, self._map.position
         if time is None:
             assert rate is not None
             stamps = np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64)
-            return stamps, np.ones(count, np.bool_), 0, self.path
+            return _Clock(stamps, np.ones(count, np.bool_), 0, self.path)
         if time.file is None and position.files is not None:
             first, *others = self._file_per_joint(position.files, "position.files")
         else:
             first, *others = (self._file(time.file or position.file, "time.file"),)
-        times = first.times(time.column, TIMES[time.unit], time.array)
+        unit = time.unit or self._unit_of_time(first, time)
+        times = first.times(time.column, TIMES[unit], time.array)
         for other in others:
-            if other.times(time.column, TIMES[time.unit], time.array) != times:
+            if other.times(time.column, TIMES[unit], time.array) != times:
                 problem = f"has other times than {first.path.name}"
                 remedy = "name one file of times for all joints: [time] file"
                 raise SourceError(other.path, problem, field="time", remedy=remedy)
-        known = [one for one in times if one is not None]
-        if not known or (len(known) < len(times) and self._map.format.missing == "refuse"):
+        valid = np.array([time is not None for time in times])
+        if not valid.any() or (not valid.all() and self._map.format.missing == "refuse"):
             problem = f"has no time in sample {times.index(None)}"
             raise SourceError(first.path, problem, field="time", remedy=HOLE)
-        origin = 0 if min(known) >= 0 and max(known) < _LATEST else min(known)
-        if max(known) - origin >= _LATEST:
-            problem = f"spans {Decimal(max(known) - min(known)).scaleb(-9):.3g} s"
-            remedy = "give the unit of its time: s, ms, us or ns"
-            raise SourceError(first.path, problem, field="time", remedy=remedy)
-        stamps = np.array([0 if one is None else one - origin for one in times], np.int64)
-        return stamps, np.array([one is not None for one in times]), origin, first.path
+        return self._within_archive(times, valid, first.path)
 
-    def _numbers(self, name: str, quantity: Quantity) -> Array:
-        """Return the numbers of a quantity as in the file, (m, k)."""
+    def _unit_of_time(self, file: Table | ArrayFile, time: TimeColumn) -> str:
+        """Return the unit of a time column where the map states none."""
+        stated = unit_of(file.unit(time.column) or "", "time")
+        if stated is not None:
+            return stated
+        unit = concluded_unit(file.times(time.column, TIMES["s"], time.array))
+        if unit != "s":
+            self.notes.append(f"time: no unit is stated; read as {unit}, which gives a usual rate")
+        return unit
+
+    def _within_archive(
+        self, times: Sequence[int | None], valid: NDArray[np.bool_], path: Path
+    ) -> _Clock:
+        """Return times [ns] as stamps that an archive can hold, wraps continued."""
+        zeros = next((row for row, time in enumerate(times) if time), 0)
+        if zeros and abs(times[zeros] or 0) > YEAR:
+            self.notes.append(f"left out: rows at the start with the time 0 ({zeros})")
+            valid = valid & (np.arange(len(times)) >= zeros)
+        base = times[int(np.argmax(valid))] or 0
+        # Differences are taken before numbers of any size become 64-bit ones.
+        shifted = [
+            time - base if time is not None and row else 0
+            for time, row in zip(times, valid, strict=True)
+        ]
+        if max(map(abs, shifted)) >= _FARTHEST:
+            self._raise_span(max(map(abs, shifted)), path)
+        stamp = np.array(shifted, np.int64)
+        continued = without_wraps(stamp[valid])
+        if continued.note is not None:
+            self.notes.append(f"time: {continued.note}")
+        low, high = base + int(continued.stamp.min()), base + int(continued.stamp.max())
+        origin = 0 if low >= 0 and high < _LATEST else low
+        if high - origin >= _LATEST:
+            self._raise_span(high - low, path)
+        stamp[valid] = continued.stamp + (base - origin)
+        return _Clock(stamp, valid, origin, path)
+
+    @staticmethod
+    def _raise_span(span: int, path: Path) -> NoReturn:
+        problem = f"spans {Decimal(span).scaleb(-9):.3g} s"
+        remedy = 'give the unit of its time: [time] unit = "s", "ms", "us" or "ns"'
+        raise SourceError(path, problem, field="time", remedy=remedy)
+
+    def complete_rows(self, clock: _Clock, values: Mapping[str, Array]) -> NDArray[np.bool_]:
+        """Return the rows with a time, and where the map drops others with all numbers (m,).
+
+        Raises:
+            SourceError: no row has all.
+        """
+        if self._map.format.missing != "drop":
+            return clock.valid
+        finite = [np.isfinite(array).all(axis=1) for array in values.values()]
+        complete = np.all([clock.valid, *finite], axis=0)
+        dropped = np.flatnonzero(~complete)
+        if len(dropped) == len(complete):
+            problem = "has a missing number in every row"
+            remedy = "check the columns of the map, delimiter and decimal mark ([format])"
+            raise SourceError(self.path, problem, remedy=remedy)
+        if dropped.size:
+            self.notes.append(
+                f"left out: rows in which a number is missing ({len(dropped)} of {len(complete)}, "
+                f"the first after {dropped[0]} rows)"
+            )
+        return np.asarray(complete)
+
+    @np.errstate(over="ignore", invalid="ignore")  # such numbers are refused later
+    def in_concluded_units(
+        self, stamp: NDArray[np.int64], values: dict[str, Array], robot: Robot
+    ) -> dict[str, Array]:
+        """Return quantities of the joint side, in degrees where no unit is stated and those fit.
+
+        Positions are taken as degrees if as radians they leave the limits of the URDF by far and as
+        degrees none does; velocities, if they are 57.3 times the slope of the positions.
+        """
+        joint = _joint_side(values, self._map, self)
+        names, degree = robot.joint_names, UNITS["position"]["deg"]
+        if "position" in self._unstated:
+            degrees = {**values, "position": values["position"] * degree}
+            converted = _joint_side(degrees, self._map, self)
+            if are_degrees(joint["position"], converted["position"], names, robot.urdf):
+                joint, values = converted, degrees
+                self.notes.append(
+                    "position: no unit is stated; read as degrees, within the limits of the URDF, "
+                    "which radians leave by far"
+                )
+        if "velocity" in self._unstated and len(stamp) > 1:
+            time = (stamp - stamp[0]) * 1e-9
+            if has_degrees_per_second(time, joint["position"], joint["velocity"]):
+                degrees = {**values, "velocity": values["velocity"] * degree}
+                joint = _joint_side(degrees, self._map, self)
+                self.notes.append(
+                    "velocity: no unit is stated; read as degrees per second, the slope of the "
+                    "positions"
+                )
+        return joint
+
+    def _numbers(self, name: str, quantity: Quantity) -> tuple[Array, list[str | None]]:
+        """Return the numbers of a quantity as in the file, (m, k), and the units it states."""
         field, columns, array = f"{name}.columns", quantity.columns, quantity.array
         if quantity.files is not None:
             return self._joint_by_joint(name, quantity, quantity.files)
         file = self._file(quantity.file, f"{name}.file")
         if isinstance(columns, str) and "{}" in columns:
-            columns = tuple(self._numbered(columns, file.names, "columns", field))
+            columns = tuple(self._numbered(columns, file.names, "columns", field, file.has))
         if columns is None or (isinstance(columns, str) and isinstance(file, ArrayFile)):
-            return self._upright(file.matrix(columns or array, field), quantity, file.path, name)
+            matrix = file.matrix(columns or array, field)
+            units = [file.unit(column) for column in range(matrix.shape[1])]
+            upright = self._upright(matrix, quantity, file.path, name)
+            return upright, units if upright is matrix else [None] * upright.shape[1]
         columns = (columns,) if isinstance(columns, str) else columns
         self._check_count(columns, field)
+        units = [file.unit(column) for column in columns]
         if isinstance(file, ArrayFile):
-            return file.numbers(columns, field, array, rows=quantity.joints_along == "rows")
-        return file.numbers(columns, field, array)
+            by_row = quantity.joints_along == "rows"
+            return file.numbers(columns, field, array, rows=by_row), units
+        return file.numbers(columns, field, array), units
 
-    def _joint_by_joint(self, name: str, quantity: Quantity, names: str | Sequence[str]) -> Array:
-        """Return the numbers of a quantity that has a file per joint, (m, k)."""
+    def _joint_by_joint(
+        self, name: str, quantity: Quantity, names: str | Sequence[str]
+    ) -> tuple[Array, list[str | None]]:
+        """Return the numbers of a quantity that has a file per joint, (m, k), and their units."""
         files, columns = self._file_per_joint(names, f"{name}.files"), quantity.columns
         field, found = f"{name}.columns", []
         if isinstance(columns, str):
@@ -186,26 +324,37 @@ class _Log:
         places = [os.path.relpath(file.path, self._folder) for file in files]
         lengths = dict(zip(places, found, strict=True))
         _check_lengths(lengths, self.path, "files", f"{name}.files")
-        return np.column_stack(found)
+        units = [
+            file.unit(0 if columns is None else columns[joint]) for joint, file in enumerate(files)
+        ]
+        return np.column_stack(found), units
 
     def _file_per_joint(self, names: str | Sequence[str], field: str) -> list[Table | ArrayFile]:
         if isinstance(names, str):
             numbers = range(len(self.joints) + _MORE)
-            possible = [names.replace("{}", str(number)) for number in numbers]
+            possible = [names.replace("{}", str(number)) for number in [*numbers, *self.joints]]
             found = [name for name in possible if (self._folder / name).is_file()]
-            names = self._numbered(names, found, "files", field)
+            names = self._numbered(names, found, "files", field, found.__contains__)
         self._check_count(names, field)
         return [self._file(name, field) for name in names]
 
     def _numbered(
-        self, pattern: str, known: Collection[str], what: Literal["columns", "files"], field: str
+        self,
+        pattern: str,
+        known: Collection[str],
+        what: Literal["columns", "files"],
+        field: str,
+        has: Callable[[str], bool],
     ) -> list[str]:
-        """Return names of columns or files from a pattern, numbered from 1, or else from 0."""
+        """Return names of columns or files from a pattern: numbered from 1 or 0, or of joints."""
+        by_joint = [pattern.replace("{}", joint) for joint in self.joints]
+        if all(map(has, by_joint)):
+            return by_joint
         count = len(self.joints)
         names = [pattern.replace("{}", str(number)) for number in range(count + _MORE)]
-        first = 0 if names[0] in known and names[count] not in known else 1
+        first = 0 if has(names[0]) and not has(names[count]) else 1
         found = names[first : first + count]
-        missing = [name for name in found if name not in known]
+        missing = [name for name in found if not has(name)]
         if missing:
             joint = found.index(missing[0])
             raise SourceError(
@@ -215,7 +364,7 @@ class _Log:
                 field=field,
                 remedy=f"{NOT_RECORDED}, name the joints of the log in joints, or list its {what}",
             )
-        present = [name for name in names if name in known]
+        present = [name for name in names if has(name)]
         if len(present) > count:
             raise SourceError(
                 self.path,

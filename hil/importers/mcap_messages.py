@@ -1,4 +1,4 @@
-"""Messages of any MCAP file, of any program and chunk size."""
+"""Messages of any MCAP file, of any program and chunk size, read by the `mcap` library."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import os
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from isal.isal_zlib import crc32
-from mcap.records import Channel, Schema
+from mcap.exceptions import McapError
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
 
 from hil.archive import container
-from hil.archive.container import Damage, Record
+from hil.archive.container import Damage
 from hil.errors import SourceError
 from hil.reading import open_file
 
@@ -22,8 +23,7 @@ LARGEST_CHUNK: Final = 1 << 28
 """Bytes of records in one chunk; usually one to sixteen million."""
 MOST_BYTES: Final = 4 << 30
 """Bytes of messages that are read, all topics together."""
-_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_READ: Final = (container.SCHEMA, container.CHANNEL, container.MESSAGE, container.CHUNK)
+_LATEST: Final = 2**63 - 1  # ns; later ones are wrong, and no signed number
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,12 @@ class Topic:
     @property
     def is_ros2(self) -> bool:
         """Whether the messages are those of ROS 2."""
-        return self.encoding == "cdr" and self.schema_encoding in ("ros2msg", "")
+        return self.encoding == "cdr" and self.schema_encoding in ("ros2msg", "ros2idl", "")
+
+    @property
+    def is_ros(self) -> bool:
+        """Whether the messages are those of ROS 1 or ROS 2."""
+        return self.is_ros2 or self.encoding == "ros1"
 
     def __str__(self) -> str:
         return self.kind if self.is_ros2 else f"{self.kind} in {self.encoding or 'no encoding'}"
@@ -54,49 +59,48 @@ def read(
     Raises:
         SourceError: it cannot be read, is no MCAP file, is truncated, or has too many messages.
     """
-    schemas: dict[int, Schema] = {}
+    schemas: dict[int, Schema] = {0: Schema(0, b"", "", "without schema")}
     topics: dict[str, Topic] = {}
     names: dict[int, str] = {}
-    found: list[tuple[str, int, bytes]] = []
+    messages: list[tuple[str, int, bytes]] = []
     size = 0
     with _opened(path) as stream:
         for record in _records(stream):
-            if record.opcode == container.SCHEMA:
-                schema = container.parse_item(record)
-                schemas.setdefault(schema.id, schema)
-            elif record.opcode == container.CHANNEL:
-                channel: Channel = container.parse_item(record)
-                kind = schemas.get(channel.schema_id, Schema(0, b"", "", "without schema"))
-                topic = Topic(kind.name, channel.message_encoding, kind.encoding, kind.data)
-                topics.setdefault(channel.topic, topic)
-                names.setdefault(channel.id, channel.topic)
-            elif record.opcode == container.MESSAGE:
-                number, _, log_time, _ = _HEAD.unpack_from(record.body)
-                name = names[number]
+            if isinstance(record, Schema):
+                schemas.setdefault(record.id, record)
+            elif isinstance(record, Channel):
+                kind = schemas.get(record.schema_id, schemas[0])
+                topic = Topic(kind.name, record.message_encoding, kind.encoding, kind.data)
+                topics.setdefault(record.topic, topic)
+                names.setdefault(record.id, record.topic)
+            elif isinstance(record, Message):
+                name = names[record.channel_id]
                 if wanted(name, topics[name]):
-                    found.append((name, log_time, record.body[_HEAD.size :]))
-                    size += len(record.body)
+                    messages.append((name, min(record.log_time, _LATEST), record.data))
+                    size += len(record.data)
             if size > MOST_BYTES:
                 problem = (
                     f"has more than {MOST_BYTES} bytes of numbers: too large to be read at once"
                 )
                 remedy = "cut it, or leave out topics (`mcap filter`)"
                 raise SourceError(path, problem, remedy=remedy)
-    return topics, sorted(found, key=lambda message: message[1])
+    return topics, sorted(messages, key=lambda message: message[1])
 
 
-def _records(stream: BinaryIO) -> Iterator[Record]:
-    """Yield schemas, channels and messages in the order of the file, also those in chunks."""
-    size = os.fstat(stream.fileno()).st_size
-    for record in container.records(stream, size, only=_READ):
-        if record.opcode != container.CHUNK:
+def _records(stream: BinaryIO) -> Iterator[McapRecord]:
+    """Yield the records in the order of the file, also those in chunks.
+
+    Chunks are decompressed in limited memory, which the library does not do.
+    """
+    reader = StreamReader(
+        stream, emit_chunks=True, validate_crcs=True, record_size_limit=LARGEST_CHUNK
+    )
+    for record in reader.records:
+        if isinstance(record, Chunk):
+            data = container.decompress(record, stream.tell(), largest=LARGEST_CHUNK)
+            yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
+        else:
             yield record
-            continue
-        head = container.parse_chunk(record)
-        data = container.decompress(head, record.offset, largest=LARGEST_CHUNK)
-        if head.uncompressed_crc and crc32(data) != head.uncompressed_crc:
-            raise Damage(record.offset, "(chunk) fails its checksum")
-        yield from container.split_records(data, record.offset)
 
 
 @contextmanager
@@ -104,10 +108,16 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
     """Open the file; convert all errors of reading to `SourceError`."""
     try:
         with open_file(path) as stream:
+            # The library would search zeros behind a truncated file to their end.
+            size = stream.seek(0, os.SEEK_END)
+            stream.seek(max(0, size - len(container.MAGIC)))
+            if stream.read() != container.MAGIC:
+                raise Damage(size, "it has no end")
+            stream.seek(0)
             yield stream
     except OSError as error:
         raise SourceError(path, f"cannot be read: {error.strerror or error}") from error
-    except (Damage, KeyError, struct.error) as error:
+    except (Damage, McapError, KeyError, ValueError, struct.error, MemoryError) as error:
         place = f"at byte {error.offset}: " if isinstance(error, Damage) else ""
         problem = f"is not an MCAP file, or truncated ({place}{type(error).__name__}: {error})"
         remedy = "recover it (`hil archive repair` for archives of hil, `mcap recover` for others)"

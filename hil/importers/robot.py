@@ -14,20 +14,19 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Samples, write_samples
+from hil.archive import Findings, Samples, write_samples
 from hil.cell import Cell
-from hil.cell.text import with_values
+from hil.cell.text import urdf_limits, with_values
 from hil.errors import ArchiveWriteError, SourceError
 from hil.files import file_digest, replace_file
 from hil.identify.cell_context import nominal_of
 from hil.importers.dh import Convention, urdf_of_dh
 from hil.importers.findings import (
     NominalTorque,
-    check_clock,
     check_positions,
     examine,
-    limits_of,
 )
+from hil.importers.stamps import check_clock
 from hil.reading import path_exists, read_input
 from hil.toml_text import to_text
 from identification import FrictionLaw
@@ -177,7 +176,7 @@ def _held(
             "a log, --rename RECORDED=URDF of a bag)"
         )
         raise SourceError(path, problem, field="--lock-others", remedy=remedy)
-    limits = limits_of(urdf, names)
+    limits = urdf_limits(urdf, names)
     rest = {
         name: 0.0 if low <= 0.0 <= high else 0.5 * (low + high)
         for name, low, high in zip(names, limits.lower.tolist(), limits.upper.tolist(), strict=True)
@@ -224,6 +223,8 @@ def write_imported(
     period: float | None = None,
     use: Use = "excitation",
     clock: Path | None = None,
+    notes: Sequence[str] = (),
+    clock_remedy: str | None = None,
     force: bool = False,
     outside_limits: bool = False,
 ) -> Path:
@@ -231,9 +232,10 @@ def write_imported(
 
     Findings on their plausibility (:mod:`hil.importers.findings`) are stored in its metadata.
     `period` is the sampling step [s] of a recording at a fixed rate, `clock` the file that the
-    stamps come from, by default the first `source`. With `force` an existing archive is replaced
-    once the new one is complete; `outside_limits` accepts positions of which no row is within the
-    limits of the URDF.
+    stamps come from, by default the first `source`; `clock_remedy` replaces the remedies for an
+    invalid clock of a log. `notes` are further lines of the findings. With `force` an existing
+    archive is replaced once the new one is complete; `outside_limits` accepts positions of which no
+    row is within the limits of the URDF.
 
     Raises:
         SourceError: no sample, a value that is not finite or above 1e12, an invalid clock, or no
@@ -243,12 +245,13 @@ def write_imported(
     output = Path(output)
     _require_writable(output, source, force=force)
     _check(samples, source[0], robot.joint_names)
-    check_clock(samples.stamp, clock or source[0])
+    check_clock(samples.stamp, clock or source[0], clock_remedy)
     if not outside_limits:
         check_positions(samples.position, robot.joint_names, robot.urdf, source[0])
     _require_joints(held_joints, robot, source[0])
     nominal = robot.nominal_torque()
     findings = examine(samples, robot.joint_names, robot.urdf, locked=robot.locked, nominal=nominal)
+    findings = Findings(lines=(*notes, *findings.lines), warnings=findings.warnings)
     entries = {
         **metadata,
         "source": json.dumps([path.name for path in source]),

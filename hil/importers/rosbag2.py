@@ -1,174 +1,36 @@
-"""Import of joint states from a rosbag2 recording, or any MCAP file with ROS 2 messages."""
+"""Import of joint states from a bag of ROS, or any MCAP file with ROS 2 messages."""
 
 from __future__ import annotations
 
-import re
-import sqlite3
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
-from functools import cache
-from itertools import chain
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Final, Literal
 
 import numpy as np
-import zstandard
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_typestore
-from rosbags.typesys.store import Typestore
 
 from hil.archive import Samples
-from hil.archive.container import MOST_INFLATION
 from hil.errors import SourceError
-from hil.importers import mcap_messages
+from hil.importers.bags import Bag, BagMessage, open_bag
 from hil.importers.mcap_messages import Topic
 from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
-from hil.reading import open_file
-
-SUFFIXES = (".db3", ".mcap")
-_PACKED = (".zstd", ".zst")
-_LONGEST_MESSAGE = 1 << 24  # bytes
-_LONGEST_ROW = 1 << 28  # bytes
-_SLACK = 1 << 20  # bytes
-_TABLES = "SELECT name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'"
-_ZSTD = b"\x28\xb5\x2f\xfd"  # begins no CDR message
-
-
-def bag_files(source: Path) -> list[Path]:
-    """Return the files of a bag in the order of writing.
-
-    Raises:
-        SourceError: there is none.
-    """
-    files = [source]
-    try:
-        if source.is_dir():
-            files = sorted((p for p in source.iterdir() if _storage(p) in SUFFIXES), key=_sort_key)
-        for file in files:
-            open_file(file).close()  # raises for a pipe, which would block
-    except OSError as error:
-        problem = f"cannot be read: {error.strerror}"
-        remedy = "name a .db3 or .mcap file, or a bag's folder"
-        raise SourceError(error.filename, problem, remedy=remedy) from error
-    if not files:
-        problem, remedy = "has no .db3 and no .mcap file in it", "name the folder of a rosbag2"
-        raise SourceError(source, problem, remedy=remedy)
-    return files
-
-
-def topics(file: Path) -> dict[str, Topic]:
-    """Return the topics of one file by name.
-
-    Raises:
-        SourceError: it is not a bag.
-    """
-    if file.suffix == ".mcap":
-        return mcap_messages.read(file, lambda *_: False)[0]
-    with _connected(file) as bag:
-        query = "SELECT name, type, serialization_format FROM topics ORDER BY name"
-        return {str(name): Topic(str(kind), str(code)) for name, kind, code in bag.execute(query)}
-
-
-def messages(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
-    """Yield time of receipt [ns] and data of the messages of one topic, in the order of time.
-
-    Raises:
-        SourceError: the file cannot be read.
-    """
-    found: Iterator[tuple[int, bytes]] = _of_sqlite(file, topic)
-    if file.suffix == ".mcap":
-        _, read = mcap_messages.read(file, lambda name, _: name == topic)
-        found = ((stamp, data) for _, stamp, data in read)
-    for stamp, data in found:
-        yield stamp, _decompressed(data, file) if data.startswith(_ZSTD) else data
-
-
-@contextmanager
-def unpacked(files: list[Path]) -> Iterator[list[Path]]:
-    """Yield the files, compressed ones as temporary decompressed copies."""
-    with TemporaryDirectory() as folder:
-        yield [
-            _unpacked(file, Path(folder) / file.stem) if file.suffix in _PACKED else file
-            for file in files
-        ]
-
-
-def _unpacked(file: Path, target: Path) -> Path:
-    try:
-        most = _SLACK + MOST_INFLATION * file.stat().st_size
-        with file.open("rb") as packed, target.open("wb") as output:
-            for block in zstandard.ZstdDecompressor().read_to_iter(packed):
-                output.write(block)
-                if output.tell() > most:
-                    raise SourceError(file, f"becomes more than {MOST_INFLATION} times as large")
-    except (OSError, zstandard.ZstdError) as error:
-        raise SourceError(file, f"cannot be decompressed ({error})") from error
-    return target
-
-
-def _decompressed(data: bytes, file: Path) -> bytes:
-    """Decompress a message that was compressed by itself."""
-    try:
-        size = zstandard.frame_content_size(data)
-        if size > _LONGEST_MESSAGE:
-            raise SourceError(file, f"has a message of {size} bytes")
-        return zstandard.ZstdDecompressor().decompress(data, max_output_size=_LONGEST_MESSAGE)
-    except zstandard.ZstdError as error:
-        raise SourceError(file, f"has a message that cannot be decompressed ({error})") from error
-
-
-def _storage(path: Path) -> str:
-    """Return the suffix of the storage format."""
-    return Path(path.stem).suffix if path.suffix in _PACKED else path.suffix
-
-
-def _sort_key(path: Path) -> list[tuple[int, str]]:
-    """Return a key that sorts ``x_10`` behind ``x_2``."""
-    parts = re.split(r"(\d+)", path.name)
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
-
-
-def _of_sqlite(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
-    query = (
-        "SELECT messages.timestamp, messages.data FROM messages"
-        " JOIN topics ON topics.id = messages.topic_id WHERE topics.name = ?"
-        " ORDER BY messages.timestamp, messages.id"
-    )
-    with _connected(file) as bag:
-        for number, (stamp, data) in enumerate(bag.execute(query, (topic,))):
-            if not isinstance(stamp, int) or not isinstance(data, bytes):
-                problem = f"message {number} has no time or no data"
-                remedy = "remove it, or record again"
-                raise SourceError(file, problem, field=topic, remedy=remedy)
-            yield stamp, data
-
-
-@contextmanager
-def _connected(file: Path) -> Iterator[sqlite3.Connection]:
-    """Open the bag read-only, without side files unless another process is writing it."""
-    options = "mode=ro" if file.with_name(file.name + "-wal").exists() else "mode=ro&immutable=1"
-    try:
-        with closing(sqlite3.connect(f"{file.resolve().as_uri()}?{options}", uri=True)) as bag:
-            bag.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_ROW)
-            # A view could produce rows without end.
-            tables = {name for (name,) in bag.execute(_TABLES)}
-            absent = sorted({"topics", "messages"} - tables)
-            if absent:
-                raise sqlite3.DatabaseError(f"it has no table {absent[0]}")
-            yield bag
-    except (sqlite3.Error, UnicodeDecodeError) as error:
-        problem = f"is not a rosbag2 in sqlite3 storage, or damaged ({error})"
-        remedy = "name the .db3 or .mcap file, or the bag's folder"
-        raise SourceError(file, problem, remedy=remedy) from error
-
+from hil.importers.ros_messages import JOINT_STATE
+from hil.importers.stamps import leading_zeros, swapped_messages
 
 Array = NDArray[np.float64]
 Effort = Literal["torque", "motor_current", "ignore"]
+Clock = Literal["auto", "header", "bag"]
 
-_JOINT_STATE = "sensor_msgs/msg/JointState"
-_JOINT_STATES = (_JOINT_STATE, "sensor_msgs/JointState")
+_JOINT_STATES: Final = (JOINT_STATE, "sensor_msgs/JointState")
+_QUANTITIES: Final = ("position", "velocity", "effort")
+_APART: Final = 0.1  # rad or m between samples of one stamp, 20 ms at 5 rad/s
+_STALLED: Final = 3  # messages with one stamp, of one publisher
+_MOST_APART: Final = 2.0  # periods between a sample and the one that it is interpolated to
+_STATIC: Final = 1e-3  # rad or m; a joint that moves less is at rest
+_AT_REST: Final = "lock joints that did not move: --locked NAME=POSITION"
+_BAG_CLOCK: Final = "use the time at which the bag received the messages: --clock bag"
 
 
 def import_rosbag2(
@@ -178,6 +40,7 @@ def import_rosbag2(
     robot: Robot,
     topic: str | None = None,
     effort: Effort = "torque",
+    clock: Clock = "auto",
     joint_names: Mapping[str, str] | None = None,
     held_joints: Sequence[str] = (),
     use: Use = "excitation",
@@ -186,11 +49,12 @@ def import_rosbag2(
 ) -> Path:
     """Convert the joint states of a bag to an archive of kind ``imported``, and return its path.
 
-    The source is a ``.db3`` or ``.mcap`` file, or the folder of a bag; compressed ones as well.
-    Joints are found by name; `joint_names` are names in the URDF by name in the bag, where they
-    differ. Messages with none of them (a gripper on the same topic) are ignored. Stamps are those
-    in the messages' headers; where all are empty, the bag's. The effort is a joint torque [N·m] or
-    a motor current [A].
+    The source is a ``.db3``, ``.mcap`` or (ROS 1) ``.bag`` file, or the folder of a bag; compressed
+    ones as well. Joints are found by name in all messages of the topic; `joint_names` are names in
+    the URDF by name in the bag, where they differ. Where joints come in messages of their own,
+    those are merged by stamp. Messages with none of them (a gripper on the same topic) are ignored.
+    Stamps are those in the messages' headers; where all are empty, or `clock` is ``bag``, the
+    bag's. The effort is a joint torque [N·m] or a motor current [A].
 
     With `force` an existing archive is replaced; `outside_limits` accepts positions of which no row
     is within the limits of the URDF.
@@ -199,10 +63,14 @@ def import_rosbag2(
         SourceError: no bag, no such topic, a joint that was not recorded, a value not finite.
         ArchiveWriteError: the archive exists or cannot be written.
     """
-    files = bag_files(Path(source))
-    with _messages(files, topic) as (topic, messages):
-        samples, clock = _samples(messages, files[0], robot.joint_names, joint_names or {}, effort)
-    metadata = {"importer": "rosbag2", "topic": str(topic), "effort": effort, "clock": clock}
+    with open_bag(Path(source)) as bag:
+        chosen = _choose(bag, topic)
+        states = _States(bag.files[0], robot.joint_names, joint_names or {}, effort, clock)
+        for message in bag.messages(chosen):
+            states.add(message)
+        files = bag.files
+    samples = states.samples()
+    metadata = {"importer": "rosbag2", "topic": chosen, "effort": effort, "clock": states.clock}
     return write_imported(
         output,
         samples,
@@ -211,6 +79,8 @@ def import_rosbag2(
         metadata=metadata,
         held_joints=held_joints,
         use=use,
+        notes=states.notes,
+        clock_remedy=_BAG_CLOCK if states.clock == "header" else "record again",
         force=force,
         outside_limits=outside_limits,
     )
@@ -221,131 +91,324 @@ def recorded_joints(
     topic: str | None = None,
     joint_names: Mapping[str, str] | None = None,
 ) -> tuple[str, ...]:
-    """Return the joints of a bag, by their names in the URDF: those of its longest message.
+    """Return the joints of a bag, by their names in the URDF: those of all its messages.
 
     Raises:
         SourceError: no bag, no such topic, or no message.
     """
-    files, found = bag_files(Path(source)), ()
-    with _messages(files, topic) as (_, messages):
-        for number, (_, data) in enumerate(messages):
-            found = max(found, tuple(_decoded(data, files[0], number).name), key=len)
-    if not found:
-        raise SourceError(files[0], "has no message with joints", field="joints")
-    return tuple((joint_names or {}).get(name, name) for name in found)
+    with open_bag(Path(source)) as bag:
+        chosen = _choose(bag, topic)
+        names = dict.fromkeys(
+            str(name) for message in bag.messages(chosen) for name in message.content.name
+        )
+        if not names:
+            raise SourceError(bag.files[0], "has no message with joints", field="joints")
+    return tuple((joint_names or {}).get(name, name) for name in names)
 
 
-@contextmanager
-def _messages(
-    files: list[Path], topic: str | None
-) -> Iterator[tuple[str, Iterator[tuple[int, bytes]]]]:
-    """Open the topic of the joint states: yield time of receipt [ns] and data of its messages."""
-    with unpacked(files) as unpacked_file:
-        known = [topics(file) for file in unpacked_file]
-        everything = {name: found for part in known for name, found in part.items()}
-        chosen = _choose(everything, files[0], topic)
-        # A part of a split bag may lack the topic.
-        parts = [file for file, part in zip(unpacked_file, known, strict=True) if chosen in part]
-        yield chosen, chain.from_iterable(messages(file, chosen) for file in parts)
-
-
-@cache
-def _typestore() -> Typestore:
-    return get_typestore(Stores.ROS2_HUMBLE)
-
-
-def _decoded(data: bytes, file: Path, number: int) -> Any:
-    """Return a joint state."""
-    try:
-        return _typestore().deserialize_cdr(data, _JOINT_STATE)
-    except Exception as error:  # rosbags does not document what it raises
-        problem = f"message {number} cannot be decoded ({error or type(error).__name__})"
-        raise SourceError(file, problem) from error
-
-
-def _choose(topics: Mapping[str, Topic], file: Path, topic: str | None) -> str:
+def _choose(bag: Bag, topic: str | None) -> str:
     """Return the requested topic, or the only one that carries joint states."""
-    fitting = [
-        name for name, found in topics.items() if found.is_ros2 and found.kind in _JOINT_STATES
-    ]
+    fitting = joint_state_topics(bag.topics)
     if topic is None and len(fitting) == 1:
         (topic,) = fitting
     if topic in fitting:
         return topic
-    problem = f"{len(fitting)} topics carry {_JOINT_STATE}"
+    problem = f"{len(fitting)} topics carry {JOINT_STATE}"
     if topic is not None:
-        problem = f"{topic} is not a topic of {_JOINT_STATE}"
-    listing = ", ".join(f"{name} ({found})" for name, found in topics.items()) or "none"
-    remedy = f"name one of its topics: {listing}; `hil import log` reads other messages, with a "
-    raise SourceError(file, problem, field="topic", remedy=f"{remedy}column map")
-
-
-def _samples(
-    messages: Iterable[tuple[int, bytes]],
-    source: Path,
-    joints: Sequence[str],
-    renamed: Mapping[str, str],
-    effort: Effort,
-) -> tuple[Samples, str]:
-    """Return joint states with the joints in this order, and their clock: header or bag."""
-    stamps: dict[str, list[int]] = {"header": [], "bag": []}
-    rows: dict[str, list[Array]] = {"position": [], "velocity": [], "effort": []}
-    orders: dict[tuple[str, ...], list[int]] = {}
-    for number, (stamp, data) in enumerate(messages):
-        message = _decoded(data, source, number)
-        names = tuple(message.name)
-        if names not in orders:
-            orders[names] = _order(names, source, joints, renamed)
-        if not orders[names]:
-            continue  # such as a gripper on the same topic
-        time = message.header.stamp
-        stamps["header"].append(time.sec * 10**9 + time.nanosec)
-        stamps["bag"].append(stamp)
-        for name, column in rows.items():
-            values = getattr(message, name)
-            if len(values) == len(names):
-                column.append(values[orders[names]])
-            elif len(values):
-                problem = f"message {number} has {len(values)} values for {len(names)} joints"
-                raise SourceError(source, problem, field=name)
-    count = len(stamps["bag"])
-    if not count:
-        recorded = ", ".join(dict.fromkeys(name for names in orders for name in names)) or "none"
-        problem = f"none of the joints {', '.join(joints)} was recorded; recorded are {recorded}"
-        remedy = "give the URDF of this robot, or map its joints: --rename RECORDED=URDF"
-        raise SourceError(source, problem, field="joints", remedy=remedy)
-    columns: dict[str, Array | None] = {}
-    if effort == "ignore":
-        rows["effort"] = []
-    for name, column in rows.items():
-        # NaN is what ros2_control publishes for an interface that the hardware does not have.
-        recorded_at_all = not all(np.isnan(row).all() for row in column)
-        if recorded_at_all and len(column) != count:
-            problem = f"only {len(column)} of {count} messages have it"
-            raise SourceError(source, problem, field=name, remedy="record it throughout")
-        columns[name] = np.array(column, np.float64) if recorded_at_all else None
-    position, strength = columns["position"], columns["effort"]
-    if position is None:
-        raise SourceError(source, "the messages have no positions", field="position")
-    clock = "header" if any(stamps["header"]) else "bag"
-    samples = Samples(
-        stamp=np.array(stamps[clock], np.int64),
-        position=position,
-        velocity=columns["velocity"],
-        torque=strength if effort == "torque" else None,
-        motor_current=strength if effort == "motor_current" else None,
+        problem = f"{topic} is not a topic of {JOINT_STATE}"
+    listing = ", ".join(f"{name} ({kind})" for name, kind in bag.topics.items()) or "none"
+    remedy = (
+        f"name one of its topics: {listing}; `hil import log` reads other messages, with a "
+        "column map"
     )
-    return samples, clock
+    if fitting:
+        remedy = f"name one of its topics: --topic {fitting[0]}; it has {listing}"
+    raise SourceError(bag.files[0], problem, field="topic", remedy=remedy)
 
 
-def _order(
-    names: tuple[str, ...], source: Path, joints: Sequence[str], renamed: Mapping[str, str]
-) -> list[int]:
-    """Return the places of the wanted joints in a message; empty when it has none of them."""
-    known = [renamed.get(name, name) for name in names]
-    missing = [joint for joint in joints if joint not in known]
-    if missing and len(missing) < len(joints):
-        problem = f"joint {missing[0]} was not recorded; recorded are {', '.join(names)}"
-        remedy = f"give a URDF with the recorded names, or {NOT_RECORDED}"
-        raise SourceError(source, problem, field="joints", remedy=remedy)
-    return [] if missing else [known.index(joint) for joint in joints]
+def joint_state_topics(topics: Mapping[str, Topic]) -> list[str]:
+    """Return the topics that carry joint states."""
+    return [name for name, kind in topics.items() if kind.is_ros and kind.kind in _JOINT_STATES]
+
+
+@dataclass
+class _Part:
+    """Messages of some of the joints: those of one publisher, in most bags the only one."""
+
+    joints: tuple[str, ...]  #: of the robot, in its order
+    numbers: list[int] = field(default_factory=list)  #: of the messages in the topic
+    header: list[int] = field(default_factory=list)  #: [ns]
+    received: list[int] = field(default_factory=list)  #: [ns]
+    rows: dict[str, list[Array]] = field(default_factory=lambda: {name: [] for name in _QUANTITIES})
+
+
+@dataclass
+class _Joined:
+    """Samples of some joints: stamps (m,) [ns] and quantities (m, joints) that were recorded."""
+
+    stamp: NDArray[np.int64]
+    values: dict[str, Array]
+
+
+class _States:
+    """Joint states of a topic, collected message by message.
+
+    Attributes:
+        clock: whose stamps are used, ``header`` or ``bag``.
+        notes: what was left out, sorted or merged.
+    """
+
+    def __init__(
+        self,
+        source: Path,
+        joints: Sequence[str],
+        renamed: Mapping[str, str],
+        effort: Effort,
+        clock: Clock,
+    ) -> None:
+        self._source, self._joints, self._renamed = source, tuple(joints), renamed
+        self._effort = effort
+        self._asked = clock
+        self._parts: dict[tuple[str, ...], _Part] = {}
+        self._orders: dict[tuple[str, ...], list[int]] = {}  # places of the joints in a message
+        self._recorded: dict[str, None] = {}  # names as in the bag
+        self.clock: Literal["header", "bag"] = "header"
+        self.notes: list[str] = []
+
+    def add(self, message: BagMessage) -> None:
+        """Add a message.
+
+        Raises:
+            SourceError: it has more or fewer values than names.
+        """
+        content = message.content
+        names = tuple(content.name)
+        if names not in self._orders:
+            self._recorded.update(dict.fromkeys(names))
+            known = [self._renamed.get(name, name) for name in names]
+            self._orders[names] = [known.index(joint) for joint in self._joints if joint in known]
+        order = self._orders[names]
+        if not order:
+            return  # such as a gripper on the same topic
+        joints = tuple(self._renamed.get(names[place], names[place]) for place in order)
+        part = self._parts.setdefault(joints, _Part(joints))
+        part.numbers.append(message.number)
+        part.header.append(content.header.stamp.sec * 10**9 + content.header.stamp.nanosec)
+        part.received.append(message.received)
+        for name, rows in part.rows.items():
+            values = getattr(content, name)
+            if len(values) == len(names):
+                rows.append(np.asarray(values, np.float64)[order])
+            elif len(values):
+                problem = (
+                    f"message {message.number} has {len(values)} values for {len(names)} joints"
+                )
+                raise SourceError(self._source, problem, field=name)
+
+    def samples(self) -> Samples:
+        """Return the samples of all joints in the robot's order.
+
+        Raises:
+            SourceError: a joint or a quantity was not recorded throughout, or messages contradict
+                each other.
+        """
+        parts = self._chosen_parts()
+        stamps = [stamp for part in parts for stamp in part.header]
+        has_header = any(stamps) if self._asked == "auto" else self._asked == "header"
+        self.clock = "header" if has_header else "bag"
+        joined = self._merged(parts, [self._joined(part) for part in parts])
+        effort = joined.values.get("effort")
+        return Samples(
+            stamp=joined.stamp,
+            position=joined.values["position"],
+            velocity=joined.values.get("velocity"),
+            torque=effort if self._effort == "torque" else None,
+            motor_current=effort if self._effort == "motor_current" else None,
+        )
+
+    def _chosen_parts(self) -> list[_Part]:
+        """Return the parts that have each joint once: a whole one, or several."""
+        parts = list(self._parts.values())
+        recorded = ", ".join(self._recorded) or "none"
+        if not parts:
+            joints = ", ".join(self._joints)
+            problem = f"none of the joints {joints} was recorded; recorded are {recorded}"
+            remedy = "give the URDF of this robot, or map its joints: --rename RECORDED=URDF"
+            raise SourceError(self._source, problem, field="joints", remedy=remedy)
+        present = {joint for part in parts for joint in part.joints}
+        missing = [joint for joint in self._joints if joint not in present]
+        if missing:
+            problem = f"joint {missing[0]} was not recorded; recorded are {recorded}"
+            remedy = f"give a URDF with the recorded names, or {NOT_RECORDED}"
+            raise SourceError(self._source, problem, field="joints", remedy=remedy)
+        whole = [part for part in parts if len(part.joints) == len(self._joints)]
+        if whole:
+            others = sum(len(part.numbers) for part in parts) - len(whole[0].numbers)
+            if others:
+                self.notes.append(f"left out: messages with some of the joints only ({others})")
+            return whole
+        for joint in self._joints:
+            holders = [part for part in parts if joint in part.joints]
+            if len(holders) > 1:
+                sets = " and ".join(f"({', '.join(part.joints)})" for part in holders)
+                problem = f"joint {joint} comes in messages of two kinds, {sets}"
+                remedy = "record again with one publisher of each joint on the topic"
+                raise SourceError(self._source, problem, field="joints", remedy=remedy)
+        return parts
+
+    def _joined(self, part: _Part) -> _Joined:
+        """Return the samples of a part, sorted by stamp."""
+        stamp = np.array(part.header if self.clock == "header" else part.received, np.int64)
+        received = np.array(part.received, np.int64)
+        numbers = np.array(part.numbers)
+        values = self._quantities(part)
+        keep = np.ones(len(stamp), np.bool_)
+        zeros = leading_zeros(stamp)
+        if zeros:
+            keep[:zeros] = False
+            self.notes.append(f"left out: messages at the start without a stamp ({zeros})")
+        silent = self._second_publisher(values["position"])
+        if silent.any():
+            keep &= ~silent
+            self.notes.append(
+                f"{np.count_nonzero(silent)} of {len(stamp)} messages have 0 for all positions "
+                "between others that do not: those of a second publisher, left out"
+            )
+        order = np.flatnonzero(keep)
+        swapped = swapped_messages(stamp[order])
+        if swapped.note is not None:
+            self.notes.append(swapped.note)
+        order = order[swapped.order]
+        values = {name: array[order] for name, array in values.items()}
+        self._check_repeats(stamp[order], received[order], numbers[order], values["position"])
+        return _Joined(stamp[order], values)
+
+    def _quantities(self, part: _Part) -> dict[str, Array]:
+        """Return the quantities of a part that were recorded, (m, joints)."""
+        count = len(part.numbers)
+        values: dict[str, Array] = {}
+        for name, rows in part.rows.items():
+            if not rows or (name == "effort" and self._effort == "ignore"):
+                continue
+            array = np.array(rows)
+            absent = np.isnan(array).all(axis=0)
+            # NaN is what ros2_control publishes for an interface that the hardware does not have.
+            if absent.all():
+                continue
+            if len(array) != count:
+                problem = f"only {len(array)} of {count} messages have it"
+                raise SourceError(self._source, problem, field=name, remedy="record it throughout")
+            if absent.any():
+                joints = ", ".join(np.array(part.joints)[absent])
+                problem = f"joint {joints} has none in any message, the others have it"
+                remedy = "record it; --effort ignore imports the motion alone"
+                if name == "effort":
+                    raise SourceError(self._source, problem, field=name, remedy=remedy)
+                if name == "velocity":
+                    self.notes.append(f"velocity: {problem}: left out for all")
+                    continue
+            values[name] = array
+        if "position" not in values:
+            raise SourceError(self._source, "the messages have no positions", field="position")
+        return values
+
+    @staticmethod
+    def _second_publisher(position: Array) -> NDArray[np.bool_]:
+        """Return which messages have exact zeros between others that move (m,)."""
+        silent = (position == 0.0).all(axis=1)
+        others = position[~silent]
+        alternating = np.count_nonzero(np.diff(silent.astype(np.int8))) > 2 * _STALLED
+        if not alternating or not len(others) or np.abs(others).max(axis=1).min() < _APART:
+            return np.zeros(len(position), np.bool_)
+        return np.asarray(silent)
+
+    def _check_repeats(
+        self,
+        stamp: NDArray[np.int64],
+        received: NDArray[np.int64],
+        numbers: NDArray[np.int64],
+        position: Array,
+    ) -> None:
+        """Raise SourceError where messages of one stamp are at other positions.
+
+        Equal stamps one after another are a clock that stands still, else two publishers.
+        """
+        if self.clock == "bag" or not len(stamp):
+            return
+        starts = np.flatnonzero(np.diff(stamp, prepend=stamp[0] - 1))
+        highest = np.maximum.reduceat(position, starts)
+        lowest = np.minimum.reduceat(position, starts)
+        apart = (highest - lowest).max(axis=1)
+        worst = np.flatnonzero(apart > _APART)
+        if not worst.size:
+            return
+        first = int(starts[worst[0]])
+        run = np.flatnonzero(stamp == stamp[first])
+        steps = np.abs(np.diff(position[run], axis=0)).max()
+        if len(run) >= _STALLED and steps < 0.5 * apart[worst[0]]:
+            elapsed = 1e-9 * float(received[run[-1]] - received[run[0]])
+            problem = (
+                f"{len(run)} messages from message {numbers[first]} have the same stamp, and were "
+                f"received in {elapsed:.3g} s: the clock of the stamps stood still"
+            )
+            raise SourceError(self._source, problem, field="time", remedy=_BAG_CLOCK)
+        problem = (
+            f"messages {numbers[first]} and {numbers[first + 1]} have the same stamp and positions "
+            f"{apart[worst[0]]:.3g} rad or m apart ({worst.size} such stamps): two publishers of "
+            "these joints"
+        )
+        remedy = "record again with one publisher of these joints on the topic"
+        raise SourceError(self._source, problem, field="position", remedy=remedy)
+
+    def _merged(self, parts: Sequence[_Part], joined: Sequence[_Joined]) -> _Joined:
+        """Return the samples of several parts side by side, in the robot's order of joints."""
+        first = joined[0]
+        if len(joined) == 1:
+            return first
+        columns = [joint for part in parts for joint in part.joints]
+        order = [columns.index(joint) for joint in self._joints]
+        missing = [
+            f"{name} of {', '.join(part.joints)}"
+            for part, samples in zip(parts, joined, strict=True)
+            for name in {name for one in joined for name in one.values} - set(samples.values)
+        ]
+        if missing:
+            problem = f"{missing[0]} was not recorded, that of the other joints was"
+            remedy = f"record it; {_AT_REST}; --effort ignore imports the motion alone"
+            raise SourceError(self._source, problem, field=missing[0].split()[0], remedy=remedy)
+        stamp = first.stamp
+        for samples in joined[1:]:
+            stamp = stamp[(stamp >= samples.stamp[0]) & (stamp <= samples.stamp[-1])]
+        exact = all(np.isin(stamp, samples.stamp).all() for samples in joined)
+        kinds = " and ".join(f"({', '.join(part.joints)})" for part in parts)
+        if len(stamp) < 2 or (not exact and not self._are_close(stamp, joined)):
+            problem = f"{kinds} come in messages of their own, not at the same time"
+            remedy = f"record them in one message; {_AT_REST}"
+            raise SourceError(self._source, problem, field="joints", remedy=remedy)
+        how = "with the same stamps" if exact else "interpolated to the stamps of the first"
+        self.notes.append(f"merged from messages of their own, {how}: {kinds}")
+        values = {
+            name: np.column_stack([_at(stamp, one.stamp, one.values[name]) for one in joined])
+            for name in first.values
+        }
+        return _Joined(stamp, {name: array[:, order] for name, array in values.items()})
+
+    @staticmethod
+    def _are_close(stamp: NDArray[np.int64], joined: Sequence[_Joined]) -> bool:
+        """Return whether all parts that move have samples within two periods of each stamp."""
+        period = float(np.median(np.diff(stamp)))
+        for samples in joined:
+            if np.ptp(samples.values["position"], axis=0).max() < _STATIC:
+                continue
+            after = np.clip(np.searchsorted(samples.stamp, stamp), 1, len(samples.stamp) - 1)
+            gap = samples.stamp[after] - samples.stamp[after - 1]
+            if (gap > _MOST_APART * period).any():
+                return False
+        return True
+
+
+def _at(stamp: NDArray[np.int64], known: NDArray[np.int64], values: Array) -> Array:
+    """Return values (k, n) known at stamps (k,), at other stamps: linear, exact where equal."""
+    origin = known[0]
+    at, places = (stamp - origin).astype(np.float64), (known - origin).astype(np.float64)
+    return np.column_stack([np.interp(at, places, column) for column in values.T])

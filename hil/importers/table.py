@@ -1,13 +1,15 @@
-"""Text files of numbers in columns, read by column name or index."""
+"""Text tables as robots, controllers and spreadsheets write them, read by column with pandas."""
 
 from __future__ import annotations
 
+import csv
 import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,88 +17,128 @@ from numpy.typing import NDArray
 from hil.errors import SourceError
 from hil.importers.arrays import READERS
 from hil.importers.column_map import HOLE, Column, Format
+from hil.importers.date_stamps import nanoseconds_of_dates
+from hil.importers.units import unit_of, without_unit
 from hil.reading import read_text, remedy_for_missing
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[np.float64]
 
 _COMMENTS = ("#", "%", "//")
-# Tried in this order; a decimal comma only where the comma is not the delimiter.
+# Tried in this order; the last is that of numbers in quotation marks.
 _WRITTEN = (
     (",", "."), (";", "."), ("\t", "."), ("|", "."), (None, "."),
-    (";", ","), ("\t", ","), ("|", ","), (None, ","),
+    (";", ","), ("\t", ","), ("|", ","), (None, ","), (",", ","),
 )  # fmt: skip
 _ROSTOPIC = "%time,"  # of `rostopic echo -p`
-_PROBED = 20  # lines
-_LONGEST = 1 << 31  # bytes; several times as many in memory
-_LONGEST_TIME = 30  # digits before the point, more than of nanoseconds since 1970
+_PROBED: Final = 100  # lines
+_LONGEST: Final = 1 << 31  # bytes; several times as many in memory
+_LONGEST_TIME: Final = 30  # digits before the point, more than of nanoseconds since 1970
 # 1.0D+03: double precision as Fortran writes it.
 _FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]?\d)")
-_MISSING = frozenset({"", "-", "--", "na", "n/a", "null", "none"})
+_THOUSANDS: Final = ".,'\u2019 \u00a0\u202f"  # of which one may separate groups of three digits
+_MISSING: Final = frozenset(
+    {"", "-", "--", "na", "n/a", "#n/a", "#na", "null", "none", "nan", "-nan", "+nan", "nan(ind)"}
+    | {"-nan(ind)", "1.#ind", "-1.#ind", "1.#qnan", "-1.#qnan", "1.#snan", "#num!", "#value!"}
+    | {"#div/0!", "#ref!", "missing"}
+)
+"""What loggers, spreadsheets and run-time libraries write where there is no number; lower case."""
+_SPELLINGS: Final = sorted({f(text) for text in _MISSING for f in (str, str.upper, str.title)})
+_DAY: Final = r"\d{1,4}([-./])(?:\d{1,2}|[A-Za-z]{3})\1\d{1,4}"
+_CLOCK: Final = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d+)?)?(?:\s*[AaPp][Mm])?\s*(?:Z|[+-]\d{2}:?\d{2})?"
+_DATE: Final = re.compile(rf"(?:{_DAY}(?:[ T]+{_CLOCK})?|{_CLOCK})")
+_QUOTES: Final = "\"'"
+
+
+class Dialect(NamedTuple):
+    """How the cells of a line are written."""
+
+    delimiter: str | None  #: between columns; None for white space
+    decimal: str  #: decimal mark
+    thousands: str | None = None  #: between groups of three digits, where the map states it
+
+    def cells(self, line: str) -> list[str]:
+        """Return the cells of a line without quotation marks."""
+        if self.delimiter is None:
+            line, delimiter = " ".join(line.split()), " "
+        else:
+            delimiter = self.delimiter
+        if '"' not in line:
+            return [cell.strip() for cell in line.split(delimiter)]
+        parsed = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
+        return [cell.strip() for cell in parsed]
+
+
+class _Layout(NamedTuple):
+    """The lines of a table by what they are: numbers of lines from 1, with their text."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    rows: list[tuple[int, str]]
+    repeated: int  #: lines that repeat the header between the rows
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A text file of numbers, not yet converted."""
+    """A text table of numbers, not yet converted."""
 
     path: Path
     names: tuple[str, ...]  #: of the columns; empty if the file has none
+    units: tuple[str, ...]  #: stated in a line below the names; empty if there is none
     width: int  #: number of columns
-    lines: list[str]  #: rows of numbers as text, points and exponents as Python reads them
+    lines: list[str]  #: rows of numbers as text
     numbered: Sequence[int]  #: line numbers in the file, from 1
-    delimiter: str | None  #: between columns; None for white space
+    dialect: Dialect
     gaps: bool  #: whether rows may lack numbers
+    notes: tuple[str, ...] = ()  #: what was left out
 
     @classmethod
     def read(cls, path: Path, form: Format) -> Table:
-        """Read a file and detect its delimiter, decimal mark and header.
+        """Read a file and detect its encoding, dialect, header and units.
 
         Raises:
             SourceError: it cannot be read, or has no row of numbers.
         """
-        try:
-            text = read_text(path, _LONGEST).removeprefix("\ufeff")
-            if text.startswith(_ROSTOPIC):  # a header, not a comment
-                text = text.removeprefix("%")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else error
-            problem = f"cannot be read ({reason})"
-            remedy = f"name a text file, or one that ends in {', '.join(READERS)}"
-            if isinstance(error, FileNotFoundError):
-                remedy = remedy_for_missing(path, remedy)
-            raise SourceError(path, problem, remedy=remedy) from error
+        text = _text(path, form)
         numbered = [
             (number, line)
             for number, line in enumerate(text.splitlines(), 1)
-            if number > form.skip_rows and not line.lstrip().startswith(_COMMENTS)
+            if number > form.skip_rows
         ]
-        numbered = _between(numbered, path, form)
-        delimiter, decimal = _written([line for _, line in numbered[:_PROBED]], form)
-        if form.transposed:
-            numbered = _transposed(numbered, delimiter, path)
-        numbers, lines = [number for number, _ in numbered], [line for _, line in numbered]
-        names: tuple[str, ...] = ()
-        if lines:
-            cells = lines[0].split(delimiter)
-            if form.header or (form.header is None and not _are_numbers(cells, decimal)):
-                names = tuple(cell.strip().strip("\"'").strip() for cell in cells)
-                numbers, lines = numbers[1:], lines[1:]
-        if not lines:
+        comments = [line for _, line in numbered if line.lstrip().startswith(_COMMENTS)]
+        numbered = [entry for entry in numbered if not entry[1].lstrip().startswith(_COMMENTS)]
+        filled = [line for _, line in numbered if line.strip()]
+        if not filled:
             raise SourceError(path, "has no row of numbers")
-        if decimal == ",":
-            lines = [line.replace(",", ".") for line in lines]
-        if _FORTRAN.search(lines[0]):
-            lines = [_FORTRAN.sub("e", line) for line in lines]
-        width = len(lines[0].split(delimiter))
-        if len(names) < width > 1 and not lines[0].split(delimiter)[-1].strip():
-            width -= 1  # each line ends with a delimiter
-        if names and len(names) < width:
-            raise SourceError(
-                path,
-                f"has {len(names)} names ({', '.join(names)}) above rows of {width} numbers",
-                remedy="name the other columns, or count columns from 0: [format] header = "
-                "false and skip_rows",
-            )
-        return cls(path, names, width, lines, numbers, delimiter, form.missing == "drop")
+        dialect = _dialect(filled[:_PROBED], form)
+        if form.transposed:
+            numbered = _transposed([entry for entry in numbered if entry[1].strip()], dialect, path)
+        names, units, rows, repeated = _layout(numbered, dialect, path, form)
+        if _FORTRAN.search(rows[0][1]):
+            rows = [(number, _FORTRAN.sub("e", line)) for number, line in rows]
+        width = _width(names, dialect.cells(rows[0][1]), path)
+        if not names and form.header is None and comments:
+            commented = dialect.cells(comments[-1].lstrip().lstrip("#%/"))
+            names = tuple(commented) if len(commented) == width > 1 else ()
+        notes = (f"left out: lines that repeat the header ({repeated})",) if repeated else ()
+        numbers, lines = [number for number, _ in rows], [line for _, line in rows]
+        gaps = form.missing == "drop"
+        return cls(path, names, units, width, lines, numbers, dialect, gaps, notes)
+
+    def unit(self, column: Column) -> str | None:
+        """Return the unit that the file states for a column: below its name, or in brackets."""
+        place = self._place(column)
+        if place is None:
+            return None
+        below = self.units[place] if place < len(self.units) else ""
+        name = self.names[place] if place < len(self.names) else ""
+        return unit_of(below.strip("[]() ")) or without_unit(name)[1]
+
+    def has(self, name: str) -> bool:
+        """Return whether a column has this name, with or without its unit."""
+        return self._place(name) is not None
 
     def numbers(self, columns: Sequence[Column], field: str, _array: str | None = None) -> Array:
         """Return columns as numbers, shape (rows, columns), NaN where missing ones are allowed.
@@ -106,19 +148,19 @@ class Table:
         """
         indices = [self._index(column, field) for column in columns]
         try:
-            values = np.loadtxt(
-                io.StringIO("\n".join(self.lines)),
-                delimiter=self.delimiter,
-                usecols=indices,
-                comments=None,
-                ndmin=2,
+            frame = self._frame(
+                indices,
                 dtype=np.float64,
+                decimal=self.dialect.decimal,
+                keep_default_na=False,
+                na_values=_SPELLINGS,
             )
-        except ValueError:
-            values = self._cell_by_cell(indices, field)
-        if not self.gaps and not np.isfinite(values).all():
-            return self._cell_by_cell(indices, field)
-        return np.asarray(values)
+            values = frame[indices].to_numpy()
+        except ValueError:  # a cell is not a number as written in this dialect
+            values = np.full((len(self.lines), 1), np.nan)
+        if np.isfinite(values).all():
+            return np.asarray(values)
+        return np.column_stack([self._cell_by_cell(index, field) for index in indices])
 
     def matrix(self, _name: str | None, field: str) -> Array:
         """Return all columns; see `numbers`."""
@@ -127,146 +169,306 @@ class Table:
     def times(self, column: Column, decimals: int, _array: str | None = None) -> list[int | None]:
         """Return a column of times as whole nanoseconds, exactly; of a single line, that line.
 
-        There are `decimals` decimal places between the column's unit and the second. Missing times
-        are None where they are allowed.
+        There are `decimals` decimal places between the column's unit and the second; a date stamp
+        needs none. Missing times are None where they are allowed.
 
         Raises:
-            SourceError: no such column, or a time that is not a number.
+            SourceError: no such column, or a time that is neither a number nor a date.
         """
         index = self._index(column, "time")
         if len(self.lines) == 1 and not self.names:
-            texts = [(self.numbered[0], cell) for cell in self.lines[0].split(self.delimiter)]
+            texts = self.dialect.cells(self.lines[0])
+            numbers = [self.numbered[0]] * len(texts)
         else:
-            texts = [
-                (number, (line.split(self.delimiter)[index : index + 1] or [""])[0])
-                for number, line in zip(self.numbered, self.lines, strict=True)
-            ]
-        found = list[int | None]()
-        for number, text in texts:
-            if self.gaps and text.strip().lower() in (*_MISSING, "nan"):
-                found.append(None)
-                continue
-            try:
-                found.append(_nanoseconds(text, decimals))
-            except (ArithmeticError, ValueError) as error:
-                shown = repr(text.strip()) if text.strip() else "nothing"
-                problem = f"line {number} has {shown} for the time"
-                raise SourceError(self.path, problem, field="time", remedy=HOLE) from error
-        return found
+            texts, numbers = self._texts(index), list(self.numbered)
+        numerals = _normalised(texts, self.dialect)
+        times: list[int | None] = [_nanoseconds(text, decimals) for text in numerals]
+        unread = [place for place, time in enumerate(times) if time is None]
+        if len(unread) > len(times) / 2:
+            times = nanoseconds_of_dates(texts)
+            unread = [place for place, time in enumerate(times) if time is None]
+        if unread and not self.gaps:
+            text = texts[unread[0]]
+            shown = repr(text) if text else "nothing"
+            problem = f"line {numbers[unread[0]]} has {shown} for the time"
+            raise SourceError(self.path, problem, field="time", remedy=self._remedy(text))
+        return times
+
+    def _remedy(self, text: str) -> str:
+        """Return the remedy for a cell that is not a number."""
+        mark = _grouped(text, self.dialect)
+        if mark is None:
+            return HOLE
+        return f'if {mark!r} separates thousands: [format] thousands = "{mark}"; else {HOLE}'
+
+    def _place(self, column: Column) -> int | None:
+        """Return the index of a column, None if there is none; a name may lack its unit."""
+        if not isinstance(column, str):
+            return column if column < self.width else None
+        if column in self.names:
+            return self.names.index(column)
+        bare = [without_unit(name)[0] for name in self.names]
+        return bare.index(column) if bare.count(column) == 1 else None
 
     def _index(self, column: Column, field: str) -> int:
-        if isinstance(column, str):
-            if column in self.names:
-                return self.names.index(column)
-        elif column < self.width:
-            return column
+        place = self._place(column)
+        if place is not None:
+            return place
         if self.names:
             remedy = f"its columns are {', '.join(self.names)}"
         else:
             remedy = f"it has {self.width} columns and no header; count them from 0"
         raise SourceError(self.path, f"there is no column {column!r}", field=field, remedy=remedy)
 
-    def _cell_by_cell(self, indices: Sequence[int], field: str) -> Array:
-        """Return what `numbers` does, or raise the error that names the first invalid cell."""
-        values = np.full((len(self.lines), len(indices)), np.nan)
-        for row, line in enumerate(self.lines):
-            cells = line.split(self.delimiter)
-            for place, index in enumerate(indices):
-                cell = cells[index].strip() if index < len(cells) else ""
-                number = float(cell) if _is_number(cell) else np.nan
-                if np.isfinite(number):
-                    values[row, place] = number
-                elif not (self.gaps and (cell.lower() in _MISSING or _is_number(cell))):
-                    name = self.names[index] if index < len(self.names) else str(index)
-                    shown = repr(cell) if cell else "nothing"
-                    raise SourceError(
-                        self.path,
-                        f"line {self.numbered[row]} has {shown} in column {name}, not a number",
-                        field=field,
-                        remedy=HOLE,
-                    )
-        return values
+    def _frame(self, indices: Sequence[int], **options: Any) -> pd.DataFrame:
+        """Return columns by index, one row for each line."""
+        import pandas as pd  # 0.4 s; only a text table needs it
+
+        text = "\n".join(self.lines)
+        delimiter = self.dialect.delimiter
+        width = max(
+            len(self.dialect.cells(line) if '"' in line else line.split(delimiter))
+            for line in self.lines
+        )
+        return pd.read_csv(
+            io.StringIO(text),
+            sep=r"\s+" if delimiter is None else delimiter,
+            header=None,
+            names=range(max(width, self.width)),
+            usecols=sorted(set(indices)),
+            index_col=False,
+            skipinitialspace=True,
+            skip_blank_lines=False,
+            quoting=csv.QUOTE_MINIMAL if '"' in text else csv.QUOTE_NONE,
+            **options,
+        )
+
+    def _texts(self, index: int) -> list[str]:
+        """Return the cells of a column as text; empty where a line is too short."""
+        try:
+            cells = self._frame([index], dtype=str, na_filter=False)[index].tolist()
+        except ValueError:  # of a quotation mark
+            cells = []
+        if len(cells) == len(self.lines):
+            return [cell.strip() if isinstance(cell, str) else "" for cell in cells]
+        odd = next((k for k, line in enumerate(self.lines) if line.count('"') % 2), 0)
+        problem = f"line {self.numbered[odd]} has a quotation mark that is not closed"
+        raise SourceError(self.path, problem, remedy="remove it")
+
+    def _cell_by_cell(self, index: int, field: str) -> Array:
+        """Return a column as numbers, or raise the error that names the first invalid cell."""
+        texts = self._texts(index)
+        numerals = _normalised(texts, self.dialect)
+        values = np.array([_number(text) for text in numerals])
+        if self.gaps:
+            values[~np.isfinite(values)] = np.nan
+            return values
+        invalid = np.flatnonzero(~np.isfinite(values))
+        if not invalid.size:
+            return values
+        row = int(invalid[0])
+        name = self.names[index] if index < len(self.names) else str(index)
+        shown = repr(texts[row]) if texts[row] else "nothing"
+        problem = f"line {self.numbered[row]} has {shown} in column {name}, not a number"
+        remedy = self._remedy(texts[row])
+        raise SourceError(self.path, problem, field=field, remedy=remedy)
 
 
-def _between(numbered: list[tuple[int, str]], path: Path, form: Format) -> list[tuple[int, str]]:
-    """Remove empty lines before and after the numbers; one between them may be a lost row."""
-    filled = [place for place, (_, line) in enumerate(numbered) if line.strip()]
-    if not filled:
+def _text(path: Path, form: Format) -> str:
+    """Return the text of a file in any usual encoding."""
+    try:
+        text = read_text(path, _LONGEST, encoding=form.encoding, or_latin=True)
+    except (OSError, ValueError, LookupError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        problem = f"cannot be read ({reason})"
+        remedy = f"name a text file, or one that ends in {', '.join(READERS)}"
+        if isinstance(error, FileNotFoundError):
+            remedy = remedy_for_missing(path, remedy)
+        raise SourceError(path, problem, remedy=remedy) from error
+    return text.removeprefix("%") if text.startswith(_ROSTOPIC) else text  # a header there
+
+
+def _dialect(lines: Sequence[str], form: Format) -> Dialect:
+    """Return the dialect in which most cells of lines are numbers, the first of equal ones."""
+    marks = [form.decimal] if form.decimal else [".", ","]
+    tried = [
+        Dialect(delimiter, mark, form.thousands)
+        for delimiter, mark in _WRITTEN
+        if mark in marks and form.delimiter in (None, delimiter)
+    ]
+    if form.delimiter is not None and not tried:
+        tried = [Dialect(form.delimiter, marks[0], form.thousands)]
+
+    def share(dialect: Dialect) -> float:
+        """Return the share of numbers in lines of the usual length that have any."""
+        rows = [dialect.cells(line) for line in lines]
+        lengths = [len(row) for row in rows]
+        usual = max(sorted(set(lengths)), key=lengths.count)
+        if usual == 1 and dialect.delimiter is not None and form.delimiter is None:
+            return -1.0
+        counts = [
+            sum(_is_written(cell, dialect) for cell in row)
+            for row in rows
+            if abs(len(row) - usual) <= 1
+        ]
+        numeric = [count for count in counts if count]
+        return sum(numeric) / (usual * len(numeric)) if numeric else -1.0
+
+    return max(tried, key=share)
+
+
+def _layout(numbered: list[tuple[int, str]], dialect: Dialect, path: Path, form: Format) -> _Layout:
+    """Return names, units and rows of a table; lines above the names and repeated ones are gone."""
+    filled = [(number, line) for number, line in numbered if line.strip()]
+    begin = 1 if form.header else _first_row(filled, dialect)
+    if form.header is False:
+        begin = 0
+    if begin >= len(filled):
         raise SourceError(path, "has no row of numbers")
+    head = [dialect.cells(line) for _, line in filled[:begin]]
+    units: list[str] = []
+    if len(head) > 1 and _are_units(head[-1]):
+        units = head.pop()
+    names = [cell.strip(_QUOTES).strip() for cell in head[-1]] if head else []
+    last = filled[-1][0]
+    rows = [entry for entry in numbered if filled[begin][0] <= entry[0] <= last]
+    above = {line.strip() for _, line in filled[:begin]}
+    repeats = [number for number, line in rows if line.strip() in above]
+    if repeats:  # a logger that was started again writes its head again, with its empty lines
+        rows = [
+            (number, line)
+            for number, line in rows
+            if line.strip() not in above
+            and (line.strip() or not {number - 1, number + 1} & set(repeats))
+        ]
     if form.skip_empty:
-        return [numbered[place] for place in filled]
-    numbered = numbered[filled[0] : filled[-1] + 1]
-    header = next((place for place, (_, line) in enumerate(numbered[1:], 1) if line.strip()), 1)
-    numbered = numbered[:1] + numbered[header:]
-    empty = next((number for number, line in numbered if not line.strip()), None)
+        rows = [entry for entry in rows if entry[1].strip()]
+    empty = next((number for number, line in rows if not line.strip()), None)
     if empty is not None:
+        problem = f"line {empty} is empty"
+        remedy = (
+            "remove it, or cut the log there; where empty lines mean nothing: [format] "
+            "skip_empty = true; to skip lines of a header: [format] skip_rows"
+        )
+        raise SourceError(path, problem, remedy=remedy)
+    return _Layout(tuple(names), tuple(units), rows, len(repeats))
+
+
+def _first_row(lines: Sequence[tuple[int, str]], dialect: Dialect) -> int:
+    """Return the place of the first row of numbers: of the usual length, with some number.
+
+    A line above it without any number is a name, a unit or a note.
+    """
+    probed = [dialect.cells(line) for _, line in lines[: 5 * _PROBED]]
+    numeric = [any(_is_written(cell, dialect) and cell for cell in row) for row in probed]
+    lengths = [len(row) for row, some in zip(probed, numeric, strict=True) if some]
+    if not lengths:
+        return len(lines)
+    usual = max(sorted(set(lengths)), key=lengths.count)
+    # A note such as "Rate, 250" has a number, too, and fewer cells.
+    fitting = [some and len(row) >= usual for row, some in zip(probed, numeric, strict=True)]
+    return fitting.index(True) if True in fitting else numeric.index(True)
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    """Return whether the cells of a line are units, of which some may be missing."""
+    filled = [cell.strip("[]() ") for cell in cells if cell.strip("[]() -")]
+    return bool(filled) and all(without_unit(f"x [{cell}]")[1] for cell in filled)
+
+
+def _width(names: Sequence[str], first: Sequence[str], path: Path) -> int:
+    width = len(first)
+    if len(names) < width > 1 and not first[-1]:
+        width -= 1  # each line ends with a delimiter
+    if names and len(names) < width:
         raise SourceError(
             path,
-            f"line {empty} is empty",
-            remedy="remove it, or cut the log there; where empty lines mean nothing: [format] "
-            "skip_empty = true; to skip lines of a header: [format] skip_rows",
+            f"has {len(names)} names ({', '.join(names)}) above rows of {width} numbers",
+            remedy="name the other columns, or count columns from 0: [format] header = "
+            "false and skip_rows",
         )
-    return numbered
+    return width
 
 
 def _transposed(
-    numbered: list[tuple[int, str]], delimiter: str | None, path: Path
+    numbered: list[tuple[int, str]], dialect: Dialect, path: Path
 ) -> list[tuple[int, str]]:
     """Return columns as lines, numbered by sample."""
-    cells = [line.split(delimiter) for _, line in numbered]
+    cells = [dialect.cells(line) for _, line in numbered]
     widths = {len(row) for row in cells}
     if len(widths) > 1:
         problem = f"its lines have from {min(widths)} to {max(widths)} numbers"
         remedy = "all channels must be equally long"
         raise SourceError(path, problem, field="format.transposed", remedy=remedy)
-    joiner = " " if delimiter is None else delimiter
+    joiner = " " if dialect.delimiter is None else dialect.delimiter
     return [(sample, joiner.join(row)) for sample, row in enumerate(zip(*cells, strict=True))]
 
 
-def _written(lines: Sequence[str], form: Format) -> tuple[str | None, str]:
-    """Return delimiter (None for white space) and decimal mark: the first pair that gives numbers.
-
-    The first line may be a header; if no pair fits, the delimiter that all lines have.
-    """
-    marks = [form.decimal] if form.decimal else [".", ","]
-    tried = [(d, m) for d, m in _WRITTEN if m in marks and form.delimiter in (None, d)]
-    if form.delimiter is not None and not tried:
-        tried = [(form.delimiter, marks[0])]
-    body = lines[1:] or lines
-    for delimiter, mark in tried:
-        split = [line.split(delimiter) for line in body]
-        width = {len(row) for row in split}
-        if len(width) > 1 or (width == {1} and delimiter is not None):
-            continue
-        if all(_are_numbers(row, mark) for row in split):
-            return delimiter, mark
-    for delimiter, mark in tried:
-        if delimiter is not None and all(delimiter in line for line in lines[:2]):
-            return delimiter, mark
-    return form.delimiter, marks[0]
+# Cells
 
 
-def _nanoseconds(text: str, decimals: int) -> int:
-    """Return a time exactly; raise ValueError or ArithmeticError where it is invalid."""
-    time = Decimal(text.strip())
-    if time and time.adjusted() > _LONGEST_TIME:
-        raise ValueError(f"{text!r} is not a time")
-    return int(time.scaleb(9 - decimals).to_integral())
-
-
-def _is_number(text: str) -> bool:
+def _nanoseconds(text: str, decimals: int) -> int | None:
+    """Return a time exactly; None where it is no number, or no time."""
     try:
-        float(text)
+        time = Decimal(text)
+        if time and time.adjusted() > _LONGEST_TIME:
+            return None
+        return int(time.scaleb(9 - decimals).to_integral())
+    except (ArithmeticError, ValueError):
+        return None
+
+
+def _number(text: str) -> float:
+    """Return the number that a text is, else NaN."""
+    try:
+        return float(text)
     except ValueError:
-        return False
-    return True
+        return np.nan
 
 
-def _are_numbers(cells: Sequence[str], decimal: str) -> bool:
-    """Return whether there are cells with content, all of them numbers."""
-    filled = [cell.strip() for cell in cells if cell.strip().lower() not in _MISSING]
-    if decimal == "," and any("." in cell for cell in filled):
-        return False
-    return bool(filled) and all(
-        _is_number(_FORTRAN.sub("e", cell.replace(decimal, "."))) for cell in filled
+def _grouped(text: str, dialect: Dialect) -> str | None:
+    """Return the mark between groups of three digits: one that is not the decimal mark, or None."""
+    match = _groups(dialect.decimal).fullmatch(text)
+    return None if match is None else match["mark"]
+
+
+def _groups(decimal: str) -> re.Pattern[str]:
+    marks = "".join(mark for mark in _THOUSANDS if mark != decimal)
+    return re.compile(
+        rf"[+-]?[1-9]\d{{0,2}}(?P<mark>[{re.escape(marks)}])\d{{3}}(?:(?P=mark)\d{{3}})*"
+        rf"(?P<part>{re.escape(decimal)}\d*)?(?:[eE][+-]?\d+)?"
     )
+
+
+def _normalised(texts: Sequence[str], dialect: Dialect) -> list[str]:
+    """Return cells of a column with a decimal point and without marks between thousands.
+
+    Such marks are taken for what they are where the map states them, or where the column proves
+    them: a number with both marks, or with two groups.
+    """
+    mark = dialect.thousands
+    if mark is None:
+        matches = [match for match in map(_groups(dialect.decimal).fullmatch, texts) if match]
+        marks = {match["mark"] for match in matches}
+        proved = any(match["part"] or match[0].count(match["mark"]) > 1 for match in matches)
+        mark = marks.pop() if proved and len(marks) == 1 else None
+    if mark is not None:
+        pattern = _groups(dialect.decimal)
+        texts = [text.replace(mark, "") if pattern.fullmatch(text) else text for text in texts]
+    if dialect.decimal == ".":
+        return list(texts)
+    return [text.replace(dialect.decimal, ".") if "." not in text else text for text in texts]
+
+
+def _is_written(cell: str, dialect: Dialect) -> bool:
+    """Return whether a cell is a number in this dialect, a missing one, or a date stamp."""
+    if cell.lower() in _MISSING or _DATE.fullmatch(cell):
+        return True
+    if dialect.decimal == "," and "." in cell:
+        return _grouped(cell, dialect) is not None
+    numeral = cell.replace(dialect.decimal, ".")
+    is_number = np.isfinite(_number(_FORTRAN.sub("e", numeral))) or numeral.lower() in (
+        "inf",
+        "-inf",
+    )
+    return bool(is_number) or _grouped(cell, dialect) is not None

@@ -78,14 +78,13 @@ class Known:
 def from_urdf(urdf: str, joint_names: Sequence[str]) -> Known:
     """Return the limits of a URDF in degrees, `"?"` if unknown; all torque limits or none."""
     limits = urdf_limits(urdf, joint_names)
-    nowhere = limits.lower >= limits.upper
     values: dict[str, Any] = {
         "limits.frame": "urdf",
-        "limits.lower_deg": _degrees(np.where(nowhere, math.inf, limits.lower)),
-        "limits.upper_deg": _degrees(np.where(nowhere, math.inf, limits.upper)),
+        "limits.lower_deg": _degrees(limits.lower),
+        "limits.upper_deg": _degrees(limits.upper),
         "limits.velocity_deg": _degrees(limits.velocity),
     }
-    if np.all((limits.effort > 0.0) & np.isfinite(limits.effort)):
+    if np.isfinite(limits.effort).all():
         values["limits.torque"] = limits.effort.tolist()
     return Known.of_origin("from the URDF", values)
 

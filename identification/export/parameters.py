@@ -116,7 +116,7 @@ def _rows(model: RobotModel, estimate: Estimate) -> list[tuple[str, str, str, fl
     """Return name, expression, unit, value and standard deviation of each parameter."""
     if estimate.names != model.parameter_names:
         raise IdentificationError("the estimate is not of the model's parameters")
-    expressions = (*model.base.expressions(), *estimate.names[model.base.rank :])
+    expressions = model.expressions()
     numbers = estimate.values.tolist(), estimate.std.tolist()
     return list(zip(estimate.names, expressions, estimate.units, *numbers, strict=True))
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,8 @@ class BaseParameters:
     smallest_pivot: float
     largest_dropped: float  #: largest residual of a dependent column: zero except for rounding
     shares: Array  #: residual of each standard parameter's column, (s,)
+    #: terms (factor, name) of parameters lumped into others without a group, by the other's name
+    lumped: Mapping[str, Sequence[tuple[float, str]]] = field(default_factory=dict)
 
     @property
     def rank(self) -> int:
@@ -55,13 +57,23 @@ class BaseParameters:
         found = []
         for row, pivot in zip(self.grouping, self.pivots, strict=True):
             text = self.standard_names[pivot]
-            for column in np.flatnonzero(np.abs(row) > _NEGLIGIBLE):
-                if column != pivot:
-                    factor, name = f"{abs(row[column]):.{digits}g}", self.standard_names[column]
-                    sign = "+" if row[column] > 0.0 else "-"
-                    text += f" {sign} {name}" if factor == "1" else f" {sign} {factor} {name}"
-            found.append(text)
+            others = [
+                (row[column], self.standard_names[column])
+                for column in np.flatnonzero(np.abs(row) > _NEGLIGIBLE)
+                if column != pivot
+            ]
+            found.append(self.expression(text, others, digits))
         return tuple(found)
+
+    def expression(
+        self, name: str, others: Sequence[tuple[float, str]] = (), digits: int = 6
+    ) -> str:
+        """Return a parameter as a formula: with other terms, and with those lumped into it."""
+        text = name
+        for value, other in (*others, *self.lumped.get(name, ())):
+            factor, sign = f"{abs(value):.{digits}g}", "+" if value > 0.0 else "-"
+            text += f" {sign} {other}" if factor == "1" else f" {sign} {factor} {other}"
+        return text
 
 
 def select_base(regressor: Array, names: Sequence[str], units: Sequence[str]) -> BaseParameters:

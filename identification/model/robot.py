@@ -187,7 +187,7 @@ class RobotModel:
 
         Raises:
             ModelError: the text is not an open chain of revolute and prismatic joints, there is no
-                joint of a name, or an offset or element cannot be separated from other parameters.
+                joint of a name, or an element cannot be separated from other parameters.
         """
         chain = chain_from_urdf(urdf, locked)
         down = np.array(gravity, dtype=np.float64)
@@ -228,8 +228,16 @@ class RobotModel:
         return self._with(self.friction, elements)
 
     def _with(self, friction: JointFriction, elements: JointElements) -> RobotModel:
-        parts = self.chain, self.gravity, self.layout, self.base
-        return replace(self, **_parameters(*parts, friction, elements))
+        base = self.base
+        if not all(self.chain.revolute):  # an offset can change them
+            base = _base_parameters(self.chain, self.gravity, self.layout, friction, elements)
+        parts = self.chain, self.gravity, self.layout, base
+        return replace(self, base=base, **_parameters(*parts, friction, elements))
+
+    def expressions(self) -> tuple[str, ...]:
+        """Return each of the p parameters as a formula of standard parameters."""
+        others = map(self.base.expression, self.parameter_names[self.base.rank :])
+        return (*self.base.expressions(), *others)
 
     @property
     def friction_columns(self) -> NDArray[np.bool_]:
@@ -454,26 +462,39 @@ def _base_parameters(
     plan = _plan(chain, gravity, layout, everything, None)
     rows = plan.evaluate(q, qd, qdd).dense(layout.size).reshape(-1, layout.size)
     base = select_base(rows, layout.names, layout.units)
-    _require_separate_offsets(chain, friction, rows[:, base.pivots])
+    base = _without_carried_rotors(layout, friction, rows, base)
     _require_separate_elements(friction, elements, rows[:, base.pivots], q)
     return base
 
 
-def _require_separate_offsets(chain: Chain, friction: JointFriction, columns: Array) -> None:
-    """Check that the column of each offset is independent of the inertial columns."""
-    n = chain.n_joints
-    if OFFSET not in friction.kinds:
-        return
-    offsets = np.tile(np.eye(n), (len(columns) // n, 1))
-    for joint, share in enumerate(share_left(offsets, columns)):
-        if share <= TOLERANCE and OFFSET.symbol in friction.laws[joint].symbols:
-            name = chain.joint_names[joint]
-            raise ModelError(
-                f"joint {name!r} is prismatic along gravity and has a rotor inertia: the offset of "
-                "its friction and the carried weight cannot be distinguished; remove the offset "
-                "(asymmetric friction has one) or the rotor inertias",
-                joint=name,
-            )
+def _without_carried_rotors(
+    layout: StandardLayout, friction: JointFriction, rows: Array, base: BaseParameters
+) -> BaseParameters:
+    """Return the base parameters with each offset of friction independent of them.
+
+    On a prismatic joint along gravity with a rotor inertia they are not: the weight M g of the
+    carried mass M and the offset are one constant force. Such a rotor inertia I is lumped into the
+    mass, M + I, and the offset is the rest of the force, fo - g I: both can have any value then.
+    """
+    n = friction.n_joints
+    offsets = np.tile(np.eye(n), (len(rows) // n, 1))
+    left = share_left(offsets, rows[:, base.pivots])
+    with_offset = [OFFSET.symbol in law.symbols for law in friction.laws]
+    joints = np.flatnonzero((left <= TOLERANCE) & np.array(with_offset))
+    if not joints.size:
+        return base
+    rotors = [layout.names.index(f"I{joint + 1}m") for joint in joints]
+    regressor = rows.copy()
+    regressor[:, rotors] = 0.0
+    base = select_base(regressor, layout.names, layout.units)
+    names = [*base.names, *(f"{OFFSET.symbol}_{joint + 1}" for joint in joints)]
+    columns = np.column_stack([regressor[:, base.pivots], offsets[:, joints]])
+    factors = np.linalg.lstsq(columns, rows[:, rotors], rcond=None)[0]
+    lumped: dict[str, list[tuple[float, str]]] = {}
+    for row, column in zip(*np.nonzero(np.abs(factors) > TOLERANCE), strict=True):
+        term = float(factors[row, column]), layout.names[rotors[column]]
+        lumped.setdefault(names[row], []).append(term)
+    return replace(base, lumped=lumped)
 
 
 def _require_separate_elements(

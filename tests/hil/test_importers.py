@@ -17,6 +17,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
+import h5py
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -34,12 +35,13 @@ from hil.cli import app
 from hil.errors import ArchiveWriteError, InputError, SourceError
 from hil.identify.cell_context import nominal_of
 from hil.identify.sources import cell_of
-from hil.importers import ColumnMap, Convention, Robot, import_log, urdf_of_dh
+from hil.importers import ColumnMap, Convention, Robot, import_log, matlab, urdf_of_dh
 from hil.importers import arrays as array_files
 from hil.importers.arrays import ArrayFile
 from hil.importers.column_map import UNITS, Format, ready_map, ready_maps
-from hil.importers.findings import check_clock, examine
+from hil.importers.findings import examine
 from hil.importers.robot import _cell_text
+from hil.importers.stamps import check_clock
 from hil.importers.table import Table
 from hil.recordings import open_recording
 from identification import FrictionLaw
@@ -450,10 +452,56 @@ class TestStructs:
         assert np.array_equal(found["position"], Q)
 
     def test_number_of_elements_is_limited(self, tmp_path, robot, monkeypatch):
-        monkeypatch.setattr(array_files, "MOST_NUMBERS", 100)
+        monkeypatch.setattr(array_files, "MOST_NUMBERS", 50)
         savemat(tmp_path / "a.mat", {"log": LOG})
-        with pytest.raises(ValueError, match="too large"):
-            array_files._struct_fields(str(tmp_path / "a.mat"), ["log"])
+        with pytest.raises(SourceError, match="too large to be read at once"):
+            read_arrays(tmp_path / "a.mat", robot, position={"columns": "log.joint.q"})
+
+
+def save_73(path: Path, **values: object) -> Path:
+    """A .mat as MATLAB 7.3 writes it: HDF5 behind 512 bytes, arrays transposed, cells as links."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        refs = file.create_group("#refs#")
+
+        def put(group: h5py.Group, name: str, value: object) -> None:
+            if isinstance(value, dict):
+                inner = group.create_group(name)
+                inner.attrs["MATLAB_class"] = np.bytes_("struct")
+                for key, one in value.items():
+                    put(inner, key, one)
+            elif isinstance(value, list):
+                names = [f"{name}{k}" for k in range(len(value))]
+                for key, one in zip(names, value, strict=True):
+                    put(refs, key, one)
+                data = np.array([[refs[key].ref] for key in names], h5py.ref_dtype)
+                group.create_dataset(name, data=data).attrs["MATLAB_class"] = np.bytes_("cell")
+            else:
+                data = np.atleast_2d(np.asarray(value, np.float64)).T
+                dataset = group.create_dataset(name, data=data)
+                dataset.attrs["MATLAB_class"] = np.bytes_("double")
+
+        for name, value in values.items():
+            put(file, name, value)
+    with path.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+    return path
+
+
+class TestMatlab73:
+    @pytest.mark.parametrize("columns", ["q", "log.q", "log.each({})"])
+    def test_arrays_structs_and_cells(self, tmp_path, robot, columns):
+        log = {"q": Q.T, "each": [column[:, None] for column in Q.T]}
+        path = save_73(tmp_path / "a.mat", q=Q, t=TIME, log=log)
+        found = read(path, robot, position={"columns": columns}, time={"column": "t"})
+        assert np.array_equal(found["position"], Q)
+        assert found["stamp"] / 1e9 == pytest.approx(TIME)
+
+    def test_a_file_without_contents_is_refused(self, tmp_path, robot):
+        head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
+        empty = b"\x89HDF\r\n\x1a\n" + bytes(2000)
+        (tmp_path / "a.mat").write_bytes(head.ljust(512, b"\0") + empty)
+        with pytest.raises(SourceError, match=r"a\.mat: cannot be read .*save the arrays again"):
+            read_arrays(tmp_path / "a.mat", robot)
 
 
 class TestUntrustedFiles:
@@ -616,11 +664,11 @@ def test_joints_are_those_of_the_robot_or_locked(tmp_path, robot):
 
 
 def test_child_process_has_limited_memory_also_after_a_restart() -> None:
-    pid = array_files._in_child(os.getpid)
+    pid = matlab._in_child(os.getpid)
     os.kill(pid, signal.SIGKILL)
-    assert array_files._readers[0].connection.poll(5.0)
-    assert array_files._in_child(resource.getrlimit, resource.RLIMIT_AS) == (2**33, 2**33)
-    assert array_files._in_child(os.getpid) != pid
+    assert matlab._readers[0].connection.poll(5.0)
+    assert matlab._in_child(resource.getrlimit, resource.RLIMIT_AS) == (2**33, 2**33)
+    assert matlab._in_child(os.getpid) != pid
 
 
 # Robots by Denavit-Hartenberg parameters
@@ -881,6 +929,10 @@ class TestWarnings:
         expected = {arm.joint_names[1]: 3.0, arm.joint_names[5]: 0.2}
         assert factors(sentence) == pytest.approx(expected, rel=1e-2)
 
+    def test_repeated_stamps_do_not_question_the_order(self, arm: Simulated) -> None:
+        """Half of the messages have the stamp of the one before."""
+        assert warnings(replace(arm, time=np.repeat(arm.time[::2], 2))) == []
+
     def test_positions_in_degrees_order_or_zero(self, panda: Simulated) -> None:
         """The ranges of joints 4 and 6 of this arm exclude each other."""
         (sentence, *others) = warnings(panda, position=DEGREES, velocity=DEGREES)
@@ -939,7 +991,7 @@ class TestReplacing:
     def command(self, panda: Simulated, tmp_path: Path) -> list[str]:
         np.savez(tmp_path / "log.npz", q=panda.position, d=np.degrees(panda.position), t=panda.time)
         for name in "qd":
-            text = f'[position]\ncolumns = "{name}"\n[time]\ncolumn = "t"\n'
+            text = f'[position]\ncolumns = "{name}"\nunit = "rad"\n[time]\ncolumn = "t"\n'
             (tmp_path / f"{name}.toml").write_text(
                 f"joints = {json.dumps(panda.joint_names)}\n{text}"
             )
@@ -1030,7 +1082,8 @@ class TestClock:
     def test_the_file_with_the_times_is_named(self, arm: Simulated, tmp_path: Path) -> None:
         np.savetxt(tmp_path / "q.txt", arm.position)
         np.savetxt(tmp_path / "t.txt", 1e3 * arm.time)
-        entries = {"time": {"column": 0, "file": "t.txt"}, "position": {"file": "q.txt"}}
+        time = {"column": 0, "file": "t.txt", "unit": "s"}
+        entries = {"time": time, "position": {"file": "q.txt"}}
         with pytest.raises(SourceError, match=r"t\.txt: time: has 0\.1 samples"):
             read(tmp_path, Robot.from_urdf(arm.urdf), **entries)
         assert not tmp_path.with_suffix(".mcap").exists()
@@ -1040,7 +1093,7 @@ class TestImportCommand:
     def test_findings_are_printed_and_archived(self, arm: Simulated, tmp_path: Path) -> None:
         np.savez(tmp_path / "log.npz", q=np.degrees(arm.position), t=arm.time)
         (tmp_path / "map.toml").write_text(
-            '[time]\ncolumn = "t"\n[position]\ncolumns = "q"\n'  # the unit is missing
+            '[time]\ncolumn = "t"\n[position]\ncolumns = "q"\nunit = "rad"\n'  # a wrong unit
         )
         arguments = ["import", "log", str(tmp_path / "log.npz"), "-o", str(tmp_path / "log.mcap")]
         arguments += ["--map", str(tmp_path / "map.toml"), "--urdf", str(arm.urdf)]

@@ -144,11 +144,10 @@ class TestRobotModel:
             RobotModel.from_urdf(text, locked=locked)
         assert caught.value.joint == ("strange" if "'strange'" in words else caught.value.joint)
 
-    def test_an_offset_equal_to_a_weight_is_refused(self):
+    def test_an_offset_equal_to_a_weight_is_no_parameter_of_its_own(self):
         law = FrictionLaw(offset=True)
-        with pytest.raises(ModelError, match=r"'strange'.*offset"):
-            RobotModel.from_urdf(slider("0 0 1"), friction=law)
-        # accepted without a rotor inertia, and across gravity
+        assert RobotModel.from_urdf(slider("0 0 1"), friction=law).n_parameters == 5
+        # it is one without a rotor inertia, and across gravity
         assert (
             RobotModel.from_urdf(slider("0 0 1"), friction=law, rotor_inertia=False).n_parameters
             == 5

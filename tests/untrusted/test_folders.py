@@ -39,8 +39,8 @@ from hil.cli.plan import read_via_points
 from hil.errors import ArchiveError, HilError, InputError
 from hil.files import write_atomically, write_files
 from hil.importers.arrays import READERS, ArrayFile
+from hil.importers.bags import bag_files, open_bag
 from hil.importers.column_map import Format
-from hil.importers.rosbag2 import bag_files, topics
 from hil.importers.table import Table
 from hil.outcome import SERIES, _load_series, rewrite_report
 from hil.reading import parse_toml, read_text
@@ -217,7 +217,7 @@ RECORDINGS: dict[str, Callable[[Path], object]] = {
     "log.csv": lambda path: Table.read(path, Format()),
     **{f"log{suffix}": ArrayFile for suffix in READERS},
     "bag.db3": bag_files,
-    "bag.mcap": lambda path: topics(*bag_files(path)),
+    "bag.mcap": lambda path: open_bag(path).__enter__(),
     "via.csv": lambda path: read_via_points(path, AngleFrame("urdf", np.ones(3), np.zeros(3))),
     "results.json": StudyResults.load,
     "excitation_000_a1.mcap": open_archive,

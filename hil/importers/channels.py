@@ -1,0 +1,184 @@
+"""What a log records: its channels with name, unit, type and rate, and what their names say.
+
+`CHANNEL_NAMES` is the one table of names; a map that nobody wrote is made from it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.errors import SourceError
+from hil.importers.arrays import READERS, ArrayFile
+from hil.importers.bags import SUFFIXES, open_bag
+from hil.importers.column_map import Format
+from hil.importers.rosbag2 import joint_state_topics
+from hil.importers.stamps import concluded_unit
+from hil.importers.table import Table
+from hil.importers.units import TIMES, Kind, unit_of, without_unit
+
+_NUMBER: Final = r"[\[(_. ]*(?P<number>\d{1,2})[\])]*"
+CHANNEL_NAMES: Final[Mapping[Kind, tuple[str, ...]]] = {
+    "time": (
+        "t", "time", "times", "timestamp", "time_stamp", "stamp", "tstamp", "header.stamp", "clock",
+        "ipoc", "duration", "seconds", "date", "datetime", "zeit",
+    ),
+    "position": (
+        "q", "pos", "position", "positions", "actual_q", "q_actual", "q_meas", "q_act", "state.q",
+        "joint_position", "joint_positions", "jointpos", "angle", "angles", "joint_angle",
+        "joint_angles", "aipos.a", "theta", "winkel", "field.position",
+    ),
+    "velocity": (
+        "qd", "dq", "vel", "v", "velocity", "velocities", "actual_qd", "qd_actual", "qd_meas",
+        "state.dq", "joint_velocity", "joint_velocities", "jointvel", "omega", "speed", "qdot",
+        "dtheta", "field.velocity",
+    ),
+    "torque": (
+        "tau", "torque", "torques", "effort", "efforts", "m", "moment", "tau_j", "state.tau_j",
+        "tau_meas", "tau_actual", "joint_torque", "joint_torques", "jointtorque", "geartorque.a",
+        "drehmoment", "field.effort",
+    ),
+    "motor_current": (
+        "i", "iq", "cur", "curr", "current", "currents", "actual_current", "motor_current",
+        "motor_currents", "motorcurrent", "joint_current", "strom", "amp",
+    ),
+}  # fmt: skip
+"""Names of channels in the logs of the field, lower case, without number and unit."""
+_BY_NAME: Final = {name: kind for kind, names in CHANNEL_NAMES.items() for name in names}
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A channel of a log: a column, an array, or a field of a topic.
+
+    Attributes:
+        name: as a column map names it.
+        size: numbers in a sample: 1, or those of a whole array.
+        samples: how many there are.
+        unit: that the log states, None if it states none.
+        dtype: numpy's name of the type that the file has, ``text`` in a table.
+        rate: samples per second by the log's time, None if it has none.
+        kind: the quantity that the name, or else the unit, says; None if neither does.
+        number: the joint's number in the name, None without one.
+        joints: that the log names, in the order of the numbers of a sample.
+    """
+
+    name: str
+    size: int
+    samples: int
+    unit: str | None = None
+    dtype: str = "float64"
+    rate: float | None = None
+    kind: Kind | None = None
+    number: int | None = None
+    joints: tuple[str, ...] = ()
+
+
+def channels_of(path: Path, form: Format | None = None) -> tuple[Channel, ...]:
+    """Return the channels of a log, an array file, a bag or an MCAP file.
+
+    Raises:
+        SourceError: it cannot be read.
+    """
+    suffix = path.suffix.lower()
+    if path.is_dir() or suffix in SUFFIXES or Path(path.stem).suffix in SUFFIXES:
+        bag = _of_bag(path)
+        if bag or suffix != ".mcap":
+            return bag
+    if suffix in READERS:
+        return tuple(_of_arrays(ArrayFile(path)))
+    return tuple(_of_table(Table.read(path, form or Format())))
+
+
+def kind_of(name: str, unit: str | None = None) -> tuple[Kind | None, int | None]:
+    """Return the quantity that the name of a channel says, and the joint's number in it.
+
+    A name that says nothing is of the quantity of its unit, where only one has it.
+    """
+    bare = without_unit(name)[0].strip().lower().rsplit("/", 1)[-1]
+    match = re.fullmatch(rf"(?P<base>.*?){_NUMBER}(?P<end>\D*)", bare)
+    base, number = (
+        (bare, None) if match is None else (match["base"] + match["end"], int(match["number"]))
+    )
+    for candidate in (base, base.strip(" _.-"), base.replace(" ", "_").strip("_")):
+        if candidate in _BY_NAME:
+            return _BY_NAME[candidate], number
+    kinds: list[Kind] = [kind for kind in CHANNEL_NAMES if unit is not None and unit_of(unit, kind)]
+    return (kinds[0] if len(kinds) == 1 else None), number
+
+
+def _of_table(table: Table) -> Iterator[Channel]:
+    names = table.names or tuple(map(str, range(table.width)))
+    rate = None
+    kinds = [kind_of(name, table.unit(place)) for place, name in enumerate(names[: table.width])]
+    for place, (kind, _) in enumerate(kinds):
+        if kind == "time" and rate is None:
+            rate = _rate(table, place)
+    for place, name in enumerate(names[: table.width]):
+        kind, number = kinds[place]
+        yield Channel(name, 1, len(table.lines), table.unit(place), "text", rate, kind, number)
+
+
+def _rate(table: Table | ArrayFile, place: int | str) -> float | None:
+    """Return the rate by a column of times, in its own unit or the one that is concluded."""
+    stated = unit_of(table.unit(place) or "", "time")
+    try:
+        times = table.times(place, TIMES[stated or "s"])
+        if stated is None:
+            times = table.times(place, TIMES[concluded_unit(times)])
+    except SourceError:
+        return None
+    return rate_of([time for time in times if time is not None])
+
+
+def rate_of(stamps: Sequence[int] | NDArray[np.int64]) -> float | None:
+    """Return samples per second of stamps [ns], None where they do not advance."""
+    steps = np.diff(np.array([float(stamp) for stamp in stamps]))
+    steps = steps[steps > 0.0]
+    return 1e9 / float(np.median(steps)) if steps.size else None
+
+
+def _of_arrays(file: ArrayFile) -> Iterator[Channel]:
+    kinds = {name: kind_of(name) for name in file.names}
+    rates = {
+        max(file.shape(name)): _rate(file, name)
+        for name, (kind, _) in kinds.items()
+        if kind == "time" and math.prod(file.shape(name)) == max(file.shape(name))
+    }
+    for name, (kind, number) in kinds.items():
+        shape = file.shape(name)
+        samples, size = max(shape), math.prod(shape) // max(shape)
+        rate = rates.get(samples)
+        yield Channel(name, size, samples, None, file.dtype(name), rate, kind, number)
+
+
+def _of_bag(path: Path) -> tuple[Channel, ...]:
+    """Return the quantities of the joint states in a bag; none where it has no such topic."""
+    channels: list[Channel] = []
+    with open_bag(path) as bag:
+        for topic in joint_state_topics(bag.topics):
+            names: dict[str, None] = {}
+            received = []
+            present = dict.fromkeys(("position", "velocity", "effort"), 0)
+            for message in bag.messages(topic):
+                names.update(dict.fromkeys(message.content.name))
+                received.append(message.received)
+                for quantity in present:
+                    values = getattr(message.content, quantity)
+                    present[quantity] += bool(len(values)) and not np.isnan(values).all()
+            for quantity, samples in present.items():
+                if samples:
+                    name = f"{topic}/{quantity}"
+                    kind, _ = kind_of(name)
+                    channels.append(
+                        Channel(name, len(names), samples, None, "float64", rate_of(received), kind,
+                                None, tuple(names))
+                    )  # fmt: skip
+    return tuple(channels)

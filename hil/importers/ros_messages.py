@@ -1,0 +1,171 @@
+"""Messages of ROS to arrays: decoded by `rosbags`, one column for each number in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import lru_cache
+from operator import attrgetter
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+JOINT_STATE: Final = "sensor_msgs/msg/JointState"
+_LONGEST: Final = 1 << 16  # elements of a sequence in a message
+_LARGEST: Final = 4096  # elements of a column; what is larger is an image or a cloud of points
+_ROS1_HEADER: Final = "seq"
+
+
+class MessageError(ValueError):
+    """Messages that cannot be decoded, or not as columns."""
+
+
+@lru_cache(maxsize=64)
+def typestore_of(kind: str, definition: str, encoding: str) -> Typestore:
+    """Return the types of messages: those of a definition, or of ROS 2 where there is none.
+
+    `encoding` is that of the definition, ``ros2msg``, ``ros2idl`` or empty.
+
+    Raises:
+        MessageError: the definition is invalid.
+    """
+    known = get_typestore(Stores.ROS2_HUMBLE)
+    if not definition.strip() and kind in known.types:
+        return known
+    try:
+        read = get_types_from_idl(definition) if "idl" in encoding else _of_msg(definition, kind)
+        for _, described in read.values():
+            for _, node in described:
+                _check_size(node)
+        # Names of the definition go before those of ROS 2, which may be of another version.
+        store = Typestore(max_sequence_length=_LONGEST)
+        store.register({**known.fielddefs, **read})
+    except Exception as error:  # rosbags does not document what it raises
+        raise MessageError(
+            f"its definition is invalid ({error or type(error).__name__})"
+        ) from error
+    return store
+
+
+def _of_msg(definition: str, kind: str) -> dict[str, Any]:
+    return dict(get_types_from_msg(definition, kind if "/msg/" in kind else _with_msg(kind)))
+
+
+def _with_msg(kind: str) -> str:
+    package, _, name = kind.rpartition("/")
+    return f"{package}/msg/{name}"
+
+
+def _check_size(node: tuple[Any, Any]) -> None:
+    """Refuse fixed arrays of which one message would fill the memory."""
+    kind, content = node
+    if kind == Nodetype.ARRAY and content[1] > _LONGEST:
+        raise MessageError(f"it has an array of {content[1]} elements")
+
+
+def decoded(store: Typestore, kind: str, data: bytes) -> Any:
+    """Return a message of ROS 2.
+
+    Raises:
+        MessageError: it cannot be decoded.
+    """
+    try:
+        return store.deserialize_cdr(data, kind if "/msg/" in kind else _with_msg(kind))
+    except Exception as error:  # rosbags does not document what it raises
+        raise MessageError(f"cannot be decoded ({error or type(error).__name__})") from error
+
+
+def columns_of(stamps: Sequence[int], messages: Sequence[Any]) -> dict[str, NDArray[Any]]:
+    """Return the numbers of messages of one type by the path of their field, and their ``stamp``.
+
+    A field of numbers is an array (m, length); lists of texts must be the same in all messages,
+    since they name what the numbers are. `stamps` are those of the file [ns], used where the
+    headers of the messages have none.
+
+    Raises:
+        MessageError: names or lengths differ, or an array is too long.
+    """
+    columns: dict[str, NDArray[Any]] = {}
+    for path, read in _fields_of(messages[0], "", lambda message: message):
+        try:
+            values = [read(message) for message in messages]
+        except (IndexError, AttributeError):
+            raise MessageError(f"its messages differ in lengths of arrays: {path}") from None
+        if isinstance(values[0], list):
+            _check_alike(values, path)
+            continue
+        try:
+            columns[path] = np.array(values)
+        except ValueError:  # of different lengths
+            raise MessageError(f"its messages differ in lengths of arrays: {path}") from None
+    columns = {path: column for path, column in columns.items() if column.size}
+    seconds, rest = (columns.pop(f"header/stamp/{part}", None) for part in ("sec", "nanosec"))
+    columns.pop(f"header/{_ROS1_HEADER}", None)
+    stamp = np.array(stamps, np.int64)
+    if seconds is not None and rest is not None and (seconds.any() or rest.any()):
+        stamp = seconds.astype(np.int64) * 10**9 + rest
+    return {"stamp": stamp, **columns}
+
+
+_Read = Callable[[Any], Any]
+
+
+def _fields_of(value: Any, path: str, read: _Read) -> Iterator[tuple[str, _Read]]:
+    """Yield paths of the numbers, arrays and lists in a message, and how each is read from one."""
+    if isinstance(value, np.ndarray):
+        if value.size > _LARGEST:
+            raise MessageError(f"{path} has {value.size} elements")
+        yield path, read
+    elif is_dataclass(value):
+        for field in fields(value):
+            if field.default is MISSING and field.name != "__msgtype__":  # else a constant
+                inner, place = getattr(value, field.name), f"{path}/{field.name}".lstrip("/")
+                # C code where only names lead to a number, as in most messages.
+                dotted = place.replace("/", ".")
+                if not any(part.isdigit() for part in place.split("/")):
+                    yield from _fields_of(inner, place, attrgetter(dotted))
+                else:
+                    yield from _fields_of(inner, place, _Attribute(read, field.name))
+    elif isinstance(value, list):
+        yield path, read  # its texts or its length
+        for index, element in enumerate(value):
+            if not isinstance(element, str):
+                yield from _fields_of(element, f"{path}/{index}", _Element(read, index))
+    elif not isinstance(value, str):
+        yield path, read
+
+
+@dataclass(frozen=True)
+class _Attribute:
+    """Reads a field of what another reads."""
+
+    outer: _Read
+    name: str
+
+    def __call__(self, message: Any) -> Any:
+        return getattr(self.outer(message), self.name)
+
+
+@dataclass(frozen=True)
+class _Element:
+    """Reads an element of what another reads."""
+
+    outer: _Read
+    index: int
+
+    def __call__(self, message: Any) -> Any:
+        return self.outer(message)[self.index]
+
+
+def _check_alike(lists: Sequence[list[Any]], path: str) -> None:
+    """Raise MessageError where lists of texts, or the lengths of lists, differ."""
+    first = lists[0]
+    if any(len(one) != len(first) for one in lists):
+        raise MessageError(f"its messages differ in lengths of arrays: {path}")
+    texts = bool(first) and isinstance(first[0], str)
+    if texts and any(one != first for one in lists):
+        raise MessageError(f"its messages differ in {path}: {', '.join(first)}")

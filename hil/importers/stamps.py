@@ -1,0 +1,145 @@
+"""Stamps of a recording: their unit where nothing states it, counters that wrap, invalid clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.errors import SourceError
+from hil.importers.units import TIMES
+
+Stamps = NDArray[np.int64]
+
+SLOWEST: Final = 20.0  # Hz; a robot's dynamics need faster sampling
+FASTEST: Final = 20_000.0  # Hz
+_LARGEST: Final = 10**40  # ns; more is no time in any unit
+_NO_MOTION: Final = 10.0  # Hz; 5 kHz in ms, read as s, are 5 Hz
+_MOST_STEPS: Final = 10  # median steps that a counter may pass where it wraps
+_SWAPPED: Final = 0.02  # share of the messages of a recording that may have changed places
+YEAR: Final = 365 * 86_400 * 10**9
+"""[ns]"""
+_WRAPS: Final[dict[str, int]] = {
+    **{
+        f"a {bits}-bit counter of {unit}": 2**bits * 10 ** (9 - places)
+        for unit, places in TIMES.items()
+        for bits in (32, 31, 16)
+    },
+    "the time of day": 86_400 * 10**9,
+}
+"""Ranges [ns] after which clocks begin again."""
+
+
+def concluded_unit(times: Sequence[int | None]) -> str:
+    """Return the unit of times that nothing states, given as nanoseconds of seconds.
+
+    It is the longest that gives a rate of sampling at which robots are recorded: in seconds where
+    none does, and for a column that only counts the samples.
+    """
+    stamps = np.array([time / 1e9 for time in times if time is not None and abs(time) < _LARGEST])
+    steps = np.diff(stamps)
+    steps = steps[steps > 0.0]
+    if not steps.size or (bool(np.all(np.abs(steps - 1.0) < 1e-9)) and stamps[0] in (0.0, 1.0)):
+        return "s"
+    step = float(np.median(steps))
+    for unit, places in TIMES.items():
+        if _NO_MOTION <= 10.0**places / step <= FASTEST:
+            return unit
+    return "s"
+
+
+class Continued(NamedTuple):
+    """Stamps of a counter without its wraps."""
+
+    stamp: Stamps
+    note: str | None  #: what wrapped, None if nothing did
+
+
+def without_wraps(stamp: Stamps) -> Continued:
+    """Return stamps (m,) [ns] that go on where a counter of limited range began again.
+
+    Every backward step must then be an ordinary one, else the stamps are returned as they are.
+    """
+    steps = np.diff(stamp)
+    backward = steps < 0
+    forward = steps[steps > 0]
+    if not backward.any() or not forward.size:
+        return Continued(stamp, None)
+    usual = int(np.median(forward))
+    for name, wrap in _WRAPS.items():
+        continued = steps[backward] + wrap
+        # A counter of a few samples' range cannot be told from a clock that was set back.
+        if wrap < 4 * _MOST_STEPS * usual:
+            continue
+        if ((continued > 0) & (continued <= _MOST_STEPS * usual)).all():
+            passed = np.concatenate([[0], np.cumsum(np.where(backward, wrap, 0))])
+            times = f"{int(backward.sum())} times" if backward.sum() > 1 else "once"
+            return Continued(stamp + passed, f"{name} wrapped {times} and was continued")
+    return Continued(stamp, None)
+
+
+def leading_zeros(stamp: Stamps) -> int:
+    """Return how many of the first stamps are 0, before a clock of the epoch was there."""
+    zeros = int(np.argmax(stamp != 0)) if stamp.any() else 0
+    return zeros if zeros and abs(int(stamp[zeros])) > YEAR else 0
+
+
+class Sorted(NamedTuple):
+    """The order of messages by stamp."""
+
+    order: NDArray[np.intp]
+    note: str | None  #: how many had changed places, None if none had
+
+
+def swapped_messages(stamp: Stamps) -> Sorted:
+    """Return the order of messages by stamp (m,) [ns] where a few neighbours changed places.
+
+    A clock that was set back stays as it is, to be refused: there a message is older than many
+    before it.
+    """
+    unchanged = np.arange(len(stamp))
+    backward = int(np.count_nonzero(np.diff(stamp) < 0))
+    if not backward:
+        return Sorted(unchanged, None)
+    order = np.argsort(stamp, kind="stable")
+    farthest = int(np.abs(order - unchanged).max())
+    if farthest > 2 or backward > max(1.0, _SWAPPED * len(stamp)):
+        return Sorted(unchanged, None)
+    messages = f"{backward} messages that came" if backward > 1 else "one message that came"
+    return Sorted(order, f"{messages} before an older one: sorted by stamp")
+
+
+def check_clock(stamp: Stamps, path: Path, remedy: str | None = None) -> None:
+    """Check that stamps (m,) [ns] of a file can be those of a motion.
+
+    `remedy` replaces those of a log with a column map.
+
+    Raises:
+        SourceError: they run backwards, are all the same, or are too far apart.
+    """
+    steps = np.diff(stamp)
+    backward = np.flatnonzero(steps < 0)
+    if backward.size:
+        first = int(backward[0]) + 1
+        problem = (
+            f"sample {first} is {-1e-9 * steps[first - 1]:.3g} s older than the one before it "
+            f"({backward.size} such steps)"
+        )
+        cut = "cut the recording where its clock runs backwards"
+        other = remedy or "name another time column"
+        raise SourceError(path, problem, field="time", remedy=f"{cut}, or {other}")
+    if steps.size and not steps.any():
+        problem = f"all {len(stamp)} samples have the same time"
+        other = remedy or "name the column of the time, or give sample_rate instead"
+        raise SourceError(path, problem, field="time", remedy=other)
+    rate = 1e9 / float(np.median(steps[steps > 0])) if steps.size else np.inf
+    if rate < _NO_MOTION:
+        problem = f"has {rate:.2g} samples per second, too few for a motion"
+        other = remedy or (
+            "check its unit ([time] unit, or sample_rate in Hz): milliseconds read as seconds "
+            f"would give {1e3 * rate:.4g} samples per second; at least {SLOWEST:g} are needed"
+        )
+        raise SourceError(path, problem, field="time", remedy=other)

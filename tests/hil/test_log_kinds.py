@@ -1,0 +1,394 @@
+"""Kinds of faults in logs: read rightly, or refused with a remedy that works when typed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hil.archive import Archive, open_archive
+from hil.errors import SourceError
+from hil.importers import ColumnMap, Robot, import_log
+
+Floats = NDArray[np.float64]
+RATE, COUNT = 250, 400
+TIME = np.arange(COUNT) / RATE
+JOINTS = ("hip", "knee", "ankle")
+POSITION = np.column_stack([0.9 * np.sin(2.0 * TIME + k) for k in range(3)])
+SLOPE = np.column_stack([1.8 * np.cos(2.0 * TIME + k) for k in range(3)])
+TORQUE = np.column_stack([20.0 * np.cos(2.0 * TIME + k) for k in range(3)])
+URDF = (
+    "<robot name='three'><link name='base'/>"
+    + "".join(
+        f"<link name='l{name}'><inertial><mass value='{mass}'/><origin xyz='0 0 0.2'/>"
+        "<inertia ixx='0.1' iyy='0.1' izz='0.1' ixy='0' ixz='0' iyz='0'/></inertial></link>"
+        f"<joint name='{name}' type='revolute'><parent link='{parent}'/><child link='l{name}'/>"
+        "<origin xyz='0 0 0.4'/><axis xyz='0 1 0'/>"
+        "<limit lower='-3' upper='3' effort='99' velocity='9'/></joint>"
+        for name, parent, mass in zip(JOINTS, ("base", "lhip", "lknee"), (3, 2, 1), strict=True)
+    )
+    + "</robot>"
+)
+
+
+@pytest.fixture
+def urdf(tmp_path: Path) -> Path:
+    path = tmp_path / "three.urdf"
+    path.write_text(URDF)
+    return path
+
+
+def rows(
+    *,
+    time: Sequence[object] = tuple(f"{t:.6f}" for t in TIME),
+    position: Floats = POSITION,
+    torque: Floats = TORQUE,
+    cell: Callable[[float], str] = lambda value: f"{value:.6f}",
+) -> list[list[str]]:
+    numbers = np.column_stack([position, torque])
+    return [[str(t), *map(cell, row)] for t, row in zip(time, numbers.tolist(), strict=True)]
+
+
+NAMES = ["t", "q1", "q2", "q3", "tau1", "tau2", "tau3"]
+
+
+def text(
+    body: Sequence[Sequence[str]] | None = None,
+    *,
+    head: Sequence[Sequence[str]] = (NAMES,),
+    delimiter: str = ",",
+) -> str:
+    lines = [*head, *(rows() if body is None else body)]
+    return "\n".join(delimiter.join(line) for line in lines) + "\n"
+
+
+MAP: dict[str, Any] = {
+    "time": {"column": "t"},
+    "position": {"columns": "q{}"},
+    "torque": {"columns": "tau{}"},
+}
+
+
+def imported(path: Path, content: str | bytes, urdf: Path, **changes: Any) -> Archive:
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    columns = ColumnMap.model_validate({**MAP, **changes})
+    output = path.with_suffix(".mcap")
+    return open_archive(
+        import_log(path, output, robot=Robot.from_urdf(urdf), columns=columns, force=True)
+    )
+
+
+def assert_right(archive: Archive, *, without: Sequence[int] = ()) -> None:
+    """The samples are those of the file, to its six digits."""
+    columns = archive.columns
+    elapsed = (columns["stamp"] - columns["stamp"][0]) * 1e-9
+    keep = np.delete(np.arange(COUNT), list(without))
+    assert elapsed == pytest.approx(TIME[keep] - TIME[keep[0]], abs=1e-6)
+    assert columns["position"] == pytest.approx(POSITION[keep], abs=1e-6)
+    assert columns["torque"] == pytest.approx(TORQUE[keep], abs=1e-6)
+
+
+def comma(value: float) -> str:
+    return f"{value:.6f}".replace(".", ",")
+
+
+def grouped(value: float, mark: str, decimal: str) -> str:
+    return f"{value:,.3f}".replace(",", "_").replace(".", decimal).replace("_", mark)
+
+
+MILLISECONDS = {"column": "t", "unit": "ms"}
+UNITS_BELOW = [NAMES, ["s", "rad", "rad", "rad", "Nm", "Nm", "Nm"]]
+DEGREES_BELOW = [NAMES, ["[ms]", *["[°]"] * 3, *["[N m]"] * 3]]
+IN_DEGREES = rows(
+    time=[f"{1e3 * t:.3f}" for t in TIME],
+    position=np.degrees(POSITION),
+    cell=lambda value: f"{value:.9f}",
+)
+
+
+def dates(form: str, mark: str = ".") -> list[str]:
+    """Stamps from one second before 08:00:00."""
+    stamps = np.datetime64("2026-11-12T07:59:59") + np.rint(1e6 * TIME).astype("m8[us]")
+    return [
+        stamp.strftime(form).replace("{f}", f"{mark}{stamp.microsecond:06d}")
+        for stamp in stamps.tolist()
+    ]
+
+
+def with_row(place: int, *lines: str) -> str:
+    """The text with lines in place of one row."""
+    content = text().splitlines()
+    return "\n".join([*content[:place], *lines, *content[place + 1 :]]) + "\n"
+
+
+def with_lines(place: int, *lines: str) -> str:
+    content = text().splitlines()
+    return "\n".join([*content[:place], *lines, *content[place:]]) + "\n"
+
+
+PREAMBLE = "Recorder;V2.1\nDate;12.11.2026\nRate;250\n\n"
+HEAD = ",".join(NAMES)
+READ: dict[str, tuple[str | bytes, dict[str, Any]]] = {
+    "as it should be": (text(), {}),
+    "units in the second line": (text(head=UNITS_BELOW), {}),
+    "units in the second line that are not those of the SI": (
+        text(IN_DEGREES, head=DEGREES_BELOW), {},
+    ),
+    "units in brackets in the names": (
+        text(IN_DEGREES, head=[["t [ms]", "q1 [deg]", "q2 [deg]", "q3 [deg]", *NAMES[4:]]]), {},
+    ),
+    "degrees by their name": (
+        text(IN_DEGREES), {"position": {"columns": "q{}", "unit": "degrees"}, "time": MILLISECONDS},
+    ),
+    "per cent of a rated torque": (
+        text(rows(torque=TORQUE / [0.5, 1.0, 2.0], cell=lambda value: f"{value:.9f}")),
+        {"torque": {"columns": "tau{}", "unit": "%", "rated": (50.0, 100.0, 200.0)}},
+    ),
+    "columns named by joint": (
+        text(head=[["t", *(f"pos {j}" for j in JOINTS), *(f"{j}_effort" for j in JOINTS)]]),
+        {"position": {"columns": "pos {}"}, "torque": {"columns": "{}_effort"}},
+    ),
+    "quoted": (text([[f'"{cell}"' for cell in row] for row in rows()]), {}),
+    "quoted with decimal commas": (
+        text([[f'"{cell.replace(".", ",")}"' for cell in row] for row in rows()]), {},
+    ),
+    "a preamble, an empty line and decimal commas": (
+        PREAMBLE + text(rows(time=[comma(t) for t in TIME], cell=comma), delimiter=";"), {},
+    ),
+    "the head once more": (with_lines(101, HEAD), {}),
+    "preamble and head once more": (
+        PREAMBLE + text(rows()[:100], delimiter=";") + PREAMBLE
+        + text(rows()[100:], delimiter=";"), {},
+    ),
+    "names in a comment": ("# " + text(), {}),
+    "ISO 8601": (text(rows(time=dates("%Y-%m-%dT%H:%M:%S{f}"))), {}),
+    "ISO 8601 with a zone": (text(rows(time=dates("%Y-%m-%d %H:%M:%S{f}+01:00"))), {}),
+    "day, month, year and a decimal comma": (
+        text(rows(time=dates("%d.%m.%Y %H:%M:%S{f}", ","), cell=comma), delimiter=";"), {},
+    ),
+    "month, day, year": (text(rows(time=dates("%m/%d/%Y %H:%M:%S{f}"))), {}),
+    "year of two digits": (text(rows(time=dates("%d.%m.%y %H:%M:%S{f}"))), {}),
+    "time of day": (text(rows(time=dates("%H:%M:%S{f}"))), {}),
+    "time of day past midnight": (
+        text(rows(time=[f"{int(s) // 3600 % 24:02d}:{int(s) // 60 % 60:02d}:{s % 60:09.6f}"
+                        for s in (86_399.5 + TIME).tolist()])), {},
+    ),
+    "UTF-16": (text(delimiter="\t").encode("utf-16"), {}),
+    "UTF-16 without a mark": (text(delimiter="\t").encode("utf-16-be"), {}),
+    "a degree sign in Latin-1": (
+        text(IN_DEGREES, head=[["t [ms]", "q1 [°]", "q2 [°]", "q3 [°]", *NAMES[4:]]])
+        .encode("latin-1"), {},
+    ),
+    "points between thousands": (
+        text(rows(time=[grouped(9e5 + 1e3 * t, ".", ",") for t in TIME], cell=comma),
+             delimiter=";"), {"time": MILLISECONDS},
+    ),
+    "apostrophes between thousands": (
+        text(rows(time=[grouped(9e5 + 1e3 * t, "'", ".") for t in TIME]), delimiter=";"),
+        {"time": MILLISECONDS},
+    ),
+    "spaces between thousands": (
+        text(rows(time=[grouped(9e5 + 1e3 * t, " ", ",") for t in TIME], cell=comma),
+             delimiter="\t"), {"time": MILLISECONDS},
+    ),
+    "nanoseconds of the epoch": (
+        text(rows(time=[1_700_000_000_000_000_000 + round(1e9 * t) for t in TIME])), {},
+    ),
+    "milliseconds that nothing states": (text(rows(time=[f"{1e3 * t:.3f}" for t in TIME])), {}),
+    "a first stamp of zero": (
+        text(rows(time=[0, *(1_700_000_000 + t for t in TIME[1:].tolist())])), {},
+    ),
+    "32 bits of microseconds": (
+        text(rows(time=[(2**32 - 900_000 + round(1e6 * t)) % 2**32 for t in TIME])), {},
+    ),
+    "signed 32 bits of microseconds": (
+        text(rows(time=[(2**31 - 900_000 + round(1e6 * t) + 2**31) % 2**32 - 2**31
+                        for t in TIME])), {"time": {"column": "t", "unit": "us"}},
+    ),
+    "16 bits of milliseconds, as seconds": (
+        text(rows(time=[f"{(65.0 + t) % 65.536:.3f}" for t in TIME])), {},
+    ),
+    "degrees that nothing states": (
+        text(rows(position=np.degrees(POSITION), cell=lambda value: f"{value:.9f}")), {},
+    ),
+}  # fmt: skip
+FIRST_IS_MISSING = ("a first stamp of zero",)
+
+
+class TestRead:
+    @pytest.mark.parametrize("kind", READ)
+    def test_samples_are_right(self, tmp_path: Path, urdf: Path, kind: str) -> None:
+        content, changes = READ[kind]
+        archive = imported(tmp_path / "log.csv", content, urdf, **changes)
+        assert_right(archive, without=(0,) if kind in FIRST_IS_MISSING else ())
+
+    def test_what_was_concluded_is_said(self, tmp_path: Path, urdf: Path) -> None:
+        for kind, sentence in {
+            "degrees that nothing states": "position: no unit is stated; read as degrees",
+            "milliseconds that nothing states": "time: no unit is stated; read as ms",
+            "32 bits of microseconds": "a 32-bit counter of us wrapped once and was continued",
+            "the head once more": "left out: lines that repeat the header (1)",
+            "a first stamp of zero": "left out: rows at the start with the time 0 (1)",
+            "units in the second line that are not those of the SI": "position: in deg, as the fi",
+        }.items():
+            content, changes = READ[kind]
+            archive = imported(tmp_path / "log.csv", content, urdf, **changes)
+            assert any(sentence in line for line in archive.header.findings.lines), kind
+
+    def test_velocities_in_degrees_that_nothing_states(self, tmp_path: Path, urdf: Path) -> None:
+        columns = np.column_stack([TIME, POSITION, np.degrees(SLOPE), TORQUE])
+        names = [*NAMES[:4], "v1", "v2", "v3", *NAMES[4:]]
+        body = [[repr(cell) for cell in row] for row in columns.tolist()]
+        archive = imported(
+            tmp_path / "log.csv", text(body, head=[names]), urdf, velocity={"columns": "v{}"}
+        )
+        assert archive.columns["velocity"] == pytest.approx(SLOPE, abs=1e-12)
+
+    def test_a_stated_unit_is_not_overruled(self, tmp_path: Path, urdf: Path) -> None:
+        content, _ = READ["degrees that nothing states"]
+        position = {"columns": "q{}", "unit": "rad"}
+        with pytest.raises(SourceError, match="leaves the limits of the URDF") as refused:
+            imported(tmp_path / "log.csv", content, urdf, position=position)
+        unit = re.search(r'write unit = "(\w+)"', str(refused.value))
+        assert unit is not None
+        position["unit"] = unit[1]
+        assert_right(imported(tmp_path / "log.csv", content, urdf, position=position))
+
+    def test_a_urdf_in_another_encoding(self, tmp_path: Path, urdf: Path) -> None:
+        content = '<?xml version="1.0" encoding="{}"?><!-- Größe -->' + URDF
+        for encoding in ("ISO-8859-1", "UTF-16", "UTF-8"):
+            urdf.write_bytes(content.format(encoding).encode(encoding))
+            archive = imported(tmp_path / "log.csv", text(), urdf)
+            assert "Größe" in archive.text("robot.urdf")
+            assert_right(archive)
+
+
+# What is refused, and the remedy that the message prints
+
+
+NOT_A_NUMBER = ["-1.#IND", "nan(ind)", "#N/A", "1.#QNAN", "NULL", "error", "#NUM!", "n/a", "inf"]
+HOLES = {cell: with_row(50, f"0.196,{cell},1,1,1,1,1") for cell in NOT_A_NUMBER} | {
+    "a note between the rows": with_lines(51, "operator pressed stop"),
+    "a time that is none": with_row(50, "later,1,1,1,1,1,1"),
+    "a row cut short": with_row(50, "0.196,1"),
+}
+GROUPED = text(rows(time=[f"{1000 + 4 * k:,}" for k in range(COUNT)]), delimiter=";")
+OTHER_REMEDIES: dict[str, tuple[str, dict[str, Any], str]] = {
+    "an empty line": (with_lines(50, ""), {}, "skip_empty"),
+    "thousands that are not certain": (GROUPED, {"time": MILLISECONDS}, "thousands"),
+    "lines that are no table": ("a b\n" * 300 + text(), {}, "skip_rows"),
+}
+TYPED = re.compile(r'\[(\w+)\] (\w+) = ("[^"]*"|true|\d+)')
+
+
+def remedy(message: str) -> dict[str, dict[str, Any]]:
+    """The entries of a column map that a message prints."""
+    found: dict[str, dict[str, Any]] = {}
+    for table, key, value in TYPED.findall(message):
+        found.setdefault(table, {})[key] = True if value == "true" else value.strip('"')
+    return found
+
+
+class TestRemedies:
+    @pytest.mark.parametrize("kind", HOLES)
+    def test_rows_without_numbers_are_left_out(self, tmp_path: Path, urdf: Path, kind: str) -> None:
+        with pytest.raises(SourceError, match=r"line 5\d ") as refused:
+            imported(tmp_path / "log.csv", HOLES[kind], urdf)
+        entries = remedy(str(refused.value))
+        assert entries == {"format": {"missing": "drop"}}
+        archive = imported(tmp_path / "log.csv", HOLES[kind], urdf, **entries)
+        assert_right(archive, without=() if "note" in kind else (49,))
+        assert any(
+            "rows in which a number is missing (1 of" in line
+            for line in archive.header.findings.lines
+        )
+
+    @pytest.mark.parametrize("kind", ["an empty line", "thousands that are not certain"])
+    def test_entries_of_the_map(self, tmp_path: Path, urdf: Path, kind: str) -> None:
+        content, changes, key = OTHER_REMEDIES[kind]
+        with pytest.raises(SourceError) as refused:
+            imported(tmp_path / "log.csv", content, urdf, **changes)
+        entries = remedy(str(refused.value))
+        assert key in entries["format"]
+        assert_right(imported(tmp_path / "log.csv", content, urdf, **changes, **entries))
+
+    def test_a_column_that_only_counts(self, tmp_path: Path, urdf: Path) -> None:
+        """It is no clock: neither seconds nor milliseconds are concluded."""
+        content = text(rows(time=range(COUNT)))
+        with pytest.raises(SourceError, match="sample_rate in Hz"):
+            imported(tmp_path / "log.csv", content, urdf)
+        assert_right(imported(tmp_path / "log.csv", content, urdf, time=None, sample_rate=RATE))
+
+    def test_per_cent_of_what(self, tmp_path: Path, urdf: Path) -> None:
+        content = text(head=[[*NAMES[:4], "tau1 [%]", "tau2 [%]", "tau3 [%]"]])
+        with pytest.raises(SourceError, match=r"add to \[torque\]: rated = "):
+            imported(tmp_path / "log.csv", content, urdf)
+        torque = {"columns": "tau{}", "rated": (100.0, 100.0, 100.0)}
+        assert_right(imported(tmp_path / "log.csv", content, urdf, torque=torque))
+
+    def test_a_clock_that_was_set_back_is_refused(self, tmp_path: Path, urdf: Path) -> None:
+        for back in (0.5, 3600.0, 5.0):
+            time = np.where(np.arange(COUNT) < 200, TIME, TIME - back)
+            with pytest.raises(SourceError, match="older than the one before it"):
+                imported(tmp_path / "log.csv", text(rows(time=time.tolist())), urdf)
+
+    def test_every_row_dropped_is_no_recording(self, tmp_path: Path, urdf: Path) -> None:
+        content = text([[*row[:-1], "x"] for row in rows()])
+        with pytest.raises(SourceError, match="has a missing number in every row"):
+            imported(tmp_path / "log.csv", content, urdf, format={"missing": "drop"})
+
+    def test_a_quotation_mark_that_is_not_closed(self, tmp_path: Path, urdf: Path) -> None:
+        content = with_row(50, '0.196,"1,1,1,1,1,1')
+        with pytest.raises(SourceError, match="line 51 has a quotation mark that is not closed"):
+            imported(tmp_path / "log.csv", content, urdf)
+
+    @pytest.mark.parametrize("content", [b"\x7fELF\0\0\1\2\3" * 50, b"", b"\n\n", b"a,b\n"])
+    def test_what_is_no_table(self, tmp_path: Path, urdf: Path, content: bytes) -> None:
+        with pytest.raises(SourceError, match=r"cannot be read|has no row of numbers|no column"):
+            imported(tmp_path / "log.csv", content, urdf)
+
+
+# The cases that were made for this project, beside this checkout
+
+
+@pytest.fixture
+def cases(shared_data: Path) -> Path:
+    folder = shared_data.parent / "cases" / "logs"
+    if not folder.is_dir():
+        pytest.skip("the cases (../shared/cases/logs) are not beside this checkout")
+    return folder
+
+
+CASES = [
+    "units_row", "quoted", "iso_time", "header_repeated_in_the_middle", "msvc_nan", "utf16",
+    "latin1_header", "thousands", "uint32_us_wrap",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_cases_have_the_samples_of_plain(tmp_path: Path, cases: Path, name: str) -> None:
+    robot = Robot.from_urdf(cases / "arm.urdf")
+
+    def read(stem: str, **entries: Any) -> dict[str, Floats]:
+        columns = ColumnMap.load(cases / f"{stem}.toml")
+        columns = ColumnMap.model_validate({**columns.model_dump(exclude_unset=True), **entries})
+        out = tmp_path / f"{stem}.mcap"
+        import_log(cases / f"{stem}.csv", out, robot=robot, columns=columns)
+        return dict(open_archive(out).columns)
+
+    expected = read("plain")
+    try:
+        found = read(name)
+    except SourceError as error:
+        found = read(name, **remedy(str(error)))
+        line = int(re.search(r"line (\d+)", str(error))[1])  # type: ignore[index]
+        expected = {key: np.delete(array, line - 2, axis=0) for key, array in expected.items()}
+    elapsed = found["stamp"] - found["stamp"][0]
+    assert np.abs(elapsed - expected["stamp"] + expected["stamp"][0]).max() < 1000  # ns
+    for quantity in ("position", "torque"):
+        assert found[quantity] == pytest.approx(expected[quantity], abs=2e-6)
