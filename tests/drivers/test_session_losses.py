@@ -273,7 +273,7 @@ class TestLostReplies:
         return rig
 
     @pytest.mark.parametrize(("lost", "rests"), [(3, False), (8, True), (60, True)])
-    def test_an_arm_that_slowed_down_does_not_speed_up_before_it_stops(self, lost, rests):
+    def test_a_slowed_arm_does_not_speed_up_before_it_stops(self, lost, rests):
         """It stays where the controller holds it; one still at speed stops on its path."""
         rig = self.lose_slowing(lost)
         held = rig.axes["d"][:, 0].copy()

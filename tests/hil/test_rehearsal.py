@@ -166,7 +166,7 @@ def test_it_passes_at_any_cycle(tmp_path: Path, designed: Campaign, cycle_ms: in
         (4, {"limits.velocity_deg": [200.0, 240.0]}, True),
     ],
 )
-def test_packets_are_lost_where_the_guard_lets_a_motion_survive_it(
+def test_packets_are_lost_where_a_motion_survives_it(
     designed: Campaign, cycle_ms: int, changes: dict[str, list[float]], survives: bool
 ) -> None:
     cell = designed.cell.with_values({"controller.cycle_ms": cycle_ms, **changes})
