@@ -43,7 +43,7 @@ _ANYWHERE, _SPEED, _ACCELERATION = math.pi, 2.0, 10.0
 _DRY: Final = (COULOMB, TANH)
 _DRY_LABELS: Final = tuple(term.label for term in _DRY)
 _TIMESTEP: Final = 1e-3  # s
-_FRICTION_TIME: Final = 2.0 * _TIMESTEP  # time constant of MuJoCo's dry friction, at least 2 steps
+_FRICTION_STEPS: Final = 2.0  # time constant of MuJoCo's dry friction, at least 2 steps
 _THICKNESS: Final = 0.03  # m, radius of the capsules that show the arm
 _SHORTEST: Final = 1e-3  # m, length of a capsule
 
@@ -128,14 +128,14 @@ class Arm:
         }
 
 
-def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
-    """Return the arm as MuJoCo's XML; motors are controlled by joint torque."""
+def mjcf(arm: Arm, name: str, remarks: Sequence[str] = (), *, step: float = _TIMESTEP) -> str:
+    """Return the arm as MuJoCo's XML, for a time step [s]; motors are controlled by joint torque."""
     model, ranges, rotors = arm.model, arm.ranges, arm.rotors
     coupled = np.array((rotors != np.diag(np.diag(rotors))).any(axis=1))
     root = Node("mujoco", model=name)
     _comment(root, [*remarks, *load_remarks(model, arm.written_load)])
     _add(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
-    _add(root, "option", gravity=as_text(model.gravity), timestep=as_text(_TIMESTEP),
+    _add(root, "option", gravity=as_text(model.gravity), timestep=as_text(step),
          integrator="implicitfast")  # fmt: skip
     places, motors = {-1: _add(root, "worldbody")}, Node("actuator")
     for j, (joint_name, mass) in enumerate(zip(model.joint_names, arm.bodies, strict=True)):
@@ -167,7 +167,7 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
             armature=as_text(0.0 if coupled[j] else rotors[j, j]),
             damping=as_text(damping),
             frictionloss=as_text(max(0.0, friction.get("f0", 0.0))),
-            solreffriction=as_text([_FRICTION_TIME, 1.0]),
+            solreffriction=as_text([_FRICTION_STEPS * step, 1.0]),
             stiffness=as_text(stiffness) if stiffness else None,
             springref=as_text(rest) if stiffness else None,
             range=as_text([lower, upper]) if limited else None,
@@ -176,7 +176,7 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
         _add(motors, "motor", name=joint_name, joint=joint_name, ctrlrange=effort)
         for frame, place in arm.fixed(j).items():
             _add(link, "site", name=frame, **_pose(*place))
-    _tendons(root, arm, coupled)
+    _tendons(root, arm, coupled, step)
     root.append(motors)
     return _text(root)
 
@@ -297,6 +297,16 @@ def _left_out(form: Format, arm: Arm, motion: Motion) -> dict[str, Array]:
     return left
 
 
+def unsupported_torque(arm: Arm, motion: Motion, form: str = "mjcf") -> Array:
+    """Return the torque (m, n) of all parts that a format does not support, along a motion.
+
+    Without dry friction at reversals, which every simulator has in its own way.
+    """
+    left = _left_out(FORMATS[form], arm, motion)
+    parts = [torque for name, torque in left.items() if name != _REVERSALS]
+    return np.asarray(np.sum([np.zeros(motion.position.shape), *parts], axis=0))
+
+
 def _supported(form: Format, arm: Arm, motion: Motion) -> Array:
     """Return the torque (m, n) of the parts that a format supports, without dry friction."""
     parts = [torque for _, torque, supported in _parts(form, arm, motion) if supported]
@@ -393,7 +403,7 @@ FORMATS: Final[Mapping[str, Format]] = {
 """Formats by name."""
 
 
-def _tendons(root: Node, arm: Arm, coupled: NDArray[np.bool_]) -> None:
+def _tendons(root: Node, arm: Arm, coupled: NDArray[np.bool_], step: float) -> None:
     """Add inertia and friction of coupled motors as fixed tendons."""
     names, friction = arm.model.joint_names, arm.model.friction
     tendons = Node("tendon")
@@ -416,7 +426,7 @@ def _tendons(root: Node, arm: Arm, coupled: NDArray[np.bool_]) -> None:
             share,
             damping=as_text(row.get("f1", 0.0)),
             frictionloss=as_text(max(0.0, row.get("f0", 0.0))),
-            solreffriction=as_text([_FRICTION_TIME, 1.0]),
+            solreffriction=as_text([_FRICTION_STEPS * step, 1.0]),
         )
     if len(tendons):
         root.append(tendons)
