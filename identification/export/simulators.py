@@ -73,6 +73,8 @@ class Arm:
     # torque of each gear (n,) [N·m, N] at which friction that grows with it is written, see
     # :func:`identification.export.friction.median_load`; None: zero
     load: Array | None = field(default=None)
+    #: whether bodies that cannot exist are changed by MuJoCo, for nominal arms
+    balanced: bool = False
 
     @property
     def written_load(self) -> Array:
@@ -129,12 +131,13 @@ class Arm:
 
 
 def mjcf(arm: Arm, name: str, remarks: Sequence[str] = (), *, step: float = _TIMESTEP) -> str:
-    """Return the arm as MuJoCo's XML, for a time step [s]; motors are controlled by joint torque."""
+    """Return the arm as MuJoCo's XML with a time step [s]; motors are controlled by torque."""
     model, ranges, rotors = arm.model, arm.ranges, arm.rotors
     coupled = np.array((rotors != np.diag(np.diag(rotors))).any(axis=1))
     root = Node("mujoco", model=name)
     _comment(root, [*remarks, *load_remarks(model, arm.written_load)])
-    _add(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
+    _add(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false",
+         balanceinertia="true" if arm.balanced else None)  # fmt: skip
     _add(root, "option", gravity=as_text(model.gravity), timestep=as_text(step),
          integrator="implicitfast")  # fmt: skip
     places, motors = {-1: _add(root, "worldbody")}, Node("actuator")

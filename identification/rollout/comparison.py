@@ -93,9 +93,7 @@ def simulate(
     """
     windows = motion.windows
     simulated = SimulatedArm.of(arm, windows.step, feedback)
-    found = simulated.simulate(
-        windows.position[:, 0], windows.start, motion.inputs(arm, extra)
-    )
+    found = simulated.simulate(windows.position[:, 0], windows.start, motion.inputs(arm, extra))
     return found[:, horizon_rows(windows)]
 
 
@@ -136,7 +134,7 @@ class Errors:
 def errors_of(positions: Array, measured: Array, tool: ToolFrame) -> Errors:
     """Return the errors of simulated positions (w, h, n)."""
     difference = np.nan_to_num(positions - measured, nan=LARGEST_ERROR)
-    stable = np.isfinite(positions).all(axis=2)
+    stable = np.asarray(np.isfinite(positions).all(axis=2))
     distances = np.full(len(HORIZONS), np.nan)
     for k in range(len(HORIZONS)):
         rows = stable[:, k]
@@ -211,13 +209,15 @@ class ResidualTorque:
     steps: int  #: number K of steps of a window
 
     @classmethod
-    def of(cls, arm: Arm, values: Array, fitted: Sequence[Samples], windows: Windows) -> ResidualTorque:
+    def of(
+        cls, arm: Arm, values: Array, fitted: Sequence[Samples], windows: Windows
+    ) -> ResidualTorque:
         """Return measured minus predicted torque of parameters (p,)."""
         found = []
         for samples in fitted:
             residual = samples.torque - samples.predicted_torque(arm.model, values)
-            for one in stretches_of(samples, np.zeros_like(samples.torque), windows.step):
-                found.append(one.mean_about_instants(residual[one.part]))
+            parts = stretches_of(samples, np.zeros_like(samples.torque), windows.step)
+            found += [one.mean_about_instants(residual[one.part]) for one in parts]
         return cls(tuple(one for one in found if len(one) >= windows.steps), windows.steps)
 
     def draw(self, count: int, random: np.random.Generator) -> Array | float:

@@ -72,9 +72,7 @@ def identify_servo(stretches: Sequence[Stretch], step: float) -> Servo:
     return servo
 
 
-def _gains_at(
-    stretches: Sequence[Stretch], delay: float, step: float
-) -> tuple[float, Servo]:
+def _gains_at(stretches: Sequence[Stretch], delay: float, step: float) -> tuple[float, Servo]:
     """Return the share of the torque's variance that is left over, and the gains."""
     rows = round(BLOCK / step)
     errors, rates, torques = [], [], []

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -95,7 +97,7 @@ class SimulatedArm:
         applied = np.empty_like(force)
         applied[:, :, self.order] = force
         data = [mujoco.MjData(self.model) for _ in range(os.cpu_count() or 1)]
-        with np.errstate(all="ignore"):
+        with _without_messages(mujoco):
             states, _ = rollout.rollout(
                 self.model,
                 data,
@@ -105,6 +107,17 @@ class SimulatedArm:
             )
         position = states[:, :, 1 + self.order]
         return _without_unstable(position, inputs.position)
+
+
+@contextmanager
+def _without_messages(mujoco: Any) -> Iterator[None]:
+    """Keep MuJoCo from printing and logging what is counted: unstable simulations."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _without_unstable(position: Array, reference: Array) -> Array:

@@ -86,10 +86,7 @@ class Windows:
     def start(self) -> Array:
         """Measured velocity half a step before each window (w, n) [rad/s or m/s]."""
         return np.array(
-            [
-                self.stretches[k].before[row]
-                for k, row in zip(self.stretch, self.first, strict=True)
-            ]
+            [self.stretches[k].before[row] for k, row in zip(self.stretch, self.first, strict=True)]
         )
 
     @property
@@ -150,9 +147,7 @@ def mean_about(time: Array, values: Array, grid: Array) -> Array:
     return np.asarray(np.diff(at, axis=0) / step)
 
 
-def windows_of(
-    stretches: Sequence[Stretch], step: float, horizon: float, stride: float
-) -> Windows:
+def windows_of(stretches: Sequence[Stretch], step: float, horizon: float, stride: float) -> Windows:
     """Return windows of a horizon [s] that start every `stride` seconds.
 
     Raises:
