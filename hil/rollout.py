@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError
 
 from hil.cell import Cell
 from hil.errors import InputError
-from hil.exporting import arm_of, consistent_of
+from hil.exporting import arm_of, consistent_of, ensemble_of
 from hil.files import write_files
 from hil.identify import Identification
 from hil.identify.cell_context import nominal_of
@@ -23,7 +23,7 @@ from hil.progress import Reporter
 from hil.reading import read_text
 from hil.results import Frozen, Known
 from identification import IdentificationError, Samples
-from identification.estimators.ensemble import Ensemble, draw_ensemble
+from identification.estimators.ensemble import Ensemble
 from identification.export.simulators import Arm
 from identification.model.pseudo_inertia import margin
 from identification.rollout.comparison import (
@@ -335,30 +335,6 @@ def _nominal(
     except IdentificationError as error:
         return None, str(error), []
     return ArmErrors.of_errors(errors_of(positions, measured, tool)), "", notes
-
-
-def ensemble_of(found: Identification, count: int, seed: int) -> Ensemble:
-    """Draw arms from the posterior of an identification.
-
-    Raises:
-        InputError: it has another estimator than a posterior.
-    """
-    estimation = found.estimation
-    if estimation.estimator not in ("auto", "prior"):
-        raise InputError(
-            found.paths[0],
-            f"the estimator {estimation.estimator} has no posterior to draw arms from",
-            field="--estimator",
-            remedy="use auto or prior",
-        )
-    return draw_ensemble(
-        found.cell.model,
-        estimation.posterior.prior,
-        estimation.stated,
-        estimation.result.factor,
-        count,
-        seed,
-    )
 
 
 def _simulated_ensemble(

@@ -1,4 +1,4 @@
-"""The identified arm for simulators: MuJoCo's XML (MJCF) and URDF."""
+"""The identified arm for simulators: MuJoCo's XML (MJCF), URDF, SDF and pinocchio's archive."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import Any, Final, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.export.friction import equivalent_coulomb, load_remarks
+from identification.export.sdf import MissingDrakeError, drake_torque, sdf
 from identification.export.urdf import WriteBackError, as_text, comment_text, rnea, write_urdf
 from identification.model.elements import TorsionSpring
 from identification.model.friction import (
@@ -191,6 +193,25 @@ def urdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     return write_urdf(arm.urdf, arm.model, arm.standard, friction, remarks, arm.load)
 
 
+def pinocchio_archive(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
+    """Return the arm as the text archive of pinocchio's model.
+
+    ``model = pinocchio.Model(); model.loadFromString(text)`` reads it, with armature, damping and
+    dry friction. It has no place for remarks.
+    """
+    del remarks
+    described = urdf(arm, name)
+    model = pinocchio_model(described, arm.model.locked)
+    model.name = name
+    model.gravity.linear = arm.model.gravity
+    dry = np.array([max(0.0, row.get("f0", 0.0)) for row in arm.friction[: arm.model.n_joints]])
+    model.armature[:] = np.diag(arm.rotors)
+    model.damping[:] = [row.get("f1", 0.0) for row in arm.friction[: arm.model.n_joints]]
+    model.friction[:] = dry
+    model.upperDryFrictionLimit[:], model.lowerDryFrictionLimit[:] = dry, -dry
+    return str(model.saveToString())
+
+
 class Format(NamedTuple):
     """A file format and the parts of the model that it supports."""
 
@@ -201,6 +222,7 @@ class Format(NamedTuple):
     friction: tuple[FrictionTerm, ...] = (COULOMB, TANH, VISCOUS)
     # rotor inertias, inertia and friction of coupled motors, torsion springs, a stated payload
     drives: bool = False
+    rotors: bool = False  # rotor inertias alone
 
 
 class Comparison(NamedTuple):
@@ -219,8 +241,26 @@ def compare(text: str, form: Format, arm: Arm, motion: Motion) -> Comparison:
     Raises:
         WriteBackError: the torque differs at some random state.
         MissingMujocoError: the format needs MuJoCo, which is not installed.
+        MissingDrakeError: likewise Drake.
     """
-    states = random_states(arm)
+    difference = read_back(text, form, arm)
+    left = {name: _rms(torque) for name, torque in _left_out(form, arm, motion).items()}
+    if form.read is _mujoco_torque:
+        dry = _mujoco_torque(text, arm, motion, friction=True) - _supported(form, arm, motion)
+        left[_REVERSALS] = _rms(dry - _dry(arm, motion))
+    whole = arm.model.torque(arm.values, *motion[1:5]) + arm.model.load_torque(*motion[1:4])
+    return Comparison(difference, _rms(whole), {k: v for k, v in left.items() if v.any()})
+
+
+def read_back(text: str, form: Format, arm: Arm, count: int = STATES) -> float:
+    """Return the largest difference of a text's torque from the arm's, see :class:`Comparison`.
+
+    Raises:
+        WriteBackError: the torque differs at some random state.
+        MissingMujocoError: the format needs MuJoCo, which is not installed.
+        MissingDrakeError: likewise Drake.
+    """
+    states = random_states(arm, count)
     expected = _supported(form, arm, states)
     error = np.abs(form.read(text, arm, states) - expected).max(axis=0)
     largest = np.abs(expected).max(axis=0)
@@ -231,12 +271,11 @@ def compare(text: str, form: Format, arm: Arm, motion: Motion) -> Comparison:
             f"read back, the torque of joint {joint!r} differs by {difference:.2g} of its"
             " largest one"
         )
-    left = {name: _rms(torque) for name, torque in _left_out(form, arm, motion).items()}
-    if form.read is _mujoco_torque:
-        dry = _mujoco_torque(text, arm, motion, friction=True) - _supported(form, arm, motion)
-        left[_REVERSALS] = _rms(dry - _dry(arm, motion))
-    whole = arm.model.torque(arm.values, *motion[1:5]) + arm.model.load_torque(*motion[1:4])
-    return Comparison(difference, _rms(whole), {k: v for k, v in left.items() if v.any()})
+    return difference
+
+
+MISSING: Final = (MissingMujocoError, MissingDrakeError)
+"""Errors of formats whose reader is not installed."""
 
 
 def random_states(arm: Arm, count: int = STATES) -> Motion:
@@ -270,7 +309,7 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[tuple[str, Array,
             yield description, torque, kind in form.friction
     diagonal = np.diag(np.diag(arm.rotors))
     motors = [one.motor and not (form.drives and one.term.label in _DRY_LABELS) for one in terms]
-    yield "rotor inertias", qdd @ diagonal, form.drives
+    yield "rotor inertias", qdd @ diagonal, form.drives or form.rotors
     yield "inertia of coupled motors", qdd @ (arm.rotors - diagonal), form.drives
     yield "friction of coupled motors", _friction(arm, motion, motors), form.drives
     yield (
@@ -359,6 +398,14 @@ def _pinocchio_torque(text: str, arm: Arm, motion: Motion) -> Array:
     return rnea(model, *motion[1:4]) + np.asarray(model.damping) * motion.velocity
 
 
+def _archive_torque(text: str, arm: Arm, motion: Motion) -> Array:
+    """Return the torques of bodies, armature and damping of a pinocchio archive."""
+    del arm
+    model = pin.Model()
+    model.loadFromString(text)
+    return rnea(model, *motion[1:4]) + np.asarray(model.damping) * motion.velocity
+
+
 def _mujoco_torque(text: str, arm: Arm, motion: Motion, *, friction: bool = False) -> Array:
     """Return the torques of MuJoCo's inverse dynamics."""
     mujoco = load_mujoco()
@@ -402,6 +449,8 @@ FORMATS: Final[Mapping[str, Format]] = {
         drives=True,
     ),
     "urdf": Format(".urdf", urdf, _pinocchio_torque),
+    "sdf": Format(".sdf", sdf, drake_torque),
+    "pinocchio": Format(".pinocchio", pinocchio_archive, _archive_torque, rotors=True),
 }
 """Formats by name."""
 
