@@ -299,7 +299,7 @@ _REVERSALS: Final = "dry friction between the two directions (velocity reversals
 def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[tuple[str, Array, bool]]:
     """Yield description and torque (m, n) of each part, and whether the format supports it."""
     model, q, qdd, terms = arm.model, motion.position, motion.acceleration, arm.model.friction.terms
-    yield "the links", _rigid(arm, motion), True
+    yield "the links", rigid_torque(arm, motion), True
     for kind in model.friction.kinds:
         if kind not in _DRY or kind not in form.friction:
             of_kind = [one.term.label == kind.label and not one.motor for one in terms]
@@ -333,7 +333,7 @@ def _left_out(form: Format, arm: Arm, motion: Motion) -> dict[str, Array]:
     left[_REVERSALS] = _dry(arm, motion) - _dry(arm, motion, jumps=True)
     base = np.where(np.arange(model.n_parameters) < model.base.rank, arm.values, 0.0)
     whole = model.torque(base, *motion[1:5])
-    rounded = whole - _rigid(arm, motion) - motion.acceleration @ arm.rotors
+    rounded = whole - rigid_torque(arm, motion) - motion.acceleration @ arm.rotors
     if np.abs(rounded).max() > AGREES * np.abs(whole).max():
         left["effect of rounded angles of the URDF on the base parameters"] = rounded
     return left
@@ -355,8 +355,8 @@ def _supported(form: Format, arm: Arm, motion: Motion) -> Array:
     return np.asarray(np.sum(parts, axis=0))
 
 
-def _rigid(arm: Arm, motion: Motion) -> Array:
-    """Return the torque (m, n) of the links."""
+def rigid_torque(arm: Arm, motion: Motion) -> Array:
+    """Return the torque (m, n) of the links, without the payload."""
     model = arm.model
     plan = RegressorPlan.of_bodies(model.chain, model.gravity)
     return plan.torque(arm.standard[model.layout.links].reshape(-1), *motion[1:4])

@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.distributions import student_limit
-from identification.export.simulators import Arm, unsupported_torque
+from identification.export.simulators import Arm, rigid_torque, unsupported_torque
 from identification.model.kinematics import pinocchio_model
 from identification.model.robot import RobotModel
 from identification.rollout.servo import Servo, command_of
@@ -44,7 +44,7 @@ class RecordedMotion:
         stretches = windows.stretches
         beside = windows.cut(
             [
-                _removed(one, samples, arm) - unsupported_torque(arm, one.motion)
+                _removed(one, samples, arm) + _late(one, arm) - unsupported_torque(arm, one.motion)
                 for one, samples in zip(stretches, self.samples, strict=True)
             ]
         )
@@ -112,6 +112,14 @@ def _removed(stretch: Stretch, samples: Samples, arm: Arm) -> Array:
     whole = model.torque(arm.values, *motion[1:5], load)
     removed = whole - samples.predicted_torque(model, arm.values)
     return stretch.mean_about_instants(removed[stretch.part])
+
+
+def _late(stretch: Stretch, arm: Arm) -> Array:
+    """Return what centrifugal torques (g, n) lack, which MuJoCo computes half a step early."""
+    before = stretch.motion._replace(velocity=stretch.before)
+    late = rigid_torque(arm, before) - rigid_torque(arm, stretch.motion)
+    load = arm.model.load_torque
+    return np.asarray(late + load(*before[1:4]) - load(*stretch.motion[1:4]))
 
 
 def _shifted(values: Array, instants: int) -> Array:

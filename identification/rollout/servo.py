@@ -77,9 +77,10 @@ def _gains_at(stretches: Sequence[Stretch], delay: float, step: float) -> tuple[
     rows = round(BLOCK / step)
     errors, rates, torques = [], [], []
     for one in stretches:
-        position, rate = command_of(one, delay)
+        position, _ = command_of(one, delay)
+        rate = np.gradient(position, step, axis=0)
         errors += _without_means(position - one.motion.position, rows)
-        rates += _without_means(rate - one.after, rows)
+        rates += _without_means(rate - one.motion.velocity, rows)
         torques += _without_means(one.torque, rows)
     if not errors:
         raise NoServoError(f"no stretch lasts {BLOCK:g} s")
