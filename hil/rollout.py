@@ -47,7 +47,7 @@ from identification.rollout.windows import STEP, windows_of
 
 Array = NDArray[np.float64]
 
-ROLLOUT: Final = "rollout.json"
+ROLLOUT, PICTURE = "rollout.json", "rollout.png"
 MOST_WINDOWS: Final = 1000
 """Windows that are simulated at most."""
 _FEW_WINDOWS: Final = 200  # of which the error of each sample is computed
@@ -159,7 +159,7 @@ class RolloutResult(Frozen):
         lines = [
             f"{self.windows} windows of {self.cell}, driven by {self.drive}",
             *self.notes,
-            f"position error (rms){columns}",
+            f"{'position error (rms)':42}{columns}",
         ]
         arms = {"identified": self.identified, "nominal": self.nominal}
         for name, arm in arms.items():
@@ -167,9 +167,9 @@ class RolloutResult(Frozen):
                 continue
             for joint, label in enumerate(self.joint_names):
                 row = "".join(f"{_milli(at[joint]):>10}" for at in arm.joints)
-                lines.append(f"{name:10} {label[:18]:18} [mrad or mm]{row}")
+                lines.append(_row(f"{name:10} {label[:17]:17} [mrad or mm]", row))
             tool = "".join(f"{_milli(at):>10}" for at in arm.tool)
-            lines.append(f"{name:10} {self.tool[:18]:18} [mm]        {tool}")
+            lines.append(_row(f"{name:10} {self.tool[:17]:17} [mm]", tool))
             if arm.unstable:
                 lines.append(
                     f"{name}: unstable in {arm.unstable} of {self.windows} windows, which count"
@@ -180,12 +180,12 @@ class RolloutResult(Frozen):
                 [arm.overall(k) for arm in self.sample_errors] for k in range(len(self.horizons))
             ]
             row = "".join(f"{_milli(float(np.median(errors))):>10}" for errors in spread)
-            lines.append(f"{self.samples} samples of the posterior, median [mrad or mm]{row}")
+            lines.append(_row(f"{self.samples} samples, median [mrad or mm]", row))
             unstable = sum(arm.unstable for arm in self.sample_errors)
             if unstable:
                 lines.append(f"samples: {unstable} of their windows are unstable")
             shares = "".join(f"{float(np.mean(at)):>10.1%}" for at in self.inside)
-            lines.append(f"measured positions in the 95 % band of the samples:{shares}")
+            lines.append(_row("measured positions in their 95 % band", shares))
             if not _WANTED[0] <= self.band <= _WANTED[1]:
                 lines.append(
                     f"warning: {self.band:.1%} at {self.horizons[_BAND]:g} s is not"
@@ -201,6 +201,10 @@ class RolloutResult(Frozen):
         except (OSError, ValueError, ValidationError) as error:
             problem = f"cannot be read as a rollout ({str(error).splitlines()[0]})"
             raise InputError(path, problem, remedy="run `hil rollout` again") from error
+
+
+def _row(head: str, figures: str) -> str:
+    return f"{head:42}{figures}"
 
 
 def _milli(value: float | None) -> str:
@@ -264,7 +268,7 @@ def _motion_of(
         windows = windows_of(stretches, STEP, HORIZONS[-1], _STRIDE).some(MOST_WINDOWS)
     except NoServoError as error:
         remedy = "omit --servo: the recorded torque drives the arm then"
-        raise InputError(found.paths[-1], str(error), field="--servo", remedy=remedy) from error
+        raise InputError(found.paths[0], str(error), field="--servo", remedy=remedy) from error
     except IdentificationError as error:
         remedy = f"hold out a longer recording (--predict), or fit less of it; {HORIZONS[-1]:g} s"
         raise InputError(found.paths[-1], str(error), remedy=f"{remedy} are needed") from error

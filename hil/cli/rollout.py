@@ -18,9 +18,11 @@ from hil.cli.identify_options import EstimatorOption, Identifying, servo_from
 from hil.cli.verdict import NOT_GOOD
 from hil.files import make_folder
 from hil.identify import identify_paths
+from hil.plots.plan_picture import save
+from hil.plots.rollout_picture import draw_rollout
 from hil.progress import reporter as make_reporter
 from hil.progress import say
-from hil.rollout import ROLLOUT, RolloutOptions, roll_out, write_rollout
+from hil.rollout import PICTURE, ROLLOUT, RolloutOptions, roll_out, write_rollout
 
 
 @with_options(Identifying, "how")
@@ -44,12 +46,12 @@ def rollout(
     Windows start at measured states; after 0.1, 0.2, 0.5 and 1 s the positions are compared with
     the measured ones, for the identified arm, the nominal one, and arms drawn from the posterior.
     The arm is driven by the recorded torque and a light feedback, or by a servo. Writes
-    rollout.json. Exit status 5 if the model is not good.
+    rollout.json and rollout.png. Exit status 5 if the model is not good.
 
     **Example:** `hil rollout runs/demo`
 
     Options:
-        output: Folder for rollout.json. Default: the campaign folder; none for single archives.
+        output: Folder for rollout.json and rollout.png. Default: the campaign folder; none for single archives.
         predict: Archive to simulate and not to fit, of any kind (repeatable).
         samples: Arms drawn from the posterior.
         seed: Of the draws.
@@ -71,12 +73,13 @@ def rollout(
     result = roll_out(found, asked, reporter)
     if output is not None:
         write_rollout(output, result)
+        save(draw_rollout(result), output / PICTURE)
     if json:
         print_json(result.model_dump(mode="json"))
     else:
         for line in result.lines()[-1 if quiet else 0 :]:
             say(line)
         if output is not None:
-            reporter.say(f"written: {output / ROLLOUT}")
+            reporter.say(f"written to {output}: {ROLLOUT}, {PICTURE}")
     if not found.verdict.good:
         raise typer.Exit(NOT_GOOD)

@@ -79,9 +79,11 @@ def _gains_at(stretches: Sequence[Stretch], delay: float, step: float) -> tuple[
     for one in stretches:
         position, _ = command_of(one, delay)
         rate = np.gradient(position, step, axis=0)
-        errors += _without_means(position - one.motion.position, rows)
-        rates += _without_means(rate - one.motion.velocity, rows)
-        torques += _without_means(one.torque, rows)
+        # The same rows for every delay: those whose command is known.
+        known = slice(round(LONGEST_DELAY / step) + 1, -1)
+        errors += _without_means((position - one.motion.position)[known], rows)
+        rates += _without_means((rate - one.motion.velocity)[known], rows)
+        torques += _without_means(one.torque[known], rows)
     if not errors:
         raise NoServoError(f"no stretch lasts {BLOCK:g} s")
     error, rate, torque = (np.concatenate(part) for part in (errors, rates, torques))

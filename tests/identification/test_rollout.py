@@ -40,9 +40,7 @@ NOTHING = Feedback(np.zeros(N), np.zeros(N))
 def an_arm(coulomb: float = 0.0) -> Arm:
     standard = MODEL.nominal
     standard[MODEL.layout.rotors] = (0.4, 0.1)
-    friction = [
-        {"f0": coulomb, "f1": 2.0}.get(term.symbol, 0.0) for term in MODEL.friction.terms
-    ]
+    friction = [{"f0": coulomb, "f1": 2.0}.get(term.symbol, 0.0) for term in MODEL.friction.terms]
     values = np.concatenate([MODEL.base.grouping @ standard, friction])
     return Arm(URDF, MODEL, standard, values, NO_LIMITS)
 
@@ -95,7 +93,7 @@ def test_the_joint_that_moves_the_tool_leads() -> None:
     arm = replace(an_arm(), urdf=URDF.replace("</robot>", tool))
     arm = replace(arm, model=RobotModel.from_urdf(arm.urdf, friction=FrictionLaw(third=None)))
     measured = np.zeros((4, N))
-    off = measured + [0.001, 0.2]
+    off = measured + np.array([0.001, 0.2])
     assert leading_joint(off, measured, ToolFrame(arm)) == 1
     assert leading_joint(off[:, ::-1], measured, ToolFrame(arm)) == 0
 
