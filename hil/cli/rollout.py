@@ -51,7 +51,8 @@ def rollout(
     **Example:** `hil rollout runs/demo`
 
     Options:
-        output: Folder for rollout.json and rollout.png. Default: the campaign folder; none for single archives.
+        output: Folder for rollout.json and rollout.png. Default: the campaign folder; none for
+            single archives.
         predict: Archive to simulate and not to fit, of any kind (repeatable).
         samples: Arms drawn from the posterior.
         seed: Of the draws.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
+from matplotlib.figure import Figure
+from matplotlib.ticker import StrMethodFormatter
 
 from hil.plots import style
 from hil.report.drawing import label
@@ -34,7 +36,8 @@ def draw_rollout(result: RolloutResult) -> Figure:
         errors.set_xticks(result.horizons, [f"{h:g}" for h in result.horizons], minor=False)
         errors.set_xticks([], minor=True)
         errors.legend(fontsize=style.SMALL)
-        errors.set_title(label(f"{result.cell}: {result.windows} windows"))
+        errors.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        errors.set_title(f"{label(result.cell)}: {result.windows} windows")
         band.axhspan(88.0, 99.0, color=style.RULE)
         for joint, name in enumerate(result.joint_names):
             shares = [100.0 * at[joint] for at in result.inside]

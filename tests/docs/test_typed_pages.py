@@ -27,6 +27,7 @@ from hil.cli import app
 from hil.demo_link import free_port
 from hil.progress import Silent
 from hil.results import Results
+from hil.rollout import RolloutResult
 from tests.docs.typed import ROOT, commands
 from tests.hil.simulated_logs import simulate
 from tests.hil.test_payload_command import CENTRE, MASS, archive_of_currents
@@ -149,15 +150,25 @@ def test_simulators_run_what_was_exported(workplace: Path) -> None:
     cell = cell.with_campaign(repetitions=2, validation_runs=1)
     demo = Campaign.create(workplace / "runs" / "demo", cell, design(cell, Silent()))
     demo.run(unrehearsed=True, durable=False)
-    names: dict[str, object] = {}
+    ran = []
     for language, block in blocks(page("simulators.md")):
-        if language == "python":
-            exec(compile(block, "docs/simulators.md", "exec"), names)
-        else:
-            typed(block)
-    assert matplotlib.image.imread("rollout.png").std() > 0.0
-    error = abs(names["simulated"] - names["position"])  # type: ignore[operator]
-    assert error.max() < 0.1, error.max()  # rad: of a motion of more than one
+        assert language == "sh"
+        ran += typed(block)
+    assert ran == ["demo", "identify", "export", "rollout", "export"]
+    found = RolloutResult.load(Path("runs/demo/rollout.json"))
+    assert found.ratio is not None
+    assert found.ratio[2] <= 0.5  # at 0.5 s
+    assert matplotlib.image.imread("runs/demo/rollout.png").std() > 0.0
+    assert len([*Path("runs/demo/identified_ensemble").iterdir()]) == 20
+    archives = {path.name for path in Path("runs/demo/archives").iterdir()}
+    copies = {path.name for path in Path("runs/demo/annotated").iterdir()}
+    assert copies < archives
+    loader = re.findall(r"^```text\n(import .*?)^```", page("simulators.md"), re.M | re.S)[0]
+    assert len(loader.splitlines()) == 3
+    typed("hil export runs/demo --to pinocchio")
+    names: dict[str, object] = {}
+    exec(loader, names)
+    assert (names["model"].armature > 0.0).all()  # type: ignore[attr-defined]
 
 
 class TestFirstHour:

@@ -70,7 +70,7 @@ def test_layouts_of_viewers_name_topics_and_fields_of_an_archive(excitation: Pat
     drawn = re.findall(r'"(/\w+)\.(\w+)\[\d\]"', texts["foxglove.json"])
     drawn += re.findall(r'name="(/\w+)/\w+/(\w+)"', texts["plotjuggler.xml"])
     assert len(drawn) == 2 * 42
-    fields |= {topic: fields["/joint_states"] for topic in (PREDICTED, RESIDUAL)}
+    fields |= dict.fromkeys((PREDICTED, RESIDUAL), fields["/joint_states"])
     assert all(re.search(rf"^\S+ {field}$", fields[topic], re.MULTILINE) for topic, field in drawn)
     panels = json.loads(texts["foxglove.json"])["configById"]
     named = {*panels["3D!arm"]["topics"], panels["RosOut!events"]["topicToRender"]}
