@@ -155,17 +155,17 @@ def test_simulators_run_what_was_exported(workplace: Path) -> None:
         assert language == "sh"
         ran += typed(block)
     assert ran == ["demo", "identify", "export", "rollout", "export"]
-    found = RolloutResult.load(Path("runs/demo/rollout.json"))
+    found = RolloutResult.load(Path("runs/simulators/rollout.json"))
     assert found.ratio is not None
     assert found.ratio[2] <= 0.5  # at 0.5 s
-    assert matplotlib.image.imread("runs/demo/rollout.png").std() > 0.0
-    assert len([*Path("runs/demo/identified_ensemble").iterdir()]) == 20
-    archives = {path.name for path in Path("runs/demo/archives").iterdir()}
-    copies = {path.name for path in Path("runs/demo/annotated").iterdir()}
+    assert matplotlib.image.imread("runs/simulators/rollout.png").std() > 0.0
+    assert len([*Path("runs/simulators/identified_ensemble").iterdir()]) == 20
+    archives = {path.name for path in Path("runs/simulators/archives").iterdir()}
+    copies = {path.name for path in Path("runs/simulators/annotated").iterdir()}
     assert copies < archives
     loader = re.findall(r"^```text\n(import .*?)^```", page("simulators.md"), re.M | re.S)[0]
     assert len(loader.splitlines()) == 3
-    typed("hil export runs/demo --to pinocchio")
+    typed("hil export runs/simulators --to pinocchio")
     names: dict[str, object] = {}
     exec(loader, names)
     assert (names["model"].armature > 0.0).all()  # type: ignore[attr-defined]

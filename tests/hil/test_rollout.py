@@ -1,4 +1,4 @@
-"""`hil rollout`, `hil export --ensemble` and `hil identify --annotate` on an identified campaign."""
+"""Rollouts, ensembles and annotated archives of an identified campaign, from the command line."""
 
 import json
 import shutil
