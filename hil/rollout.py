@@ -358,10 +358,10 @@ def _simulated_ensemble(
     alone, disturbed = [], []
     with reporter.task("simulating", len(ensemble)) as task:
         for standard, parameters in zip(ensemble.standard, ensemble.values, strict=True):
-            drawn = replace(arm, standard=standard, values=parameters)
-            alone.append(simulate(drawn, few, feedback))
+            sample = replace(arm, standard=standard, values=parameters)
+            alone.append(simulate(sample, few, feedback))
             torque = residual.draw(len(motion.windows), random)
-            disturbed.append(simulate(drawn, motion, feedback, -1.0 * torque))
+            disturbed.append(simulate(sample, motion, feedback, -1.0 * torque))
             task.advance(1)
     return ensemble, (np.stack(alone), np.stack(disturbed))
 

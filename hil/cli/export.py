@@ -71,8 +71,8 @@ def export(
     if ensemble is not None:
         target = output or default_output(archives, to, ensemble=True)
         identified = identify_paths(archives, reporter, options)
-        drawn = export_ensemble(identified, target, to, ensemble, seed)
-        print_export(drawn, json=json, quiet=quiet)
+        exported_ensemble = export_ensemble(identified, target, to, ensemble, seed)
+        print_export(exported_ensemble, json=json, quiet=quiet)
         if not identified.verdict.good:
             raise typer.Exit(NOT_GOOD)
         return

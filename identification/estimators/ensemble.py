@@ -111,26 +111,26 @@ class _Draws:
         pull = np.linalg.pinv(combined / size[:, None], rcond=_RANK)
         start = self.prior.mean + self._start
         change = self.estimate.values + scale * self._change - start @ combinations.T
-        drawn = start + (change / size @ pull.T) * self._deviations
+        arms = start + (change / size @ pull.T) * self._deviations
         unseen = _not_combined(combined / size[:, None]) / _or_one(self._deviations)
         rows = np.concatenate([self._inverse_root @ combinations, unseen])
-        program, moved = Program.of(model, self.prior), np.zeros(len(drawn), dtype=np.bool_)
-        for k, arm in enumerate(drawn):
+        program, moved = Program.of(model, self.prior), np.zeros(len(arms), dtype=np.bool_)
+        for k, arm in enumerate(arms):
             if not is_consistent(model, arm):
                 moved[k] = True
-                drawn[k] = without_rounding(model, program.solve(rows, rows @ arm))
-        values = drawn @ combinations.T
+                arms[k] = without_rounding(model, program.solve(rows, rows @ arm))
+        values = arms @ combinations.T
         spread = _spread(factor, values, self.estimate.covariance)
-        return Ensemble(drawn[:, : model.layout.size], values, moved, spread, scale)
+        return Ensemble(arms[:, : model.layout.size], values, moved, spread, scale)
 
 
 def _spread(factor: Factor, values: Array, covariance: Array) -> Array:
     """Return the spread of the torque of each joint (n,) over that of a covariance (p, p)."""
     change = values - values.mean(axis=0)
     grams = factor.gram[:, :-1, :-1]
-    drawn = np.einsum("ka,jab,kb->j", change, grams, change) / max(len(values) - 1, 1)
+    scatter = np.einsum("ka,jab,kb->j", change, grams, change) / max(len(values) - 1, 1)
     stated = np.einsum("jab,ab->j", grams, covariance)
-    return np.where(stated > 0.0, np.sqrt(drawn / np.where(stated > 0.0, stated, 1.0)), np.nan)
+    return np.where(stated > 0.0, np.sqrt(scatter / np.where(stated > 0.0, stated, 1.0)), np.nan)
 
 
 def _balanced(normal: Array) -> Array:

@@ -58,14 +58,14 @@ def final_errors(arm: Arm, motion: RecordedMotion, feedback: Feedback = NOTHING)
     return errors_of(simulate(arm, motion, feedback), measured, ToolFrame(arm))
 
 
-def test_the_true_arm_moves_as_measured_and_to_second_order_in_the_step() -> None:
+def test_errors_of_the_true_arm_are_of_second_order() -> None:
     arm = an_arm()
     coarse, fine = (final_errors(arm, a_recording(arm, step)).joints for step in (0.01, 0.005))
     assert fine[:3].max() < 1e-3  # rad at 0.5 s, of a motion of one
     assert (coarse[2:] / fine[2:]).min() > 3.0
 
 
-def test_an_arm_with_other_masses_leaves_the_motion_with_the_horizon() -> None:
+def test_other_masses_leave_the_motion() -> None:
     arm = an_arm()
     motion = a_recording(arm, 0.005)
     heavier = replace(arm, standard=1.3 * arm.standard, values=1.3 * arm.values)
