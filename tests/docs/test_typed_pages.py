@@ -148,7 +148,7 @@ def test_simulators_run_what_was_exported(workplace: Path) -> None:
     pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
     cell = Cell.load(ROOT / "examples" / "two_joints" / "cell.toml")
     cell = cell.with_campaign(repetitions=2, validation_runs=1)
-    demo = Campaign.create(workplace / "runs" / "demo", cell, design(cell, Silent()))
+    demo = Campaign.create(workplace / "runs" / "simulators", cell, design(cell, Silent()))
     demo.run(unrehearsed=True, durable=False)
     ran = []
     for language, block in blocks(page("simulators.md")):
