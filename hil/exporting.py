@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -28,22 +29,26 @@ from hil.results import Results
 from identification import Samples
 from identification.errors import IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
+from identification.estimators.ensemble import Ensemble, draw_ensemble
 from identification.export.friction import median_load
 from identification.export.simulators import (
     FORMATS,
+    MISSING,
     STATES,
     Arm,
     Comparison,
-    MissingMujocoError,
+    Format,
     Ranges,
     compare,
+    read_back,
 )
 from identification.model.motion import Motion
 from identification.model.regressor import LINK_SYMBOLS
 
 Array = NDArray[np.float64]
-FormatName = Literal["mjcf", "urdf"]
+FormatName = Literal["mjcf", "urdf", "sdf", "pinocchio"]
 
+_ENSEMBLE_STATES: Final = 50  # random states at which each drawn arm is read back
 _MOST_ROWS: Final = 2000  # of the recorded motion, enough for root mean squares
 
 
@@ -163,21 +168,151 @@ def export_model(found: Identification | IdentifiedModel, output: Path, to: Form
     """
     model = found if isinstance(found, IdentifiedModel) else model_of(found)
     form, arm = FORMATS[to], model.arm
-    unknown = ", ".join(model.undetermined)
-    remarks = (
-        "Identified by hil; bodies are physically consistent parameters.",
-        *([f"Not determined by the data: {unknown}."] if unknown else []),
-        *(" ".join(f"{key}: {value}".split()) for key, value in model.provenance.items()),
-    )
     make_folder(output.parent)
-    text = form.write(arm, model.name, remarks)
+    text = form.write(arm, model.name, _remarks(model))
     try:
         comparison: Comparison | str = compare(text, form, arm, model.motion)
-    except MissingMujocoError as error:
+    except MISSING as error:
         comparison = str(error)
     write_files(output.parent, {output.name: text})
     units = tuple("N·m" if turns else "N" for turns in arm.model.chain.revolute)
     return Exported(output, arm.model.joint_names, units, comparison, model.verdict, model.origin)
+
+
+def _remarks(model: IdentifiedModel) -> tuple[str, ...]:
+    unknown = ", ".join(model.undetermined)
+    return (
+        "Identified by hil; bodies are physically consistent parameters.",
+        *([f"Not determined by the data: {unknown}."] if unknown else []),
+        *(" ".join(f"{key}: {value}".split()) for key, value in model.provenance.items()),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ExportedEnsemble:
+    """Summary of the written arms of an ensemble."""
+
+    path: Path  #: of the folder, or of the .npz file
+    ensemble: Ensemble
+    seed: int
+    joint_names: tuple[str, ...]
+    difference: float | str  #: largest difference read back, or why it was not
+    verdict: str
+
+    def lines(self) -> list[str]:
+        """Return the summary as lines of text."""
+        arms = self.ensemble
+        spread = ", ".join(f"{share:.2f}" for share in arms.spread)
+        pooled = float(np.sqrt(np.nanmean(arms.spread**2)))
+        lines = [
+            f"written: {len(arms)} arms drawn with seed {self.seed} in {self.path}",
+            f"moved to the nearest physically consistent arm: {np.count_nonzero(arms.moved)}",
+            "spread of their torque on the fitted motion over that of the stated intervals:"
+            f" {pooled:.2f} over all joints ({spread})",
+        ]
+        if isinstance(self.difference, str):
+            lines.append(f"warning: not read back: {self.difference}")
+        else:
+            lines.append(
+                f"read back: torque error at most {self.difference:.1e} of the joint's largest"
+                f" torque, at {_ENSEMBLE_STATES} random states of each arm"
+            )
+        return [*lines, self.verdict]
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the summary for JSON."""
+        read = not isinstance(self.difference, str)
+        return {
+            "path": str(self.path),
+            "joints": [*self.joint_names],
+            "arms": len(self.ensemble),
+            "seed": self.seed,
+            "moved": int(np.count_nonzero(self.ensemble.moved)),
+            "widened": self.ensemble.widened,
+            "spread": [None if np.isnan(one) else float(one) for one in self.ensemble.spread],
+            "read_back": self.difference if read else None,
+            "not_read_back": None if read else self.difference,
+            "verdict": self.verdict,
+        }
+
+
+def ensemble_of(found: Identification, count: int, seed: int) -> Ensemble:
+    """Draw arms from the posterior of an identification.
+
+    Raises:
+        InputError: it has another estimator than a posterior.
+    """
+    estimation = found.estimation
+    if estimation.estimator not in ("auto", "prior"):
+        raise InputError(
+            found.paths[0],
+            f"the estimator {estimation.estimator} has no posterior to draw arms from",
+            field="--estimator",
+            remedy="use auto or prior",
+        )
+    return draw_ensemble(
+        found.cell.model,
+        estimation.posterior.prior,
+        estimation.stated,
+        estimation.result.factor,
+        count,
+        seed,
+    )
+
+
+def export_ensemble(
+    found: Identification, output: Path, to: FormatName, count: int, seed: int
+) -> ExportedEnsemble:
+    """Write drawn arms as files in a folder, or as arrays if the output is an .npz file.
+
+    Raises:
+        InputError: there are no physically consistent parameters, or no posterior.
+        IdentificationError: an arm cannot be written, or reads back with other parameters.
+    """
+    model = model_of(found)
+    ensemble = ensemble_of(found, count, seed)
+    names = model.arm.model
+    difference: float | str = 0.0
+    if output.suffix == ".npz":
+        difference = "arrays have no reader"
+        content = BytesIO()
+        np.savez_compressed(
+            content,
+            standard=ensemble.standard,
+            standard_names=names.layout.names,
+            parameters=ensemble.values,
+            parameter_names=names.parameter_names,
+            joint_names=names.joint_names,
+            seed=seed,
+        )
+        make_folder(output.parent)
+        write_files(output.parent, {output.name: content.getvalue()})
+    else:
+        texts, difference = _ensemble_texts(model, ensemble, FORMATS[to], seed)
+        make_folder(output)
+        write_files(output, texts)
+    return ExportedEnsemble(output, ensemble, seed, names.joint_names, difference, model.verdict)
+
+
+def _ensemble_texts(
+    model: IdentifiedModel, ensemble: Ensemble, form: Format, seed: int
+) -> tuple[dict[str, str], float | str]:
+    """Return the files of the arms, and their largest difference when read back."""
+    texts, difference, missing = dict[str, str](), 0.0, ""
+    digits = len(str(len(ensemble)))
+    for k, (standard, values) in enumerate(
+        zip(ensemble.standard, ensemble.values, strict=True), start=1
+    ):
+        arm = replace(model.arm, standard=standard, values=values)
+        remark = f"Arm {k} of {len(ensemble)} drawn from the posterior with seed {seed}."
+        text = form.write(arm, model.name, (remark, *_remarks(model)))
+        texts[f"arm_{k:0{digits}}{form.suffix}"] = text
+        if not missing:
+            try:
+                difference = max(difference, read_back(text, form, arm, _ENSEMBLE_STATES))
+            except MISSING as error:
+                missing = str(error)
+    return texts, missing or difference
 
 
 def model_for_export(
@@ -282,9 +417,11 @@ def _stored_values(cell: Cell, content: Mapping[str, Any]) -> tuple[Cell, Array,
     return cell, standard, values
 
 
-def default_output(sources: Sequence[Path], to: FormatName) -> Path:
+def default_output(sources: Sequence[Path], to: FormatName, *, ensemble: bool = False) -> Path:
     """Return the default path: in the campaign folder, or in the working directory."""
     folder = sources[0] if sources[0].is_dir() else Path()
+    if ensemble:
+        return folder / "identified_ensemble"
     return folder / f"identified{FORMATS[to].suffix}"
 
 

@@ -1,5 +1,6 @@
 """Write `arm.rbl`: `rerun arm.rbl runs/demo/archives/validation_000_a1.mcap` opens both.
 
+Predicted and residual torque are in the copies of `hil identify --annotate`.
 Needs `pip install rerun-sdk`; hil itself does not.
 """
 
@@ -10,6 +11,8 @@ import rerun.blueprint as rrb
 PLOTS = {
     "position, velocity and torque": "/joint_states",
     "commanded": "/joint_states_commanded",
+    "predicted torque": "/joint_states_predicted",
+    "residual torque": "/joint_states_residual",
 }
 EVENTS = "/hil/events"
 ARM = "/robot_description"

@@ -178,8 +178,8 @@ COMMANDS = LazyCommands(
     dict.fromkeys(
         (
             "demo", "design", "rehearse", "status", "report", "identify", "reidentify",
-            "compare", "export", "gains", "payload", "plan", "plot", "new", "move", "run",
-            "record", "simulate", "study", "doctor", "import", "archive",
+            "compare", "export", "rollout", "gains", "payload", "plan", "plot", "new", "move",
+            "run", "record", "simulate", "study", "doctor", "import", "archive",
         )
     )
 )  # fmt: skip

@@ -16,8 +16,16 @@ from hil.cli.arguments import (
 )
 from hil.cli.identify_options import FEW, EstimatorOption, Identifying
 from hil.cli.verdict import NOT_GOOD
-from hil.exporting import FormatName, default_output, export_model, model_for_export
-from hil.identify import Options
+from hil.exporting import (
+    Exported,
+    ExportedEnsemble,
+    FormatName,
+    default_output,
+    export_ensemble,
+    export_model,
+    model_for_export,
+)
+from hil.identify import Options, identify_paths
 from hil.progress import reporter as make_reporter
 from hil.progress import say
 
@@ -31,6 +39,8 @@ def export(
     *,
     how: Identifying,
     again: bool = False,
+    ensemble: Annotated[int | None, typer.Option(min=1, max=10000, metavar="N")] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 1,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -46,21 +56,39 @@ def export(
     **Example:** `hil export runs/demo --to mjcf`
 
     Options:
-        to: mjcf: MuJoCo XML; urdf: other tools.
-        output: File to write. Default: identified.xml or .urdf in the campaign folder or the
-            working directory.
+        to: mjcf: MuJoCo XML; urdf: other tools; sdf: Gazebo and Drake (read back by Drake, extra
+            `sdf`); pinocchio: text archive of pinocchio's model.
+        output: File to write. Default: identified.xml, .urdf, .sdf or .pinocchio in the campaign
+            folder or the working directory. With --ensemble a folder, by default
+            identified_ensemble, or an .npz file of all parameters.
+        ensemble: Write so many physically consistent arms drawn from the posterior, whose torques
+            vary as the stated intervals say.
+        seed: Of the draws.
         again: Identify again even if results.json and parameters.json are there.
     """
     reporter = make_reporter(quiet=quiet or json)
     options = how.options(estimator=estimator)
+    if ensemble is not None:
+        target = output or default_output(archives, to, ensemble=True)
+        identified = identify_paths(archives, reporter, options)
+        exported_ensemble = export_ensemble(identified, target, to, ensemble, seed)
+        print_export(exported_ensemble, json=json, quiet=quiet)
+        if not identified.verdict.good:
+            raise typer.Exit(NOT_GOOD)
+        return
     as_usual = options == Options() and not again
     found = model_for_export(archives, options, reporter, reuse=as_usual)
     target = output or default_output(archives, to)
     exported = export_model(found, target, to)
-    if json:
-        print_json(exported.to_dict())
-    else:
-        for line in exported.lines()[-1 if quiet else 0 :]:
-            say(line)
+    print_export(exported, json=json, quiet=quiet)
     if not found.good:
         raise typer.Exit(NOT_GOOD)
+
+
+def print_export(exported: Exported | ExportedEnsemble, *, json: bool, quiet: bool) -> None:
+    """Print the summary of written files."""
+    if json:
+        print_json(exported.to_dict())
+        return
+    for line in exported.lines()[-1 if quiet else 0 :]:
+        say(line)

@@ -7,9 +7,11 @@ from typing import Annotated
 
 import typer
 
+from hil.annotate import annotate as write_annotated
 from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption, with_options
 from hil.cli.identify_options import EstimatorOption, Identifying
 from hil.cli.verdict import finish
+from hil.errors import InputError
 from hil.files import make_folder
 from hil.identify import identify_paths
 from hil.outcome import write_outcome
@@ -25,6 +27,7 @@ def identify(
     split: Annotated[float, typer.Option(min=0.1, max=0.9)] = 0.7,
     in_sample: bool = False,
     estimator: EstimatorOption = "auto",
+    annotate: bool = False,
     *,
     how: Identifying,
     quiet: QuietOption = False,
@@ -45,6 +48,8 @@ def identify(
             predicted.
         in_sample: Fit all recordings and hold nothing out. All errors are then in-sample, and the
             model cannot be judged good.
+        annotate: Also write copies of the archives for viewers, with the predicted torque and the
+            residual as channels, in the subfolder annotated of the output.
     """
     reporter = make_reporter(quiet=quiet or json)
     method = "paper" if paper else "default"
@@ -53,8 +58,14 @@ def identify(
         output = output or (archives[0] / "paper" if paper else archives[0])
     if output is not None:
         make_folder(output)
+    elif annotate:
+        remedy = "name a folder for the copies with --output"
+        raise InputError(None, "needs an output folder", field="--annotate", remedy=remedy)
     found = identify_paths(archives, reporter, options, predict=predict or ())
     results = found.results
     if output is not None:
         results = write_outcome(output, found, reporter)
+        if annotate:
+            copies = write_annotated(found, output)
+            reporter.say(f"annotated for viewers: {', '.join(map(str, copies))}")
     finish(results, json=json, quiet=quiet)

@@ -6,10 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, cast
 
+import numpy as np
 import typer
 
 from hil.errors import InputError
 from hil.identify.options import ESTIMATORS, FRICTION_TERMS, Estimator, Options, friction_from
+from identification.rollout.servo import Servo
 
 LONGEST_DELAY: Final = 0.5
 """Largest delay accepted, s."""
@@ -99,6 +101,20 @@ def delay_from(text: str | None) -> float | Literal["auto", "stated"] | None:
         remedy = f"give seconds between {-LONGEST_DELAY:g} and {LONGEST_DELAY:g}, stated or auto"
         raise InputError(None, f"{text!r} is not a delay", field="--delay", remedy=remedy)
     return value
+
+
+def servo_from(text: str | None) -> Servo | str | None:
+    """Parse the value of `--servo`; InputError if it is neither gains and delay nor a word."""
+    if text is None or text == "identified":
+        return text
+    figures = [_number(part) for part in text.split(",")]
+    if len(figures) != 3 or not (figures[0] > 0.0 and figures[1] >= 0.0):
+        remedy = "give kp,kd,delay such as 2000,50,0.004, or the word identified"
+        raise InputError(None, f"{text!r} is not a servo", field="--servo", remedy=remedy)
+    if not 0.0 <= figures[2] <= LONGEST_DELAY:
+        remedy = f"give a delay of 0 to {LONGEST_DELAY:g} s"
+        raise InputError(None, f"{text!r} is not a servo", field="--servo", remedy=remedy)
+    return Servo(np.array(figures[0]), np.array(figures[1]), figures[2])
 
 
 def _bandwidth(text: str, option: str) -> float | Literal["auto"]:

@@ -312,6 +312,28 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
         problem = "contains neither joint torques nor motor currents"
         remedy = "import torques, or motor currents with gear ratios and torque constants"
         raise ArchiveError(archive.path, problem, remedy=remedy)
+    return _usable(archive, cell, recording)
+
+
+def stamps_of(source: Source, cell: Cell) -> NDArray[np.int64]:
+    """Return the time stamps in the archive of the samples of a source (m,) [ns].
+
+    Raises:
+        ArchiveError: the archive cannot be read again.
+    """
+    archive = open_archive(source.path)
+    recording = recording_of(archive)
+    rows = np.arange(recording.n_samples, dtype=np.float64)[:, None]
+    numbered = replace(recording, motor_current=np.repeat(rows, recording.n_joints, axis=1))
+    whole = _usable(archive, cell, numbered).recording.motor_current
+    assert whole is not None
+    first = 0 if source.context is None else source.context[1]
+    part = whole[first : first + source.recording.n_samples, 0]
+    stamps: NDArray[np.int64] = archive.columns["stamp"][np.rint(part).astype(np.intp)]
+    return stamps
+
+
+def _usable(archive: Archive, cell: Cell, recording: Recording) -> Source:
     useful = useful_part(archive, recording)
     if useful is not None:
         recording = recording.between(useful.start, useful.stop)

@@ -180,15 +180,21 @@ def consistent_parameters(
         np.concatenate([data, weight[:, None] * np.eye(len(prior.std))[known]]),
         np.concatenate([target / np.sqrt(design_effect), weight * prior.mean[known]]),
     )
+    x = without_rounding(model, x)
+    return x[:s], x[s:]
+
+
+def without_rounding(model: RobotModel, parameters: Array) -> Array:
+    """Return parameters of drives and friction (s + k,) without what rounding left below zero."""
+    x, s, layout = parameters.copy(), model.layout.size, model.layout
     friction = dissipation(model.friction)
-    others = x[s:]
-    part = slice(0, len(friction.combine))
-    shares = np.linalg.solve(friction.combine, others[part])
+    part = slice(s, s + len(friction.combine))
+    shares = np.linalg.solve(friction.combine, x[part])
     shares[friction.not_negative] = np.maximum(shares[friction.not_negative], 0.0)
-    others[part] = friction.combine @ shares
-    alone = np.setdiff1d(model.layout.rotors, [i for pair in model.layout.pairs for i in pair])
+    x[part] = friction.combine @ shares
+    alone = np.setdiff1d(layout.rotors, [joint for pair in layout.pairs for joint in pair])
     x[alone] = np.maximum(x[alone], 0.0)
-    return x[:s], others
+    return x
 
 
 def is_consistent(model: RobotModel, parameters: Array) -> bool:

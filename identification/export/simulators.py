@@ -1,4 +1,4 @@
-"""The identified arm for simulators: MuJoCo's XML (MJCF) and URDF."""
+"""The identified arm for simulators: MuJoCo's XML (MJCF), URDF, SDF and pinocchio's archive."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import Any, Final, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.export.friction import equivalent_coulomb, load_remarks
+from identification.export.sdf import MissingDrakeError, drake_torque, sdf
 from identification.export.urdf import WriteBackError, as_text, comment_text, rnea, write_urdf
 from identification.model.elements import TorsionSpring
 from identification.model.friction import (
@@ -43,7 +45,7 @@ _ANYWHERE, _SPEED, _ACCELERATION = math.pi, 2.0, 10.0
 _DRY: Final = (COULOMB, TANH)
 _DRY_LABELS: Final = tuple(term.label for term in _DRY)
 _TIMESTEP: Final = 1e-3  # s
-_FRICTION_TIME: Final = 2.0 * _TIMESTEP  # time constant of MuJoCo's dry friction, at least 2 steps
+_FRICTION_STEPS: Final = 2.0  # time constant of MuJoCo's dry friction, at least 2 steps
 _THICKNESS: Final = 0.03  # m, radius of the capsules that show the arm
 _SHORTEST: Final = 1e-3  # m, length of a capsule
 
@@ -73,6 +75,8 @@ class Arm:
     # torque of each gear (n,) [N·m, N] at which friction that grows with it is written, see
     # :func:`identification.export.friction.median_load`; None: zero
     load: Array | None = field(default=None)
+    #: whether bodies that cannot exist are changed by MuJoCo, for nominal arms
+    balanced: bool = False
 
     @property
     def written_load(self) -> Array:
@@ -128,14 +132,15 @@ class Arm:
         }
 
 
-def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
-    """Return the arm as MuJoCo's XML; motors are controlled by joint torque."""
+def mjcf(arm: Arm, name: str, remarks: Sequence[str] = (), *, step: float = _TIMESTEP) -> str:
+    """Return the arm as MuJoCo's XML with a time step [s]; motors are controlled by torque."""
     model, ranges, rotors = arm.model, arm.ranges, arm.rotors
     coupled = np.array((rotors != np.diag(np.diag(rotors))).any(axis=1))
     root = Node("mujoco", model=name)
     _comment(root, [*remarks, *load_remarks(model, arm.written_load)])
-    _add(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
-    _add(root, "option", gravity=as_text(model.gravity), timestep=as_text(_TIMESTEP),
+    _add(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false",
+         balanceinertia="true" if arm.balanced else None)  # fmt: skip
+    _add(root, "option", gravity=as_text(model.gravity), timestep=as_text(step),
          integrator="implicitfast")  # fmt: skip
     places, motors = {-1: _add(root, "worldbody")}, Node("actuator")
     for j, (joint_name, mass) in enumerate(zip(model.joint_names, arm.bodies, strict=True)):
@@ -167,7 +172,7 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
             armature=as_text(0.0 if coupled[j] else rotors[j, j]),
             damping=as_text(damping),
             frictionloss=as_text(max(0.0, friction.get("f0", 0.0))),
-            solreffriction=as_text([_FRICTION_TIME, 1.0]),
+            solreffriction=as_text([_FRICTION_STEPS * step, 1.0]),
             stiffness=as_text(stiffness) if stiffness else None,
             springref=as_text(rest) if stiffness else None,
             range=as_text([lower, upper]) if limited else None,
@@ -176,7 +181,7 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
         _add(motors, "motor", name=joint_name, joint=joint_name, ctrlrange=effort)
         for frame, place in arm.fixed(j).items():
             _add(link, "site", name=frame, **_pose(*place))
-    _tendons(root, arm, coupled)
+    _tendons(root, arm, coupled, step)
     root.append(motors)
     return _text(root)
 
@@ -186,6 +191,25 @@ def urdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     del name
     friction = arm.values[arm.model.friction_part]
     return write_urdf(arm.urdf, arm.model, arm.standard, friction, remarks, arm.load)
+
+
+def pinocchio_archive(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
+    """Return the arm as the text archive of pinocchio's model.
+
+    ``model = pinocchio.Model(); model.loadFromString(text)`` reads it, with armature, damping and
+    dry friction. It has no place for remarks.
+    """
+    del remarks
+    described = urdf(arm, name)
+    model = pinocchio_model(described, arm.model.locked)
+    model.name = name
+    model.gravity.linear = arm.model.gravity
+    dry = np.array([max(0.0, row.get("f0", 0.0)) for row in arm.friction[: arm.model.n_joints]])
+    model.armature[:] = np.diag(arm.rotors)
+    model.damping[:] = [row.get("f1", 0.0) for row in arm.friction[: arm.model.n_joints]]
+    model.friction[:] = dry
+    model.upperDryFrictionLimit[:], model.lowerDryFrictionLimit[:] = dry, -dry
+    return str(model.saveToString())
 
 
 class Format(NamedTuple):
@@ -198,6 +222,7 @@ class Format(NamedTuple):
     friction: tuple[FrictionTerm, ...] = (COULOMB, TANH, VISCOUS)
     # rotor inertias, inertia and friction of coupled motors, torsion springs, a stated payload
     drives: bool = False
+    rotors: bool = False  # rotor inertias alone
 
 
 class Comparison(NamedTuple):
@@ -216,8 +241,26 @@ def compare(text: str, form: Format, arm: Arm, motion: Motion) -> Comparison:
     Raises:
         WriteBackError: the torque differs at some random state.
         MissingMujocoError: the format needs MuJoCo, which is not installed.
+        MissingDrakeError: likewise Drake.
     """
-    states = random_states(arm)
+    difference = read_back(text, form, arm)
+    left = {name: _rms(torque) for name, torque in _left_out(form, arm, motion).items()}
+    if form.read is _mujoco_torque:
+        dry = _mujoco_torque(text, arm, motion, friction=True) - _supported(form, arm, motion)
+        left[_REVERSALS] = _rms(dry - _dry(arm, motion))
+    whole = arm.model.torque(arm.values, *motion[1:5]) + arm.model.load_torque(*motion[1:4])
+    return Comparison(difference, _rms(whole), {k: v for k, v in left.items() if v.any()})
+
+
+def read_back(text: str, form: Format, arm: Arm, count: int = STATES) -> float:
+    """Return the largest difference of a text's torque from the arm's, see :class:`Comparison`.
+
+    Raises:
+        WriteBackError: the torque differs at some random state.
+        MissingMujocoError: the format needs MuJoCo, which is not installed.
+        MissingDrakeError: likewise Drake.
+    """
+    states = random_states(arm, count)
     expected = _supported(form, arm, states)
     error = np.abs(form.read(text, arm, states) - expected).max(axis=0)
     largest = np.abs(expected).max(axis=0)
@@ -228,12 +271,11 @@ def compare(text: str, form: Format, arm: Arm, motion: Motion) -> Comparison:
             f"read back, the torque of joint {joint!r} differs by {difference:.2g} of its"
             " largest one"
         )
-    left = {name: _rms(torque) for name, torque in _left_out(form, arm, motion).items()}
-    if form.read is _mujoco_torque:
-        dry = _mujoco_torque(text, arm, motion, friction=True) - _supported(form, arm, motion)
-        left[_REVERSALS] = _rms(dry - _dry(arm, motion))
-    whole = arm.model.torque(arm.values, *motion[1:5]) + arm.model.load_torque(*motion[1:4])
-    return Comparison(difference, _rms(whole), {k: v for k, v in left.items() if v.any()})
+    return difference
+
+
+MISSING: Final = (MissingMujocoError, MissingDrakeError)
+"""Errors of formats whose reader is not installed."""
 
 
 def random_states(arm: Arm, count: int = STATES) -> Motion:
@@ -257,7 +299,7 @@ _REVERSALS: Final = "dry friction between the two directions (velocity reversals
 def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[tuple[str, Array, bool]]:
     """Yield description and torque (m, n) of each part, and whether the format supports it."""
     model, q, qdd, terms = arm.model, motion.position, motion.acceleration, arm.model.friction.terms
-    yield "the links", _rigid(arm, motion), True
+    yield "the links", rigid_torque(arm, motion), True
     for kind in model.friction.kinds:
         if kind not in _DRY or kind not in form.friction:
             of_kind = [one.term.label == kind.label and not one.motor for one in terms]
@@ -267,7 +309,7 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[tuple[str, Array,
             yield description, torque, kind in form.friction
     diagonal = np.diag(np.diag(arm.rotors))
     motors = [one.motor and not (form.drives and one.term.label in _DRY_LABELS) for one in terms]
-    yield "rotor inertias", qdd @ diagonal, form.drives
+    yield "rotor inertias", qdd @ diagonal, form.drives or form.rotors
     yield "inertia of coupled motors", qdd @ (arm.rotors - diagonal), form.drives
     yield "friction of coupled motors", _friction(arm, motion, motors), form.drives
     yield (
@@ -291,10 +333,20 @@ def _left_out(form: Format, arm: Arm, motion: Motion) -> dict[str, Array]:
     left[_REVERSALS] = _dry(arm, motion) - _dry(arm, motion, jumps=True)
     base = np.where(np.arange(model.n_parameters) < model.base.rank, arm.values, 0.0)
     whole = model.torque(base, *motion[1:5])
-    rounded = whole - _rigid(arm, motion) - motion.acceleration @ arm.rotors
+    rounded = whole - rigid_torque(arm, motion) - motion.acceleration @ arm.rotors
     if np.abs(rounded).max() > AGREES * np.abs(whole).max():
         left["effect of rounded angles of the URDF on the base parameters"] = rounded
     return left
+
+
+def unsupported_torque(arm: Arm, motion: Motion, form: str = "mjcf") -> Array:
+    """Return the torque (m, n) of all parts that a format does not support, along a motion.
+
+    Without dry friction at reversals, which every simulator has in its own way.
+    """
+    left = _left_out(FORMATS[form], arm, motion)
+    parts = [torque for name, torque in left.items() if name != _REVERSALS]
+    return np.asarray(np.sum([np.zeros(motion.position.shape), *parts], axis=0))
 
 
 def _supported(form: Format, arm: Arm, motion: Motion) -> Array:
@@ -303,8 +355,8 @@ def _supported(form: Format, arm: Arm, motion: Motion) -> Array:
     return np.asarray(np.sum(parts, axis=0))
 
 
-def _rigid(arm: Arm, motion: Motion) -> Array:
-    """Return the torque (m, n) of the links."""
+def rigid_torque(arm: Arm, motion: Motion) -> Array:
+    """Return the torque (m, n) of the links, without the payload."""
     model = arm.model
     plan = RegressorPlan.of_bodies(model.chain, model.gravity)
     return plan.torque(arm.standard[model.layout.links].reshape(-1), *motion[1:4])
@@ -343,6 +395,14 @@ def _pinocchio_torque(text: str, arm: Arm, motion: Motion) -> Array:
     """Return the torques of a URDF's bodies and damping."""
     model = pinocchio_model(text, arm.model.locked)
     model.gravity.linear = arm.model.gravity
+    return rnea(model, *motion[1:4]) + np.asarray(model.damping) * motion.velocity
+
+
+def _archive_torque(text: str, arm: Arm, motion: Motion) -> Array:
+    """Return the torques of bodies, armature and damping of a pinocchio archive."""
+    del arm
+    model = pin.Model()
+    model.loadFromString(text)
     return rnea(model, *motion[1:4]) + np.asarray(model.damping) * motion.velocity
 
 
@@ -389,11 +449,13 @@ FORMATS: Final[Mapping[str, Format]] = {
         drives=True,
     ),
     "urdf": Format(".urdf", urdf, _pinocchio_torque),
+    "sdf": Format(".sdf", sdf, drake_torque),
+    "pinocchio": Format(".pinocchio", pinocchio_archive, _archive_torque, rotors=True),
 }
 """Formats by name."""
 
 
-def _tendons(root: Node, arm: Arm, coupled: NDArray[np.bool_]) -> None:
+def _tendons(root: Node, arm: Arm, coupled: NDArray[np.bool_], step: float) -> None:
     """Add inertia and friction of coupled motors as fixed tendons."""
     names, friction = arm.model.joint_names, arm.model.friction
     tendons = Node("tendon")
@@ -416,7 +478,7 @@ def _tendons(root: Node, arm: Arm, coupled: NDArray[np.bool_]) -> None:
             share,
             damping=as_text(row.get("f1", 0.0)),
             frictionloss=as_text(max(0.0, row.get("f0", 0.0))),
-            solreffriction=as_text([_FRICTION_TIME, 1.0]),
+            solreffriction=as_text([_FRICTION_STEPS * step, 1.0]),
         )
     if len(tendons):
         root.append(tendons)

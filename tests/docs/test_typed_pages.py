@@ -27,6 +27,7 @@ from hil.cli import app
 from hil.demo_link import free_port
 from hil.progress import Silent
 from hil.results import Results
+from hil.rollout import RolloutResult
 from tests.docs.typed import ROOT, commands
 from tests.hil.simulated_logs import simulate
 from tests.hil.test_payload_command import CENTRE, MASS, archive_of_currents
@@ -147,17 +148,27 @@ def test_simulators_run_what_was_exported(workplace: Path) -> None:
     pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
     cell = Cell.load(ROOT / "examples" / "two_joints" / "cell.toml")
     cell = cell.with_campaign(repetitions=2, validation_runs=1)
-    demo = Campaign.create(workplace / "runs" / "demo", cell, design(cell, Silent()))
+    demo = Campaign.create(workplace / "runs" / "simulators", cell, design(cell, Silent()))
     demo.run(unrehearsed=True, durable=False)
-    names: dict[str, object] = {}
+    ran = []
     for language, block in blocks(page("simulators.md")):
-        if language == "python":
-            exec(compile(block, "docs/simulators.md", "exec"), names)
-        else:
-            typed(block)
-    assert matplotlib.image.imread("rollout.png").std() > 0.0
-    error = abs(names["simulated"] - names["position"])  # type: ignore[operator]
-    assert error.max() < 0.1, error.max()  # rad: of a motion of more than one
+        assert language == "sh"
+        ran += typed(block)
+    assert ran == ["demo", "identify", "export", "rollout", "export"]
+    found = RolloutResult.load(Path("runs/simulators/rollout.json"))
+    assert found.ratio is not None
+    assert found.ratio[2] <= 0.5  # at 0.5 s
+    assert matplotlib.image.imread("runs/simulators/rollout.png").std() > 0.0
+    assert len([*Path("runs/simulators/identified_ensemble").iterdir()]) == 20
+    archives = {path.name for path in Path("runs/simulators/archives").iterdir()}
+    copies = {path.name for path in Path("runs/simulators/annotated").iterdir()}
+    assert copies < archives
+    loader = re.findall(r"^```text\n(import .*?)^```", page("simulators.md"), re.M | re.S)[0]
+    assert len(loader.splitlines()) == 3
+    typed("hil export runs/simulators --to pinocchio")
+    names: dict[str, object] = {}
+    exec(loader, names)
+    assert (names["model"].armature > 0.0).all()  # type: ignore[attr-defined]
 
 
 class TestFirstHour:

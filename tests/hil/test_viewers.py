@@ -15,6 +15,7 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
+from hil.annotate import PREDICTED, RESIDUAL
 from hil.archive import Samples, open_archive, write_samples
 from hil.campaign import Campaign
 from hil.cli import app
@@ -68,7 +69,8 @@ def test_layouts_of_viewers_name_topics_and_fields_of_an_archive(excitation: Pat
     texts = {path.name: path.read_text("utf-8") for path in VIEWERS.iterdir()}
     drawn = re.findall(r'"(/\w+)\.(\w+)\[\d\]"', texts["foxglove.json"])
     drawn += re.findall(r'name="(/\w+)/\w+/(\w+)"', texts["plotjuggler.xml"])
-    assert len(drawn) == 2 * 30
+    assert len(drawn) == 2 * 42
+    fields |= dict.fromkeys((PREDICTED, RESIDUAL), fields["/joint_states"])
     assert all(re.search(rf"^\S+ {field}$", fields[topic], re.MULTILINE) for topic, field in drawn)
     panels = json.loads(texts["foxglove.json"])["configById"]
     named = {*panels["3D!arm"]["topics"], panels["RosOut!events"]["topicToRender"]}

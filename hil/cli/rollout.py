@@ -1,0 +1,86 @@
+"""`hil rollout`: simulate the held-out motion with the identified arm, and compare."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hil.cli.arguments import (
+    ArchivesArgument,
+    JsonOption,
+    QuietOption,
+    print_json,
+    with_options,
+)
+from hil.cli.identify_options import EstimatorOption, Identifying, servo_from
+from hil.cli.verdict import NOT_GOOD
+from hil.files import make_folder
+from hil.identify import identify_paths
+from hil.plots.plan_picture import save
+from hil.plots.rollout_picture import draw_rollout
+from hil.progress import reporter as make_reporter
+from hil.progress import say
+from hil.rollout import PICTURE, ROLLOUT, RolloutOptions, roll_out, write_rollout
+
+
+@with_options(Identifying, "how")
+def rollout(
+    archives: ArchivesArgument,
+    output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
+    predict: Annotated[list[Path] | None, typer.Option(metavar="ARCHIVE")] = None,
+    samples: Annotated[int, typer.Option(min=3, max=1000)] = 50,
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+    feedback: Annotated[float, typer.Option(min=0.0, max=20.0, metavar="HZ")] = 1.0,
+    servo: Annotated[str | None, typer.Option(metavar="KP,KD,DELAY|identified")] = None,
+    split: Annotated[float, typer.Option(min=0.1, max=0.9)] = 0.7,
+    estimator: EstimatorOption = "auto",
+    *,
+    how: Identifying,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Simulate held-out motions by MuJoCo (extra `mujoco`) with the identified arm.
+
+    Windows start at measured states; after 0.1, 0.2, 0.5 and 1 s the positions are compared with
+    the measured ones, for the identified arm, the nominal one, and arms drawn from the posterior.
+    The arm is driven by the recorded torque and a light feedback, or by a servo. Writes
+    rollout.json and rollout.png. Exit status 5 if the model is not good.
+
+    **Example:** `hil rollout runs/demo`
+
+    Options:
+        output: Folder for rollout.json and rollout.png. Default: the campaign folder; none for
+            single archives.
+        predict: Archive to simulate and not to fit, of any kind (repeatable).
+        samples: Arms drawn from the posterior.
+        seed: Of the draws.
+        feedback: Natural frequency of the feedback that keeps the simulated arm near the measured
+            motion; 0 for none.
+        servo: A servo in place of the recorded torque: gains in N·m/rad and N·m·s/rad and delay
+            in s, or identified from commanded and measured positions.
+        split: Fraction of the recording that is fitted if there is no validation run; the rest is
+            simulated.
+    """
+    reporter = make_reporter(quiet=quiet or json)
+    asked = RolloutOptions(samples, seed, feedback, servo_from(servo))
+    options = how.options(split=split, estimator=estimator)
+    if len(archives) == 1 and archives[0].is_dir():
+        output = output or archives[0]
+    if output is not None:
+        make_folder(output)
+    found = identify_paths(archives, reporter, options, predict=predict or ())
+    result = roll_out(found, asked, reporter)
+    if output is not None:
+        write_rollout(output, result)
+        save(draw_rollout(result), output / PICTURE)
+    if json:
+        print_json(result.model_dump(mode="json"))
+    else:
+        for line in result.lines()[-1 if quiet else 0 :]:
+            say(line)
+        if output is not None:
+            reporter.say(f"written to {output}: {ROLLOUT}, {PICTURE}")
+    if not found.verdict.good:
+        raise typer.Exit(NOT_GOOD)

@@ -1,0 +1,1 @@
+"""Measured motions simulated forward by MuJoCo, and the position error over the horizon."""

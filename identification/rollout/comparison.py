@@ -1,0 +1,267 @@
+"""Position errors of simulated windows: identified arm, nominal arm, ensemble of arms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from identification.distributions import student_limit
+from identification.export.simulators import Arm, rigid_torque, unsupported_torque
+from identification.model.kinematics import pinocchio_model
+from identification.model.robot import RobotModel
+from identification.rollout.servo import Servo, command_of
+from identification.rollout.simulation import LARGEST_ERROR, Feedback, Inputs, SimulatedArm
+from identification.rollout.windows import Stretch, Windows, stretches_of
+from identification.signals.samples import Samples
+
+Array = NDArray[np.float64]
+
+HORIZONS: Final = (0.1, 0.2, 0.5, 1.0)
+"""Times after the start of a window at which positions are compared [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedMotion:
+    """Windows of recordings, and what acts on an arm in them."""
+
+    windows: Windows
+    samples: tuple[Samples, ...]  #: of each stretch
+    servo: Servo | None = None  #: in place of the recorded torque
+    later: int = 0  #: instants by which the recorded torque is applied later
+
+    def inputs(self, arm: Arm, extra: Array | float = 0.0) -> Inputs:
+        """Return the inputs of an arm, with an additional torque (w, K, n).
+
+        What MuJoCo cannot simulate acts as along the measured motion, as does the part of the
+        arm's torque that a low-pass took from the record.
+        """
+        windows = self.windows
+        stretches = windows.stretches
+        beside = windows.cut(
+            [
+                _removed(one, samples, arm) + _late(one, arm) - unsupported_torque(arm, one.motion)
+                for one, samples in zip(stretches, self.samples, strict=True)
+            ]
+        )
+        change = windows.cut([one.after - one.motion.velocity for one in stretches])
+        if self.servo is None:
+            rate = windows.cut([one.after for one in stretches])
+            torque = windows.cut([_shifted(one.torque, self.later) for one in stretches])
+            return Inputs(torque + beside + extra, windows.position, rate, change)
+        commands = [command_of(one, self.servo.delay) for one in stretches]
+        position = windows.cut([command for command, _ in commands])
+        rate = windows.cut([rate for _, rate in commands])
+        error = position[:, :1] - windows.position[:, :1]
+        slip = rate[:, :1] - windows.cut([one.after for one in stretches])[:, :1]
+        held = windows.torque[:, :1] - self.servo.kp * error - self.servo.kd * slip
+        return Inputs(held + beside + extra, position, rate, change)
+
+
+def recorded_stretches(
+    model: RobotModel, recordings: Sequence[tuple[Samples, Array | None]], step: float
+) -> tuple[list[Stretch], list[Samples]]:
+    """Return the stretches of samples with their commanded positions, and the samples of each."""
+    stretches, owners = [], []
+    for samples, commanded in recordings:
+        parts = stretches_of(samples, samples.known_torque(model), step, commanded)
+        stretches += parts
+        owners += [samples] * len(parts)
+    return stretches, owners
+
+
+def light_feedback(arm: Arm, step: float, frequency: float) -> Feedback:
+    """Return a critically damped feedback of some natural frequency [Hz] for each joint alone."""
+    n = arm.model.n_joints
+    simulated = SimulatedArm.of(arm, step, Feedback(np.zeros(n), np.zeros(n)))
+    inertia = simulated.model.dof_M0[simulated.order]
+    rate = 2.0 * np.pi * frequency
+    return Feedback(rate**2 * inertia, 2.0 * rate * inertia)
+
+
+def simulate(
+    arm: Arm, motion: RecordedMotion, feedback: Feedback, extra: Array | float = 0.0
+) -> Array:
+    """Return the positions of an arm at the horizons (w, h, n), NaN where it is unstable.
+
+    Raises:
+        NotSimulatedError: MuJoCo does not accept the arm.
+    """
+    windows = motion.windows
+    simulated = SimulatedArm.of(arm, windows.step, feedback)
+    found = simulated.simulate(windows.position[:, 0], windows.start, motion.inputs(arm, extra))
+    return found[:, horizon_rows(windows)]
+
+
+def horizon_rows(windows: Windows) -> list[int]:
+    """Return the steps of a window that end at the horizons."""
+    return [round(horizon / windows.step) - 1 for horizon in HORIZONS]
+
+
+def _removed(stretch: Stretch, samples: Samples, arm: Arm) -> Array:
+    """Return the part of an arm's torque (g, n) that the low-pass of the record removed."""
+    if samples.torque_bandwidth is None:
+        return np.zeros(stretch.motion.position.shape)
+    model, motion, load = arm.model, samples.motion, None
+    if model.friction.has_load:
+        load = model.gear_torque(arm.values, *motion[1:4])
+    whole = model.torque(arm.values, *motion[1:5], load)
+    removed = whole - samples.predicted_torque(model, arm.values)
+    return stretch.mean_about_instants(removed[stretch.part])
+
+
+def _late(stretch: Stretch, arm: Arm) -> Array:
+    """Return what centrifugal torques (g, n) lack, which MuJoCo computes half a step early."""
+    before = stretch.motion._replace(velocity=stretch.before)
+    late = rigid_torque(arm, before) - rigid_torque(arm, stretch.motion)
+    load = arm.model.load_torque
+    return np.asarray(late + load(*before[1:4]) - load(*stretch.motion[1:4]))
+
+
+def _shifted(values: Array, instants: int) -> Array:
+    rows = np.clip(np.arange(len(values)) - instants, 0, len(values) - 1)
+    return values[rows]
+
+
+# Errors
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Root mean square errors of an arm at the horizons."""
+
+    joints: Array  #: position (h, n) [rad or m]; where unstable, `LARGEST_ERROR`
+    tool: Array  #: distance of the tool (h,) [m] in stable windows; NaN without any
+    unstable: int  #: windows in which it became unstable
+
+
+def errors_of(positions: Array, measured: Array, tool: ToolFrame) -> Errors:
+    """Return the errors of simulated positions (w, h, n)."""
+    difference = np.nan_to_num(positions - measured, nan=LARGEST_ERROR)
+    stable = np.asarray(np.isfinite(positions).all(axis=2))
+    distances = np.full(len(HORIZONS), np.nan)
+    for k in range(len(HORIZONS)):
+        rows = stable[:, k]
+        if rows.any():
+            away = tool.positions(positions[rows, k]) - tool.positions(measured[rows, k])
+            distances[k] = np.sqrt(np.mean(np.sum(away**2, axis=1)))
+    rms = np.sqrt(np.mean(difference**2, axis=0))
+    return Errors(rms, distances, int(np.count_nonzero(~stable[:, -1])))
+
+
+class ToolFrame:
+    """The last link of an arm that its last joint moves."""
+
+    def __init__(self, arm: Arm) -> None:
+        chain = arm.model.chain
+        names = [name for name, frame in chain.frames.items() if frame.joint == chain.n_joints - 1]
+        self._model = pinocchio_model(arm.urdf, arm.model.locked)
+        self._data = self._model.createData()
+        self.name = names[-1] if names else chain.joint_names[-1]
+        place = chain.frame(names[-1] if names else None).translation
+        self._joint = self._model.getJointId(chain.joint_names[-1])
+        self._place = place
+
+    def positions(self, joints: Array) -> Array:
+        """Return the origins (m, 3) [m] at joint positions (m, n)."""
+        neutral = pin.neutral(self._model)
+        found = np.empty((len(joints), 3))
+        for k, q in enumerate(joints):
+            pin.forwardKinematics(self._model, self._data, pin.integrate(self._model, neutral, q))
+            found[k] = self._data.oMi[self._joint].act(self._place)
+        return found
+
+
+def leading_joint(positions: Array, measured: Array, tool: ToolFrame) -> int:
+    """Return the joint whose error alone moves the tool most, of positions (w, n) at a horizon."""
+    stable = np.isfinite(positions).all(axis=1)
+    moved = np.zeros(measured.shape[1])
+    if not stable.any():
+        return 0
+    at = tool.positions(measured[stable])
+    for joint in range(len(moved)):
+        alone = measured[stable].copy()
+        alone[:, joint] = positions[stable, joint]
+        moved[joint] = np.mean(np.sum((tool.positions(alone) - at) ** 2, axis=1))
+    return int(np.argmax(moved))
+
+
+def coverage(ensemble: Array, measured: Array) -> Array:
+    """Return the share of measured positions in the 95 % band of an ensemble (N, w, h, n): (h, n).
+
+    The band is that of one more arm, from mean and scatter of the stable ones.
+    """
+    count = np.count_nonzero(np.isfinite(ensemble), axis=0)
+    known = count >= _FEWEST
+    filled = np.nan_to_num(ensemble)
+    mean = filled.sum(axis=0) / np.maximum(count, 1)
+    deviation = np.where(np.isfinite(ensemble), ensemble - mean, 0.0)
+    variance = np.sum(deviation**2, axis=0) / np.maximum(count - 1, 1)
+    factor = float(student_limit(0.025, len(ensemble))) * np.sqrt(1.0 + 1.0 / len(ensemble))
+    inside = known & (np.abs(measured - mean) <= factor * np.sqrt(variance))
+    return np.asarray(inside.mean(axis=0))
+
+
+_FEWEST: Final = 3  # arms of which a scatter is computed
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualTorque:
+    """Residual torque of fitted motions, of which stretches are drawn."""
+
+    parts: tuple[Array, ...]  #: residual at the instants of a stretch (g, n), each K or longer
+    steps: int  #: number K of steps of a window
+
+    @classmethod
+    def of(
+        cls, arm: Arm, values: Array, fitted: Sequence[Samples], windows: Windows
+    ) -> ResidualTorque:
+        """Return measured minus predicted torque of parameters (p,)."""
+        found = []
+        for samples in fitted:
+            residual = samples.torque - samples.predicted_torque(arm.model, values)
+            parts = stretches_of(samples, np.zeros_like(samples.torque), windows.step)
+            found += [one.mean_about_instants(residual[one.part]) for one in parts]
+        return cls(tuple(one for one in found if len(one) >= windows.steps), windows.steps)
+
+    def draw(self, count: int, random: np.random.Generator) -> Array | float:
+        """Return random stretches (count, K, n), zero without any that is long enough."""
+        if not self.parts:
+            return 0.0
+        starts = np.array([len(part) - self.steps + 1 for part in self.parts])
+        chosen = random.choice(len(starts), count, p=starts / starts.sum())
+        return np.stack(
+            [self.parts[k][(row := random.integers(starts[k])) : row + self.steps] for k in chosen]
+        )
+
+
+# What would lessen the error
+
+Variant = tuple[str, Callable[[Arm, RecordedMotion], tuple[Arm, RecordedMotion]]]
+
+
+def variants(joint: int) -> list[Variant]:
+    """Return changes of the friction of a joint, and of the delay of all, by the effect's name."""
+
+    def scaled(symbols: Sequence[str], factor: float) -> Callable[..., tuple[Arm, RecordedMotion]]:
+        def change(arm: Arm, motion: RecordedMotion) -> tuple[Arm, RecordedMotion]:
+            values, model = arm.values.copy(), arm.model
+            part = model.friction_part
+            of = [one.owner == joint and one.symbol in symbols for one in model.friction.terms]
+            values[part] = np.where(of, factor * values[part], values[part])
+            return replace(arm, values=values), motion
+
+        return change
+
+    def delayed(instants: int) -> Callable[..., tuple[Arm, RecordedMotion]]:
+        return lambda arm, motion: (arm, replace(motion, later=instants))
+
+    return [
+        *(("dry friction", scaled(("f0", "fl"), factor)) for factor in (0.7, 1.3)),
+        *(("viscous friction", scaled(("f1", "f2"), factor)) for factor in (0.7, 1.3)),
+        *(("delay", delayed(instants)) for instants in (-1, 1)),
+    ]

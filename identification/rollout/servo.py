@@ -1,0 +1,107 @@
+"""A joint servo, identified from commanded and measured positions and the torque between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import IdentificationError
+from identification.rollout.windows import Stretch
+
+Array = NDArray[np.float64]
+
+BLOCK: Final = 0.5
+"""Time over which the sum of gravity, friction and integral action counts as constant [s]."""
+LONGEST_DELAY: Final = 0.04
+"""Largest delay of the command that is tried [s]."""
+
+
+class NoServoError(IdentificationError):
+    """The recordings do not show a servo."""
+
+
+class Servo(NamedTuple):
+    """Joint torque ``kp (q_c(t - delay) - q) + kd (v_c(t - delay) - v)`` beside a constant."""
+
+    kp: Array  # (n,) [N·m/rad or N/m]
+    kd: Array  # (n,) [N·m·s/rad or N·s/m]
+    delay: float  # of the command [s]
+
+
+def command_of(stretch: Stretch, delay: float) -> tuple[Array, Array]:
+    """Return the delayed command, and its rate half a step after each instant (g, n).
+
+    Raises:
+        NoServoError: the recording has no commanded positions.
+    """
+    if stretch.commanded is None:
+        raise NoServoError("the recordings have no commanded positions")
+    time = stretch.motion.time
+    half = 0.5 * float(time[1] - time[0])
+    position, later, earlier = (
+        np.column_stack(
+            [np.interp(time - delay + shift, time, column) for column in stretch.commanded.T]
+        )
+        for shift in (0.0, 2.0 * half, 0.0)
+    )
+    return position, (later - earlier) / (2.0 * half)
+
+
+def identify_servo(stretches: Sequence[Stretch], step: float) -> Servo:
+    """Return the servo of some stretches, by least squares for each delay on a grid of `step` [s].
+
+    Raises:
+        NoServoError: there are no commanded positions, or the torque does not follow the error.
+    """
+    best: tuple[float, Servo] | None = None
+    for delay in step * np.arange(int(LONGEST_DELAY / step + 1e-9) + 1):
+        found = _gains_at(stretches, float(delay), step)
+        if best is None or found[0] < best[0]:
+            best = found
+    assert best is not None
+    servo = best[1]
+    if not (servo.kp > 0.0).all():
+        joint = int(np.argmin(servo.kp))
+        raise NoServoError(
+            f"the torque of joint {joint + 1} does not grow with its position error; state kp, kd"
+            " and delay"
+        )
+    return servo
+
+
+def _gains_at(stretches: Sequence[Stretch], delay: float, step: float) -> tuple[float, Servo]:
+    """Return the share of the torque's variance that is left over, and the gains."""
+    rows = round(BLOCK / step)
+    errors, rates, torques = [], [], []
+    for one in stretches:
+        position, _ = command_of(one, delay)
+        rate = np.gradient(position, step, axis=0)
+        # The same rows for every delay: those whose command is known.
+        known = slice(round(LONGEST_DELAY / step) + 1, -1)
+        errors += _without_means((position - one.motion.position)[known], rows)
+        rates += _without_means((rate - one.motion.velocity)[known], rows)
+        torques += _without_means(one.torque[known], rows)
+    if not errors:
+        raise NoServoError(f"no stretch lasts {BLOCK:g} s")
+    error, rate, torque = (np.concatenate(part) for part in (errors, rates, torques))
+    n, left = error.shape[1], 0.0
+    kp, kd = np.zeros(n), np.zeros(n)
+    for joint in range(n):
+        columns = np.column_stack([error[:, joint], rate[:, joint]])
+        size = np.linalg.norm(columns, axis=0)
+        size[size == 0.0] = 1.0
+        gains = np.linalg.lstsq(columns / size, torque[:, joint], rcond=None)[0] / size
+        kp[joint], kd[joint] = gains[0], max(0.0, float(gains[1]))
+        residual = torque[:, joint] - columns @ gains
+        left += float(residual @ residual) / max(float(torque[:, joint] @ torque[:, joint]), 1e-300)
+    return left, Servo(kp, kd, delay)
+
+
+def _without_means(values: Array, rows: int) -> list[Array]:
+    """Return the blocks of some rows of values (g, n), each without its mean."""
+    whole = len(values) // rows
+    blocks = values[: whole * rows].reshape(whole, rows, -1)
+    return list(blocks - blocks.mean(axis=1, keepdims=True))

@@ -1,0 +1,128 @@
+"""Forward simulation of windows by MuJoCo, all at once."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.errors import IdentificationError
+from identification.export.simulators import Arm, load_mujoco, mjcf
+
+Array = NDArray[np.float64]
+
+LARGEST_ERROR: Final = np.pi
+"""Position error [rad or m] from which on a simulation counts as unstable."""
+
+
+class NotSimulatedError(IdentificationError):
+    """MuJoCo does not accept the arm."""
+
+
+class Feedback(NamedTuple):
+    """Joint torque ``stiffness (q_ref - q) + damping (v_ref - v)``, each (n,)."""
+
+    stiffness: Array  # N·m/rad or N/m
+    damping: Array  # N·m·s/rad or N·s/m
+
+
+class Inputs(NamedTuple):
+    """What acts on w windows in K steps."""
+
+    torque: Array  # on the joints (w, K, n) [N·m or N]
+    position: Array  # reference of the feedback before each step (w, K, n) [rad or m]
+    velocity: Array  # likewise, half a step later (w, K, n) [rad/s or m/s]
+    change: Array  # of the measured velocity in half a step (w, K, n) [rad/s or m/s]
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedArm:
+    """An arm in MuJoCo without limits, contacts and motors; torques act on its joints."""
+
+    model: Any  #: `mujoco.MjModel`
+    order: NDArray[np.intp]  #: MuJoCo's coordinate of each joint (n,)
+    rest: Array  #: angle of the springs (n,) [rad or m]
+    viscous: Array  #: friction of the joints (n,) [N·m·s/rad or N·s/m]
+    step: float  #: s
+    feedback: Feedback
+
+    @classmethod
+    def of(cls, arm: Arm, step: float, feedback: Feedback) -> SimulatedArm:
+        """Compile an arm.
+
+        Raises:
+            NotSimulatedError: MuJoCo does not accept it.
+            MissingMujocoError: MuJoCo is not installed.
+        """
+        mujoco = load_mujoco()
+        try:
+            model = mujoco.MjModel.from_xml_string(mjcf(arm, "arm", step=step))
+        except ValueError as error:
+            message = " ".join(str(error).split())
+            raise NotSimulatedError(f"MuJoCo does not accept the arm: {message}") from error
+        off = mujoco.mjtDisableBit
+        model.opt.disableflags |= (
+            off.mjDSBL_LIMIT | off.mjDSBL_CONTACT | off.mjDSBL_ACTUATION | off.mjDSBL_AUTORESET
+        )
+        order = [int(model.joint(name).dofadr[0]) for name in arm.model.joint_names]
+        places = np.array(order, dtype=np.intp)
+        # A spring and a damper to zero are the part of the feedback that depends on the state.
+        viscous = model.dof_damping[places].copy()
+        model.jnt_stiffness[places] += feedback.stiffness
+        model.dof_damping[places] += feedback.damping
+        return cls(model, places, model.qpos_spring[places].copy(), viscous, step, feedback)
+
+    def simulate(self, start: Array, velocity: Array, inputs: Inputs) -> Array:
+        """Return the positions after each step (w, K, n); NaN from where on they are unstable.
+
+        From positions and, half a step before, velocities (w, n).
+        """
+        mujoco = load_mujoco()
+        from mujoco import rollout  # optional dependency
+
+        stiffness, damping = self.feedback
+        # The viscous friction of a step is that of the velocity after it, half a step late.
+        force = inputs.torque + damping * inputs.velocity + self.viscous * inputs.change
+        force = force + stiffness * (inputs.position - self.rest)
+        n = len(self.order)
+        size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        state = np.zeros((len(start), size))
+        state[:, 1 + self.order] = start
+        state[:, 1 + n + self.order] = velocity
+        applied = np.empty_like(force)
+        applied[:, :, self.order] = force
+        data = [mujoco.MjData(self.model) for _ in range(os.cpu_count() or 1)]
+        with _without_messages(mujoco):
+            states, _ = rollout.rollout(
+                self.model,
+                data,
+                state,
+                applied,
+                control_spec=mujoco.mjtState.mjSTATE_QFRC_APPLIED,
+            )
+        position = states[:, :, 1 + self.order]
+        return _without_unstable(position, inputs.position)
+
+
+@contextmanager
+def _without_messages(mujoco: Any) -> Iterator[None]:
+    """Keep MuJoCo from printing and logging what is counted: unstable simulations."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _without_unstable(position: Array, reference: Array) -> Array:
+    """Return positions with NaN from the first on that is far from the reference."""
+    with np.errstate(invalid="ignore"):
+        near = (np.abs(position - reference) < LARGEST_ERROR).all(axis=2)
+    stable = np.logical_and.accumulate(near, axis=1)
+    return np.asarray(np.where(stable[:, :, None], position, np.nan))

@@ -1,0 +1,167 @@
+"""Windows of a measured motion, on an even time grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from identification.errors import IdentificationError
+from identification.model.motion import Motion
+from identification.signals.samples import Samples
+
+Array = NDArray[np.float64]
+
+STEP: Final = 5e-3
+"""Longest time step of a simulation [s]."""
+_FEWEST_SAMPLES: Final = 4  # of a stretch that is interpolated
+
+
+class NoWindowError(IdentificationError):
+    """The motion has no stretch that is long enough."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A measured motion without gap, on an even grid of g instants.
+
+    MuJoCo's step advances the velocity by the torque, then the position by the new velocity. With
+    velocities half a step before and after an instant, and the mean torque about the instant, this
+    is of second order (Störmer and Verlet).
+    """
+
+    motion: Motion  #: smoothed, at the instants
+    before: Array  #: velocity half a step before (g, n) [rad/s or m/s]
+    after: Array  #: velocity half a step after (g, n) [rad/s or m/s]
+    torque: Array  #: recorded, mean over a step about each instant (g, n) [N·m or N]
+    time: Array  #: of the samples that it comes from (m,) [s]
+    part: slice  #: these samples in their recording
+    commanded: Array | None = None  #: commanded position at the instants (g, n) [rad or m]
+
+    def mean_about_instants(self, values: Array) -> Array:
+        """Return the mean of values at the samples (m, c) over a step about each instant (g, c)."""
+        return mean_about(self.time, values, self.motion.time)
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """w windows of K steps, of several stretches."""
+
+    stretches: tuple[Stretch, ...]
+    stretch: NDArray[np.intp]  #: of each window (w,)
+    first: NDArray[np.intp]  #: instant of its stretch at which it starts (w,)
+    step: float  #: time step [s]
+    steps: int  #: number K of steps
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def cut(self, parts: Sequence[Array], shift: int = 0) -> Array:
+        """Return the windows (w, K, n) of arrays at the instants of each stretch (g, n).
+
+        With `shift` of these so many instants later.
+        """
+        offsets = shift + np.arange(self.steps)
+        found = np.empty((len(self), self.steps, parts[0].shape[1]))
+        for k, values in enumerate(parts):
+            inside = self.stretch == k
+            found[inside] = values[self.first[inside][:, None] + offsets]
+        return found
+
+    @property
+    def position(self) -> Array:
+        """Measured positions before each step (w, K, n) [rad or m]."""
+        return self.cut([one.motion.position for one in self.stretches])
+
+    @property
+    def reached(self) -> Array:
+        """Measured positions after each step (w, K, n) [rad or m]."""
+        return self.cut([one.motion.position for one in self.stretches], 1)
+
+    @property
+    def start(self) -> Array:
+        """Measured velocity half a step before each window (w, n) [rad/s or m/s]."""
+        return np.array(
+            [self.stretches[k].before[row] for k, row in zip(self.stretch, self.first, strict=True)]
+        )
+
+    @property
+    def torque(self) -> Array:
+        """Recorded torque, mean over a step about each instant (w, K, n) [N·m or N]."""
+        return self.cut([one.torque for one in self.stretches])
+
+    def some(self, most: int) -> Windows:
+        """Return at most so many windows, evenly distributed."""
+        if len(self) <= most:
+            return self
+        chosen = np.linspace(0, len(self) - 1, most).round().astype(np.intp)
+        return replace(self, stretch=self.stretch[chosen], first=self.first[chosen])
+
+
+def stretches_of(
+    samples: Samples, known: Array, step: float, commanded: Array | None = None
+) -> list[Stretch]:
+    """Return the stretches of a recording without gap.
+
+    `known` torque (m, n), which was subtracted from that of the samples, is added. The positions
+    are interpolated by a cubic spline, of which the velocity is the derivative.
+    """
+    found = []
+    for part in samples.segments:
+        motion = samples.motion.rows(part)
+        time = motion.time
+        if len(time) < _FEWEST_SAMPLES or time[-1] - time[0] < 2.0 * step:
+            continue
+        count = int((time[-1] - time[0]) / step - 1.0 + 1e-9) + 1
+        grid = time[0] + step * (0.5 + np.arange(count))
+        spline = CubicSpline(time, motion.position)
+        on_grid = Motion(grid, spline(grid), spline(grid, 1), spline(grid, 2))
+        before, after = (spline(grid + shift, 1) for shift in (-0.5 * step, 0.5 * step))
+        command = None
+        if commanded is not None and np.isfinite(commanded[part]).all():
+            columns = commanded[part].T
+            command = np.column_stack([np.interp(grid, time, column) for column in columns])
+        torque = mean_about(time, (samples.torque + known)[part], grid)
+        found.append(Stretch(on_grid, before, after, torque, time, part, command))
+    return found
+
+
+def mean_about(time: Array, values: Array, grid: Array) -> Array:
+    """Return the mean of values (m, c) over one step about each instant of an even grid (g, c).
+
+    The values are interpolated linearly.
+    """
+    step = float(grid[1] - grid[0]) if len(grid) > 1 else float(time[-1] - time[0])
+    edges = np.append(grid - 0.5 * step, grid[-1] + 0.5 * step)
+    widths = np.diff(time)[:, None]
+    areas = np.cumsum(0.5 * widths * (values[1:] + values[:-1]), axis=0)
+    integral = np.concatenate([np.zeros((1, values.shape[1])), areas])
+    place = np.clip(np.searchsorted(time, edges, side="right") - 1, 0, len(time) - 2)
+    share = ((edges - time[place]) / widths[place, 0])[:, None]
+    slope = values[place + 1] - values[place]
+    at = integral[place] + widths[place] * (share * values[place] + 0.5 * share**2 * slope)
+    return np.asarray(np.diff(at, axis=0) / step)
+
+
+def windows_of(stretches: Sequence[Stretch], step: float, horizon: float, stride: float) -> Windows:
+    """Return windows of a horizon [s] that start every `stride` seconds.
+
+    Raises:
+        NoWindowError: no stretch is as long.
+    """
+    steps, between = round(horizon / step), max(1, round(stride / step))
+    starts = [
+        np.arange(0, len(one.motion.time) - steps, between, dtype=np.intp) for one in stretches
+    ]
+    if not sum(len(first) for first in starts):
+        longest = max((np.ptp(one.motion.time) for one in stretches), default=0.0)
+        raise NoWindowError(
+            f"no part of the motion without gap lasts {horizon:g} s; the longest lasts"
+            f" {longest:.3g} s"
+        )
+    stretch = np.repeat(np.arange(len(starts)), [len(first) for first in starts])
+    return Windows(tuple(stretches), stretch, np.concatenate(starts), step, steps)

@@ -1,0 +1,153 @@
+"""Windows of a measured motion, simulated by MuJoCo and compared."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from identification.export.simulators import Arm, Ranges
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.rollout.comparison import (
+    HORIZONS,
+    RecordedMotion,
+    ToolFrame,
+    coverage,
+    errors_of,
+    horizon_rows,
+    leading_joint,
+    light_feedback,
+    recorded_stretches,
+    simulate,
+)
+from identification.rollout.servo import NoServoError, identify_servo
+from identification.rollout.simulation import LARGEST_ERROR, Feedback
+from identification.rollout.windows import (
+    NoWindowError,
+    mean_about,
+    stretches_of,
+    windows_of,
+)
+from tests.identification.two_link import MODEL, URDF, four_sines, simulated
+
+pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
+
+N = MODEL.n_joints
+NO_LIMITS = Ranges(*(np.full(N, limit) for limit in (-np.inf, np.inf, np.inf, np.inf)))
+NOTHING = Feedback(np.zeros(N), np.zeros(N))
+
+
+def an_arm(coulomb: float = 0.0) -> Arm:
+    standard = MODEL.nominal
+    standard[MODEL.layout.rotors] = (0.4, 0.1)
+    friction = [{"f0": coulomb, "f1": 2.0}.get(term.symbol, 0.0) for term in MODEL.friction.terms]
+    values = np.concatenate([MODEL.base.grouping @ standard, friction])
+    return Arm(URDF, MODEL, standard, values, NO_LIMITS)
+
+
+def a_recording(arm: Arm, step: float, duration: float = 3.0):
+    """Torque of an arm along sines, and its windows at a time step [s]."""
+    motion = four_sines(np.arange(0.0, duration, 0.001), 0.5)
+    samples = simulated(MODEL, arm.values, motion)
+    stretches, owners = recorded_stretches(MODEL, [(samples, None)], step)
+    return RecordedMotion(windows_of(stretches, step, 1.0, 0.2), tuple(owners))
+
+
+def final_errors(arm: Arm, motion: RecordedMotion, feedback: Feedback = NOTHING):
+    measured = motion.windows.reached[:, horizon_rows(motion.windows)]
+    return errors_of(simulate(arm, motion, feedback), measured, ToolFrame(arm))
+
+
+def test_errors_of_the_true_arm_are_of_second_order() -> None:
+    arm = an_arm()
+    coarse, fine = (final_errors(arm, a_recording(arm, step)).joints for step in (0.01, 0.005))
+    assert fine[:3].max() < 1e-3  # rad at 0.5 s, of a motion of one
+    assert (coarse[2:] / fine[2:]).min() > 3.0
+
+
+def test_other_masses_leave_the_motion() -> None:
+    arm = an_arm()
+    motion = a_recording(arm, 0.005)
+    heavier = replace(arm, standard=1.3 * arm.standard, values=1.3 * arm.values)
+    errors = final_errors(heavier, motion)
+    assert (np.diff(errors.joints.max(axis=1)) > 0.0).all()
+    assert errors.joints[2].max() > 20.0 * final_errors(arm, motion).joints[2].max()
+    kept = final_errors(heavier, motion, light_feedback(arm, 0.005, 3.0))
+    assert kept.joints[3].max() < errors.joints[3].max()
+
+
+def test_an_unstable_arm_is_counted_and_silent(capfd) -> None:
+    arm = an_arm()
+    motion = a_recording(arm, 0.005)
+    light = replace(arm, standard=1e-6 * arm.standard, values=1e-6 * arm.values)
+    errors = final_errors(light, motion)
+    assert errors.unstable == len(motion.windows)
+    assert np.isfinite(errors.joints).all()
+    assert errors.joints[-1].max() == pytest.approx(LARGEST_ERROR)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_the_joint_that_moves_the_tool_leads() -> None:
+    tool = """<link name="tool"/><joint name="to_tool" type="fixed"><parent link="lower"/>
+      <child link="tool"/><origin xyz="0.3 0 -0.3"/></joint></robot>"""
+    arm = replace(an_arm(), urdf=URDF.replace("</robot>", tool))
+    arm = replace(arm, model=RobotModel.from_urdf(arm.urdf, friction=FrictionLaw(third=None)))
+    measured = np.zeros((4, N))
+    off = measured + np.array([0.001, 0.2])
+    assert leading_joint(off, measured, ToolFrame(arm)) == 1
+    assert leading_joint(off[:, ::-1], measured, ToolFrame(arm)) == 0
+
+
+def test_a_band_holds_its_share() -> None:
+    rng = np.random.default_rng(1)
+    shape = (2000, len(HORIZONS), 1)
+    ensemble = rng.standard_normal((50, *shape))
+    assert coverage(ensemble, rng.standard_normal(shape)) == pytest.approx(0.95, abs=0.02)
+    ensemble[:, :, 0] = np.nan  # unstable: no band
+    assert coverage(ensemble, np.zeros(shape))[0] == 0.0
+
+
+def test_means_over_a_step_of_a_line_are_its_values() -> None:
+    time = np.sort(np.random.default_rng(1).uniform(0.0, 1.0, 200))
+    line = np.column_stack([2.0 * time, 1.0 - time])
+    grid = 0.1 + 0.05 * np.arange(15)
+    expected = np.column_stack([2.0 * grid, 1.0 - grid])
+    assert mean_about(time, line, grid) == pytest.approx(expected, abs=1e-4)
+
+
+def test_too_short_a_motion_has_no_window() -> None:
+    arm = an_arm()
+    with pytest.raises(NoWindowError, match=r"lasts 1 s; the longest lasts 0\.59"):
+        a_recording(arm, 0.005, duration=0.6)
+
+
+class TestServo:
+    def stretches(self, kp, kd, delay):
+        """A command that the arm follows late, and the torque of a servo, with gravity."""
+        motion = four_sines(np.arange(0.0, 6.0, 0.001), 0.5)
+        samples = simulated(MODEL, an_arm().values, motion)
+        lag = 0.05
+        commanded = motion.position + lag * motion.velocity
+
+        def late(values):
+            at = motion.time - delay
+            return np.column_stack([np.interp(at, motion.time, one) for one in values.T])
+
+        error = late(commanded) - motion.position
+        rate = late(np.gradient(commanded, motion.time, axis=0)) - motion.velocity
+        torque = kp * error + kd * rate + 30.0
+        return stretches_of(
+            replace(samples, torque=torque), np.zeros_like(torque), 0.005, commanded
+        )
+
+    def test_is_found_from_commanded_and_measured_positions(self) -> None:
+        kp, kd = np.array([2000.0, 500.0]), np.array([40.0, 10.0])
+        servo = identify_servo(self.stretches(kp, kd, 0.010), 0.005)
+        assert servo.delay == pytest.approx(0.010)
+        assert servo.kp == pytest.approx(kp, rel=0.05)
+        assert servo.kd == pytest.approx(kd, rel=0.2)
+
+    def test_needs_commanded_positions(self) -> None:
+        stretches = [replace(one, commanded=None) for one in self.stretches(1.0, 1.0, 0.0)]
+        with pytest.raises(NoServoError, match="no commanded positions"):
+            identify_servo(stretches, 0.005)
