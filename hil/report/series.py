@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from identification import RobotModel
 from identification.signals.samples import Samples
+from identification.signals.spectrum import power_density
 from identification.validation.prediction import for_figure
 
 Array = NDArray[np.float64]
@@ -204,23 +205,6 @@ def _spectra(samples: Samples, error: Array) -> dict[str, Any]:
         "spectrum_measured": measured,
         "spectrum_residual": residual,
     }
-
-
-def power_density(signals: Array, rate: float, length: int) -> tuple[Array, Array]:
-    """Return frequencies (f,) [Hz] and one-sided power densities (f, c) of signals (m, c) [1/Hz].
-
-    Welch (1967): mean over parts of `length` rows that overlap by half, with a Hann window; without
-    mean and highest frequency. Written here since importing `scipy.signal` takes longer.
-    """
-    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
-    starts = range(0, len(signals) - length + 1, max(1, length // 2))
-    power = np.zeros((length // 2 + 1, signals.shape[1]))
-    for first in starts:
-        part = signals[first : first + length]
-        power += np.abs(np.fft.rfft(window[:, None] * (part - part.mean(axis=0)), axis=0)) ** 2
-    density = 2.0 * power / (len(starts) * rate * float(np.sum(window**2)))
-    frequency = np.asarray(np.fft.rfftfreq(length, 1.0 / rate), np.float64)
-    return frequency[1:-1], density[1:-1]
 
 
 def _by_ratio(frequency: Array, power: Array) -> tuple[Array, Array]:

@@ -23,6 +23,7 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.signals.recording import RecordingError
+from identification.signals.spectrum import HARRIS, power_density
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -104,7 +105,6 @@ def _difference_variance(time: Array, values: Array, order: int) -> Array:
 _ROWS_AT_ONCE: Final = 8192
 _STRETCH: Final = 4.0  # s; resolution 0.25 Hz
 _FEWEST: Final = 32  # samples
-_HARRIS: Final = np.array([0.35875, -0.48829, 0.14128, -0.01168])  # of cosines
 _NO_POWER: Final = 1e-6  # share of a signal's power; noise of 0.1 % of the amplitude
 _LOW_PASSED: Final = 0.75  # share of half the sampling rate; anti-alias filters cut at about 0.8
 
@@ -122,7 +122,7 @@ def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> f
 
 
 def _power(time: Array, signals: Array, segments: Sequence[slice]) -> tuple[Array, Array]:
-    """Return frequencies (f,) above zero and power (f, c) in units of its own."""
+    """Return frequencies (f,) above zero and power spectral densities (f, c)."""
     longest = max(segments, key=lambda one: int(one.stop - one.start), default=slice(0, 0))
     time, signals = time[longest], signals[longest]
     if time.size < _FEWEST:
@@ -131,22 +131,7 @@ def _power(time: Array, signals: Array, segments: Sequence[slice]) -> tuple[Arra
     even = np.arange(time[0], time[-1], interval)
     resampled = np.column_stack([np.interp(even, time, column) for column in signals.T])
     length = min(len(even), max(_FEWEST, round(_STRETCH / interval)))
-    # Welch (1967): mean of overlapping parts, with the four-term window of Harris (1978), written
-    # here since importing `scipy.signal` takes longer than all of this function.
-    phase = 2.0 * np.pi * np.arange(length)[:, None] / length
-    window = _HARRIS @ np.cos(np.arange(len(_HARRIS))[:, None, None] * phase)[..., 0]
-    starts = range(0, len(even) - length + 1, max(1, length // 2))
-    parts = [resampled[first : first + length] for first in starts]
-    power = np.mean(
-        [
-            np.abs(np.fft.rfft(window[:, None] * (part - part.mean(axis=0)), axis=0)) ** 2
-            for part in parts
-        ],
-        axis=0,
-    )
-    # Without the mean, and the line changed by removing it.
-    frequency = np.asarray(np.fft.rfftfreq(length, interval), dtype=np.float64)
-    return frequency[1:], np.asarray(power)[1:]
+    return power_density(resampled, 1.0 / interval, length, HARRIS)
 
 
 DEGREE: Final = 5

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from hil.report.series import power_density, torque_parts, with_torques
+from hil.report.series import torque_parts, with_torques
+from identification.signals.spectrum import HARRIS, power_density
 from tests.hil.test_report import make_series
 from tests.identification.two_link import MODEL, NOISE, a_motion, recording, truth
 
@@ -79,9 +80,13 @@ class TestSeries:
         assert with_torques(older, MODEL, truth(), None, few).spectrum_frequency is None
 
 
-def test_power_density_is_that_of_scipy():
+@pytest.mark.parametrize("length", [1000, 999])
+@pytest.mark.parametrize(("name", "arguments"), [("hann", ()), ("blackmanharris", (HARRIS,))])
+def test_power_density_is_that_of_scipy(length, name, arguments):
     signals = np.random.default_rng(0).standard_normal((5000, 3)).cumsum(axis=0)
-    frequency, density = power_density(signals, 250.0, 1000)
-    expected = scipy.signal.welch(signals, 250.0, nperseg=1000, axis=0)
-    np.testing.assert_allclose(frequency, expected[0][1:-1])
-    np.testing.assert_allclose(density, expected[1][1:-1], rtol=1e-9)
+    frequency, density = power_density(signals, 250.0, length, *arguments)
+    expected = scipy.signal.welch(
+        signals, 250.0, window=name, nperseg=length, noverlap=length - length // 2, axis=0
+    )
+    np.testing.assert_allclose(frequency, expected[0][1:])
+    np.testing.assert_allclose(density, expected[1][1:], rtol=1e-9)
