@@ -339,5 +339,5 @@ def test_dates_and_free_fields_reach_every_output(
     for line in ("# recorded: 2023-11-14", "# operator: A. <Person>", "# notes: cover off"):
         assert line in table
     page = (tmp_path / "result" / "report.html").read_text()
-    for part in ("A. &lt;Person&gt;", "SN 17", "2023-11-14T22:13:20"):
+    for part in ("A. &lt;Person&gt;", "SN 17", "2023-11-14 22:13"):
         assert part in page

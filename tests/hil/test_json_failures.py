@@ -38,6 +38,7 @@ FAILING = {
     "gains": ("gains", NOWHERE, NOWHERE, "--mass", "1"),
     "payload": ("payload", NOWHERE, "--loaded", NOWHERE),
     "export": ("export", NOWHERE, "--to", "mjcf"),
+    "rollout": ("rollout", NOWHERE),
     "plan": ("plan", NOWHERE, "--cell", NOWHERE),
     "record": ("record", NOWHERE),
     "simulate": ("simulate", NOWHERE),
