@@ -22,9 +22,6 @@ permissible."""
 REPETITIONS: Final = 100
 """Times that a set-point is sent again, at most, to a controller that does not accept it."""
 
-SLOWED: Final = 0.8
-"""Share of the speed sent last below which an arm that is to stop rests at the target held."""
-
 
 class SentSetPoints:
     """The set-points sent last, compared with the controller's target, motor revolutions.
@@ -292,17 +289,14 @@ class PositionMode(OpenMode):
     def next(self, execution: Execution | None) -> None:
         """Send the motion's next set-point, or the last one without a motion."""
         cycle, commanded = self._cycle, self._commanded
-        stopping = execution is not None and execution.outcome == "stopped"
         self._check_feedback(self._sent)
-        self._check_accepted(stopping=stopping)
+        self._check_accepted(stopping=execution is not None and execution.outcome == "stopped")
         if execution is None:
             self._guard.check_set_point(self.set_point, self._still, "plan", cycle)
             self._rest()
             return
         frame = self._frame.floats
-        if self._history.again and stopping and self._has_slowed_down(execution):
-            self._continue_from(execution, self._raw[TARGET].copy(), self._still, 0)
-        elif self._history.again:
+        if self._history.again:
             # The controller holds the target before the last one: send that once more.
             frame[self._slots] = self._last_reply
             self._history.repeat()
@@ -323,19 +317,6 @@ class PositionMode(OpenMode):
         self._sent = motor
         self._history.add(motor)
         self._last_reply = frame[self._slots]
-
-    def _has_slowed_down(self, execution: Execution) -> bool:
-        """Whether the arm, whose target is held, has lost part of the speed sent last.
-
-        A stop on the path begins at that speed: the arm would speed up first.
-        """
-        age, sent = self._wire.age, self._velocity
-        if not (execution.is_resumable and sent.any()):
-            return False
-        if age is not None and age[[TARGET, ACTUAL_VELOCITY]].any():
-            return False
-        velocity = self._wire.joint_difference(self._raw[ACTUAL_VELOCITY]) / self._guard.period
-        return float(velocity @ sent) < SLOWED * float(sent @ sent)
 
     def _require_closed_still(self, motor: Array) -> None:
         """Require closed axes to stay where the controller holds them, wrist couplings included."""
@@ -393,17 +374,10 @@ class PositionMode(OpenMode):
         step = self._still if not moves and (moved or steps == 0) else step
         self._guard.check_after_gap(target, velocity, ahead[steps], step, cycle, where)
         step = velocity[0] if moves else step
-        spread = min(SPREAD * steps, round(RETURN / self._guard.period))
-        self._continue_from(execution, target, step, spread)
-
-    def _continue_from(self, execution: Execution, target: Array, step: Array, spread: int) -> None:
-        """Continue the motion from the controller's target and step (n,), as if they were sent.
-
-        Motor revolutions, per cycle; the velocity across the path decays in `spread` cycles.
-        """
         position = self.set_point + self._wire.joint_difference(target - self._sent)
         speed = self._wire.joint_difference(step) / self._guard.period
-        execution.resume_from(position, speed, spread, self._cycle)
+        spread = min(SPREAD * steps, round(RETURN / self._guard.period))
+        execution.resume_from(position, speed, spread, cycle)
         self._guard.resume_from(position, speed, spread)
         self._history.resume_from(target, step)
         self.set_point, self._sent = position, target

@@ -128,7 +128,8 @@ def test_a_repetition_with_a_stuck_joint_is_run_again(tmp_path: Path) -> None:
     assert first is not None
     assert first.outcome == "rejected"
     assert first.reason.startswith("joint_1 is stuck: its position stays the same from 0.")
-    assert "excitation_000_a2.mcap" in seen.found.pooled
+    # The arm may need a further attempt to come to rest.
+    assert {"excitation_000_a2.mcap", "excitation_000_a3.mcap"} & {*seen.found.pooled}
 
 
 class TestClosedLink:

@@ -563,7 +563,7 @@ def test_a_model_that_predicts_other_torques_is_found(observed: Observed) -> Non
     assert observed.twin_found is not None
     found_one, pooled = observed.found, observed.found.result.pooled
     (samples, *_) = found_one.fitted
-    for share, seen in ((0.1, False), (10.0, True)):
+    for share, seen in ((0.05, False), (10.0, True)):
         change = share * pooled.std * np.sign(pooled.values)
         torque = samples.predicted_torque(found_one.model, change)
         assert (np.abs(torque).max(axis=0) > pooled.noise_std).any() is np.bool_(seen)
