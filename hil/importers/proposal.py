@@ -7,6 +7,7 @@ positions, velocities and torques against the URDF.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,8 @@ from hil.toml_text import to_text
 _NUMBER: Final = re.compile(r"\d{1,2}(?=\D*$)")
 _JOINT_KINDS: Final[tuple[Kind, ...]] = ("position", "velocity", "torque", "motor_current")
 _MOST_NAMED: Final = 30
+_Columns = str | Sequence[str | int]
+"""A name, with ``{}`` for the joint, or a list of names or of indices."""
 _SIDE: Final = 'side = "motor" with [drive] gear_ratio'
 
 
@@ -121,22 +124,26 @@ def kinds_of_file(path: Path) -> list[Kind]:
 
 def _groups(channels: Iterable[Channel], joints: Sequence[str]) -> list[_Group]:
     """Group channels by their name without number or joint, in the order of the log."""
+    channels = list(channels)
+    bare_names = [without_unit(channel.name)[0].strip() or channel.name for channel in channels]
+    repeated = {name for name, times in Counter(bare_names).items() if times > 1}
     members: dict[tuple[str, Kind | None, bool], list[tuple[int, str, Channel]]] = {}
-    for channel in channels:
-        name = without_unit(channel.name)[0].strip() or channel.name
-        kind, pattern, place, by_joint = channel.kind, name, 0, False
-        match = _NUMBER.search(name)
+    for channel, bare in zip(channels, bare_names, strict=True):
+        end = channel.name.strip()[len(bare) :] if bare in repeated else ""
+        kind, pattern, place, by_joint = channel.kind, bare, 0, False
+        match = _NUMBER.search(bare)
         if match is not None:
-            pattern = f"{name[: match.start()]}{{}}{name[match.end() :]}"
+            pattern = f"{bare[: match.start()]}{{}}{bare[match.end() :]}"
             place = int(match[0])
-        joint = _joint_in(name, joints) if kind is None else None
+        joint = _joint_in(bare, joints) if kind is None else None
         if joint is not None:
-            bare = name.replace(joint, "").strip(" _.-/")
-            kind = kind_of(bare, channel.unit)[0]
+            quantity = bare.replace(joint, "").strip(" _.-/")
+            kind = kind_of(quantity, channel.unit)[0]
             if kind is not None:
                 by_joint = True
-                pattern, place = name.replace(joint, "{}"), list(joints).index(joint)
-        members.setdefault((pattern, kind, by_joint), []).append((place, name, channel))
+                pattern, place = bare.replace(joint, "{}"), list(joints).index(joint)
+        entry = (place, bare + end, channel)
+        members.setdefault((pattern + end, kind, by_joint), []).append(entry)
     groups = []
     for (pattern, kind, by_joint), entries in members.items():
         entries.sort(key=lambda entry: entry[0])
@@ -198,7 +205,7 @@ class _Search:
 
     def proposal(self) -> Proposal:
         """Return the map, or raise SourceError with what is missing."""
-        columns: dict[str, str | list[str]] = {}
+        columns: dict[str, _Columns] = {}
         kinds: list[Kind] = [*(("time",) if self._rate is None else ()), *_JOINT_KINDS]
         for kind in kinds:
             names = self._channels(kind)
@@ -211,25 +218,26 @@ class _Search:
             missing.append("torque")
         if missing:
             self._refuse_missing(missing)
-        others = [group.label for group in self._groups if group.pattern not in self._used]
-        if others:
+        others = [group.label for group in self._groups if not self._is_used(group)]
+        if others and not self._nameless:
             self._lines.append(f"not used: {', '.join(others[:_MOST_NAMED])}")
         table: dict[str, object] = {kind: {"columns": names} for kind, names in columns.items()}
         if self._rate is not None:
             table = {"sample_rate": self._rate, **table}
         else:
-            table["time"] = {"column": columns["time"]}
+            time = columns["time"]
+            table["time"] = {"column": time if isinstance(time, str) else time[0]}
         comment = "Proposed by hil from the names and units of the channels"
         text = to_text(table, {"": comment})
         return Proposal(text, ColumnMap.model_validate(parse_toml(text)), tuple(self._lines))
 
-    def _channels(self, kind: Kind) -> str | list[str] | None:
+    def _channels(self, kind: Kind) -> _Columns | None:
         """Return the channels of a quantity; None if the log has none."""
         if kind in self._chosen:
             names = self._chosen[kind]
             self._lines.append(f"{names}: {kind}, as given with --columns")
-            self._used.add(names)
-            return names if "," not in names else [name.strip() for name in names.split(",")]
+            self._used.update([names, *map(str.strip, names.split(","))])
+            return self._given(names)
         taken = set(self._chosen.values())
         groups = [g for g in self._groups if g.kind == kind and g.pattern not in taken]
         if not groups:
@@ -247,6 +255,21 @@ class _Search:
         self._used.add(group.pattern)
         self._lines.append(f"{group.label}: {self._reason(kind, group)}")
         return group.columns(self._joints)
+
+    def _is_used(self, group: _Group) -> bool:
+        return group.pattern in self._used or self._used.issuperset(group.names)
+
+    def _given(self, text: str) -> _Columns:
+        """Return names or, where the log has none, indices that were given for a quantity."""
+        names: _Columns = [name.strip() for name in text.split(",")]
+        if self._nameless and all(str(name).isdigit() for name in names):
+            names = [int(name) for name in names]
+        return names if len(names) > 1 or isinstance(names[0], int) else text
+
+    @property
+    def _nameless(self) -> bool:
+        """Whether the log has no names, but indices."""
+        return all(group.pattern in ("{}", "0") for group in self._groups)
 
     @staticmethod
     def _reason(kind: Kind, group: _Group) -> str:
@@ -316,10 +339,18 @@ class _Search:
             problem += f", which name no quantity (the name of the file says {_named(stated[0])})"
             remedy = self._remedy_for_files(files)
         else:
-            steps = ["--sample-rate HZ or --columns time=NAME"] if "time" in missing else []
-            pattern = unnamed[0].pattern if unnamed else "NAME{}"
-            steps += [f"--columns '{kind}={pattern}'" for kind in missing if kind != "time"]
+            place = "0" if self._nameless else "NAME"
+            steps = [f"--sample-rate HZ or --columns time={place}"] if "time" in missing else []
+            count = len(self._joints)
+            for number, kind in enumerate(kind for kind in missing if kind != "time"):
+                pattern = unnamed[0].pattern if unnamed else "NAME{}"
+                if self._nameless:
+                    first = 1 + number * count
+                    pattern = ",".join(map(str, range(first, first + count)))
+                steps.append(f"--columns '{kind}={pattern}'")
             remedy = f"state {'; '.join(steps)}; or write a map (--map map.toml)"
+            if missing == ["torque"] and not unnamed:
+                remedy = f"record it, since nothing can be identified without, or {remedy}"
         raise SourceError(self._log, problem, field=", ".join(missing), remedy=remedy)
 
     def _files(self) -> dict[Kind, str]:

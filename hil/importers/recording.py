@@ -107,7 +107,7 @@ def import_recording(
         SourceError: it cannot be read, or its channels leave a quantity open.
         ArchiveWriteError: the archive exists or cannot be written.
     """
-    if options.columns is None and not options.chosen and has_joint_states(source):
+    if options.columns is None and has_joint_states(source) and not _read_as_log(source, options):
         return _import_bag(source, output, robot_of, options, held_joints, use, force=force)
     lines: tuple[str, ...] = ()
     if options.columns is not None:
@@ -130,6 +130,17 @@ def import_recording(
         outside_limits=options.outside_limits,
     )
     return ImportedRecording(output, text, lines)
+
+
+def _read_as_log(source: Path, options: ImportOptions) -> bool:
+    """Return whether options of a log are given for a file that also has joint states."""
+    if not options.chosen and options.sample_rate is None:
+        return False
+    if source.suffix.lower() == ".mcap":
+        return True
+    field = "--columns" if options.chosen else "--sample-rate"
+    remedy = "omit it; its topic of joint states is chosen with --topic"
+    raise SourceError(source, "is a bag, which names its quantities", field=field, remedy=remedy)
 
 
 def _import_bag(

@@ -11,6 +11,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Final
+
+import numpy as np
 
 from hil.archive import open_archive
 from hil.errors import InputError, SourceError
@@ -25,7 +28,10 @@ from hil.importers.recording import (
 from hil.importers.robot import Use
 from hil.progress import Reporter
 
-MAP = "map.toml"
+MAP: Final = "map.toml"
+"""File of the column map in a folder of results."""
+
+_SHORTEST: Final = 1.0  # s
 
 
 @dataclass
@@ -36,11 +42,13 @@ class Staging:
         fitted: archives to fit.
         predicted: archives to predict.
         recordings: those that were imported, by archive.
+        sources: the files that those are from, by archive.
     """
 
     fitted: list[Path] = field(default_factory=list)
     predicted: list[Path] = field(default_factory=list)
     recordings: dict[Path, ImportedRecording] = field(default_factory=dict)
+    sources: dict[Path, Path] = field(default_factory=dict)
 
     def move_to(self, folder: Path, sources: Sequence[Path]) -> Mapping[Path, Path]:
         """Move archives and maps to an existing folder; return the new paths by the old ones.
@@ -78,7 +86,7 @@ def staged(
     """Import those recordings that are no archives, and report what was concluded.
 
     Raises:
-        SourceError: one cannot be imported, or has no torque.
+        SourceError: one cannot be imported, or nothing can be identified from it.
     """
     with TemporaryDirectory(prefix="hil-") as folder:
         staging = Staging()
@@ -93,11 +101,20 @@ def staged(
                     continue
                 archive = _free(Path(folder), path)
                 recording = import_recording(path, archive, robot_of, options, use=use)
-                _require_torque(archive, path)
+                _require_usable(archive, path)
                 _report(recording, path, reporter)
                 archives.append(archive)
                 staging.recordings[archive] = recording
-        yield staging
+                staging.sources[archive] = path
+        try:
+            yield staging
+        except InputError as error:
+            if error.path not in staging.sources:
+                raise
+            source = staging.sources[error.path]
+            raise InputError(
+                source, error.problem, field=error.field, remedy=error.remedy
+            ) from error
 
 
 def _free(folder: Path, recording: Path) -> Path:
@@ -109,15 +126,29 @@ def _free(folder: Path, recording: Path) -> Path:
     return path
 
 
-def _require_torque(archive: Path, recording: Path) -> None:
-    """Raise SourceError for a recording without a torque."""
-    columns = open_archive(archive, fields=("torque",)).columns
+def _require_usable(archive: Path, recording: Path) -> None:
+    """Raise SourceError for a recording that nothing can be identified from."""
+    imported = open_archive(archive, fields=("torque",))
+    columns, stamp = imported.columns, imported.columns["stamp"]
+    duration = float(stamp[-1] - stamp[0]) * 1e-9
+    if duration < _SHORTEST:
+        samples = f"{len(stamp)} {'sample' if len(stamp) == 1 else 'samples'}"
+        problem = f"has {samples} in {duration:.3g} s, too few to identify from"
+        remedy = "record a motion of all joints, of 10 s or more"
+        raise SourceError(recording, problem, remedy=remedy)
     if "torque" not in columns:
-        problem = "has no joint torque, and motor currents alone determine no model"
+        problem = "has motor currents and no joint torque"
         remedy = (
-            "give the torque constants, gears included (N.m/A), in a copy of the map: [drive] "
-            "torque_constant = [...] (--map map.toml); `hil gains` estimates them"
+            "`hil import log` writes its column map: add [drive] torque_constant = [...] (N.m/A, "
+            "gears included, one for each joint) and give it with --map; or measure the constants "
+            "(`hil gains`)"
         )
+        raise SourceError(recording, problem, field="torque", remedy=remedy)
+    torque = np.asarray(columns["torque"])
+    if not np.ptp(torque, axis=0).any():
+        values = ", ".join(f"{value:g}" for value in torque[0])
+        problem = f"the torque of each joint is constant ({values})"
+        remedy = "check which channels hold the measured torque (--columns 'torque=NAME{}')"
         raise SourceError(recording, problem, field="torque", remedy=remedy)
 
 
