@@ -115,11 +115,13 @@ class _Work:
         with staged(
             self.recordings, self.predict, arm.robot, reading.options, self.reporter
         ) as staging:
+            if self.output is not None:
+                staging.check_places(self.output)
             found = identify_paths(
                 staging.fitted, self.reporter, self.options, predict=staging.predicted
             )
             folder, sources = self._folder()
-            places = staging.move_to(folder, [*self.recordings, *self.predict])
+            places = staging.move_to(folder)
             found = replace(found, paths=tuple(places.get(path, path) for path in found.paths))
             results = write_outcome(folder, found, self.reporter)
         if sources is not None:

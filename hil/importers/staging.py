@@ -50,18 +50,22 @@ class Staging:
     recordings: dict[Path, ImportedRecording] = field(default_factory=dict)
     sources: dict[Path, Path] = field(default_factory=dict)
 
-    def move_to(self, folder: Path, sources: Sequence[Path]) -> Mapping[Path, Path]:
+    def check_places(self, folder: Path) -> None:
+        """Raise InputError if an archive in this folder would replace a recording."""
+        recordings = {path.resolve() for path in self.sources.values()}
+        for archive in self.recordings:
+            place = folder / archive.name
+            if place.resolve() in recordings:
+                problem = "is the recording itself, which its archive would replace"
+                raise InputError(place, problem, remedy="name another folder: --output FOLDER")
+
+    def move_to(self, folder: Path) -> Mapping[Path, Path]:
         """Move archives and maps to an existing folder; return the new paths by the old ones.
 
         Raises:
-            InputError: an archive would replace one of the `sources`.
-            OutputError: the folder cannot be written to.
+            InputError: the folder cannot be written to.
         """
         places = {archive: folder / archive.name for archive in self.recordings}
-        for place in places.values():
-            if any(place.resolve() == source.resolve() for source in sources):
-                problem = "is the recording itself, which the archive would replace"
-                raise InputError(place, problem, remedy="name another folder: --output FOLDER")
         with convert_write_errors(folder):
             for archive, place in places.items():
                 with replace_file(place) as temporary:
