@@ -238,8 +238,8 @@ class _Search:
             self._lines.append(f"{names}: {kind}, as given with --columns")
             self._used.update([names, *map(str.strip, names.split(","))])
             return self._given(names)
-        taken = set(self._chosen.values())
-        groups = [g for g in self._groups if g.kind == kind and g.pattern not in taken]
+        given = set(self._chosen.values())
+        groups = [g for g in self._groups if g.kind == kind and g.pattern not in given]
         if not groups:
             return None
         if len(groups) > 1:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
@@ -22,7 +21,8 @@ from hil.importers import ColumnMap, Robot, import_log, import_rosbag2
 from hil.importers.proposal import proposed_map
 from hil.importers.recording import import_recording
 from hil.output_folder import SOURCES, folder_beside, sources_text
-from tests.hil.simulated_logs import urdf_path
+from tests.hil.simulated_logs import urdf_path, write_moving_log
+from tests.hil.simulated_logs import write_log as log
 from tests.hil.test_bag_kinds import WHOLE
 from tests.hil.test_importers_rosbag2 import DEFINITION, STATE, bag, mcap
 from tests.hil.test_log_kinds import JOINTS, POSITION, SLOPE, TIME, TORQUE, URDF
@@ -38,33 +38,8 @@ def urdf(tmp_path: Path) -> Path:
     return path
 
 
-def log(path: Path, names: Sequence[str], *columns: Floats) -> Path:
-    """Write a CSV file; a name with {} is that of a column for each joint, from 1."""
-    header = []
-    for name, values in zip(names, columns, strict=True):
-        count = np.atleast_2d(values.T).shape[0]
-        header += [name.replace("{}", str(number)) for number in range(1, count + 1)]
-    table = np.column_stack(columns)
-    rows = [",".join(f"{value:.9g}" for value in row) for row in table.tolist()]
-    path.write_text("\n".join([",".join(header), *rows]) + "\n")
-    return path
-
-
-def moving(path: Path, *, phase: float = 0.0, duration: float = 8.0) -> Path:
-    """Write the log of a simulated motion with the torques of the URDF's masses and friction."""
-    model = pin.buildModelFromXML(URDF)
-    data = model.createData()
-    time = np.arange(0.0, duration, 0.01)
-    rate = np.array([[2.1], [3.7], [5.3]]) * np.array([1.0, 1.3, 1.7])
-    shift = phase + np.arange(9.0).reshape(3, 3)
-    angle = rate * time[:, None, None] + shift
-    q = 0.3 * np.sin(angle).sum(axis=1)
-    v = 0.3 * (rate * np.cos(angle)).sum(axis=1)
-    a = -0.3 * (rate**2 * np.sin(angle)).sum(axis=1)
-    torque = np.array([pin.rnea(model, data, *row) for row in zip(q, v, a, strict=True)])
-    noise = np.random.default_rng(int(10 * phase)).normal(0.0, 0.02, torque.shape)
-    torque = torque + 0.4 * np.sign(v) + 0.2 * v + noise
-    return log(path, ["t", "q{}", "v{}", "tau{}"], time, q, v, torque)
+def moving(path: Path, *, seed: int = 0) -> Path:
+    return write_moving_log(path, URDF, seed=seed)
 
 
 def hil(*arguments: object) -> Any:
@@ -219,7 +194,7 @@ REFUSED: Mapping[str, tuple[list[str], list[Floats], str, str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_decided_is_refused(tmp_path: Path, urdf: Path, case: str) -> None:
+def test_it_is_refused(tmp_path: Path, urdf: Path, case: str) -> None:
     names, columns, problem, remedy = REFUSED[case]
     path = log(tmp_path / "a.csv", names, *columns)
     before = sorted(tmp_path.iterdir())
@@ -277,7 +252,7 @@ def test_a_bag_needs_no_map(tmp_path: Path, urdf: Path) -> None:
 class TestIdentify:
     def test_a_log_and_a_urdf_are_enough(self, tmp_path: Path, urdf: Path) -> None:
         """One log fitted, one predicted; the folder holds what the next run needs."""
-        first, second = moving(tmp_path / "a.csv"), moving(tmp_path / "b.csv", phase=1.0)
+        first, second = moving(tmp_path / "a.csv"), moving(tmp_path / "b.csv", seed=1)
         result = hil("identify", first, "--urdf", urdf, "--predict", second)
         assert result.exit_code == 0, (result.output, result.exception)
         folder = tmp_path / "a"
@@ -317,7 +292,7 @@ class TestIdentify:
         path = log(tmp_path / "a.csv", ["t", "q{}", "tau{}"], TIME, POSITION, TORQUE)
         assert "add --urdf ARM.urdf" in str(hil("identify", path).exception)
 
-    def test_options_of_logs_are_not_ignored_with_archives(self, tmp_path: Path) -> None:
+    def test_archives_have_no_options_of_logs(self, tmp_path: Path) -> None:
         refused = hil("identify", tmp_path / "a.mcap", "--sample-rate", "100").exception
         assert "--sample-rate" in str(refused)
         assert "add --urdf ARM.urdf" in str(refused)
@@ -381,7 +356,7 @@ def test_a_real_bag_is_read_with_file_and_urdf_alone(tmp_path: Path, shared_data
     assert all(np.array_equal(first[name], second[name]) for name in second)
 
 
-def test_a_real_log_on_the_motor_side_says_what_is_missing(shared_data: Path) -> None:
+def test_a_real_motor_side_log_names_what_is_missing(shared_data: Path) -> None:
     folder = shared_data / "tx40"
     robot = Robot.from_urdf(folder / "tx40_mdh_modified.urdf")
     with pytest.raises(SourceError) as refused:
