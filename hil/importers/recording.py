@@ -111,8 +111,8 @@ def import_recording(
         return _import_bag(source, output, robot_of, options, held_joints, use, force=force)
     lines: tuple[str, ...] = ()
     if options.columns is not None:
-        columns, text = ColumnMap.load(options.columns), map_text(options.columns)
         robot = robot_of(partial(_joints_of_map, options.columns))
+        columns, text = ColumnMap.load(options.columns), map_text(options.columns)
     else:
         robot = robot_of(partial(_no_joints, source))
         rate = options.sample_rate
