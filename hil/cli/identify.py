@@ -9,13 +9,14 @@ from typing import Annotated
 
 import typer
 
+from hil.annotate import annotate as write_annotated
 from hil.cli.arguments import JsonOption, QuietOption, with_options
 from hil.cli.identify_options import EstimatorOption, Identifying
 from hil.cli.imports import Described, Reading
 from hil.cli.verdict import finish
 from hil.errors import InputError
 from hil.files import make_folder, write_output
-from hil.identify import Options, identify_paths
+from hil.identify import Identification, Options, identify_paths
 from hil.importers.recording import is_archive
 from hil.importers.staging import staged
 from hil.outcome import REPORT, write_outcome
@@ -44,6 +45,7 @@ def identify(
     split: Annotated[float, typer.Option(min=0.1, max=0.9)] = 0.7,
     in_sample: bool = False,
     estimator: EstimatorOption = "auto",
+    annotate: bool = False,
     *,
     arm: Described,
     reading: Reading,
@@ -70,6 +72,8 @@ def identify(
             predicted.
         in_sample: Fit all recordings and hold nothing out. All errors are then in-sample, and the
             model cannot be judged good.
+        annotate: Also write copies of the archives for viewers, with the predicted torque and the
+            residual as channels, in the subfolder annotated of the output.
     """
     reporter = make_reporter(quiet=quiet or json)
     method = "paper" if paper else "default"
@@ -78,7 +82,7 @@ def identify(
         output = output or (recordings[0] / "paper" if paper else recordings[0])
     if output is not None:
         require_possible(output)
-    work = _Work(recordings, predict or [], output, options, reporter)
+    work = _Work(recordings, predict or [], output, options, annotate, reporter)
     if arm.is_given:
         results, folder = work.from_recordings(arm, reading)
     else:
@@ -95,6 +99,7 @@ class _Work:
     predict: Sequence[Path]
     output: Path | None
     options: Options
+    annotate: bool
     reporter: Reporter
 
     def from_archives(self) -> tuple[Results, Path]:
@@ -105,7 +110,7 @@ class _Work:
                 raise InputError(path, problem, remedy="add --urdf ARM.urdf")
         found = identify_paths(self.recordings, self.reporter, self.options, predict=self.predict)
         folder, sources = self._folder()
-        results = write_outcome(folder, found, self.reporter)
+        results = self._write(folder, found)
         if sources is not None:
             write_output(folder / SOURCES, sources)
         return results, folder
@@ -123,10 +128,17 @@ class _Work:
             folder, sources = self._folder()
             places = staging.move_to(folder)
             found = replace(found, paths=tuple(places.get(path, path) for path in found.paths))
-            results = write_outcome(folder, found, self.reporter)
+            results = self._write(folder, found)
         if sources is not None:
             write_output(folder / SOURCES, sources)
         return results, folder
+
+    def _write(self, folder: Path, found: Identification) -> Results:
+        results = write_outcome(folder, found, self.reporter)
+        if self.annotate:
+            copies = write_annotated(found, folder)
+            self.reporter.say(f"annotated for viewers: {', '.join(map(str, copies))}")
+        return results
 
     def _folder(self) -> tuple[Path, str | None]:
         """Create the folder of the results; return it and what it states as their sources."""
