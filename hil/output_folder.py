@@ -54,7 +54,7 @@ def require_possible(folder: Path) -> None:
             folder, f"cannot be created ({existing} is a file)", remedy="name another folder"
         )
     if not os.access(existing, os.W_OK | os.X_OK):
-        raise InputError(existing, "cannot be written to", remedy="name another folder")
+        raise InputError(existing, "cannot be written to", remedy="name another folder (--output)")
 
 
 def _candidates(recording: Path) -> Iterator[Path]:

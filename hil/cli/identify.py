@@ -23,6 +23,7 @@ from hil.outcome import REPORT, write_outcome
 from hil.output_folder import SOURCES, folder_beside, require_possible, sources_text
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
+from hil.reading import path_exists
 from hil.results import Results
 
 RecordingsArgument = Annotated[
@@ -80,8 +81,8 @@ def identify(
     options = how.options(method=method, split=split, in_sample=in_sample, estimator=estimator)
     if len(recordings) == 1 and recordings[0].is_dir() and is_archive(recordings[0]):
         output = output or (recordings[0] / "paper" if paper else recordings[0])
-    if output is not None:
-        require_possible(output)
+    if output is not None or path_exists(recordings[0]):
+        require_possible(output or recordings[0].resolve().parent)
     work = _Work(recordings, predict or [], output, options, annotate, reporter)
     if arm.is_given:
         results, folder = work.from_recordings(arm, reading)
