@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -14,26 +15,28 @@ from hil.cli.arguments import (
     ConventionOption,
     DhOption,
     JsonOption,
+    at_most_one,
     exactly_one,
     figures,
     print_json,
     with_options,
 )
 from hil.errors import InputError
+from hil.files import write_output
 from hil.identify.options import FRICTION_TERMS, friction_from
 from hil.importers import (
     STANDARD_GRAVITY,
     Clock,
-    ColumnMap,
     Effort,
     Robot,
     Use,
     convention_of,
-    import_log,
     import_rosbag2,
     recorded_joints,
 )
+from hil.importers.channels import CHANNEL_NAMES
 from hil.importers.column_map import ready_map, ready_maps
+from hil.importers.recording import ImportOptions, import_recording
 from hil.progress import say
 from hil.terminal_text import printable
 from identification import FrictionLaw
@@ -110,6 +113,11 @@ class Described:
         ),
     ] = False
 
+    @property
+    def is_given(self) -> bool:
+        """Whether an option names a description of the robot."""
+        return any((self.urdf, self.cell, self.dh))
+
     def robot(self, recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
         """Return the robot of a cell file, URDF or DH table; `recorded` reads the joint names."""
         exactly_one(
@@ -135,6 +143,76 @@ class Described:
             locked=at,
             recorded=joints,
         )
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Options that state what the channels of a recording are, where that is not concluded."""
+
+    columns: Annotated[
+        Path | None,
+        typer.Option(
+            "--map",
+            help="TOML file with the column map, or a ready one by name (`hil import maps`). "
+            "Default: concluded from the names and units of the channels, and printed.",
+        ),
+    ] = None
+    channels: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--columns",
+            metavar="QUANTITY=NAME",
+            help="Channels of a quantity (time, position, velocity, torque, motor_current): a name "
+            "with {} for the joint, or names separated by commas (repeatable).",
+        ),
+    ] = None
+    sample_rate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Sampling rate of a log without a time.")
+    ] = None
+    topic: Annotated[
+        str | None,
+        typer.Option(help="Topic of the joint states of a bag; needed if it has several."),
+    ] = None
+    rename: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="RECORDED=URDF",
+            help="Joint whose name in a bag differs from the URDF (repeatable).",
+        ),
+    ] = None
+    outside_limits: OutsideOption = False
+
+    @property
+    def options(self) -> ImportOptions:
+        """How recordings are read; InputError for an option that is not understood."""
+        at_most_one(map=self.columns, columns=self.channels)
+        at_most_one(map=self.columns, sample_rate=self.sample_rate)
+        if self.sample_rate is not None and not 0.0 < self.sample_rate < math.inf:
+            remedy = "give a rate above 0 Hz"
+            raise InputError(None, "is not a rate", field="--sample-rate", remedy=remedy)
+        return ImportOptions(
+            self.columns,
+            _chosen(self.channels or []),
+            self.sample_rate,
+            self.topic,
+            _names(self.rename or []),
+            self.outside_limits,
+        )
+
+    def refuse_without_robot(self) -> None:
+        """Raise InputError if an option is given that archives do not need."""
+        given = {
+            "--map": self.columns,
+            "--columns": self.channels,
+            "--sample-rate": self.sample_rate,
+            "--topic": self.topic,
+            "--rename": self.rename,
+            "--outside-limits": self.outside_limits,
+        }
+        for option, value in given.items():
+            if value:
+                problem = "is for logs and bags, which need the description of their arm"
+                raise InputError(None, problem, field=option, remedy="add --urdf ARM.urdf")
 
 
 @app.command("rosbag2")
@@ -188,54 +266,53 @@ def rosbag2(
 
 
 @with_options(Described, "arm")
+@with_options(Reading, "reading")
 def log(
     source: Source,
-    output: Output,
-    columns: Annotated[Path, typer.Option("--map")],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="The archive to write (*.mcap). Default: beside it."),
+    ] = None,
     *,
     arm: Described,
+    reading: Reading,
     held: Held = None,
     kind: Kind = "excitation",
     force: ForceOption = False,
-    outside_limits: OutsideOption = False,
     uncoupled: bool = False,
     json: JsonOption = False,
 ) -> None:
     """Import a numeric log: CSV, text matrices, .npz, .npy, .mat, MATLAB text or .mcap.
 
     A column map names columns or arrays, their units and sides: `docs/archive-format.md`. It can
-    also name a separate file per quantity or per joint; the source is then a folder. Warnings
-    report probable errors of the map, with the error of each of two interpretations.
+    also name a separate file per quantity or per joint; the source is then a folder. Without --map
+    it is concluded from the names and units of the channels, printed, and written beside the
+    archive. Warnings report probable errors of the map, with the error of each of two
+    interpretations.
 
-    **Example:** `hil import log log.csv --map map.toml --urdf arm.urdf -o log.mcap`, with
-    `map.toml` of `[time] column = "t"`, `[position] columns = "q{}"`, `[torque] columns = "tau{}"`
+    **Example:** `hil import log log.csv --urdf arm.urdf -o log.mcap`, with `--map map.toml` of
+    `[time] column = "t"`, `[position] columns = "q{}"`, `[torque] columns = "tau{}"`
 
     Options:
-        columns: TOML file with the column map, or a ready one by name (`hil import maps`).
         uncoupled: Leave the inertia and friction of coupled motors out of the model, to measure
             their contribution. Angles and torques remain those of the map.
     """
-
-    def recorded() -> tuple[str, ...]:
-        joints = ColumnMap.load(columns).joints
-        if joints is None:
-            problem = "does not name the recorded joints"
-            remedy = "--lock-others needs joints = [...], the URDF's joint of each column"
-            raise InputError(columns, problem, field="joints", remedy=remedy)
-        return joints
-
-    path = import_log(
+    recording = import_recording(
         source,
-        output,
-        robot=arm.robot(recorded),
-        columns=ColumnMap.load(columns),
+        output or source.with_suffix(".mcap"),
+        arm.robot,
+        reading.options,
         held_joints=held or (),
         use=kind,
-        force=force,
-        outside_limits=outside_limits,
         coupled=not uncoupled,
+        force=force,
     )
-    _print(path, json=json)
+    proposed = reading.columns is None and recording.map_text is not None
+    if proposed:
+        write_output(recording.archive.with_suffix(".map.toml"), recording.map_text or "")
+    _print(recording.archive, recording.lines, json=json)
+    if proposed and not json:
+        say(f"wrote {recording.archive.with_suffix('.map.toml')}")
 
 
 app.command("log")(log)
@@ -263,13 +340,14 @@ def maps(
             say(f"{known:<18} {purpose}")
 
 
-def _print(path: Path, *, json: bool) -> None:
-    """Print the findings in the new archive."""
+def _print(path: Path, concluded: Sequence[str] = (), *, json: bool) -> None:
+    """Print what was concluded of the channels, and the findings in the new archive."""
     found = open_archive(path).header.findings
+    lines = [*concluded, *found.lines]
     if json:
-        print_json({"archive": str(path), "found": found.lines, "warnings": found.warnings})
+        print_json({"archive": str(path), "found": lines, "warnings": found.warnings})
         return
-    for line in found.lines:
+    for line in lines:
         say(line)
     for warning in found.warnings:
         typer.secho(printable(f"warning: {warning}"), fg=typer.colors.YELLOW)
@@ -284,3 +362,15 @@ def _names(renamed: list[str]) -> dict[str, str]:
             problem = f"{recorded or '=' + name!r} is not a pair"
             raise InputError(None, problem, field="--rename", remedy="give RECORDED=URDF")
     return names
+
+
+def _chosen(texts: Sequence[str]) -> dict[str, str]:
+    """Parse QUANTITY=NAME pairs."""
+    chosen = {}
+    for text in texts:
+        kind, _, name = text.partition("=")
+        if kind not in CHANNEL_NAMES or not name.strip():
+            remedy = f"give QUANTITY=NAME, with a quantity of {', '.join(CHANNEL_NAMES)}"
+            raise InputError(None, f"{text!r} is not a pair", field="--columns", remedy=remedy)
+        chosen[kind] = name.strip()
+    return chosen

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json as json_module
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 import typer
@@ -19,8 +20,17 @@ _MISSING: Final = "-"
 _LEVELS: Final = {"wrong": "WRONG", "doubtful": "warning", "information": "info", "good": "ok"}
 
 
-def finish(results: Results, *, json: bool, quiet: bool = False) -> None:
-    """Print table and findings to stderr, then the verdict or JSON; exit 5 if it is not good."""
+def finish(
+    results: Results,
+    *,
+    json: bool,
+    quiet: bool = False,
+    written: tuple[Path, Path] | None = None,
+) -> None:
+    """Print table and findings to stderr, then the verdict or JSON; exit 5 if it is not good.
+
+    `written` are folder and report, which the last line names, on stderr.
+    """
     if json:
         typer.echo(as_json(results))
     else:
@@ -34,6 +44,8 @@ def finish(results: Results, *, json: bool, quiet: bool = False) -> None:
         for line in lines:
             say(line, err=True)
         say(results.verdict.line)
+    if written is not None and not quiet:
+        say(f"results: {written[0]}, report: {written[1]}", err=True)
     if not results.verdict.good:
         raise typer.Exit(NOT_GOOD)
 

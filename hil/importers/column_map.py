@@ -212,9 +212,7 @@ class ColumnMap(_Table):
         """
         path = Path(path)
         try:
-            is_ready = str(path) in ready_maps() and not path_exists(path)
-            text = ready_map(str(path)) if is_ready else read_text(path)
-            return cls.model_validate(parse_toml(text))
+            return cls.model_validate(parse_toml(map_text(path)))
         except ValidationError as error:
             wrong = first_error(path, error, cls, documentation=_DOCUMENTATION)
             problem, field, remedy = wrong.problem, wrong.field, wrong.remedy
@@ -226,6 +224,12 @@ class ColumnMap(_Table):
             if isinstance(error, FileNotFoundError):
                 remedy = remedy_for_missing(path, remedy)
             raise SourceError(path, problem, remedy=remedy) from error
+
+
+def map_text(path: Path) -> str:
+    """Return the text of a file with a map, or of the ready one of this name; OSError."""
+    is_ready = str(path) in ready_maps() and not path_exists(path)
+    return ready_map(str(path)) if is_ready else read_text(path)
 
 
 def ready_maps() -> dict[str, str]:

@@ -19,6 +19,7 @@ from hil.campaign import design
 from hil.cli import app
 from hil.progress import Silent
 from tests.docs.typed import PAGES, ROOT, commands, parse
+from tests.hil.simulated_logs import write_moving_log
 
 TYPED_ELSEWHERE = {
     "campaign.md": "tests/hil/test_campaign_day.py",
@@ -65,7 +66,7 @@ NOT_TYPED = {
     "hil import log log.csv --map columns.toml": "typed in bring-your-own-robot.md",
     "hil gains empty.mcap": "typed in bring-your-own-robot.md",
     "hil payload bare --loaded gripper": "typed in payload.md",
-    "hil identify ur10.mcap": "needs a recording; tests/benchmarks/test_studies.py",
+    "hil identify ur10": "needs a recording; tests/hil/test_one_command.py reads it",
     "hil reidentify /data": "needs other people's archives",
     "hil study --quick": "minutes; tests/hil/test_study.py runs a shorter one",
     "hil study --output": "an hour; tests/hil/test_study.py runs a short one",
@@ -101,6 +102,9 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "arm.urdf").symlink_to(ROOT / "examples" / "two_joints" / "robot.urdf")
     (tmp_path / "quick.toml").write_text(QUICK)
     (tmp_path / "points.csv").write_text("0, 20\n30, -10\n-20, 40\n0, 20\n")
+    urdf = (tmp_path / "robot.urdf").read_text()
+    for seed, name in enumerate(("log.csv", "other.csv")):
+        write_moving_log(tmp_path / name, urdf, seed=seed)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -188,7 +192,7 @@ def test_no_exception_is_left_over() -> None:
     assert OTHER_PROGRAMS.keys() >= {words[0] for words in written} - {"hil"}
 
 
-FAST = ("connect.md", "motion.md")
+FAST = ("connect.md", "i-have-a-log.md", "motion.md", "README.md")
 AFTER_A_DEMO = ("commands.md", "tutorial.md")
 AFTER_TWO = {
     "commands.md": ("march", "june"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -105,6 +105,33 @@ def simulate(
         clean=clean,
         size=size,
     )
+
+
+def write_log(path: Path, names: Sequence[str], *columns: Array) -> Path:
+    """Write a CSV file; a name with {} is that of a column for each joint, from 1."""
+    header = []
+    for name, values in zip(names, columns, strict=True):
+        count = 1 if values.ndim == 1 else values.shape[1]
+        header += [name.replace("{}", str(number)) for number in range(1, count + 1)]
+    table = np.column_stack(columns)
+    rows = [",".join(f"{value:.9g}" for value in row) for row in table.tolist()]
+    path.write_text("\n".join([",".join(header), *rows]) + "\n")
+    return path
+
+
+def write_moving_log(path: Path, urdf: str, *, seed: int = 0, duration: float = 8.0) -> Path:
+    """Write the log of a simulated motion, its torques those of the URDF's masses and friction."""
+    model = pin.buildModelFromXML(urdf)
+    data, rng = model.createData(), np.random.default_rng(seed)
+    time = np.arange(0.0, duration, 0.01)
+    rate = rng.uniform(2.0, 8.0, (3, model.nv))
+    angle = rate * time[:, None, None] + rng.uniform(0.0, 6.0, rate.shape)
+    q = 0.3 * np.sin(angle).sum(axis=1)
+    v = 0.3 * (rate * np.cos(angle)).sum(axis=1)
+    a = -0.3 * (rate**2 * np.sin(angle)).sum(axis=1)
+    torque = np.array([pin.rnea(model, data, *row) for row in zip(q, v, a, strict=True)])
+    torque += 0.4 * np.sign(v) + 0.2 * v + rng.normal(0.0, 0.02, v.shape)
+    return write_log(path, ["t", "q{}", "v{}", "tau{}"], time, q, v, torque)
 
 
 def planted(robot: RobotModel, simulated: Simulated) -> Array:

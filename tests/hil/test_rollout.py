@@ -98,8 +98,8 @@ def test_annotated_copies_add_up_and_are_no_archives(folder: Path, tmp_path: Pat
     assert "not an archive" in str(refused.exception)
 
 
-def test_annotated_copies_need_a_folder(folder: Path) -> None:
+def test_annotated_copies_of_single_archives_lie_beside_them(folder: Path, tmp_path: Path) -> None:
     archive = next((folder / "archives").glob("excitation*.mcap"))
-    done = run("identify", archive, "--annotate")
-    assert isinstance(done.exception, InputError)
-    assert "name a folder for the copies with --output" in str(done.exception)
+    shutil.copy(archive, tmp_path / "run.mcap")
+    run("identify", tmp_path / "run.mcap", "--annotate")
+    assert len([*(tmp_path / "run" / FOLDER).glob("*.mcap")]) == 1

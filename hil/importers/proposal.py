@@ -1,0 +1,387 @@
+"""A column map that nobody wrote: proposed from the names and units of a log's channels.
+
+The map goes through the ordinary import, which concludes units that nothing states and checks
+positions, velocities and torques against the URDF.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NoReturn
+
+from hil.errors import SourceError
+from hil.importers.channels import CHANNEL_NAMES, Channel, channels_of, kind_of
+from hil.importers.column_map import ColumnMap, ready_map, ready_maps
+from hil.importers.robot import Robot
+from hil.importers.units import UNITS, Kind, unit_of, without_unit
+from hil.reading import parse_toml
+from hil.toml_text import to_text
+
+_NUMBER: Final = re.compile(r"\d{1,2}(?=\D*$)")
+_JOINT_KINDS: Final[tuple[Kind, ...]] = ("position", "velocity", "torque", "motor_current")
+_MOST_NAMED: Final = 30
+_Columns = str | Sequence[str | int]
+"""A name, with ``{}`` for the joint, or a list of names or of indices."""
+_SIDE: Final = 'side = "motor" with [drive] gear_ratio'
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A proposed column map.
+
+    Attributes:
+        text: the map, TOML.
+        columns: the same, parsed.
+        lines: one for each group of channels: names, quantity, unit and the reason.
+    """
+
+    text: str
+    columns: ColumnMap
+    lines: tuple[str, ...]
+
+    @property
+    def has_torque(self) -> bool:
+        """Whether the map names joint torques."""
+        return self.columns.torque is not None
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Channels that differ by the number or the name of a joint only.
+
+    Attributes:
+        pattern: their name, with ``{}`` in place of number or joint.
+        kind: the quantity, None if neither name nor unit says it.
+        names: in the order of the joints, without units.
+        size: numbers in a sample.
+        unit: that the log states for the first, None without one.
+        by_joint: whether the names are those of joints of the URDF.
+    """
+
+    pattern: str
+    kind: Kind | None
+    names: tuple[str, ...]
+    size: int
+    unit: str | None
+    by_joint: bool = False
+
+    @property
+    def label(self) -> str:
+        """First and last name."""
+        first, last = self.names[0], self.names[-1]
+        return first if first == last else f"{first} .. {last}"
+
+    def columns(self, joints: Sequence[str]) -> str | list[str]:
+        """Return `columns` of the map: the pattern where it gives these names, else the list."""
+        numbers = range(len(joints) + 1)
+        series = ([str(k) for k in numbers[1:]], [str(k) for k in numbers[:-1]], joints)
+        if self.size == 1 or self.pattern == self.names[0]:
+            return self.names[0]
+        for parts in series:
+            if self.names == tuple(self.pattern.replace("{}", part) for part in parts):
+                return self.pattern
+        return list(self.names)
+
+
+def proposed_map(
+    log: Path,
+    robot: Robot,
+    chosen: Mapping[str, str] | None = None,
+    *,
+    sample_rate: float | None = None,
+) -> Proposal:
+    """Return the column map that the channels of a log suggest for a robot.
+
+    A ready map whose columns the log has comes first, then the names of
+    :data:`hil.importers.channels.CHANNEL_NAMES`. `chosen` are channels by quantity that are given:
+    a name with ``{}`` for the joint, or names separated by commas. `sample_rate` [Hz] replaces the
+    time.
+
+    Raises:
+        SourceError: the log cannot be read, or its channels leave a quantity open.
+    """
+    chosen = dict(chosen or {})
+    joints = robot.joint_names
+    groups = _groups(channels_of(log), joints)
+    if not chosen and sample_rate is None:
+        ready = _matching_ready_map(groups, len(joints))
+        if ready is not None:
+            return _of_ready_map(ready)
+    search = _Search(log, joints, groups, chosen, sample_rate)
+    return search.proposal()
+
+
+def kinds_of_file(path: Path) -> list[Kind]:
+    """Return the quantities that the name of a file says, such as ``curr_data.csv``."""
+    parts = re.split(r"[^a-z]+", path.stem.lower())
+    kinds = [kind_of(part)[0] for part in parts if len(part) > 1]
+    return list(dict.fromkeys(kind for kind in kinds if kind is not None and kind != "time"))
+
+
+def _groups(channels: Iterable[Channel], joints: Sequence[str]) -> list[_Group]:
+    """Group channels by their name without number or joint, in the order of the log."""
+    channels = list(channels)
+    bare_names = [without_unit(channel.name)[0].strip() or channel.name for channel in channels]
+    repeated = {name for name, times in Counter(bare_names).items() if times > 1}
+    members: dict[tuple[str, Kind | None, bool], list[tuple[int, str, Channel]]] = {}
+    for channel, bare in zip(channels, bare_names, strict=True):
+        end = channel.name.strip()[len(bare) :] if bare in repeated else ""
+        kind, pattern, place, by_joint = channel.kind, bare, 0, False
+        match = _NUMBER.search(bare)
+        if match is not None:
+            pattern = f"{bare[: match.start()]}{{}}{bare[match.end() :]}"
+            place = int(match[0])
+        joint = _joint_in(bare, joints) if kind is None else None
+        if joint is not None:
+            quantity = bare.replace(joint, "").strip(" _.-/")
+            kind = kind_of(quantity, channel.unit)[0]
+            if kind is not None:
+                by_joint = True
+                pattern, place = bare.replace(joint, "{}"), list(joints).index(joint)
+        entry = (place, bare + end, channel)
+        members.setdefault((pattern + end, kind, by_joint), []).append(entry)
+    groups = []
+    for (pattern, kind, by_joint), entries in members.items():
+        entries.sort(key=lambda entry: entry[0])
+        names = tuple(name for _, name, _ in entries)
+        size = sum(channel.size for _, _, channel in entries)
+        unit = entries[0][2].unit
+        whole = names[0] if len(names) == 1 else pattern
+        groups.append(_Group(whole, kind, names, size, unit, by_joint))
+    return groups
+
+
+def _joint_in(name: str, joints: Sequence[str]) -> str | None:
+    """Return the joint whose name is in that of a channel, the longest; None without one."""
+    return max((joint for joint in joints if joint in name), key=len, default=None)
+
+
+def _matching_ready_map(groups: Sequence[_Group], count: int) -> str | None:
+    """Return the ready map whose columns are all in the log, one for each of `count` joints."""
+    sizes = {group.pattern: group.size for group in groups}
+    has_torque = any(group.kind == "torque" for group in groups)
+    for name in ready_maps():
+        columns = ColumnMap.load(name)
+        quantities = columns.quantities()
+        if has_torque and "torque" not in quantities:
+            continue
+        time = columns.time is not None and columns.time.column in sizes
+        if time and all(sizes.get(str(q.columns)) == count for q in quantities.values()):
+            return name
+    return None
+
+
+def _of_ready_map(name: str) -> Proposal:
+    columns = ColumnMap.load(name)
+    reason = f"as in the ready map {name}"
+    lines = [
+        f"{quantity.columns}: {kind}, {quantity.unit}, {reason}"
+        for kind, quantity in columns.quantities().items()
+    ]
+    if columns.time is not None:
+        lines.insert(0, f"{columns.time.column}: time, {columns.time.unit}, {reason}")
+    return Proposal(ready_map(name), columns, tuple(lines))
+
+
+class _Search:
+    """The search for the channels of each quantity."""
+
+    def __init__(
+        self,
+        log: Path,
+        joints: Sequence[str],
+        groups: Sequence[_Group],
+        chosen: Mapping[str, str],
+        sample_rate: float | None,
+    ) -> None:
+        self._log, self._joints, self._groups = log, joints, groups
+        self._chosen, self._rate = chosen, sample_rate
+        self._lines: list[str] = []
+        self._used: set[str] = set()
+
+    def proposal(self) -> Proposal:
+        """Return the map, or raise SourceError with what is missing."""
+        columns: dict[str, _Columns] = {}
+        kinds: list[Kind] = [*(("time",) if self._rate is None else ()), *_JOINT_KINDS]
+        for kind in kinds:
+            names = self._channels(kind)
+            if names is not None:
+                columns[kind] = names
+        missing = [kind for kind in ("time", "position") if kind not in columns]
+        if self._rate is not None:
+            missing.remove("time")
+        if "torque" not in columns and "motor_current" not in columns:
+            missing.append("torque")
+        if missing:
+            self._refuse_missing(missing)
+        others = [group.label for group in self._groups if not self._is_used(group)]
+        if others and not self._nameless:
+            self._lines.append(f"not used: {', '.join(others[:_MOST_NAMED])}")
+        table: dict[str, object] = {kind: {"columns": names} for kind, names in columns.items()}
+        if self._rate is not None:
+            table = {"sample_rate": self._rate, **table}
+        else:
+            time = columns["time"]
+            table["time"] = {"column": time if isinstance(time, str) else time[0]}
+        comment = "Proposed by hil from the names and units of the channels"
+        text = to_text(table, {"": comment})
+        return Proposal(text, ColumnMap.model_validate(parse_toml(text)), tuple(self._lines))
+
+    def _channels(self, kind: Kind) -> _Columns | None:
+        """Return the channels of a quantity; None if the log has none."""
+        if kind in self._chosen:
+            names = self._chosen[kind]
+            self._lines.append(f"{names}: {kind}, as given with --columns")
+            self._used.update([names, *map(str.strip, names.split(","))])
+            return self._given(names)
+        given = set(self._chosen.values())
+        groups = [g for g in self._groups if g.kind == kind and g.pattern not in given]
+        if not groups:
+            return None
+        if len(groups) > 1:
+            self._refuse_several(kind, groups)
+        (group,) = groups
+        if group.unit is not None and unit_of(group.unit, kind) is None:
+            self._refuse_unit(kind, group)
+        if kind == "time":
+            if group.size > 1:
+                self._refuse_several(kind, [group])
+        elif group.size != len(self._joints):
+            self._refuse_count(kind, group)
+        self._used.add(group.pattern)
+        self._lines.append(f"{group.label}: {self._reason(kind, group)}")
+        return group.columns(self._joints)
+
+    def _is_used(self, group: _Group) -> bool:
+        return group.pattern in self._used or self._used.issuperset(group.names)
+
+    def _given(self, text: str) -> _Columns:
+        """Return names or, where the log has none, indices that were given for a quantity."""
+        names: _Columns = [name.strip() for name in text.split(",")]
+        if self._nameless and all(str(name).isdigit() for name in names):
+            names = [int(name) for name in names]
+        return names if len(names) > 1 or isinstance(names[0], int) else text
+
+    @property
+    def _nameless(self) -> bool:
+        """Whether the log has no names, but indices."""
+        return all(group.pattern in ("{}", "0") for group in self._groups)
+
+    @staticmethod
+    def _reason(kind: Kind, group: _Group) -> str:
+        """Return quantity, unit and why."""
+        if group.unit is not None:
+            unit = f"{group.unit} as the log states"
+        else:
+            unit = "no unit stated"
+            if kind in ("torque", "motor_current"):
+                unit += f", read as {next(iter(UNITS[kind]))}"
+            else:
+                unit += ", concluded from the numbers"
+        where = "by the URDF's joint in the name" if group.by_joint else "by the name"
+        if group.unit is not None and kind_of(group.names[0])[0] is None and not group.by_joint:
+            where = "by the unit"
+        return f"{kind}, {where}; {unit}"
+
+    def _refuse_several(self, kind: Kind, groups: Sequence[_Group]) -> NoReturn:
+        names = [name for group in groups for name in (group.pattern, *group.names)]
+        patterns = [group.pattern for group in groups]
+        if len(groups) == 1:
+            patterns = [name for name in names if "{}" not in name]
+        listing = " and ".join(group.label for group in groups)
+        problem = f"{listing} are all named as {kind}"
+        options = " or ".join(f"--columns '{kind}={pattern}'" for pattern in patterns[:_MOST_NAMED])
+        raise SourceError(self._log, problem, field=kind, remedy=f"choose one: {options}")
+
+    def _refuse_unit(self, kind: Kind, group: _Group) -> NoReturn:
+        assert group.unit is not None
+        problem = f"{group.label} is named as {kind}, and {group.unit} is not a unit of it"
+        kinds = [kind, *(other for other in _JOINT_KINDS if unit_of(group.unit, other))]
+        options = " or ".join(f"--columns '{name}={group.pattern}'" for name in kinds)
+        raise SourceError(self._log, problem, field=kind, remedy=f"choose one: {options}")
+
+    def _refuse_count(self, kind: Kind, group: _Group) -> NoReturn:
+        count, joints = group.size, ", ".join(self._joints)
+        problem = (
+            f"{count} {'channel is' if count == 1 else 'channels are'} named as {kind} "
+            f"({group.label}), and the URDF has {len(self._joints)} joints: {joints}"
+        )
+        if count < len(self._joints):
+            last = " ".join(f"--locked {name}" for name in self._joints[count:])
+            remedy = f"fix the joints that were not recorded, for the last ones with {last}"
+        else:
+            some = ",".join(group.names[: len(self._joints)])
+            remedy = "give the URDF of this arm"
+            if len(group.names) == count:
+                remedy += f", or the channels of its joints, such as --columns '{kind}={some}'"
+        remedy += "; or name the URDF's joint of each channel in joints of a map (--map map.toml)"
+        raise SourceError(self._log, problem, field=kind, remedy=remedy)
+
+    def _refuse_missing(self, missing: Sequence[str]) -> NoReturn:
+        """Raise SourceError with the quantities without a channel, and what would name them."""
+        unnamed = [
+            group
+            for group in self._groups
+            if group.kind is None and group.size == len(self._joints) and len(group.names) > 1
+        ]
+        listing = ", ".join(group.label for group in self._groups[:_MOST_NAMED])
+        examples = [
+            f"{kind} ({', '.join(CHANNEL_NAMES[_kind(kind)][:3])}, ...)" for kind in missing
+        ]
+        problem = f"no channel is named as {' or '.join(examples)}; its channels are {listing}"
+        stated = kinds_of_file(self._log)
+        files = self._files()
+        if unnamed and stated and len(files) > 1:
+            problem += f", which name no quantity (the name of the file says {_named(stated[0])})"
+            remedy = self._remedy_for_files(files)
+        else:
+            place = "0" if self._nameless else "NAME"
+            steps = [f"--sample-rate HZ or --columns time={place}"] if "time" in missing else []
+            count = len(self._joints)
+            for number, kind in enumerate(kind for kind in missing if kind != "time"):
+                pattern = unnamed[0].pattern if unnamed else "NAME{}"
+                if self._nameless:
+                    first = 1 + number * count
+                    pattern = ",".join(map(str, range(first, first + count)))
+                steps.append(f"--columns '{kind}={pattern}'")
+            remedy = f"state {'; '.join(steps)}; or write a map (--map map.toml)"
+            if missing == ["torque"] and not unnamed:
+                remedy = f"record it, since nothing can be identified without, or {remedy}"
+        raise SourceError(self._log, problem, field=", ".join(missing), remedy=remedy)
+
+    def _files(self) -> dict[Kind, str]:
+        """Return the files beside the log whose names say a quantity."""
+        files: dict[Kind, str] = {}
+        for path in sorted(self._log.parent.glob(f"*{self._log.suffix}")):
+            for kind in kinds_of_file(path):
+                files.setdefault(kind, path.name)
+        return files
+
+    def _remedy_for_files(self, files: Mapping[Kind, str]) -> str:
+        """Return the lines of a map for quantities in files of their own."""
+        lines = ["sample_rate = HZ" if self._rate is None else f"sample_rate = {self._rate:g}"]
+        lines += [f'[{kind}] file = "{files[kind]}"' for kind in _JOINT_KINDS[:3] if kind in files]
+        if "torque" not in files:
+            current = files.get("motor_current")
+            lines.append(
+                '[torque] file = "FILE"'
+                if current is None
+                else f'[torque] file = "{current}" if it has N.m, or [motor_current] file = '
+                f'"{current}" with [drive] torque_constant if it has A'
+            )
+        return (
+            f"write a map of the files (--map map.toml): {'; '.join(lines)}; and {_SIDE} where a "
+            "quantity was measured before the gears"
+        )
+
+
+def _named(kind: str) -> str:
+    return kind.replace("_", " ")
+
+
+def _kind(name: str) -> Kind:
+    return next(kind for kind in CHANNEL_NAMES if kind == name)
