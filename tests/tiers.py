@@ -53,6 +53,7 @@ LONG: Final = (
     "hil/test_rehearsal.py",
     "hil/test_report.py",
     "hil/test_report_browser.py",
+    "hil/test_rollout.py",
     "hil/test_screen.py",
     "hil/test_simulate.py",
     "hil/test_study.py",

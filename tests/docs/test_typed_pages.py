@@ -76,7 +76,7 @@ class TestBringYourOwnRobot:
 
     def test_every_block_runs(self, workplace: Path, identified_campaign: Campaign) -> None:
         """After `hil demo`, with recordings with and without a payload."""
-        (workplace / "runs" / "demo").symlink_to(identified_campaign.folder.root)
+        (workplace / "runs" / "source").symlink_to(identified_campaign.folder.root)
         times = np.arange(0.0, 20.0, 8e-3)
         load = pin.Inertia(MASS, np.array(CENTRE), np.zeros((3, 3)))
         archive_of_currents(workplace, "empty", simulate("ur5_robot.urdf", times, seed=1))
