@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sqlite3
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
@@ -143,7 +144,7 @@ def open_bag(source: Path) -> Iterator[Bag]:
         yield Bag(files, parts)
 
 
-class _Part:
+class _Part(ABC):
     """One file of a bag.
 
     Attributes:
@@ -154,9 +155,9 @@ class _Part:
     file: Path
     topics: Mapping[str, Topic]
 
+    @abstractmethod
     def messages(self, topic: str) -> Iterator[tuple[int, bytes]]:
         """Yield time of receipt [ns] and data of the messages of a topic."""
-        raise NotImplementedError
 
     def decoded(self, topic: str, data: bytes) -> Any:
         """Return a message; MessageError if it cannot be decoded."""

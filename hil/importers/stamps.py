@@ -71,7 +71,7 @@ def without_wraps(stamp: Stamps) -> Continued:
     usual = int(np.median(forward))
     for name, wrap in _WRAPS.items():
         continued = steps[backward] + wrap
-        # A counter of a few samples' range cannot be told from a clock that was set back.
+        # A counter with a range of a few samples looks like a clock that was set back.
         if wrap < 4 * _MOST_STEPS * usual:
             continue
         if ((continued > 0) & (continued <= _MOST_STEPS * usual)).all():

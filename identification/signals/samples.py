@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 # Default (see :mod:`identification.selection.inner_prediction`). Planned motion is below 10 Hz, the
 # first resonance of large arms at 10 to 30 Hz; on the simulated NS 16 20 to 60 Hz are equal.
 RIGID_BANDWIDTH: Final = 40.0  # Hz
-_MOST_PREDICTIONS: Final = 3  # that are kept: result, its friction, nominal model
+_MOST_PREDICTIONS: Final = 3  # in memory: result, its friction, nominal model
 _SHORTEST_SEGMENT: Final = 12  # samples, twice the minimum of a quintic spline
 
 VelocitySource = Literal["position", "measured"]

@@ -72,8 +72,8 @@ def test_other_masses_leave_the_motion() -> None:
     errors = final_errors(heavier, motion)
     assert (np.diff(errors.joints.max(axis=1)) > 0.0).all()
     assert errors.joints[2].max() > 20.0 * final_errors(arm, motion).joints[2].max()
-    kept = final_errors(heavier, motion, light_feedback(arm, 0.005, 3.0))
-    assert kept.joints[3].max() < errors.joints[3].max()
+    controlled = final_errors(heavier, motion, light_feedback(arm, 0.005, 3.0))
+    assert controlled.joints[3].max() < errors.joints[3].max()
 
 
 def test_an_unstable_arm_is_counted_and_silent(capfd) -> None:
