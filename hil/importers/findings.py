@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from hil.archive import Findings, Samples
 from hil.cell.text import UrdfLimits, urdf_limits
@@ -123,7 +123,7 @@ def _outside(
     radians = np.where(turning, np.radians(position), position)
     farthest = 3.0 * np.maximum(-limits.lower, limits.upper)
     far = (np.maximum(-low, high) > farthest)[beyond].any()
-    columns = linear_sum_assignment(~fits + 1e-6 * (1.0 - np.eye(len(names))))[1]
+    columns = scipy.optimize.linear_sum_assignment(~fits + 1e-6 * (1.0 - np.eye(len(names))))[1]
     check = "check unit, sign and zero in the column map"
     if far and np.diag(_fits(radians, limits)).all():
         remedy = 'as degrees read as radians, none would: write unit = "deg"'
@@ -223,7 +223,7 @@ def _velocities(
         return
     factor, correlation = _against_position(time, position[:, moving], velocity[:, moving])
     itself = np.diag(correlation)
-    columns = linear_sum_assignment(-correlation)[1]
+    columns = scipy.optimize.linear_sum_assignment(-correlation)[1]
     best = correlation[np.arange(len(moving)), columns]
     if itself.min() < _CORRELATED <= best.min():
         order = list(names)

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.io.matlab import varmats_from_mat
 
 from hil.reading import read_text
 from planner.errors import PlannerCrashed, PlanningTimedOut
@@ -82,7 +82,7 @@ def _variables(path: str) -> dict[str, Any]:
     except Exception as error:  # scipy does not document what it raises
         readable: dict[str, Any] = {}
         with suppress(Exception), Path(path).open("rb") as file:  # none of the file can be read
-            for name, _ in varmats_from_mat(file):
+            for name, _ in scipy.io.matlab.varmats_from_mat(file):
                 with suppress(Exception):
                     readable |= read_mat(path, variable_names=[name])
         if not readable:

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from identification.distributions import student_limit
@@ -68,9 +67,17 @@ _CHANCE: Final = 0.005  # one-sided probability of a false delay
 
 def read_at(time: Array, values: Array, at: Array) -> Array:
     """Interpolate values (m, ...) of one segment at times (k,), constant outside."""
-    # Local, since a global spline oscillates at Coulomb friction steps.
-    source = scipy.interpolate.CubicHermiteSpline(time, values, np.gradient(values, time, axis=0))
-    return np.asarray(source(np.clip(at, time[0], time[-1])))
+    # Hermite cubics, which are local: a global spline oscillates at Coulomb friction steps.
+    slope = np.gradient(values, time, axis=0)
+    at = np.clip(at, time[0], time[-1])
+    left = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(time) - 2)
+    column = (-1,) + (1,) * (values.ndim - 1)
+    step = (time[left + 1] - time[left]).reshape(column)
+    share = (at - time[left]).reshape(column) / step
+    start, end = values[left], values[left + 1]
+    bend = step * (1.0 - share) * slope[left] - step * share * slope[left + 1]
+    bend += (2.0 * share - 1.0) * (end - start)
+    return np.asarray(start + share * (end - start) + share * (1.0 - share) * bend)
 
 
 def predicted_rate(samples: Samples, torque: Array) -> Array:

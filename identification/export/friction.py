@@ -44,16 +44,20 @@ def friction_curve(
 
 def friction_torque(model: RobotModel, values: Array, samples: Samples) -> Array:
     """Return measured minus predicted torque (m, n) of parameters (p,) without joint friction."""
-    without = values.copy()
-    without[model.friction_part] *= [term.motor for term in model.friction.terms]
-    return samples.torque - samples.predicted_torque(model, without)
+    joints = np.zeros(model.n_parameters, dtype=np.bool_)
+    joints[model.friction_part] = [not term.motor for term in model.friction.terms]
+    friction = samples.predicted_torque(model, values, joints)
+    return samples.torque - samples.predicted_torque(model, values) + friction
 
 
 def median_load(model: RobotModel, values: Array, recordings: Sequence[Samples]) -> Array:
     """Return the median size of the torque that each gear transmits (n,) [N·m or N].
 
-    Of parameters (p,), in the usable rows, or in all rows of a joint without any.
+    Of parameters (p,), in the usable rows, or in all rows of a joint without any; zero if no
+    friction grows with it.
     """
+    if not model.friction.has_load:
+        return np.zeros(model.n_joints)
     sizes = [np.abs(model.gear_torque(values, *one.motion[1:4])) for one in recordings]
     size = np.concatenate(sizes)
     usable = np.concatenate([one.usable for one in recordings])

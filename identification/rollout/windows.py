@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from identification.errors import IdentificationError
 from identification.model.motion import Motion
@@ -118,7 +118,7 @@ def stretches_of(
             continue
         count = int((time[-1] - time[0]) / step - 1.0 + 1e-9) + 1
         grid = time[0] + step * (0.5 + np.arange(count))
-        spline = CubicSpline(time, motion.position)
+        spline = scipy.interpolate.CubicSpline(time, motion.position)
         on_grid = Motion(grid, spline(grid), spline(grid, 1), spline(grid, 2))
         before, after = (spline(grid + shift, 1) for shift in (-0.5 * step, 0.5 * step))
         command = None

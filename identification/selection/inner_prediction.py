@@ -346,8 +346,12 @@ def choose_settings(
         now, choices = decision.settings, [*choices, decision.choice]
     if "consistency" in asked:
         possible = replace(now, strength=replace(now.strength, consistent=True))
-        decision = trial.decide(CONSISTENT, [possible, now], IMPOSSIBLE_WORTHWHILE)
-        now, choices = decision.settings, [*choices, decision.choice]
+        # What bodies that cannot exist fit better is the most that they can predict better.
+        if trial.fitted_error(now) < (1.0 - IMPOSSIBLE_WORTHWHILE) * trial.fitted_error(possible):
+            decision = trial.decide(CONSISTENT, [possible, now], IMPOSSIBLE_WORTHWHILE)
+            now, choices = decision.settings, [*choices, decision.choice]
+        else:
+            now = possible
     if not trial.errors(now).overall < _MEANINGLESS:
         return start, ()
     return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
@@ -475,12 +479,16 @@ class _Trial:
         self._tables: dict[tuple[Columns, Preprocessing], _Reduced] = {}
         self._errors: dict[tuple[Columns, Preprocessing, Strength, str], Errors] = {}
         self._effect = 1.0
+        self._weighed: tuple[Columns, Preprocessing] | None = None
 
     def weigh(self, settings: Settings) -> None:
         """Set how many rows count as one by the correlation of the residuals of settings.
 
         It is the same for all that are compared, so that none wins by a weaker prior.
         """
+        if settings.factor_key == self._weighed:
+            return
+        self._weighed = settings.factor_key
         model = settings.model
         total = total_factor(model, self.samples(settings))
         prior = self._reduced(settings).prior.gaussian
@@ -578,6 +586,15 @@ class _Trial:
             return values
 
         return estimate
+
+    def fitted_error(self, settings: Settings) -> float:
+        """Return the error of the fitted rows themselves; infinite if none can be fitted."""
+        reduced = self._reduced(settings)
+        try:
+            values = self._estimator(settings, reduced)(reduced.folds.fitted)
+        except (IdentificationError, np.linalg.LinAlgError):
+            return math.inf
+        return reduced.folds.fitted.relative_error(values)
 
     def fast_error(self, settings: Settings) -> float:
         """Return the error of fast motion predicted from slower one; zero if there is none."""

@@ -186,13 +186,12 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
         late = time[rows] - times
         missing += lost
         scatter.append(late / base.step)
-        evidence.append(_residuals(number, times, signals[rows], late, base.step))
+        evidence.append((number, times, signals[rows], late))
     scattered = np.concatenate([np.zeros(1), *scatter])
     share, deviation, residuals = np.nan, np.nan, (1.0, 1.0)
     if np.abs(scattered).max() > UNIFORM:
-        share, deviation, residuals = _stamp_share(
-            *map(np.concatenate, zip(*evidence, strict=True))
-        )
+        parts = [_residuals(*part, base.step) for part in evidence]
+        share, deviation, residuals = _stamp_share(*map(np.concatenate, zip(*parts, strict=True)))
     # Not between the hypotheses.
     certain = bool(abs(share - 0.5) > max(_MARGIN * deviation, 0.25))
     is_even = certain and share < 0.5 and bool(np.all(np.diff(even[~(repeated | idle)]) > 0.0))
@@ -239,7 +238,10 @@ def _numbers(time: Array, signals: Array, step: float) -> Array:
         steady = _steady(before / passed[0] / noise, after / passed[1] / noise, 0.25)
         clear = clarity - (unit**2).max(axis=1) > _CLEAR**2
         clear &= alike & steady & (whole_steps >= 0.0) & (whole_steps <= GAP_STEPS)
-        steps = np.where(clear, whole_steps, phased)
+        improved = np.where(clear, whole_steps, phased)
+        if np.array_equal(improved, steps):
+            break
+        steps = improved
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 # Default (see :mod:`identification.selection.inner_prediction`). Planned motion is below 10 Hz, the
 # first resonance of large arms at 10 to 30 Hz; on the simulated NS 16 20 to 60 Hz are equal.
 RIGID_BANDWIDTH: Final = 40.0  # Hz
-_MOST_PREDICTIONS: Final = 3  # in memory: result, its friction, nominal model
+_MOST_PREDICTIONS: Final = 2  # in memory: those of the result and of the nominal model
 _SHORTEST_SEGMENT: Final = 12  # samples, twice the minimum of a quintic spline
 
 VelocitySource = Literal["position", "measured"]
@@ -186,20 +186,24 @@ class Samples:
         if self.parent is not None:
             samples, part = self.parent
             return samples.predicted_torque(model, values, chosen)[part]
-        used = values if chosen is None else np.where(chosen, values, 0.0)
-        key = values.tobytes() + used.tobytes()
-        of_model, torque = self._predictions.get(key, (None, np.empty(0)))
+        if chosen is not None:
+            return self._torque_of(model, values, np.where(chosen, values, 0.0))
+        of_model, torque = self._predictions.get(values.tobytes(), (None, np.empty(0)))
         if of_model is not model:
-            load = None
-            if model.friction.has_load:
-                load = model.gear_torque(values, *self.motion[1:4])
-            torque = self._filtered(model.torque(used, *self.motion[1:5], load))
+            torque = self._torque_of(model, values, values)
             torque.flags.writeable = False
             # The tests of a verdict ask for those of few estimates, again and again.
             if len(self._predictions) >= _MOST_PREDICTIONS:
                 del self._predictions[next(iter(self._predictions))]
-            self._predictions[key] = model, torque
+            self._predictions[values.tobytes()] = model, torque
         return torque
+
+    def _torque_of(self, model: RobotModel, values: Array, part: Array) -> Array:
+        """Return the torque (m, n) of a part of the values (p,), with the load of all."""
+        load = None
+        if model.friction.has_load:
+            load = model.gear_torque(values, *self.motion[1:4])
+        return self._filtered(model.torque(part, *self.motion[1:5], load))
 
     def known_torque(self, model: RobotModel) -> Array:
         """Return the torque (m, n) of known payload and elements, filtered likewise."""

@@ -141,6 +141,7 @@ ORDER: Final = DEGREE + 1  # non-zero basis functions per knot interval
 _LIGHTEST: Final = 1e-9
 _HEAVIEST: Final = 1e11
 _PENALTY: Final = 1e-2  # of its logarithm; 0.2 % of the bandwidth
+_FLAT: Final = 1e-6  # slope of the residual over the penalty that is none
 _KNOT_OF_CUTOFF: Final = 0.5  # radians of the cutoff frequency per knot
 
 
@@ -234,20 +235,44 @@ class _Problem:
         return float(self.density * share)
 
     def penalty_for(self, channel: int, tolerance: float, widest: float) -> float:
-        """Return the penalty at which a channel's mean squared residual equals the tolerance."""
+        """Return the penalty at which a channel's mean squared residual equals the tolerance.
 
-        def excess(log_penalty: float) -> float:
-            correction = self.correction(channel, float(np.exp(log_penalty)))
-            residual = self.closest_residual[:, channel] - self.rows @ correction
-            variance = float(np.mean(residual**2))
-            return float(np.log(max(variance / tolerance, np.finfo(np.float64).tiny)))
+        By Newton's method in logarithms, or bisection where a step would leave the bracket.
+        """
+        low, high = (float(np.log(self.penalty_at(width))) for width in (widest, 0.0))
+        point, high_tried = low, False
+        while high - low > _PENALTY:
+            excess, slope = self._excess(channel, float(np.exp(point)), tolerance)
+            if excess > 0.0:
+                high, high_tried = point, True
+            else:
+                low = point
+            target = point - excess / max(slope, _FLAT)
+            if abs(target - point) < _PENALTY:
+                return float(np.exp(np.clip(target, low, high)))
+            if target >= high and not high_tried:
+                target, high_tried = high, True
+            elif not low < target < high:
+                target = 0.5 * (low + high)
+            point = target
+        return float(np.exp(low))
 
-        lightest, heaviest = np.log(self.penalty_at(widest)), np.log(self.penalty_at(0.0))
-        if excess(lightest) >= 0.0:
-            return float(np.exp(lightest))
-        if excess(heaviest) <= 0.0:
-            return float(np.exp(heaviest))
-        return float(np.exp(scipy.optimize.brentq(excess, lightest, heaviest, xtol=_PENALTY)))
+    def _excess(self, channel: int, penalty: float, tolerance: float) -> tuple[float, float]:
+        """Return the logarithm of mean squared residual over tolerance, and its slope.
+
+        The slope is that over the logarithm of the penalty.
+        """
+        factor = scipy.linalg.cholesky_banded(self.gram + penalty * self.penalty, lower=True)
+        change = penalty - _LIGHTEST * self.density
+        correction = scipy.linalg.cho_solve_banded(
+            (factor, True), -change * self.roughness[:, channel]
+        )
+        residual = self.closest_residual[:, channel] - self.rows @ correction
+        variance = max(float(np.mean(residual**2)), np.finfo(np.float64).tiny)
+        bending = self.roughness[:, channel] + _roughness(correction[:, None])[:, 0]
+        sensitivity = float(bending @ scipy.linalg.cho_solve_banded((factor, True), bending))
+        slope = 2.0 * penalty**2 * sensitivity / (len(residual) * variance)
+        return float(np.log(variance / tolerance)), slope
 
 
 @cache
@@ -405,7 +430,7 @@ def _filtered_without_phase(columns: Array, cycles: float, order: int) -> Array:
     reach = math.log(1.0 / _NEGLIGIBLE) / decay
     length = 2 * (count - 1)
     if count + 2 * reach < length:
-        length = min(length, scipy.fft.next_fast_len(count + 2 * int(reach), real=True))
+        length = min(length, _quick_length(count + 2 * int(reach)))
     after = (length - count) // 2
     before = length - count - after
     ratio = np.tan(np.pi * np.arange(length // 2 + 1) / length) / math.tan(np.pi * cycles)
@@ -419,10 +444,17 @@ def _filtered_without_phase(columns: Array, cycles: float, order: int) -> Array:
         extended[:count] = part - line
         extended[count : count + after] = -extended[count - 1 - after : count - 1][::-1]
         extended[count + after :] = -extended[1 : before + 1][::-1]
-        spectrum = gain * scipy.fft.rfft(extended, axis=0)
-        line += scipy.fft.irfft(spectrum, length, axis=0)[:count]
+        spectrum = gain * np.fft.rfft(extended, axis=0)
+        line += np.fft.irfft(spectrum, length, axis=0)[:count]
         filtered[:, first : first + _AT_ONCE] = line
     return filtered
+
+
+def _quick_length(least: int) -> int:
+    """Return a length of few and small factors, which a transform takes least time for."""
+    power = 1 << max(0, least - 1).bit_length()
+    shares = (power * numerator // 16 for numerator in (9, 10, 12, 15, 16))
+    return next(length for length in shares if length >= least)
 
 
 def _interpolated(at: Array, time: Array, columns: Array) -> Array:

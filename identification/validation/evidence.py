@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
@@ -47,6 +46,9 @@ Array = NDArray[np.float64]
 SIGMAS: Final = 3.0
 _STANDARD: Final = 9.81  # m/s²
 _PASSES: Final = 2
+_MOST_TURNS: Final = 20
+_SHARES: Final = (1.0, 0.5, 0.1)  # of a Gauss-Newton step that are tried
+_SAME_FIT: Final = 0.1  # difference of twice the log likelihood that is none
 # Of each column's information: combinations of standard parameters of a condition above 10^4.5
 # count as undetermined.
 _RIDGE: Final = 1e-9
@@ -110,23 +112,46 @@ def find_gravity(model: RobotModel, training: Factor, held_out: Factor) -> Gravi
     first = min(starts, key=misfit)
     if not np.any(first):
         return GravityDirection(model.gravity, model.gravity, 1.0)
-    across = np.linalg.svd(first[None, :])[2][1:]
-
-    def pulled(tilt: Array) -> Array:
-        direction = first / size + tilt @ across
-        return np.asarray(size * direction / np.linalg.norm(direction))
-
-    simplex = [[0.0, 0.0], [0.2, 0.0], [0.0, 0.2]]
-    found = scipy.optimize.minimize(
-        lambda tilt: misfit(pulled(tilt)),
-        np.zeros(2),
-        method="Nelder-Mead",
-        options={"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-3, "maxfev": 80},
-    )
-    best, counts = pulled(found.x), held_out.samples > 0
+    best, least = first, misfit(first)
+    for _ in range(_MOST_TURNS):
+        values, errors = fitted(best)
+        turn = _turn(training, best, values, training.samples / errors)
+        for share in _SHARES:
+            turned = _turned(best, share * turn)
+            height = misfit(turned)
+            if height < least - _SAME_FIT:
+                break
+        else:
+            break
+        best, least = turned, height
+    counts = held_out.samples > 0
     change = np.log(unseen(best)) - np.log(unseen(model.gravity))
     ratio = float(np.exp(change[counts].mean())) if counts.any() else 1.0
     return GravityDirection(model.gravity, best, ratio)
+
+
+def _turn(factor: Factor, gravity: Array, values: Array, weights: Array) -> Array:
+    """Return the change of gravity (3,) of a Gauss-Newton step, at a right angle to it.
+
+    The factor is a :func:`standard_factor`, with joints weighted (n,); values (s,) are those of the
+    fit under this gravity.
+    """
+    s, across = len(values), np.linalg.svd(gravity[None, :])[2][1:]
+    # Columns [W | torque of values by gravity along each direction across | y].
+    change = np.zeros((4 * s + 1, s + 3))
+    change[: 4 * s, :s] = np.kron(np.append(1.0, gravity)[:, None], np.eye(s))
+    change[s : 4 * s, s : s + 2] = np.kron(across.T, values[:, None])
+    change[-1, -1] = 1.0
+    names = (*factor.parameter_names[:s], "turn 1", "turn 2")
+    both = _solved(Factor.of_gram(factor.products(change), factor.samples, names), weights)
+    return np.asarray(both[s:] @ across)
+
+
+def _turned(gravity: Array, turn: Array) -> Array:
+    """Return a gravity turned by a change at a right angle, at most by 45 degrees."""
+    size = float(np.linalg.norm(gravity))
+    turn = turn * min(1.0, size / max(float(np.linalg.norm(turn)), 1e-300))
+    return np.asarray(size * (gravity + turn) / np.linalg.norm(gravity + turn))
 
 
 def repetition_noise(

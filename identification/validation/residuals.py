@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from identification.distributions import student_limit
@@ -291,9 +290,9 @@ def _products(values: Array, lags: int) -> Array:
     m, n = values.shape
     found = np.zeros((lags + 1, n))
     reach = min(lags, m - 1)
-    length = scipy.fft.next_fast_len(m + reach, real=True)  # zero-padded against wrap-around
-    power = np.abs(scipy.fft.rfft(values, length, axis=0)) ** 2
-    found[: reach + 1] = scipy.fft.irfft(power, length, axis=0)[: reach + 1]
+    length = 1 << (m + reach - 1).bit_length()  # zero-padded against wrap-around
+    power = np.abs(np.fft.rfft(values, length, axis=0)) ** 2
+    found[: reach + 1] = np.fft.irfft(power, length, axis=0)[: reach + 1]
     return found
 
 
