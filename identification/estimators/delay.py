@@ -62,6 +62,7 @@ _REVERSAL_PERIODS: Final = 0.5  # periods of the smoothing's bandwidth beside a 
 _FOLDS: Final = 5
 _BLOCKS: Final = 80  # blocks of time
 _ROWS_AT_ONCE: Final = 8192
+_RATE: Final = 250.0  # rows per second of rates; the motion is smoothed to 40 Hz at most
 _CHANCE: Final = 0.005  # one-sided probability of a false delay
 
 
@@ -90,8 +91,16 @@ def predicted_rate(samples: Samples, torque: Array) -> Array:
 
 
 def rate_products(model: RobotModel, samples: Samples) -> Array:
-    """Return sums ``W' d[W | t]/dt`` per joint (n, p, p + 1); t is of the known payload."""
+    """Return sums ``W' d[W | t]/dt`` per joint (n, p, p + 1); t is of the known payload.
+
+    Of some `_RATE` rows a second, for all rows, unless the torque has a low-pass.
+    """
     products = np.zeros((model.n_joints, model.n_parameters, model.n_parameters + 1))
+    count = 1
+    if samples.torque_bandwidth is None:
+        step = float(np.median(np.diff(samples.motion.time)))
+        count = max(1, round(1.0 / (_RATE * step)))
+        samples = samples.thinned(count)
     m = len(samples.torque)
     # A low-pass needs all rows at once; otherwise the regressor of a long recording is never whole.
     length = m if samples.torque_bandwidth is not None else _ROWS_AT_ONCE
@@ -106,7 +115,7 @@ def rate_products(model: RobotModel, samples: Samples) -> Array:
             usable = part.usable[inside, joint]
             places = np.ix_(columns, np.append(columns, model.n_parameters))
             products[joint][places] += block[inside][usable].T @ rate[usable]
-    return products
+    return count * products
 
 
 def with_uncertain_delay(

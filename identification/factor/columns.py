@@ -28,7 +28,7 @@ from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]
 
-_MOST_ROWS: Final = 1000  # of one recording, in standard parameters
+_MOST_ROWS: Final = 500  # of one recording, in standard parameters
 _PARTS: Final = ("W0", "Wx", "Wy", "Wz")
 
 
@@ -102,7 +102,7 @@ def gain_factor(
 
 
 def standard_factor(model: RobotModel, recordings: Sequence[Samples]) -> Factor:
-    """Reduce about a thousand usable rows of each recording to [W0 | Wx | Wy | Wz | y].
+    """Reduce some `_MOST_ROWS` usable rows of each recording to [W0 | Wx | Wy | Wz | y].
 
     The columns are of s standard parameters, friction, springs and balancers; the regressor is
     affine in gravity: W(g) = W0 + gx Wx + gy Wy + gz Wz, so one pass serves any.

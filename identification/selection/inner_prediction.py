@@ -344,6 +344,7 @@ def choose_settings(
         weights = [replace(now.strength, weight=weight) for weight in STRENGTHS]
         decision = trial.decide(STRENGTH, [replace(now, strength=weight) for weight in weights])
         now, choices = decision.settings, [*choices, decision.choice]
+    compared = now
     if "consistency" in asked:
         possible = replace(now, strength=replace(now.strength, consistent=True))
         # What bodies that cannot exist fit better is the most that they can predict better.
@@ -352,7 +353,7 @@ def choose_settings(
             now, choices = decision.settings, [*choices, decision.choice]
         else:
             now = possible
-    if not trial.errors(now).overall < _MEANINGLESS:
+    if not trial.errors(compared).overall < _MEANINGLESS:
         return start, ()
     return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
 

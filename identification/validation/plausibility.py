@@ -207,7 +207,7 @@ ELEMENTS: Final = "a spring, a balancer or a hydraulic counterweight"
 # inertia dominate.
 _LOADED: Final = 0.2
 _POSTURES: Final = 50
-_MOST_ROWS: Final = 20_000  # that are compared with the nominal torque
+_MOST_ROWS: Final = 5_000  # that are compared with the nominal torque
 
 
 @dataclass(frozen=True, eq=False)
