@@ -19,11 +19,9 @@ from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import file_digest, write_files
 from hil.identify import Identification
-from hil.identify.cell_context import nominal_of
 from hil.progress import Reporter
 from hil.reading import open_file
 from hil.report import ReportSeries, report_bytes
-from hil.report.series import with_torques
 from hil.results import ExportResult, OccasionResult, Results
 from identification import Estimate, IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
@@ -52,12 +50,11 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
         load=median_load(found.cell.model, found.estimate.pooled.values, found.prepared.fitted),
     )
     results = found.results.model_copy(update={"exports": exports.result, "occasion": occasion})
-    series = _series_of(found)
     files = {
         **exports.contents,
         RESULTS: results.to_json(),
-        SERIES: _series_bytes(series),
-        REPORT: report_bytes(results, series),
+        SERIES: _series_bytes(found.series),
+        REPORT: report_bytes(results, found.series),
     }
     write_files(folder, files)
     for name, reason in exports.withheld.items():
@@ -65,14 +62,6 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
     reporter.say(f"written to {folder}: {RESULTS}, {', '.join(exports.result.written)}")
     reporter.say(f"report: {folder / REPORT}")
     return results
-
-
-def _series_of(found: Identification) -> ReportSeries:
-    """Return the series of the figures with the torque of the nominal model, parts and spectra."""
-    nominal, values = nominal_of(found.cell), found.estimate.pooled.values
-    nominal_values = None if nominal is None else nominal.values
-    example = found.prepared.held_out[0]
-    return with_torques(found.series, found.cell.model, values, nominal_values, example)
 
 
 def occasion_of(found: Identification) -> OccasionResult:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,6 @@ from identification.excitation import (
     coupling_index_max,
     information,
 )
-from identification.export.friction import friction_curve, friction_torque, median_load
 from identification.model.elements import TorqueRipple
 from identification.selection.essential import Elimination, choose_essential
 from identification.signals.samples import Samples
@@ -38,7 +37,6 @@ from identification.validation.evidence import Evidence, gather
 from identification.validation.plausibility import ConsistencyCheck, check_consistency
 from identification.validation.prediction import (
     PredictionError,
-    for_figure,
     pooled_error,
     prediction_error,
 )
@@ -49,18 +47,12 @@ from sim_fixtures.ns16 import TABLE2, URDF_PATH
 
 from .cell_context import cell_context_of, nominal_of
 from .estimating import Estimation, estimate_with, with_transmitted_load
+from .figure_series import report_series
 from .options import ESTIMATORS, Options
-from .prepared import Prepared, executed_rows, moving_rows, prepare_sources
+from .prepared import Prepared, executed_rows, prepare_sources
 from .sources import Sources, gather_sources
 
 Array = NDArray[np.float64]
-
-FIGURE_SAMPLES: Final = 4000
-"""Maximum number of rows of a time series in a figure."""
-FRICTION_POINTS: Final = 600
-"""Points per joint in a friction figure."""
-_RECORDINGS: Final = 4  # fitted recordings in a friction figure
-_MARGIN: Final = 1.0  # time shown before and after the motion, s
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +66,6 @@ class Identification:
     consistency: ConsistencyCheck | str  #: consistent parameters, or the reason why there are none
     verdict: Verdict
     results: results.Results  #: content of `results.json`
-    series: ReportSeries  #: data of the report's figures
 
     @property
     def cell(self) -> Cell:
@@ -85,6 +76,11 @@ class Identification:
     def estimate(self) -> RepeatedEstimate:
         """Pooled and per repetition."""
         return self.estimation.result
+
+    @cached_property
+    def series(self) -> ReportSeries:
+        """Data of the report's figures."""
+        return report_series(self.prepared, self.estimate)
 
 
 def consistency_of(estimation: Estimation, held_out: Factor) -> ConsistencyCheck | str:
@@ -239,69 +235,7 @@ def identify_archives(
             essential,
             consistency,
         ),
-        series=report_series(prepared, result),
     )
-
-
-def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSeries:
-    """Return the figure data of a report: the first fitted and the first held-out recording."""
-    sources, fitted, example = prepared.sources, prepared.fitted, prepared.held_out[0]
-    model, values = sources.cell.model, estimate.pooled.values
-    excitation, motion = fitted[0], fitted[0].motion
-    shown, seen = _shown(prepared.training[0]), _shown(example)
-    time = example.motion.time
-    predicted = example.predicted_torque(model, values)
-    speed, torque = _friction_data(model, values, fitted)
-    slowest, fastest = (end(speed, axis=0, initial=0.0) for end in (np.nanmin, np.nanmax))
-    load = median_load(model, values, fitted)
-    curves = [
-        friction_curve(
-            model, values, joint, float(slowest[joint]), float(fastest[joint]), float(load[joint])
-        )
-        for joint in range(model.n_joints)
-    ]
-    return ReportSeries(
-        excitation_time=motion.time[shown] - excitation.origin,
-        excitation_position=motion.position[shown],
-        excitation_velocity=motion.velocity[shown],
-        example_archive=sources.held_out[0].name,
-        example_time=time[seen] - example.origin,
-        example_measured=for_figure(time, example.torque)[seen],
-        example_predicted=for_figure(time, predicted)[seen],
-        excitation_fitted=excitation.usable[shown].astype(np.float64),
-        example_used=example.usable[seen].astype(np.float64),
-        friction_speed=speed,
-        friction_torque=torque,
-        law_speed=np.column_stack([curve.speed for curve in curves]),
-        law_torque=np.column_stack([curve.torque for curve in curves]),
-    )
-
-
-def _shown(samples: Samples) -> slice:
-    """Rows of a figure: the motion with a margin before and after it."""
-    moving, time = moving_rows(samples), samples.motion.time
-    if moving.start == moving.stop:
-        return moving
-    first = int(np.searchsorted(time, time[moving.start] - _MARGIN))
-    last = int(np.searchsorted(time, time[moving.stop - 1] + _MARGIN, side="right"))
-    return slice(first, last, max(1, (last - first) // FIGURE_SAMPLES))
-
-
-def _friction_data(
-    model: RobotModel, values: Array, fitted: tuple[Samples, ...]
-) -> tuple[Array, Array]:
-    """Speed and friction torque of fitted rows, each (FRICTION_POINTS, n), padded with NaN."""
-    some = fitted[:: -(-len(fitted) // _RECORDINGS)]
-    parts = [(one.motion.velocity, friction_torque(model, values, one), one.usable) for one in some]
-    speed, torque, usable = (np.concatenate(column) for column in zip(*parts, strict=True))
-    found = np.full((2, FRICTION_POINTS, model.n_joints), np.nan)
-    for joint in range(model.n_joints):
-        rows = np.flatnonzero(usable[:, joint])
-        count = min(len(rows), FRICTION_POINTS)
-        if count:
-            chosen = rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
-            found[:, :count, joint] = speed[chosen, joint], torque[chosen, joint]
-    return found[0], found[1]
 
 
 # Results

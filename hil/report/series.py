@@ -107,36 +107,65 @@ class ReportSeries:
 _OPTIONAL: Final = tuple(one.name for one in fields(ReportSeries) if one.default is None)
 
 
-def with_torques(
-    series: ReportSeries, model: RobotModel, values: Array, nominal: Array | None, samples: Samples
-) -> ReportSeries:
-    """Return the series with the example's torque by part, of the nominal model, and spectra.
+def example_series(
+    model: RobotModel, values: Array, nominal: Array | None, samples: Samples, shown: slice
+) -> dict[str, Array]:
+    """Return the example's torque, as measured, predicted, nominal and by part, and its spectra.
 
-    `values` are the identified parameters (p,), `nominal` those of the nominal model (p,), and
-    `samples` the held-out recording of the example.
+    By the names of :class:`ReportSeries`. `values` are the identified parameters (p,), `nominal`
+    those of the nominal model (p,), and `samples` a held-out recording, of which the rows `shown`
+    are in the figures.
     """
-    shown = _rows_between(series, samples)
-    time = samples.motion.time
-    parts = torque_parts(model, values, samples)
+    step = _step(samples)
+    few = samples if step == 1 else samples.thinned(step)
+    predicted = samples.predicted_torque(model, values)
     torques = {
-        "example_measured": samples.torque,
-        "example_predicted": sum(parts.values(), np.zeros_like(samples.torque)),
-        **{f"example_{name}": part for name, part in parts.items()},
+        "example_measured": _means(samples.torque, step),
+        "example_predicted": _means(predicted, step),
     }
+    parts = torque_parts(model, values, few)
+    # Means of dry friction, which has steps.
+    others = sum(part for name, part in parts.items() if name != "friction")
+    parts["friction"] = torques["example_predicted"] - others
+    torques |= {f"example_{name}": part for name, part in parts.items()}
     if nominal is not None:
-        torques["example_nominal"] = samples.predicted_torque(model, nominal)
-    columns = for_figure(time, np.hstack([*torques.values()]))[shown]
-    low_passed: dict[str, Any] = dict(
-        zip(torques, np.split(columns, len(torques), axis=1), strict=True)
-    )
-    error = samples.torque - torques["example_predicted"]
-    absent: dict[str, Any] = dict.fromkeys(_OPTIONAL)
-    return replace(
-        series,
-        **(absent | low_passed | _spectra(samples, error)),
-        example_time=time[shown] - samples.origin,
-        example_used=samples.usable[shown].astype(np.float64),
-    )
+        torques["example_nominal"] = _means(samples.predicted_torque(model, nominal), step)
+    time = few.motion.time
+    rows = _rows_between(time, *samples.motion.time[shown][[0, -1]]) if _any(shown) else shown
+    columns = for_figure(time, np.hstack([*torques.values()]))[rows]
+    low_passed = dict(zip(torques, np.split(columns, len(torques), axis=1), strict=True))
+    return {
+        "example_time": time[rows] - samples.origin,
+        "example_used": few.usable[rows].astype(np.float64),
+        **low_passed,
+        **_spectra(samples, samples.torque - predicted),
+    }
+
+
+def _step(samples: Samples) -> int:
+    """Return how many rows one row of a figure stands for, an odd number.
+
+    One of a torque with a low-pass, which applies to rows side by side.
+    """
+    time, m = samples.motion.time, len(samples.torque)
+    if m < 2 or samples.torque_bandwidth is not None:
+        return 1
+    step = max(1, int((m - 1) / max(float(time[-1] - time[0]), 1e-9) / (2.0 * _RATE)))
+    return step - 1 + step % 2
+
+
+def _means(torque: Array, step: int) -> Array:
+    """Return means of torques (m, n) over `step` rows about those of :meth:`Samples.thinned`."""
+    if step == 1:
+        return torque
+    starts = np.arange(0, len(torque), step)
+    sums = np.add.reduceat(torque, starts, axis=0)
+    means = sums / np.diff(np.append(starts, len(torque)))[:, None]
+    return np.asarray(means[: len(torque[step // 2 :: step])])
+
+
+def _any(rows: slice) -> bool:
+    return bool(rows.stop > rows.start)
 
 
 def torque_parts(model: RobotModel, values: Array, samples: Samples) -> dict[str, Array]:
@@ -176,20 +205,16 @@ def _with_motion(samples: Samples, *, velocity: bool, acceleration: bool) -> Sam
     return replace(samples, motion=moving, parent=(parent, part))
 
 
-def _rows_between(series: ReportSeries, samples: Samples) -> slice:
-    """Return the rows of the example's time, often enough for the low-pass of the figures."""
-    time = samples.motion.time - samples.origin
-    if not len(series.example_time):
-        return slice(0, 0)
-    first = int(np.searchsorted(time, series.example_time[0] - 1e-9))
-    last = int(np.searchsorted(time, series.example_time[-1] + 1e-9, side="right"))
-    rows = last - first
-    duration = max(float(time[last - 1] - time[first]), 1e-9)
-    step = max(int(rows / duration / _RATE), -(-rows // _ROWS), 1)
-    return slice(first, last, step)
+def _rows_between(time: Array, first: float, last: float) -> slice:
+    """Return the rows of times (m,) from the first to the last, at most `_ROWS`, at `_RATE`."""
+    start = int(np.searchsorted(time, first - 1e-9))
+    stop = int(np.searchsorted(time, last + 1e-9, side="right"))
+    rows = stop - start
+    duration = max(float(time[stop - 1] - time[start]), 1e-9) if rows else 1.0
+    return slice(start, stop, max(int(rows / duration / _RATE), -(-rows // _ROWS), 1))
 
 
-def _spectra(samples: Samples, error: Array) -> dict[str, Any]:
+def _spectra(samples: Samples, error: Array) -> dict[str, Array]:
     """Return the spectra of the longest stretch without a gap; none of less than 16 rows."""
     part = max(samples.segments, key=lambda one: one.stop - one.start, default=slice(0, 0))
     rows = part.stop - part.start

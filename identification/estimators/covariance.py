@@ -102,7 +102,7 @@ def block_covariance(
         information = longer.blocks(part).by_block(weights)[:, :-1, :-1]
         shares[part] = _shares(information, root, root)
     spread = None if prior is None else design_effect**2 * prior
-    return _sandwich(shares, scores, solution, length * FINE_BLOCK, spread)
+    return _sandwich(shares, scores, solution, longer.block, spread)
 
 
 def solve_with_prior(equations: NormalEquations, precision: Array) -> Solution:

@@ -28,6 +28,8 @@ Blocks = TypeVar("Blocks", NDArray[np.float64], NDArray[np.intp])
 Storage = Literal["gram", "qr"]
 
 FINE_BLOCK: Final = 0.125  # s
+_COARSEST: Final = 4  # fine blocks in a block of a long recording
+_MANY_BLOCKS: Final = 400  # from which on they are longer: a covariance needs some tens
 
 # Condition 1e6 leaves four digits of a Gram matrix, enough for torque measurements; rank deficiency
 # shows as 1e8 and more.
@@ -36,6 +38,7 @@ WORST_CONDITION: Final = 1e6
 WORST_ROW_CONDITION: Final = 1e10
 QR_CONDITION: Final = 1e5
 _PARTICIPATION: Final = 1e-3
+_NO_COLUMN: Final = 1e-10  # length of a column that is rounding, over that of the longest
 
 
 class NormalEquations(NamedTuple):
@@ -81,6 +84,7 @@ class Factor:
     counts: Indices  #: rows (B, n)
     parameter_names: tuple[str, ...]  #: (p,)
     storage: Storage = "gram"
+    block: float = FINE_BLOCK  #: duration of a block [s]
 
     @classmethod
     def zero(cls, model: RobotModel, blocks: int = 0, storage: Storage = "gram") -> Self:
@@ -108,8 +112,13 @@ class Factor:
 
     @classmethod
     def by_time(cls, model: RobotModel, samples: Samples) -> Self:
-        """Reduce the usable rows of a recording by :func:`fine_blocks`."""
-        return cls.of(model, samples, index=fine_blocks(samples))
+        """Reduce the usable rows of a recording by :func:`fine_blocks`, longer ones if many."""
+        index = fine_blocks(samples)
+        length = 1
+        while length < _COARSEST and index.max(initial=0) >= length * _MANY_BLOCKS:
+            length *= 2
+        factor = cls.of(model, samples, index=index // length)
+        return replace(factor, block=length * FINE_BLOCK)
 
     @classmethod
     def from_samples(
@@ -263,15 +272,20 @@ class Factor:
     def __add__(self, other: Self) -> Self:
         """Add blocks at equal times since the origin, as of repetitions of a motion.
 
+        They are as long as the longer ones.
+
         Raises:
             IdentificationError: the two belong to different models.
         """
         same = self.n_joints == other.n_joints and self.storage == other.storage
         if not same or self.parameter_names != other.parameter_names:
             raise IdentificationError("factors with different joints or parameters cannot be added")
+        longest = max((part.block for part in (self, other) if len(part)), default=self.block)
+        mine, its = (part.of_blocks(longest) for part in (self, other))
         add = _added if self.storage == "gram" else _triangles_of_both
-        matrices = tuple(add(a, b) for a, b in zip(self.matrices, other.matrices, strict=True))
-        return replace(self, matrices=matrices, counts=_added(self.counts, other.counts))
+        matrices = tuple(add(a, b) for a, b in zip(mine.matrices, its.matrices, strict=True))
+        counts = _added(mine.counts, its.counts)
+        return replace(mine, matrices=matrices, counts=counts)
 
     def by_block(self, weights: Array) -> Array:
         """Return the Gram matrices of the blocks (B, p + 1, p + 1) with joint weights (n,)."""
@@ -316,7 +330,15 @@ class Factor:
         """Merge runs of `length` blocks; the last one may be shorter."""
         assert self.storage == "gram"
         matrices = tuple(merged(own, length) for own in self.matrices)
-        return replace(self, matrices=matrices, counts=merged(self.counts, length))
+        counts, block = merged(self.counts, length), length * self.block
+        return replace(self, matrices=matrices, counts=counts, block=block)
+
+    def of_blocks(self, block: float) -> Self:
+        """Merge blocks to this duration [s], a multiple of theirs."""
+        length = round(block / self.block)
+        if length == 1 or not len(self):
+            return replace(self, block=block)
+        return self.merged(length)
 
     def restricted(self, chosen: Indices) -> Self:
         """Return the factor of the parameters `chosen` (k,), in that order."""
@@ -482,10 +504,11 @@ def solve(equations: NormalEquations, worst: float = WORST_CONDITION) -> Solutio
 def solve_with_ridge(gram: Array, cross: Array, ridge: float) -> Array:
     """Solve ``G x = b`` (k, k), (k,), with a ridge as a share of each column's information.
 
-    Several times faster than :func:`solve`; columns of zeros have parameters of zero.
+    Several times faster than :func:`solve`; columns of zeros, but for rounding, have parameters of
+    zero.
     """
-    length = np.sqrt(np.diag(gram))
-    present = length > 0.0
+    length = np.sqrt(np.maximum(np.diag(gram), 0.0))
+    present = length > _NO_COLUMN * length.max(initial=0.0)
     scale = np.where(present, length, 1.0)
     normal = gram / np.outer(scale, scale)
     np.fill_diagonal(normal, np.where(present, 1.0 + ridge, 1.0))

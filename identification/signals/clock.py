@@ -29,6 +29,7 @@ _REFINEMENTS: Final = 3  # iterations of step and count of steps
 _DRIFT: Final = 101
 _MARGIN: Final = 3.0  # required significance of the decision, standard deviations
 _OUTLIER: Final = 6.0  # limit of the influence of a row, standard deviations
+_ROWS_AT_ONCE: Final = 20_000
 _SHORTEST: Final = 32  # samples; shorter segments keep their stamps
 _BESIDE: Final = 4  # steps to either side for the speed at one
 _SPEED_TIME: Final = 0.025  # s to either side for the speed beside a residual
@@ -222,6 +223,18 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
 
 def _numbers(time: Array, signals: Array, step: float) -> Array:
     """Return the number of each sample (m,) in an even clock, the first zero."""
+    starts = range(0, len(time) - 1, _ROWS_AT_ONCE)
+    # Each part begins with the last sample of the one before; a short rest belongs to the last.
+    edges = [*starts, len(time) - 1]
+    if len(starts) > 1 and edges[-1] - edges[-2] < _SHORTEST:
+        del edges[-2]
+    parts = [slice(start, stop + 1) for start, stop in pairwise(edges)]
+    steps = [_steps_by_position(time[part], signals[part], step) for part in parts]
+    return np.concatenate([[0.0], np.cumsum(np.concatenate(steps))])
+
+
+def _steps_by_position(time: Array, signals: Array, step: float) -> Array:
+    """Return the steps of an even clock between samples (m - 1,), by stamps and positions."""
     phased = _steps_by_phase(time, step)
     moved, resolution = np.diff(signals, axis=0), _resolution(signals)[1:]
     before, after = (_run(signals, side) for side in (-1, 1))
@@ -245,7 +258,7 @@ def _numbers(time: Array, signals: Array, step: float) -> Array:
         if np.array_equal(improved, steps):
             break
         steps = improved
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    return steps
 
 
 def _run(values: Array, side: int) -> Array:

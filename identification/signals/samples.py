@@ -114,16 +114,12 @@ class Samples:
     def thinned(self, step: int) -> Samples:
         """Return every `step`-th row, as of a torque without a low-pass."""
         rows = slice(step // 2, None, step)
-        edges = [
-            [max(0, -(-(end - step // 2) // step)) for end in (segment.start, segment.stop)]
-            for segment in self.segments
-        ]
         return replace(
             self,
             motion=self.motion.rows(rows),
             torque=self.torque[rows],
             usable=self.usable[rows],
-            segments=tuple(slice(start, stop) for start, stop in edges if stop > start),
+            segments=(),
             mask=None if self.mask is None else self.mask.rows(rows),
             torque_bandwidth=None,
             parent=None,

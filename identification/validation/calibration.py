@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from identification.distributions import normal_limit, student_limit
 from identification.errors import IdentificationError
 from identification.factor.factor import (
-    FINE_BLOCK,
     Estimate,
     Factor,
     augmented_rows,
@@ -134,7 +133,7 @@ def inner_errors(factor: Factor, means: TorqueMeans, refit: Refit) -> Array:
     Folds have equally many rows and are cut at equal times of all recordings. NaN where a mean is
     unknown, infinite where the other folds have no row of the joint.
     """
-    fine = round(BLOCK / FINE_BLOCK)
+    fine = round(BLOCK / factor.block)
     rows = merged(factor.counts, fine).sum(axis=1)
     if np.count_nonzero(rows) < FEWEST_BLOCKS:
         raise IdentificationError(

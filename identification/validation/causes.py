@@ -55,7 +55,7 @@ _EXPLAINED: Final = 0.5
 # 0.5, a payload in half of a recording 0.66; false ones: at least 0.9.
 _EXPLAINS: Final = 0.55
 # Relative error of each joint without which no axis or column has a wrong sign or place.
-_SMALL_ERROR: Final = 0.1
+_SMALL_ERROR: Final = 0.02
 _STANDS_OUT: Final = 0.7  # the same, if the joint then is as good as the others
 _SAME_PART: Final = 0.85  # the same, if separate parameters for the part do no better
 _NEAR_NOISE: Final = 2.0  # noise floors; those of coloured noise are underestimated by a third

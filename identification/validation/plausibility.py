@@ -58,9 +58,9 @@ def implausibilities(
 ) -> Implausible:
     """Return messages on what is physically impossible in an estimate.
 
-    The torque of wrong signs on a `motion` is compared with the error of its prediction (n,), on
-    axes whose torque is not too small to decide;
-    friction is evaluated up to the highest speeds (n,). Terms of friction of `added` symbols were
+    The torque of wrong signs on a `motion` is compared with the error of its prediction (n,), of
+    which it must be a multiple on axes of little torque; friction is evaluated up to the highest
+    speeds (n,). Terms of friction of `added` symbols were
     chosen, not stated: they follow the friction within the fitted speeds and are no reason against
     a model.
     """
@@ -68,7 +68,8 @@ def implausibilities(
     doubtful: list[str] = []
     chosen: list[str] = []
     torque_rms = np.sqrt(motion.gram[:, -1, -1] / np.maximum(motion.samples, 1))
-    decides = ~little_torque(torque_rms, ~model.chain.revolute)
+    little = little_torque(torque_rms, ~model.chain.revolute)
+    limit = np.where(little, _FAR_ABOVE, 1.0) * error_rms
     for words, part, by_added in _wrong_signs(model, estimate, speed, added):
         if by_added:
             chosen.append(words)
@@ -76,7 +77,7 @@ def implausibilities(
         own = np.where(part, estimate.values, 0.0)
         squares = np.einsum("i,jik,k->j", own, motion.gram[:, :-1, :-1], own)
         torque = np.sqrt(np.maximum(squares, 0.0) / np.maximum(motion.samples, 1))
-        (impossible if np.any(decides & (torque > error_rms)) else doubtful).append(words)
+        (impossible if np.any(torque > limit) else doubtful).append(words)
     return Implausible(tuple(impossible), tuple(doubtful), tuple(chosen))
 
 
@@ -208,6 +209,8 @@ ELEMENTS: Final = "a spring, a balancer or a hydraulic counterweight"
 _LOADED: Final = 0.2
 _POSTURES: Final = 50
 _MOST_ROWS: Final = 5_000  # that are compared with the nominal torque
+_FAR_ABOVE: Final = 4.0  # errors of an axis of little torque; its error is mostly friction
+_ROWS_AT_ONCE: Final = 50_000  # that are searched for steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -535,10 +538,35 @@ def position_jumps(recording: Recording, name: str = "the recording") -> list[Po
 
 def position_steps(recording: Recording, name: str = "the recording") -> PositionSteps:
     """Return lasting steps of the positions of a named recording, apart from those of its log."""
+    jumps: list[PositionJump] = []
+    logged: list[PositionJump] = []
+    for parts in _pieces(recording):
+        steps = _steps_of(recording, parts, name)
+        jumps += steps.jumps
+        logged += steps.logged
+    return PositionSteps(tuple(jumps), tuple(logged))
+
+
+def _pieces(recording: Recording) -> Iterator[list[slice]]:
+    """Yield stretches without a gap, together some `_ROWS_AT_ONCE` rows, with the row before."""
+    parts: list[slice] = []
+    for segment in recording.segments():
+        for start in range(segment.start, segment.stop, _ROWS_AT_ONCE):
+            stop = min(start + _ROWS_AT_ONCE, segment.stop)
+            first = max(segment.start, start - 1)
+            if stop - first <= 2 * _BESIDE + 2:
+                continue
+            parts.append(slice(first, stop))
+            if sum(part.stop - part.start for part in parts) >= _ROWS_AT_ONCE:
+                yield parts
+                parts = []
+    if parts:
+        yield parts
+
+
+def _steps_of(recording: Recording, parts: Sequence[slice], name: str) -> PositionSteps:
+    """Return the lasting steps within stretches of a recording."""
     time, position = recording.time, recording.position
-    parts = [part for part in recording.segments() if part.stop - part.start > 2 * _BESIDE + 2]
-    if not parts:
-        return PositionSteps((), ())
     pieces = [_departures(time[part], position[part]) for part in parts]
     departure, speed, change = map(np.concatenate, zip(*pieces, strict=True))
     steps = np.concatenate([np.diff(time[part]) for part in parts])[:, None]
@@ -605,8 +633,12 @@ def _departures(time: Array, position: Array) -> tuple[Array, Array, Array]:
     speed = np.diff(position, axis=0) / steps
     padded = np.pad(speed, ((_BESIDE, _BESIDE), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BESIDE + 1, axis=0)
-    before = np.median(windows[..., :_BESIDE], axis=-1)
-    after = np.median(windows[..., _BESIDE + 1 :], axis=-1)
+    # One joint at a time, since the windows are copied.
+    sides = slice(None, _BESIDE), slice(_BESIDE + 1, None)
+    before, after = (
+        np.column_stack([np.median(joint[:, side], axis=-1) for joint in windows.swapaxes(0, 1)])
+        for side in sides
+    )
     # The mean of both sides' medians follows a steady acceleration and ignores single jumps.
     usual = 0.5 * (before + after)
     return (speed - usual) * steps, usual, np.abs(after - before) * steps

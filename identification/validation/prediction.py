@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import reduce
+from itertools import pairwise
 from operator import add
 from typing import Final, NamedTuple
 
@@ -20,6 +21,7 @@ Array = NDArray[np.float64]
 FRICTION_CHANGE: Final = 0.10
 # Hz. The torque of a rigid arm lies below, torque ripple and current noise above.
 SLOW: Final = 10.0
+_ROWS_AT_ONCE: Final = 30_000  # of a low-pass
 FIGURE_BANDWIDTH: Final = 30.0  # Hz, the paper's Fig. 4
 
 
@@ -105,8 +107,12 @@ def _usable_part(samples: Samples, torque: Array, bandwidth: float | None) -> Ar
         return torque
     slow = np.zeros_like(torque)
     for segment in samples.segments:
-        if samples.usable[segment].any():
-            slow[segment] = low_pass(samples.motion.time[segment], torque[segment], bandwidth)
+        count = max(1, (segment.stop - segment.start) // _ROWS_AT_ONCE)
+        edges = np.linspace(segment.start, segment.stop, count + 1).astype(np.intp).tolist()
+        for start, stop in pairwise(edges):
+            part = slice(start, stop)
+            if samples.usable[part].any():
+                slow[part] = low_pass(samples.motion.time[part], torque[part], bandwidth)
     return slow
 
 

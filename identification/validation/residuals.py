@@ -291,8 +291,9 @@ def _products(values: Array, lags: int) -> Array:
     found = np.zeros((lags + 1, n))
     reach = min(lags, m - 1)
     length = 1 << (m + reach - 1).bit_length()  # zero-padded against wrap-around
-    power = np.abs(np.fft.rfft(values, length, axis=0)) ** 2
-    found[: reach + 1] = np.fft.irfft(power, length, axis=0)[: reach + 1]
+    for products, column in zip(found.T, values.T, strict=True):
+        power = np.abs(np.fft.rfft(column, length)) ** 2
+        products[: reach + 1] = np.fft.irfft(power, length)[: reach + 1]
     return found
 
 

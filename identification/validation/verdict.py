@@ -251,7 +251,10 @@ def _cause_facts(evidence: Evidence, limit: Thresholds) -> Facts:
         most = 2 * load.axes >= len(evidence.held_out.rows)
         half = f" ± {load.half_interval:.2g}" if np.isfinite(load.half_interval) else ""
         more = f"{abs(load.mass):.3g}{half} kg {'more' if load.mass > 0.0 else 'less'}"
-        facts |= {"carried": load.explained >= limit.load and most, "more": more, "load": load}
+        # A mass whose interval includes zero is no load; one without an interval is not known.
+        certain = not load.half_interval < np.inf or abs(load.mass) > load.half_interval
+        carried = load.explained >= limit.load and most and certain
+        facts |= {"carried": carried, "more": more, "load": load}
     if (checks := evidence.residuals) is not None:
         # Few samples cause most of the error, and it exceeds its limit with them only.
         found, error_of = checks.outliers, evidence.held_out

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace as Series
 
 import numpy as np
 import pytest
 import scipy.signal
 
-from hil.report.series import torque_parts, with_torques
+from hil.report.series import example_series, torque_parts
 from identification.signals.spectrum import HARRIS, power_density
-from tests.hil.test_report import make_series
 from tests.identification.two_link import MODEL, NOISE, a_motion, recording, truth
 
 
 @pytest.fixture
 def samples():
-    motion = a_motion()
+    return at_steps_of(0.005)
+
+
+def at_steps_of(step):
+    """A recording with white noise."""
+    motion = a_motion(step=step)
     noise = np.random.default_rng(3).standard_normal((len(motion.time), 2))
     return recording(NOISE * noise, motion)
 
@@ -49,35 +54,36 @@ class TestParts:
 
 class TestSeries:
     def test_have_the_nominal_model_and_rows_often_enough(self, samples):
-        time = samples.motion.time
-        older = make_series(samples=2000, joints=2)
-        shown = slice(0, len(time), 9)
-        older = replace(
-            older, example_time=time[shown],
-            **{name: np.zeros((len(time[shown]), 2)) for name in older.arrays
-               if name.startswith("example_") and name != "example_time"},
-        )  # fmt: skip
-        series = with_torques(older, MODEL, truth(), 0.5 * truth(), samples)
+        shown = slice(0, len(samples.motion.time), 9)
+        series = Series(**example_series(MODEL, truth(), 0.5 * truth(), samples, shown))
         assert 110.0 < 1.0 / np.diff(series.example_time).mean() < 260.0
         error = series.example_measured - series.example_predicted
         assert np.all(np.std(error, axis=0) < NOISE), "low-passed"
         np.testing.assert_allclose(series.example_nominal, 0.5 * series.example_predicted)
         parts = series.example_inertia + series.example_coriolis + series.example_gravity
         np.testing.assert_allclose(parts + series.example_friction, series.example_predicted)
-        assert series.example_elements is None
+        assert not hasattr(series, "example_elements")
         # White noise has the same density at all frequencies.
         white = NOISE * np.sqrt(2.0 * 0.005)
         middle = np.median(series.spectrum_residual, axis=0)
         np.testing.assert_allclose(middle, white, rtol=0.2)
-        assert with_torques(older, MODEL, truth(), None, samples).example_nominal is None
+        assert "example_nominal" not in example_series(MODEL, truth(), None, samples, shown)
 
     def test_have_no_spectrum_of_a_few_rows(self, samples):
         few = samples.between(0, 10)
-        older = make_series(samples=20, joints=2)
-        older = replace(older, example_time=few.motion.time)
-        older = replace(older, spectrum_frequency=None, spectrum_measured=None,
-                        spectrum_residual=None)  # fmt: skip
-        assert with_torques(older, MODEL, truth(), None, few).spectrum_frequency is None
+        series = example_series(MODEL, truth(), None, few, slice(0, 10))
+        assert "spectrum_frequency" not in series
+
+    def test_are_means_of_a_fast_log(self, samples):
+        """What the figure shows of noise does not depend on the rows that it takes."""
+        slow = example_series(MODEL, truth(), None, samples, slice(0, len(samples.torque)))
+        fast = at_steps_of(0.00125)
+        shown = slice(0, len(fast.torque))
+        series = Series(**example_series(MODEL, truth(), None, fast, shown))
+        assert np.diff(series.example_time).mean() < 1.0 / 110.0
+        error = series.example_measured - series.example_predicted
+        expected = slow["example_measured"] - slow["example_predicted"]
+        np.testing.assert_allclose(np.std(error, axis=0), np.std(expected, axis=0) / 2.0, rtol=0.25)
 
 
 @pytest.mark.parametrize("length", [1000, 999])
