@@ -20,9 +20,9 @@ from scipy.optimize import brentq
 from scipy.stats import t as student
 
 from hil.batch import run
+from hil.batch.cluster import Cluster
 from hil.batch.discovery import ArchiveRef, cell_in, open_ref
-from hil.batch.run import Arm, LevelEstimate
-from hil.batch.workers import Workers
+from hil.batch.estimates import Arm, BatchEstimate
 from hil.errors import InputError
 from hil.identify.options import Options
 from hil.identify.sources import arm_differences
@@ -92,7 +92,7 @@ class Comparison:
     simulated: bool
     dated: bool  #: whether campaigns are in chronological order
     verdict: str  #: one line
-    campaigns: tuple[LevelEstimate, ...]
+    campaigns: tuple[BatchEstimate, ...]
     names: tuple[str, ...]  #: of the campaigns, with their days if known
     changes: tuple[Change, ...]  #: of all quantities, by campaign
     warnings: tuple[str, ...]
@@ -124,7 +124,7 @@ class Comparison:
         }
 
 
-def compare(places: Sequence[str], workers: Workers, reporter: Reporter) -> Comparison:
+def compare(places: Sequence[str], cluster: Cluster, reporter: Reporter) -> Comparison:
     """Identify campaigns, given as folders or `results.json`, by unregularised least squares.
 
     They are compared in chronological order if the times of all are known, else as given.
@@ -141,7 +141,7 @@ def compare(places: Sequence[str], workers: Workers, reporter: Reporter) -> Comp
         refs.extend(found)
 
     options = Options(estimator="wls")
-    result = run.reidentify([str(root) for root in roots], options, workers, reporter, check=check)
+    result = run.reidentify([str(root) for root in roots], options, cluster, reporter, check=check)
     campaigns = list(result.campaigns)
     if len(campaigns) < 2:
         reason = "".join(f"; {one.path}: {one.reason}" for one in result.broken[:1])
@@ -149,7 +149,7 @@ def compare(places: Sequence[str], workers: Workers, reporter: Reporter) -> Comp
         raise InputError(only, f"is the only campaign that can be estimated{reason}", remedy=_TWO)
     given = [root.resolve() for root in roots]
 
-    def order(one: LevelEstimate) -> tuple[str, int, str]:
+    def order(one: BatchEstimate) -> tuple[str, int, str]:
         own = Path(one.campaign)
         inside = [own.is_relative_to(root) for root in given]
         return (one.when if dated else "", inside.index(True) if any(inside) else 0, one.campaign)
@@ -191,7 +191,7 @@ def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
 
 
 def compare_campaigns(
-    arm: Arm, campaigns: Sequence[LevelEstimate], repetitions: Sequence[Sequence[LevelEstimate]]
+    arm: Arm, campaigns: Sequence[BatchEstimate], repetitions: Sequence[Sequence[BatchEstimate]]
 ) -> Comparison:
     """Compare the parameters of campaigns of one arm, with their repetitions, with the first."""
     names, compared = _names(campaigns), quantities(arm.cell.model, campaigns[0])
@@ -233,7 +233,7 @@ def compare_campaigns(
     )
 
 
-def quantities(model: RobotModel, first: LevelEstimate) -> list[Quantity]:
+def quantities(model: RobotModel, first: BatchEstimate) -> list[Quantity]:
     """Return what is compared: all parameters but friction, and the friction of each axis.
 
     That is the mean of both directions at the speed at which the first campaign determines it best:
@@ -266,14 +266,14 @@ def quantities(model: RobotModel, first: LevelEstimate) -> list[Quantity]:
     return found
 
 
-def _projected(level: LevelEstimate, weights: Array) -> tuple[Array, Array]:
+def _projected(level: BatchEstimate, weights: Array) -> tuple[Array, Array]:
     """Return values and variances (k,) of weighted sums (k, p) of parameters; NaN if unknown."""
-    covariance = np.diag(level.std**2) if level.covariance is None else level.covariance
-    known = np.isfinite(level.std)
+    covariance = level.estimate.covariance
+    known = np.isfinite(level.estimate.std)
     determined = ~weights[:, ~known].any(axis=1)
     finite = np.where(np.isfinite(covariance), covariance, 0.0)
     variance = np.einsum("kp,pq,kq->k", weights, finite, weights)
-    value = np.where(determined, weights @ level.values, np.nan)
+    value = np.where(determined, weights @ level.estimate.values, np.nan)
     return value, np.where(determined, variance, np.nan)
 
 
@@ -285,7 +285,7 @@ def _verdict(changed: Sequence[Change]) -> str:
     return f"Changed: {', '.join(names)}" if names else "No significant change"
 
 
-def _names(campaigns: Sequence[LevelEstimate]) -> list[str]:
+def _names(campaigns: Sequence[BatchEstimate]) -> list[str]:
     """Return names of campaigns: folder below the common one, setup if ambiguous, and day."""
     folders = [one.campaign for one in campaigns]
     shared = commonpath([Path(folder).parent for folder in folders])
@@ -299,8 +299,8 @@ def _names(campaigns: Sequence[LevelEstimate]) -> list[str]:
 
 def _warnings(
     names: Sequence[str],
-    campaigns: Sequence[LevelEstimate],
-    repetitions: Sequence[Sequence[LevelEstimate]],
+    campaigns: Sequence[BatchEstimate],
+    repetitions: Sequence[Sequence[BatchEstimate]],
 ) -> list[str]:
     found = []
     setups = {name: one.setup for name, one in zip(names, campaigns, strict=True)}
@@ -320,16 +320,16 @@ def _warnings(
 # Statistics
 
 
-def freedom_of(level: LevelEstimate) -> float:
+def freedom_of(level: BatchEstimate) -> float:
     """Return the degrees of freedom of the covariance, from the Student factor of its intervals."""
-    factor = level.interval_factor
+    factor = level.estimate.interval_factor
     if factor <= _NORMAL:
         return 1e6
     return float(brentq(lambda freedom: student.ppf(0.975, freedom) - factor, 0.5, 1.1e6))
 
 
 def _figures(
-    compared: Sequence[Quantity], one: LevelEstimate, repetitions: Sequence[LevelEstimate]
+    compared: Sequence[Quantity], one: BatchEstimate, repetitions: Sequence[BatchEstimate]
 ) -> list[Figure]:
     """Return the figure of each quantity of a campaign."""
     weights, freedom = np.array([each.weights for each in compared]), freedom_of(one)

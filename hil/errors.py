@@ -33,7 +33,7 @@ from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
-from typing import ClassVar, Final, Self
+from typing import Any, ClassVar, Final, Self
 
 from hil.terminal_text import printable
 
@@ -50,10 +50,21 @@ class HilError(Exception):
     exit_code: ClassVar[int] = 1
     figures: Mapping[str, object] = MappingProxyType({})
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return the parts of a pickle: the constructors have other arguments than the message."""
+        return _restored, (type(self), self.args, vars(self))
+
     def beside(self, figures: Mapping[str, object]) -> Self:
         """Return this error with figures."""
         self.figures = dict(figures)
         return self
+
+
+def _restored(kind: type[HilError], args: tuple[Any, ...], state: dict[str, Any]) -> HilError:
+    error = kind.__new__(kind)
+    error.args = args
+    vars(error).update(state)
+    return error
 
 
 class InputError(HilError):
@@ -73,7 +84,8 @@ class InputError(HilError):
         self.field = field
         self.problem = problem
         self.remedy = remedy
-        place = [printable(str(part), keep="") for part in (self.path, field) if part]
+        shown = path if isinstance(path, str) and "://" in path else self.path  # a URL as it is
+        place = [printable(str(part), keep="") for part in (shown, field) if part]
         sentence = ": ".join([*place, problem])
         super().__init__(f"{sentence}; {remedy}" if remedy else sentence)
 

@@ -6,11 +6,12 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
 
 from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
@@ -23,13 +24,23 @@ from hil.files import digest, file_digest, json_digest
 from hil.identify.prepared import Settings, stated_delay
 from hil.progress import Reporter
 
-from .cache import BESIDE, CacheLocation, cacheable, code_digest
-from .workers import ArchiveTask, Unused, Workers
+from .cache import BESIDE, CacheError, CacheLocation, code_digest
+from .cluster import Cluster, Task, Unused, reason_of
+from .places import (
+    SUFFIX,
+    Stamp,
+    archives_at,
+    as_file,
+    folder_of,
+    is_url,
+    name_of,
+    stamp_of,
+    text_at,
+)
 
 USES: Final = ("excitation", "validation", "standstill")
 """Uses of archives in a batch; archives of other kinds are skipped."""
 
-_SUFFIX: Final = ".mcap"
 _ARCHIVES: Final = "/archives"  # folder of a campaign's archives
 _REHEARSAL: Final = "/rehearsal/"  # see `hil.campaign.folder`
 _LOADED: Final = re.compile(r"/payload/[^/]+/loaded/")  # campaigns of earlier versions
@@ -47,6 +58,9 @@ _FIELDS: Final = (
 )
 
 
+_UNKNOWN: Final = Stamp("")
+
+
 class GroupKey(NamedTuple):
     """Key of archives that are fitted together."""
 
@@ -55,22 +69,11 @@ class GroupKey(NamedTuple):
     setup: str = ""  #: delay and payload stated by their cells, as text; "" for neither
 
 
-def name_of(location: str) -> str:
-    """Return the file name of a path."""
-    return location.rsplit("/", 1)[-1]
-
-
-def folder_of(location: str) -> str:
-    """Return the folder of a path."""
-    return location.rsplit("/", 1)[0]
-
-
-@cacheable
 @dataclass(frozen=True, slots=True)
 class ArchiveRef:
     """Location and properties of an archive, without its samples."""
 
-    location: str  #: path
+    location: str  #: path or URL
     sha256: str  #: of all bytes
     #: "excitation" (fitted), "validation" (predicted), "standstill" (noise), or the kind of an
     #: archive that a batch does not use, for which `arm` and `cell` are ""
@@ -83,7 +86,7 @@ class ArchiveRef:
     motion: str  #: digest of the planned motion, "" where unknown
     when: str = ""  #: time of recording, ISO 8601; "" in simulation
     setup: str = ""
-    stamp: tuple[int, ...] = ()  #: size, times [ns] and inode of the file when it was hashed
+    stamp: Stamp = _UNKNOWN  #: of the file when it was hashed
     kind: str = ""  #: as in its metadata
     attempt: int = 0  #: 0 where the archive does not number them
     outcome: str = "completed"  #: how the recording ended
@@ -111,6 +114,26 @@ class ArchiveRef:
         return *self.key, self.index, self.name, self.sha256
 
 
+@dataclass(frozen=True)
+class _Note:
+    """Cached properties of an archive whose file has not changed."""
+
+    code: str  #: digest of the programs that read it
+    ref: ArchiveRef
+
+
+@dataclass(frozen=True)
+class CellTexts:
+    """Texts of a cell, cached for several archives."""
+
+    cell: str
+    urdf: str
+
+
+_CHUNK: Final = 16
+"""Archives whose metadata one task reads: a task costs 2.5 ms, as much as the metadata of one."""
+
+
 class Discovery(NamedTuple):
     """Result of a search."""
 
@@ -120,7 +143,7 @@ class Discovery(NamedTuple):
 
 
 def discover(
-    roots: Sequence[str], cache: CacheLocation, workers: Workers, reporter: Reporter
+    roots: Sequence[str], cache: CacheLocation, cluster: Cluster, reporter: Reporter
 ) -> Discovery:
     """Find every archive at or below some places.
 
@@ -129,34 +152,56 @@ def discover(
 
     Raises:
         InputError: a place does not exist, or there is no archive.
+        ClusterError: the cluster cannot be used.
         CacheError: the cache cannot be written.
     """
     places, refused = find_archives(roots)
     if not places:
         reasons = ["there is no archive (*.mcap) in it", *(" ".join(one) for one in refused[:1])]
         raise InputError(", ".join(roots), "; ".join(reasons), remedy="name others")
-    known: dict[str, ArchiveRef | Unused] = {}
+    refs: dict[str, ArchiveRef | Unused] = {}
     with reporter.task("reading the metadata of archives", len(places)) as task:
         for place in places:
             with suppress(ArchiveError):  # it has disappeared: the worker reports it
-                if (ref := _known(place, cache)) is not None:
-                    known[place] = ref
-        task.advance(len(known))
-        unknown = [place for place in places if place not in known]
-        tasks = [ArchiveTask(place, inspect_archive, (place, cache)) for place in unknown]
-        known.update(zip(unknown, workers.results(tasks, task.advance), strict=True))
-    found = _select({place: known[place] for place in places})
-    return found._replace(broken=(*refused, *found.broken))
+                if (ref := _cached_ref(place, cache)) is not None:
+                    refs[place] = ref
+        task.advance(len(refs))
+        new = [place for place in places if place not in refs]
+        refs.update(_inspected(new, cache, cluster, task.advance))
+    selected = _select({place: refs[place] for place in places})
+    return selected._replace(broken=(*refused, *selected.broken))
+
+
+def _inspected(
+    places: Sequence[str],
+    cache: CacheLocation,
+    cluster: Cluster,
+    advance: Callable[[float], None],
+) -> dict[str, ArchiveRef | Unused]:
+    """Return what workers find in archives; those of a task that fails are tried one by one."""
+    refs: dict[str, ArchiveRef | Unused] = {}
+    chunks = [places[k : k + _CHUNK] for k in range(0, len(places), _CHUNK)]
+    tasks = [Task(chunk[0], inspect_archives, (chunk, cache)) for chunk in chunks]
+    failed: list[str] = []
+    results = cluster.results(tasks, lambda n: advance(n * _CHUNK), archives=len(places))
+    for chunk, result in zip(chunks, results, strict=True):
+        if isinstance(result, Unused):
+            failed += chunk
+        else:
+            refs.update(zip(chunk, result, strict=True))
+    singles = [Task(place, inspect_archive, (place, cache)) for place in failed]
+    refs.update(zip(failed, cluster.results(singles), strict=True))
+    return refs
 
 
 def find_archives(roots: Sequence[str]) -> tuple[list[str], list[Unused]]:
-    """Return the paths of archives at or below some folders or archives, sorted.
+    """Return the paths or URLs of archives at or below some folders or archives, sorted.
 
     Further, folders and files that cannot be read. Links are followed; a folder reached by several
     links is searched once, under its own name.
 
     Raises:
-        InputError: a place does not exist.
+        InputError: a place does not exist, or a URL cannot be reached.
     """
     found: set[str] = set()
     refused: list[Unused] = []
@@ -175,7 +220,7 @@ def find_archives(roots: Sequence[str]) -> tuple[list[str], list[Unused]]:
             visited.add(folder)
             folders[:] = [one for one in folders if one != BESIDE]
             for path in (folder / file for file in files):
-                if path.suffix != _SUFFIX:
+                if path.suffix != SUFFIX:
                     continue
                 if os.path.isfile(path):  # noqa: PTH113 - False where it cannot be reached
                     found.add(path.as_posix())
@@ -184,7 +229,9 @@ def find_archives(roots: Sequence[str]) -> tuple[list[str], list[Unused]]:
 
     for root in roots:
         path = Path(root)
-        if path.is_file():
+        if is_url(root):
+            found.update(archives_at(root))
+        elif path.is_file():
             found.add(path.resolve().as_posix())
         elif path.is_dir():
             walk(path.resolve())
@@ -202,14 +249,14 @@ def open_ref(ref: ArchiveRef) -> Archive:
     Raises:
         ArchiveError: it cannot be read, is damaged, or has changed since it was found.
     """
-    path = Path(ref.location)
-    _require_same(path, ref)
+    _require_same(ref)
     try:
-        archive = open_archive(path, fields=_FIELDS)
-        if archive.header.by_controller_program:
-            archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
+        with as_file(ref.location) as path:
+            archive = open_archive(path, fields=_FIELDS)
+            if archive.header.by_controller_program:
+                archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
     finally:  # an error may be due to a change
-        _require_same(path, ref)
+        _require_same(ref)
     require_complete(archive, ref.location)
     return archive
 
@@ -223,11 +270,13 @@ def require_complete(archive: Archive, location: str) -> None:
     """Raise an `ArchiveError` with the command of the repair if an archive is damaged."""
     if archive.damage is not None:
         remedy = f"hil archive repair {location}"
+        if is_url(location):
+            remedy = "repair it where it is stored: hil archive repair"
         raise ArchiveError(location, str(archive.damage), remedy=remedy)
 
 
-def _require_same(path: Path, ref: ArchiveRef) -> None:
-    if stamp_of(path) != ref.stamp:
+def _require_same(ref: ArchiveRef) -> None:
+    if stamp_of(ref.location) != ref.stamp:
         raise changed_error(ref.location)
 
 
@@ -242,15 +291,6 @@ def digest_of(path: Path) -> str:
         return file_digest(path)
     except OSError as error:
         raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
-
-
-def stamp_of(path: Path) -> tuple[int, ...]:
-    """Return size, times and inode of a file, or raise an `ArchiveError`."""
-    try:
-        found = path.stat()
-    except OSError as error:
-        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
-    return found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino
 
 
 def cell_in(archive: Archive, settings: Settings | None = None) -> Cell:
@@ -304,6 +344,23 @@ def describe_setup(cell: Cell) -> str:
     return ", ".join(words)
 
 
+def inspect_archives(places: Sequence[str], cache: CacheLocation) -> list[ArchiveRef | Unused]:
+    """Return what `inspect_archive` finds in each archive, or why it cannot be used.
+
+    Raises:
+        CacheError: the cache cannot be written.
+    """
+    refs: list[ArchiveRef | Unused] = []
+    for place in places:
+        try:
+            refs.append(inspect_archive(place, cache))
+        except CacheError:
+            raise
+        except Exception as error:
+            refs.append(Unused(place, reason_of(error)))
+    return refs
+
+
 def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
     """Hash an archive, read its metadata, and cache both with the texts of its cell.
 
@@ -311,17 +368,18 @@ def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
         HilError: it cannot be read, is damaged, or was changed meanwhile.
         CacheError: the cache cannot be written.
     """
-    if (known := _known(place, cache)) is not None:
-        return known
-    path = Path(place)
-    begun, stamp, sha256 = time.time_ns(), stamp_of(path), digest_of(path)
-    # Of an intact file this reads summary, metadata, attachments and one chunk.
-    archive = open_archive(path, fields=(), stop=-1.0)
+    if (cached := _cached_ref(place, cache)) is not None:
+        return cached
+    begun, stamp = time.time_ns(), stamp_of(place)
+    with as_file(place) as path:
+        sha256 = digest_of(path)
+        # Of an intact file this reads summary, metadata, attachments and one chunk.
+        archive = open_archive(path, fields=(), stop=-1.0)
     require_complete(archive, place)
     header, plan = archive.header, archive.attachments.get("plan.json")
     index, attempt = header.index, header.attempt
     if index is None or attempt is None:  # else as stated in the archive, even if renamed
-        name = ArchiveName.parse(path.name)
+        name = ArchiveName.parse(name_of(place))
         index, attempt = (0, 0) if name is None else (name.index, name.attempt)
     ref = ArchiveRef(
         location=place,
@@ -344,25 +402,22 @@ def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
         cell, drives = cell_in(archive), archive.attachments.get("drive_train.json")
         key = json_digest([cell.text, cell.urdf])
         if not cache.has(place, key):
-            cache.put(place, key, [cell.text, cell.urdf])
+            cache.put(place, key, CellTexts(cell.text, cell.urdf))
         arm = arm_digest(cell, drives, simulated=ref.simulated)
         ref = replace(ref, arm=arm, cell=key, setup=describe_setup(cell))
-    if stamp_of(path) != stamp:
+    if stamp_of(place) != stamp:
         raise changed_error(place)
-    if begun - max(stamp[1:3]) > _UNTOUCHED:
-        cache.put(place, _key(place), {"code": code_digest(), "ref": ref})
+    if stamp.text and begun - stamp.changed > _UNTOUCHED:
+        cache.put(place, _key(place), _Note(code_digest(), ref))
     return ref
 
 
-def _known(place: str, cache: CacheLocation) -> ArchiveRef | None:
+def _cached_ref(place: str, cache: CacheLocation) -> ArchiveRef | None:
     """Return the cached reference of an archive whose file has not changed; None if none."""
-    note = cache.get(place, _key(place), dict)
-    if note is None or note.get("code") != code_digest():
+    note = cache.get(place, _key(place), _Note)
+    if note is None or note.code != code_digest() or stamp_of(place) != note.ref.stamp:
         return None
-    ref: ArchiveRef = note["ref"]
-    if stamp_of(Path(place)) != ref.stamp:
-        return None
-    return replace(ref, location=place, campaign=_campaign_of(place))
+    return replace(note.ref, location=place, campaign=_campaign_of(place))
 
 
 def _key(place: str) -> str:
@@ -427,13 +482,29 @@ def _manifests(places: Iterable[str]) -> tuple[dict[str, dict[str, Entry]], list
     found: dict[str, dict[str, Entry]] = {}
     broken = []
     for folder, campaign in {folder_of(place): _campaign_of(place) for place in places}.items():
+        if folder == campaign:
+            continue
         try:
-            if folder != campaign and (records := CampaignFolder(Path(campaign))).sealed:
-                found[folder] = {entry.name: entry for entry in records.manifest()}
-        except CampaignFolderError as error:
+            with _campaign_records(campaign) as records:
+                if records.sealed:
+                    found[folder] = {entry.name: entry for entry in records.manifest()}
+        except (CampaignFolderError, ArchiveError) as error:
             reason = f"{error}; the campaign's archives are used without being checked against it"
             broken.append(Unused(f"{campaign}/manifest.json", reason))
     return found, broken
+
+
+@contextmanager
+def _campaign_records(campaign: str) -> Iterator[CampaignFolder]:
+    """Provide the folder of a campaign; of one at a URL, a folder with its manifest only."""
+    if not is_url(campaign):
+        yield CampaignFolder(Path(campaign))
+        return
+    with TemporaryDirectory(prefix="hil-") as copy:
+        text = text_at(f"{campaign}/manifest.json")
+        if text is not None:
+            Path(copy, "manifest.json").write_text(text, encoding="utf-8")
+        yield CampaignFolder(Path(copy))
 
 
 def _not_needed(place: str, latest: _Attempts) -> str:

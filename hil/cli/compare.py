@@ -8,7 +8,7 @@ from typing import Annotated, Final
 import typer
 
 from hil import compare as comparing
-from hil.batch.workers import Workers
+from hil.batch.cluster import Cluster
 from hil.cli.arguments import JsonOption, QuietOption, print_json
 from hil.files import make_folder, write_files
 from hil.progress import reporter as make_reporter
@@ -37,8 +37,8 @@ def compare(
         fail_on_change: Return exit status 5 if something has changed.
     """
     reporter = make_reporter(quiet=quiet or json)
-    with Workers() as workers:
-        found = comparing.compare(campaigns, workers, reporter)
+    with Cluster(reporter=reporter) as cluster:
+        found = comparing.compare(campaigns, cluster, reporter)
     if output is not None:
         from hil.report.changes import comparison_page  # figures are slow to import
 

@@ -13,11 +13,13 @@ import typer
 
 from hil.batch import run
 from hil.batch.cache import CacheLocation
-from hil.batch.run import BatchEstimator, BatchResult, LevelEstimate, relative_error
+from hil.batch.cluster import Cluster, Unused
+from hil.batch.estimates import BatchEstimate, BatchEstimator, relative_error
+from hil.batch.run import BatchResult
 from hil.batch.table import write_tables
-from hil.batch.workers import Unused, Workers
 from hil.cli.arguments import JsonOption, QuietOption, print_json, with_options
 from hil.cli.identify_options import Identifying
+from hil.errors import InputError
 from hil.files import convert_write_errors, make_folder
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import plural, printable
@@ -34,6 +36,7 @@ def reidentify(
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
     estimator: BatchEstimator = "auto",
     workers: Annotated[int | None, typer.Option(min=1)] = None,
+    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS")] = None,
     cache: Annotated[str | None, typer.Option(metavar="FOLDER|none")] = None,
     *,
     how: Identifying,
@@ -50,20 +53,26 @@ def reidentify(
     stopped motions and copies, are skipped and counted by reason.
 
     Options:
-        places: Folders with archives at any depth, or archives.
-        output: Folder for the tables (CSV). Default: none.
+        places: Folders with archives at any depth, archives, or URLs of either.
+        output: Folder for the tables (CSV and Parquet). Default: none.
         estimator: Estimator that needs no samples: see `hil identify --estimator`.
-        workers: Number of processes. Default: one per core.
+        workers: Number of processes. Default: one per core, and none if few archives are read.
+        scheduler: Address of a running Dask scheduler, such as tcp://host:8786, whose workers do
+            the work. They need the same version of hil, and archives and cache under these paths.
         cache: Folder of cached factors, or none. Default: .hil-cache next to the archives, or in
             the user's cache folder if those are read-only.
     """
+    if workers is not None and scheduler is not None:
+        problem = "a running cluster has its own workers"
+        remedy = "omit --workers, or --scheduler"
+        raise InputError(None, problem, field="--workers", remedy=remedy)
     reporter = make_reporter(quiet=quiet or json)
     if output is not None:
         make_folder(output)
     options, keep = how.options(estimator=estimator), cache != "none"
     location = CacheLocation(str(Path(cache).resolve()) if keep and cache else None, keep)
-    with Workers(workers) as hands:
-        result = run.reidentify(places, options, hands, reporter, cache=location)
+    with Cluster(workers, scheduler=scheduler, reporter=reporter) as cluster:
+        result = run.reidentify(places, options, cluster, reporter, cache=location)
     written: list[Path] = []
     if output is not None:
         with convert_write_errors(output):
@@ -101,10 +110,10 @@ def result_lines(result: BatchResult) -> Iterator[str]:
             yield f"  note: {warning}"
 
 
-def _line(one: LevelEstimate) -> str:
+def _line(one: BatchEstimate) -> str:
     """Format a campaign."""
     named = ", ".join(text for text in (one.campaign, one.setup, one.when[:10]) if text)
-    error = relative_error(one.noise_std, one.torque_rms, one.samples)
+    error = relative_error(one.estimate.noise_std, one.torque_rms, one.estimate.samples)
     unseen = relative_error(one.unseen_rms, one.unseen_torque_rms)
     held_out = "" if math.isnan(unseen) else f", held out {unseen:.1%}"
     return f"  {named}: {plural(one.repetitions, 'repetition')}, torque error {error:.1%}{held_out}"
@@ -149,15 +158,17 @@ def as_dict(result: BatchResult, written: Sequence[Path]) -> dict[str, Any]:
     }
 
 
-def _level(one: LevelEstimate) -> dict[str, Any]:
+def _level(one: BatchEstimate) -> dict[str, Any]:
     return {
         "when": one.when or None,
         "setup": one.setup,
         "repetitions": one.repetitions,
-        "method": one.method,
+        "method": one.estimate.method,
         "parameters": {
             name: {"value": float(value), "std": float(std) if math.isfinite(std) else None}
-            for name, value, std in zip(one.names, one.values, one.std, strict=True)
+            for name, value, std in zip(
+                one.estimate.names, one.estimate.values, one.estimate.std, strict=True
+            )
         },
         "warnings": list(one.warnings),
     }

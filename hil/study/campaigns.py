@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from hil.batch.workers import ArchiveTask, Unused, Workers
+from hil.batch.cluster import Cluster, Task, Unused
 from hil.campaign import Campaign, CampaignFolder, CampaignPlan, Stop
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.plan import moves_of, plan_around
@@ -28,7 +28,6 @@ A: Final = "a"
 B: Final = "b"
 LABELS: Final = {A: "A", B: "B"}
 NO_EFFECTS, EFFECTS = "no-effects", "effects"
-LONGEST: Final = 6 * 3600.0  #: Time limit of one campaign or one estimation, s
 SINES: Final[dict[str, tuple[str, dict[str, str]]]] = {
     "a-middle": ("about the middle of the ranges, frequencies as printed", {}),
     "a-home": ("about the home posture, frequencies as printed", {"offset": "home"}),
@@ -210,18 +209,19 @@ def in_children(
     calls: Sequence[tuple[Path, tuple[Any, ...]]],
     title: str,
     reporter: Reporter,
-    workers: Workers,
+    cluster: Cluster,
 ) -> list[T]:
     """Call a function in child processes with the arguments of each place; results in order.
 
     Raises:
         StudyError: a call failed, crashed or timed out.
     """
-    tasks = [ArchiveTask(str(place), function, own) for place, own in calls]
-    found: list[T] = []
+    tasks = [Task(str(place), function, arguments) for place, arguments in calls]
+    values: list[T] = []
     with reporter.task(title, len(tasks)) as task:
-        for one in workers.results(tasks, task.advance):
-            if isinstance(one, Unused):
-                raise StudyError(f"{one.path}: {one.reason}; start the study again to resume")
-            found.append(one)
-    return found
+        results = cluster.results(tasks, task.advance)
+    for result in results:
+        if isinstance(result, Unused):
+            raise StudyError(f"{result.path}: {result.reason}; start the study again to resume")
+        values.append(result)
+    return values

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from hil.batch.workers import Workers
+from hil.batch.cluster import Cluster
 from hil.cell import Cell
 from hil.design import preset
 from hil.files import digest, write_files
@@ -60,7 +60,7 @@ def run_study(
         simulated_link(cell)  # raises for real hardware
         settings = settings.model_copy(update={"cell": digest(cell.text + cell.urdf)})
     truth = planted_values(cell)
-    with folder.locked(), Workers(workers, timeout=campaigns.LONGEST) as processes:
+    with folder.locked(), Cluster(workers, reporter=reporter) as processes:
         folder.begin(settings)
         wanted = campaigns.searches(settings, len(cell.joint_names))
         found = campaigns.run_searches(folder, cell, wanted, reporter, workers)

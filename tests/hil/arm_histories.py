@@ -10,7 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from hil.batch.run import LevelEstimate
+from hil.batch.estimates import BatchEstimate
 from hil.cell import Cell
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import Factor, estimate, joint_weights
@@ -91,8 +91,8 @@ def campaign(condition, k, random):
         noise = lfilter([0.6], [1.0, -0.8], random.standard_normal(clean.shape), axis=0)
         factor = factor + Factor.by_time(arm, as_samples(arm, motion(), clean + size * noise))
     weights = joint_weights(factor)
-    return LevelEstimate.of(
-        with_block_covariance(estimate(arm, factor, weights), factor, weights),
+    return BatchEstimate(
+        estimate=with_block_covariance(estimate(arm, factor, weights), factor, weights),
         level="campaign",
         arm="digest",
         campaign=f"line/c{k:02d}",

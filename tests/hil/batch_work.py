@@ -1,15 +1,21 @@
-"""Workers for tests: in this process, or with archives and tasks that end theirs."""
+"""Clusters for tests: in this process, with archives and tasks that end theirs, and run by hand."""
 
 from __future__ import annotations
 
 import os
+import re
 import signal
-import time
-from pathlib import Path
-from typing import Any, Final
+import subprocess
+import sys
+import threading
+from contextlib import ExitStack
+from functools import cache
+from typing import Final
 
-from hil.batch.discovery import ArchiveRef
-from hil.batch.workers import ArchiveTask, Unused, Workers, run_task
+from distributed import WorkerPlugin
+
+from hil.batch import discovery
+from hil.batch.cluster import Cluster, Task, Unused
 from hil.errors import ArchiveError
 
 NOTHING_OPEN: Final = (
@@ -19,29 +25,92 @@ NOTHING_OPEN: Final = (
 """Options of `hil reidentify` that leave nothing to be chosen of a controller's archives."""
 
 
-class Here(Workers):
-    """Workers in this process; `deadly` archives, by name, are as if they ended theirs."""
-
-    def __init__(self, *deadly):
-        super().__init__(1)
-        self.deadly = deadly
-        self.tasks: list[ArchiveTask[Any]] = []
-
-    def results(self, tasks, done=None):
-        for task in tasks:
-            self.tasks.append(task)
-            if done is not None:
-                done(1)
-            deadly = any(ref.name in self.deadly for ref in _refs(task.arguments[0]))
-            yield Unused(task.path, "ended its process") if deadly else run_task(task)
+@cache
+def _shared():
+    return Cluster()
 
 
-def _refs(argument):
-    if isinstance(argument, ArchiveRef):
-        yield argument
-    elif not isinstance(argument, str):
-        for one in argument:
-            yield from _refs(one)
+class Here(Cluster):
+    """The cluster of few archives: a thread of this process, shared by tests for speed."""
+
+    def client(self, archives):
+        return _shared().client(1)
+
+
+class Deadly(WorkerPlugin):
+    """Ends the processes of workers that open archives of these names, also restarted ones."""
+
+    name = "deadly archives"
+
+    def __init__(self, *names):
+        self.names = names
+
+    def setup(self, worker):
+        read = discovery.open_archive
+
+        def deadly(path, **how):
+            if path.name in self.names and how["fields"]:
+                os.kill(os.getpid(), signal.SIGSEGV)
+            return read(path, **how)
+
+        discovery.open_archive = deadly
+
+
+class Process:
+    """A process of Dask's own command line; its log is read until it is ready."""
+
+    def __init__(self, *arguments, ready, environment=()):
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "distributed.cli." + arguments[0], *arguments[1:]],
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1", **dict(environment)},
+            start_new_session=True,
+        )
+        self.log = ""
+        self.found = ""
+        for line in self.process.stderr:
+            self.log += line
+            if match := re.search(ready, line):
+                self.found = match[1]
+                break
+        # Else the pipe fills up and the process stops.
+        threading.Thread(target=self.process.stderr.read, daemon=True).start()
+
+    def kill(self):
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+
+
+class HandMade:
+    """A scheduler and workers, each a process of its own, as on several machines."""
+
+    def __init__(self, workers=2):
+        self.open = ExitStack()
+        self.scheduler = self.run("dask_scheduler", *_QUIET, ready=r"Scheduler at: +(tcp://\S+)")
+        self.address = self.scheduler.found
+        self.workers = [self.add_worker() for _ in range(workers)]
+
+    def add_worker(self, **environment):
+        options = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--death-timeout", "30")
+        return self.run(
+            "dask_worker", self.address, *options, ready=r"(Registered to)", environment=environment
+        )
+
+    def run(self, *arguments, **how):
+        process = Process(*arguments, **how)
+        self.open.callback(process.kill)
+        return process
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.open.close()
+
+
+_QUIET: Final = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard")
 
 
 def number(k):
@@ -60,40 +129,10 @@ def crash(_):
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
-def once(path):
-    """End the process the first time."""
-    if not Path(path).exists():
-        Path(path).touch()
-        os._exit(3)
-    return "again"
-
-
-def hang(_):
-    time.sleep(600.0)
-
-
 def task(function, argument):
-    return ArchiveTask(f"{function.__name__}-{argument}.mcap", function, (argument,))
+    return Task(f"{function.__name__}-{argument}.mcap", function, (argument,))
 
 
-def tasks_with_failures(count, **more):
-    """Return tasks of which some fail, and the number and reason of those."""
-    reasons = {
-        "crash": "ended its process, twice",
-        "absent": "No such file",
-        "faulty": "IndexError",
-    }
-    places = {"crash": 2, "absent": 4, "faulty": 7} | more
-    tasks = [task(number, k) for k in range(count)]
-    for name, k in places.items():
-        tasks[k] = task(globals()[name], k)
-    return tasks, {k: reasons.get(name, "took too long") for name, k in places.items()}
-
-
-def check_failures(tasks, found, failing, others=None):
-    for k, one in enumerate(found):
-        if k in failing:
-            assert isinstance(one, Unused)
-            assert (one.path, failing[k] in one.reason) == (tasks[k].path, True), one
-        else:
-            assert one == (others or {}).get(k, k)
+def check_unused(result, name, reason):
+    assert isinstance(result, Unused)
+    assert (result.path, reason in result.reason) == (name, True), result

@@ -20,12 +20,14 @@ from typer.testing import CliRunner
 from benchmarks import archive_files
 from hil.archive import ArchiveWriter, Samples, write_samples
 from hil.archive.repair import repair, repaired_name
-from hil.batch import discovery
+from hil.batch import discovery, reduction
 from hil.batch import run as batch_run
 from hil.batch.cache import CacheLocation
+from hil.batch.cluster import Cluster
 from hil.batch.discovery import discover, open_ref
-from hil.batch.run import BatchEstimator, cached_bundle, reduce_bundle, reidentify
-from hil.batch.workers import Workers
+from hil.batch.estimates import BatchEstimator
+from hil.batch.reduction import cached_reduction, reduce_archives
+from hil.batch.run import reidentify
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import ArchiveError, InputError
@@ -38,7 +40,7 @@ from hil.progress import Silent
 from identification.selection.inner_prediction import Strength
 from identification.signals.samples import Preprocessing
 
-from .batch_work import NOTHING_OPEN, Here
+from .batch_work import NOTHING_OPEN, Deadly, Here
 from .conftest import small
 from .mcap_bytes import with_attachment
 
@@ -48,9 +50,9 @@ SETTINGS = Settings(Preprocessing())
 NAMES = ("excitation_000", "excitation_001", "excitation_002")
 
 
-def batch(*places, options=FIXED, cache=UNCACHED, workers=None, **changed):
+def batch(*places, options=FIXED, cache=UNCACHED, cluster=None, **changed):
     names, options = [str(place) for place in places], replace(options, **changed)
-    return reidentify(names, options, workers or Here(), Silent(), cache=cache)
+    return reidentify(names, options, cluster or Here(), Silent(), cache=cache)
 
 
 def found_in(*roots, cache=UNCACHED):
@@ -89,7 +91,7 @@ def damage(path):
 
 def bits(result):
     levels = (*result.repetitions, *result.campaigns, *result.pooled)
-    return [one.values.tobytes() + one.std.tobytes() for one in levels]
+    return [one.estimate.values.tobytes() + one.estimate.std.tobytes() for one in levels]
 
 
 def assert_equal_repetitions(result, one):
@@ -98,6 +100,7 @@ def assert_equal_repetitions(result, one):
     They agree far better than the scatter over its blocks, at least 20, determines them.
     """
     for mine, theirs in zip(result.repetitions, one.repetitions, strict=True):
+        mine = mine.estimate
         np.testing.assert_allclose(mine.values, theirs.values, **EXACT)
         np.testing.assert_allclose(mine.noise_std, theirs.noise_std, **EXACT)
         np.testing.assert_allclose(mine.std, theirs.std, rtol=1.0 / np.sqrt(2.0 * 20.0))
@@ -142,8 +145,9 @@ class TestNumbers:
         one = identify_campaign(campaign.folder.root, Silent()).estimate
         found = batch(campaign.folder.root, options=Options())
         (level,), (pooled,) = found.campaigns, found.pooled
-        assert pooled.values.tobytes() == level.values.tobytes()
         assert (pooled.level, pooled.campaign) == ("pooled", "")
+        level, pooled = level.estimate, pooled.estimate
+        assert pooled.values.tobytes() == level.values.tobytes()
         np.testing.assert_allclose(level.values, one.pooled.values, **EXACT)
         np.testing.assert_allclose(level.covariance, one.pooled.covariance, rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose(level.noise_std, one.pooled.noise_std, **EXACT)
@@ -175,7 +179,7 @@ class TestNumbers:
         ready = with_transmitted_load(prepare(campaign, options))
         one = estimate_with(ready, options, Silent()).result
         found = batch(campaign.folder.root, options=options)
-        (level,) = found.campaigns
+        level = found.campaigns[0].estimate
         np.testing.assert_allclose(level.values, one.pooled.values, **EXACT)
         np.testing.assert_allclose(level.std, one.pooled.std, **EXACT)
         assert level.method == one.pooled.method
@@ -184,7 +188,7 @@ class TestNumbers:
     @pytest.mark.parametrize("name", get_args(BatchEstimator))
     def test_equal_those_with_samples_for_each_estimator(self, name, campaign, prepared):
         one = estimate_with(prepared, replace(FIXED, estimator=name), Silent()).result
-        (level,) = batch(campaign.folder.root, estimator=name).campaigns
+        level = batch(campaign.folder.root, estimator=name).campaigns[0].estimate
         # The program of the consistent estimate stops at its own tolerance.
         rtol, atol = (1e-4, 1e-4) if name == "consistent" else (1e-8, 1e-12)
         np.testing.assert_allclose(level.values, one.pooled.values, rtol=rtol, atol=atol)
@@ -194,7 +198,7 @@ class TestNumbers:
         (level,), model = found.campaigns, prepared.sources.cell.model
         squares, rows = np.zeros(6), np.zeros(6)
         for samples in prepared.held_out:
-            error = samples.torque - samples.predicted_torque(model, level.values)
+            error = samples.torque - samples.predicted_torque(model, level.estimate.values)
             squares += np.where(samples.usable, error**2, 0.0).sum(axis=0)
             rows += samples.usable.sum(axis=0)
         np.testing.assert_allclose(level.unseen_rms, np.sqrt(squares / rows), rtol=1e-6)
@@ -207,9 +211,9 @@ class TestNumbers:
         assert [one.repetitions for one in result.campaigns] == [1, 2]
         assert [one.repetitions for one in result.pooled] == [3]
         # Sums in another order: rounding of poorly determined parameters.
-        apart = result.pooled[0].values - found.pooled[0].values
-        assert np.abs(apart / found.pooled[0].std).max() < 1e-6
-        np.testing.assert_allclose(result.pooled[0].std, found.pooled[0].std, rtol=1e-6)
+        mine, theirs = result.pooled[0].estimate, found.pooled[0].estimate
+        assert np.abs((mine.values - theirs.values) / theirs.std).max() < 1e-6
+        np.testing.assert_allclose(mine.std, theirs.std, rtol=1e-6)
 
     def test_settings_are_decided_once_for_each_arm(self, campaign, tmp_path, monkeypatch):
         """On the first readable campaign; the noise of the positions is that of each campaign."""
@@ -232,9 +236,9 @@ class TestNumbers:
 
     @pytest.mark.slow
     def test_do_not_depend_on_workers_order_or_cache(self, folder, tmp_path, monkeypatch):
-        monkeypatch.setattr(batch_run, "BUNDLE", 1)
-        with Workers(2) as workers:
-            alone = batch(folder, workers=workers)
+        monkeypatch.setattr(batch_run, "PARTITION", 1)
+        with Cluster(2) as cluster:
+            alone = batch(folder, cluster=cluster)
         files = sorted((folder / "archives").glob("*.mcap"), reverse=True)
         assert bits(batch(*files)) == bits(alone)
         place = CacheLocation(str(tmp_path / "cache"))
@@ -256,10 +260,9 @@ class TestCache:
         assert (first.read, first.cached) == (5, 0)
         with monkeypatch.context() as patch:
             patch.setattr(discovery, "open_archive", pytest.fail)
-            workers = Here()
-            second = batch(folder, cache=CacheLocation(), workers=workers, estimator="consistent")
-        assert (second.read, second.cached, workers.tasks) == (0, 5, [])
-        assert "consistent" in second.campaigns[0].method
+            second = batch(folder, cache=CacheLocation(), estimator="consistent")
+        assert (second.read, second.cached) == (0, 5)
+        assert "consistent" in second.campaigns[0].estimate.method
         assert batch(folder, cache=CacheLocation(), delay=0.002).read == 5
 
     def test_of_a_read_only_folder_is_in_the_home(self, folder, tmp_path, monkeypatch):
@@ -286,7 +289,8 @@ class TestBroken:
             assert set(reasons) == {truncated.name, damaged.name, "nothing.mcap", "other.mcap"}
             assert "repair" in reasons[truncated.name]
             assert fitted(result) == [left.name]
-        found, expected = result.repetitions[0].values, intact.repetitions[2].values
+        found = result.repetitions[0].estimate.values
+        expected = intact.repetitions[2].estimate.values
         np.testing.assert_allclose(found, expected, **EXACT)
 
     def test_repaired_copies_are_not_fitted_with_their_originals(self, loose):
@@ -304,17 +308,18 @@ class TestBroken:
         assert not result.broken
         assert len(result.repetitions) == len(files)
 
+    @pytest.mark.slow
     def test_archives_that_end_their_process(self, folder):
         names = [path.name for path in excitations(folder)]
-        result = batch(folder, workers=Here(names[1]))
-        assert [*reasons_of(result.broken)] == [names[1]]
-        assert fitted(result) == [names[0], names[2]]
-        left = [path for path in (folder / "archives").glob("*.mcap") if path.name != names[1]]
-        assert bits(batch(*left)) == bits(result)
         (standstill,) = [path.name for path in (folder / "archives").glob("standstill*")]
-        result = batch(folder, workers=Here(standstill))
-        assert standstill in reasons_of(result.broken)
-        assert len(result.repetitions) == 3
+        with Cluster(2) as cluster:
+            cluster.client(1).register_plugin(Deadly(names[1], standstill))
+            result = batch(folder, cluster=cluster)
+        assert {*reasons_of(result.broken)} == {names[1], standstill}
+        assert fitted(result) == [names[0], names[2]]
+        intact = list((folder / "archives").glob("*.mcap"))
+        left = [path for path in intact if path.name not in (names[1], standstill)]
+        assert bits(batch(*left)) == bits(result)
 
     def test_nothing_to_fit_is_an_error(self, tmp_path):
         with pytest.raises(InputError, match="'huber' reads samples; use auto, wls, consistent"):
@@ -519,13 +524,13 @@ class TestGroups:
             victim, tmp_path / victim.name, "delay_cycles = 0.2", "delay_cycles = 4.2"
         )
         other.replace(victim)
-        used, reduce_one = {}, batch_run.archive_factor
+        used, reduce_one = {}, reduction.archive_factor
 
         def spied(ref, settings):
             used[ref.name] = settings.preprocessing.torque_delay
             return reduce_one(ref, settings)
 
-        monkeypatch.setattr(batch_run, "archive_factor", spied)
+        monkeypatch.setattr(reduction, "archive_factor", spied)
         result = batch(loose)
         assert not result.broken
         assert [one.repetitions for one in result.campaigns] == [2, 1]
@@ -613,5 +618,5 @@ class TestMetadata:
         with pytest.raises(ArchiveError, match="was changed"):
             open_ref(ref)
         cache = CacheLocation(str(tmp_path / "cache"))
-        assert reduce_bundle((ref,), SETTINGS, cache).broken
-        assert cached_bundle((ref,), SETTINGS, cache) is None
+        assert reduce_archives((ref,), SETTINGS, cache).broken
+        assert cached_reduction((ref,), SETTINGS, cache) is None

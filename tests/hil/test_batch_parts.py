@@ -1,46 +1,33 @@
-"""Parts of a batch: cache, keys, workers and tables."""
+"""Parts of a batch: cache, keys and tables."""
 
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import math
+import os
 import re
-import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from isal.isal_zlib import crc32
+from pyarrow import parquet
 
-from hil.batch.cache import (
-    _HEAD,
-    _MAGIC,
-    CacheError,
-    CacheLocation,
-    code_digest,
-    decoded,
-    encoded,
-)
+from hil.batch.cache import HEADER, CacheError, CacheLocation, code_digest
+from hil.batch.cluster import Unused
 from hil.batch.discovery import ArchiveRef, arm_digest
-from hil.batch.run import (
-    BUNDLE,
-    Arm,
-    BatchResult,
-    Bundle,
-    cached_bundle,
-    settings_digest,
-    split_bundles,
-    sum_key,
-)
+from hil.batch.estimates import Arm
+from hil.batch.reduction import cached_reduction, reduction_key, settings_digest
+from hil.batch.run import PARTITION, BatchResult, _Campaign
 from hil.batch.table import COLUMNS, write_tables
-from hil.batch.workers import Unused, Workers
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, TorsionSpringTable
 from hil.identify.prepared import Settings
@@ -49,10 +36,16 @@ from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
 from sim_fixtures.ns16 import CELL_PATH
 
-from . import batch_work as work
 from .arm_histories import cell, history, model, steady
 
 KEY = "0123456789abcdef"
+
+
+def assert_intact(entry, content, arrays):
+    assert entry[0] == content
+    assert {name: array.tobytes() for name, array in entry[1].items()} == {
+        name: array.tobytes() for name, array in arrays.items()
+    }
 
 
 def a_ref(index):
@@ -61,59 +54,85 @@ def a_ref(index):
 
 
 @given(st.permutations(range(40)))
-def test_bundles_do_not_depend_on_the_order_of_archives(order):
-    found = split_bundles([a_ref(k) for k in order])
-    assert [len(one) for one in found] == [BUNDLE, BUNDLE, 40 - 2 * BUNDLE]
-    assert [ref.index for one in found for ref in one] == list(range(40))
+def test_partitions_do_not_depend_on_the_order_of_archives(order):
+    refs = [a_ref(k) for k in order]
+    partitions = _Campaign(refs[0].key, refs).partitions
+    assert [len(part) for part in partitions] == [PARTITION, PARTITION, 40 - 2 * PARTITION]
+    assert [ref.index for part in partitions for ref in part] == list(range(40))
 
 
 class TestCache:
+    CONTENT: Final = {"a": [1.5, "x"], "b": None}
+    ARRAYS: Final = {"values": np.eye(7), "none": np.zeros((0, 3)), "counts": np.arange(3)}
+
+    @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(st.data())
-    def test_entries_with_one_wrong_bit_are_ignored(self, data):
-        content = {"a": [1.5, "x"], "values": np.eye(7), "none": [np.zeros((0, 3))]}
-        intact = encoded(KEY, content)
-        found = decoded(intact, KEY)
-        assert found["a"] == [1.5, "x"]
-        assert found["values"].tobytes() == np.eye(7).tobytes()
-        assert found["none"][0].shape == (0, 3)
+    def test_entries_with_one_wrong_bit_are_ignored(self, tmp_path, data):
+        """Or they are as written, if the bit is one of those that a reader does not need."""
+        cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
+        cache.write(place, KEY, self.CONTENT, self.ARRAYS)
+        path = cache.path(place, KEY)
+        intact = path.read_bytes()
+        assert_intact(cache.read(place, KEY), self.CONTENT, self.ARRAYS)
         bit = data.draw(st.integers(0, 8 * len(intact) - 1))
         damaged = bytearray(intact)
         damaged[bit // 8] ^= 1 << bit % 8
-        assert decoded(bytes(damaged), KEY) is None
-        assert decoded(intact[: data.draw(st.integers(0, len(intact) - 1))], KEY) is None
-        assert decoded(intact, KEY[::-1]) is None
+        path.write_bytes(damaged)
+        entry = cache.read(place, KEY)
+        if entry is not None:
+            assert_intact(entry, self.CONTENT, self.ARRAYS)
+        path.write_bytes(intact[: data.draw(st.integers(0, len(intact) - 1))])
+        assert cache.read(place, KEY) is None
+
+    def test_entries_of_another_key_are_ignored(self, tmp_path):
+        cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
+        cache.write(place, KEY, self.CONTENT, {})
+        other = cache.path(place, KEY[::-1])
+        other.parent.mkdir(parents=True)
+        cache.path(place, KEY).rename(other)
+        assert cache.read(place, KEY[::-1]) is None
 
     @pytest.mark.parametrize(
-        "array",
+        ("content", "arrays"),
         [
-            *({"array": "O", "shape": [1], "at": 0}, {"array": "(2,", "shape": [1], "at": 0}),
-            *({"array": "f", "shape": [1 << 62, 4], "at": 0}, {"array": "f", "shape": 3, "at": 0}),
-            *({"array": "f", "shape": [1], "at": -1}, {"array": ["a", "<f8"]}, {"array": "f"}),
+            *(([{"gram": 3}], {}), (None, {}), ({"archives": [{}]}, {}), ("text", {})),
+            (
+                {"archives": [{"warnings": [], "products": False}], "parameters": [], "units": []},
+                {"counts": np.zeros((1, 2), np.intp)},
+            ),
         ],
     )
-    def test_forged_arrays_with_valid_checksum_are_ignored(self, array):
-        text = json.dumps({"key": KEY, "content": array}).encode()
-        body = text + bytes(-len(text) % 8)
-        assert decoded(_HEAD.pack(_MAGIC, len(text), crc32(body)) + body, KEY) is None
+    def test_forged_reductions_are_ignored(self, tmp_path, content, arrays):
+        stated, cache = Settings(Preprocessing()), CacheLocation(str(tmp_path))
+        cache.write(a_ref(0).location, reduction_key([a_ref(0)], stated), content, arrays)
+        assert cached_reduction([a_ref(0)], stated, cache) is None
 
-    @pytest.mark.parametrize("forged", [[{"gram": 3}], {"type": "Factor"}, Bundle(), None])
-    def test_forged_sums_are_ignored(self, tmp_path, forged):
-        settings, cache = Settings(Preprocessing()), CacheLocation(str(tmp_path))
-        cache.put(a_ref(0).location, sum_key([a_ref(0)], settings), forged)
-        assert cached_bundle([a_ref(0)], settings, cache) is None
+    def test_objects_that_a_pickle_would_make_are_not_read(self, tmp_path):
+        cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
+        header = np.frombuffer(
+            json.dumps({"key": KEY, "content": {}, "arrays": ["values"]}).encode(), np.uint8
+        )
+        path = cache.path(place, KEY)
+        path.parent.mkdir(parents=True)
+        np.savez(path, **{HEADER: header, "values": np.array([{"an": "object"}])})
+        assert cache.read(place, KEY) is None
 
     def test_entries_of_two_writers_are_intact(self, tmp_path):
         cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
-        contents = [np.full(20_000, number) for number in (1.0, 2.0)]
+        contents = [{"values": np.full(20_000, number)} for number in (1.0, 2.0)]
+
+        def write(arrays):
+            for _ in range(100):
+                cache.write(place, KEY, {}, arrays)
+
         with ThreadPoolExecutor(2) as pool:
-            writing = [
-                pool.submit(lambda c=one: [cache.put(place, KEY, c) for _ in range(100)])
-                for one in contents
-            ]
-            found = [cache.get(place, KEY, np.ndarray) for _ in range(100)]
-        assert all(one.exception() is None for one in writing)
-        assert {float(np.ptp(one)) for one in found if one is not None} <= {0.0}
-        assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [KEY]
+            writing = [pool.submit(write, arrays) for arrays in contents]
+            entries = [cache.read(place, KEY) for _ in range(100)]
+        assert all(future.exception() is None for future in writing)
+        values = [entry[1]["values"] for entry in entries if entry is not None]
+        assert {float(np.ptp(array)) for array in values} <= {0.0}
+        files = [path.name for path in tmp_path.rglob("*") if path.is_file()]
+        assert files == [f"{KEY}.npz"]
 
     def test_unwritable_folders_are_refused_with_a_remedy(self, tmp_path):
         (tmp_path / "file").write_text("")
@@ -121,6 +140,21 @@ class TestCache:
         with pytest.raises(CacheError, match="--cache"):
             cache.put("/data/a.mcap", KEY, {})
         assert cache.get("/data/a.mcap", KEY, dict) is None
+
+    def test_a_full_disk_is_reported_with_a_remedy(self, tmp_path, monkeypatch):
+        def full(*_, **__):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr(np, "savez", full)
+        cache = CacheLocation(str(tmp_path))
+        with pytest.raises(CacheError, match=r"No space left.*make room, or name another folder"):
+            cache.put("/data/a.mcap", KEY, {})
+        assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+    def test_urls_are_cached_in_the_home(self, tmp_path, monkeypatch):
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        folder = CacheLocation().folder("https://host/line/a.mcap")
+        assert folder.parent == tmp_path / "hil"
 
     def test_archives_of_a_folder_share_a_folder(self, tmp_path):
         here, there = str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap")
@@ -132,7 +166,7 @@ class TestCache:
         assert tmp_path not in CacheLocation().folder(here).parents
 
     def test_settings_are_restored_exactly(self, tmp_path):
-        settings = Settings(
+        stated = Settings(
             Preprocessing(torque_bandwidth=1.0 / 3.0, torque_shape=LowPassShape(2, causal=True)),
             friction={"presliding": 1e-4, "third": "none"},
             noise_variance=(1e-9 / 3.0,) * 6,
@@ -141,8 +175,8 @@ class TestCache:
             choices=(Choice("rows", ("slow", "rests"), (0.1, np.inf), 0),),
         )
         cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
-        cache.put(place, KEY, settings)
-        assert cache.get(place, KEY, Settings) == settings
+        cache.put(place, KEY, stated)
+        assert cache.get(place, KEY, Settings) == stated
         cache.put(place, KEY, {"velocity": "position", "torque_delay": 0.0})
         assert cache.get(place, KEY, Settings) is None
 
@@ -194,26 +228,8 @@ class TestDigests:
             replace(stated, loading=(1.0, 2.0)),
         ]
         assert len({settings_digest(one) for one in (stated, *others)}) == 1 + len(others)
-        assert sum_key([a_ref(0), a_ref(1)], stated) != sum_key([a_ref(1), a_ref(0)], stated)
-
-
-class TestWorkers:
-    def test_tasks_that_kill_their_process_do_not_affect_others(self, tmp_path):
-        """A task whose process ends is run once more."""
-        tasks, failing = work.tasks_with_failures(12, hang=5)
-        tasks[9] = work.task(work.once, str(tmp_path / "ran"))
-        finished = []
-        with Workers(2, timeout=4.0) as workers:
-            found = list(workers.results(tasks, finished.append))
-        assert sum(finished) == 12
-        work.check_failures(tasks, found, failing, {9: "again"})
-
-    def test_closing_ends_tasks_at_work(self):
-        begin = time.monotonic()
-        with Workers(2) as workers:
-            found = workers.results([work.task(work.number, 0), *[work.task(work.hang, 1)] * 20])
-            assert next(found) == 0
-        assert time.monotonic() - begin < 60.0
+        both = [a_ref(0), a_ref(1)]
+        assert reduction_key(both, stated) != reduction_key(both[::-1], stated)
 
 
 DOCS = Path(__file__).parents[2] / "docs" / "batch.md"
@@ -222,16 +238,16 @@ DOCS = Path(__file__).parents[2] / "docs" / "batch.md"
 @cache
 def result():
     one, other = history(steady, 2, seed=2)
-    undetermined = one.std.copy()
-    undetermined[3] = np.inf
+    covariance = one.estimate.covariance.copy()
+    covariance[3, 3] = np.inf
+    names = (one.estimate.names[3],)
+    open_estimate = replace(one.estimate, covariance=covariance, undetermined=names)
     repetition = replace(
         one,
         level="repetition",
         archive='line "3", spring/\udcff.mcap',
         sha256="ab" * 32,
-        covariance=None,
-        std=undetermined,
-        undetermined=(one.names[3],),
+        estimate=open_estimate,
         when="",
         warnings=("stood still at first", "two gaps"),
     )
@@ -259,6 +275,8 @@ def tables(tmp_path_factory):
     """Rows of the tables by name."""
     found = {}
     for path in write_tables(tmp_path_factory.mktemp("tables"), result()):
+        if path.suffix != ".csv":
+            continue
         with path.open(encoding="utf-8", newline="") as file:
             found[path.stem] = list(csv.DictReader(file))
     return found
@@ -270,13 +288,15 @@ class TestTables:
         columns = [
             (level.level, level.campaign, name, value, std)
             for level in levels()
-            for name, value, std in zip(level.names, level.values, level.std, strict=True)
+            for name, value, std in zip(
+                level.estimate.names, level.estimate.values, level.estimate.std, strict=True
+            )
         ]
         for row, expected in zip(rows, columns, strict=True):
             found = (row["level"], row["campaign"], row["parameter"])
             assert (*found, float(row["value"]), float(row["std"])) == expected
         row, undetermined = rows[0], rows[3]
-        half = levels()[0].interval_factor * float(row["std"])
+        half = levels()[0].estimate.interval_factor * float(row["std"])
         for end, sign in (("low", -1.0), ("high", 1.0)):
             assert float(row[end]) == pytest.approx(float(row["value"]) + sign * half)
         expected = {
@@ -295,8 +315,8 @@ class TestTables:
         assert by_name["f1_3"] == ("friction", "joint_3")
         assert by_name["mc2x"] == ("inertial", "")
         one = result().campaigns[0]
-        weight = one.samples.astype(float)
-        expected = math.sqrt((weight @ one.noise_std**2) / (weight @ one.torque_rms**2))
+        weight, noise = one.estimate.samples.astype(float), one.estimate.noise_std
+        expected = math.sqrt((weight @ noise**2) / (weight @ one.torque_rms**2))
         campaign = next(row for row in rows if row["level"] == "campaign")
         assert datetime.fromisoformat(campaign["when"]) == datetime(2026, 1, 1, 8, tzinfo=UTC)
         assert float(campaign["relative_error"]) == pytest.approx(expected)
@@ -304,7 +324,7 @@ class TestTables:
         assert float(rows[-1]["unseen_relative_error"]) == pytest.approx(0.1)
         axes = tables["axes"]
         assert len(axes) == len(levels()) * model().n_joints
-        assert float(axes[1]["error_std"]) == levels()[0].noise_std[1]
+        assert float(axes[1]["error_std"]) == levels()[0].estimate.noise_std[1]
         assert [row["axis"] for row in axes[:6]] == list(model().joint_names)
         assert [tuple(row.values()) for row in tables["not_used"]] == [
             ("a/truncated.mcap", "broken", "its footer is missing"),
@@ -317,6 +337,22 @@ class TestTables:
         with pytest.raises(KeyError):
             write_tables(tmp_path, replace(result(), arms={}))
         assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+    def test_in_parquet_have_the_rows_of_csv_with_their_types(self, tmp_path, tables):
+        write_tables(tmp_path, result())
+        for name, rows in tables.items():
+            table = parquet.read_table(tmp_path / f"{name}.parquet")
+            assert table.column_names == list(COLUMNS[name])
+            assert table.num_rows == len(rows)
+        parameters = parquet.read_table(tmp_path / "parameters.parquet").to_pylist()
+        repetition = levels()[0].estimate
+        row = parameters[3]
+        assert row["value"] == repetition.values[3]
+        assert (row["std"], row["determined"], row["when"]) == (math.inf, False, None)
+        assert row["archive"] == 'line "3", spring/?.mcap'
+        assert row["archives"] == levels()[0].repetitions
+        campaign = next(row for row in parameters if row["level"] == "campaign")
+        assert campaign["when"] == datetime(2026, 1, 1, 8, tzinfo=UTC)
 
     def test_have_the_documented_columns_and_no_other(self):
         text = DOCS.read_text(encoding="utf-8")

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from hil.batch.run import Arm
-from hil.batch.workers import Workers
+from hil.batch.cluster import Cluster
+from hil.batch.estimates import Arm
 from hil.campaign import Campaign
 from hil.campaign.plan import design
 from hil.cell import Cell
@@ -66,8 +66,8 @@ def ran(folder, cell, plan):
 
 
 def compared(*places):
-    with Workers(1) as workers:
-        return compare([str(place) for place in places], workers, Silent())
+    with Cluster() as cluster:
+        return compare([str(place) for place in places], cluster, Silent())
 
 
 class TestRecorded:
@@ -115,15 +115,16 @@ class TestRecorded:
 
 
 def equal(level):
-    return np.array([level.values] * 2)
+    return np.array([level.estimate.values] * 2)
 
 
 def scattered(level):
     """Repetitions with 20 % scatter of the friction."""
     random = np.random.default_rng(len(level.when) + int(level.campaign[-2:]))
-    factor = np.ones((4, len(level.values)))
+    values = level.estimate.values
+    factor = np.ones((4, len(values)))
     factor[:, -FRICTION.size :] += 0.2 * random.standard_normal((4, 1))
-    return factor * level.values
+    return factor * values
 
 
 def levels_of(*conditions):
@@ -132,7 +133,13 @@ def levels_of(*conditions):
 
 def judged(levels, repetitions=equal):
     """Compare campaigns with repetitions of these values."""
-    single = [[replace(level, values=own) for own in repetitions(level)] for level in levels]
+    single = [
+        [
+            replace(level, estimate=replace(level.estimate, values=values))
+            for values in repetitions(level)
+        ]
+        for level in levels
+    ]
     return compare_campaigns(Arm("digest", arm_histories.cell()), levels, single)
 
 
@@ -205,8 +212,9 @@ class TestInMemory:
 
     def test_undetermined_values_are_not_judged(self):
         first, second = levels_of(Condition(), Condition())
-        unknown = replace(second, std=np.full_like(second.std, np.inf), covariance=None)
-        again = judged([first, unknown], lambda level: [level.values])
+        infinite = np.diag(np.full_like(second.estimate.std, np.inf))
+        unknown = replace(second, estimate=replace(second.estimate, covariance=infinite))
+        again = judged([first, unknown], lambda level: [level.estimate.values])
         assert not again.changed
         assert any("one repetition" in warning for warning in again.warnings)
         assert "nan" not in Page(comparison_page(again).decode()).text

@@ -1,0 +1,332 @@
+"""Dask clusters that execute the tasks of a batch.
+
+Few tasks run in a thread of this process, others on a local cluster of one process per core, or on
+the cluster of a scheduler. Linear algebra has one thread in the processes of a local cluster, so
+that the bits do not depend on their number.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self, TypeVar
+from uuid import uuid4
+
+from hil.errors import HilError, InputError
+from hil.progress import Reporter, Silent
+from hil.version import software
+from identification import IdentificationError
+
+from .cache import CacheError, code_digest
+
+if TYPE_CHECKING:  # half a second, only for those who use it
+    from distributed import Client, Future
+
+T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
+
+FEW: Final = 32
+"""Archives that are read in this process: a cluster takes two seconds to start, as do these."""
+
+CONNECT_TIMEOUT: Final = 10.0  # s, for a scheduler to answer
+PATIENCE: Final = 60.0  # s, for a worker of a scheduler to be there
+_WATCH: Final = 1.0  # s between looks at the workers while no task ends
+
+_CONFIGURATION: Final = {
+    "distributed.scheduler.allowed-failures": 1,  # another task may have ended the process first
+    "distributed.worker.profile.enabled": False,
+    "distributed.comm.retry.count": 3,
+}
+
+
+class Unused(NamedTuple):
+    """An archive or campaign that was not used, and why."""
+
+    path: str
+    reason: str
+
+
+class ClusterError(HilError):
+    """A cluster that ended, has no workers, or has workers of another version."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task(Generic[T_co]):
+    """A call in a worker."""
+
+    path: str  #: file or folder that names the task in errors
+    function: Callable[..., T_co]  #: importable in the worker
+    arguments: tuple[Any, ...]  #: pickled, so they should be small; futures become their results
+
+
+class Cluster:
+    """A Dask cluster, started when it is needed.
+
+    Args:
+        workers: number of local processes; by default one for each core that this process may use,
+            and none for few archives.
+        scheduler: address of a running scheduler, whose workers are used.
+        reporter: is told which workers there are, and the address of the dashboard.
+    """
+
+    def __init__(
+        self,
+        workers: int | None = None,
+        *,
+        scheduler: str | None = None,
+        reporter: Reporter | None = None,
+    ) -> None:
+        self._workers = workers
+        self._scheduler = scheduler
+        self._reporter = Silent() if reporter is None else reporter
+        self._open = ExitStack()
+        self._client: Client | None = None
+        self._in_process = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Cancel all tasks and end the workers that were started here."""
+        self._close()
+
+    def _close(self) -> None:
+        self._client = None
+        self._open.close()
+
+    # Clients
+
+    def client(self, archives: int) -> Client:
+        """Return a client of the cluster for work that reads so many archives.
+
+        Raises:
+            InputError: no scheduler answers at the address.
+            ClusterError: the scheduler has no worker, or one of another version.
+        """
+        few = archives <= FEW and self._workers is None and self._scheduler is None
+        if self._client is not None and self._in_process and not few:
+            self._close()
+        if self._client is None:
+            logger = logging.getLogger("distributed")
+            self._open.callback(logger.setLevel, logger.level)
+            logger.setLevel(logging.CRITICAL)
+            self._in_process = few
+            if self._scheduler is not None:
+                self._client = self._connected(self._scheduler)
+            else:
+                self._client = self._started(few)
+        return self._client
+
+    def _started(self, few: bool) -> Client:
+        import dask
+        from distributed import Client, LocalCluster
+
+        count = self._workers or len(os.sched_getaffinity(0))
+        self._open.enter_context(dask.config.set(_CONFIGURATION))
+        cluster = LocalCluster(
+            n_workers=1 if few else count,
+            threads_per_worker=1,
+            processes=not few,
+            dashboard_address=None if few else "127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
+        )
+        self._open.enter_context(cluster)
+        client = self._open.enter_context(Client(cluster))
+        if not few:
+            self._reporter.say(f"{count} workers on this PC; dashboard {cluster.dashboard_link}")
+        return client
+
+    def _connected(self, address: str) -> Client:
+        from distributed import Client
+
+        try:
+            client = self._open.enter_context(Client(address, timeout=CONNECT_TIMEOUT))
+        except (OSError, ValueError) as error:
+            raise InputError(
+                None,
+                f"no Dask scheduler answers at {address}",
+                field="--scheduler",
+                remedy="start one with `dask scheduler`, or name the address that it prints, such"
+                " as tcp://host:8786",
+            ) from error
+        try:
+            client.wait_for_workers(1, timeout=PATIENCE)
+        except TimeoutError as error:
+            raise self._without_workers() from error
+        self._require_same_code(client)
+        count = len(client.scheduler_info(n_workers=-1)["workers"])
+        self._reporter.say(f"{count} workers of {address}; dashboard {client.dashboard_link}")
+        return client
+
+    def _require_same_code(self, client: Client) -> None:
+        """Raise a `ClusterError` if a worker has other programs than this process."""
+        try:
+            digests = client.run(code_digest, on_error="return")
+        except Exception as error:
+            digests = {self._scheduler: error}
+        for address, digest in digests.items():
+            if digest != code_digest():
+                raise other_version(str(address))
+
+    def _without_workers(self) -> ClusterError:
+        return ClusterError(
+            f"the Dask scheduler {self._scheduler} has no worker since {PATIENCE:.0f} s; start some"
+            f" with `dask worker {self._scheduler}` and run the command again: what was computed"
+            " is in the cache"
+        )
+
+    # Tasks
+
+    def submit(self, task: Task[Any], *, archives: int) -> Future:
+        """Submit a task whose work reads so many archives."""
+        key = f"{task.function.__name__}-{uuid4().hex}"
+        arguments = (code_digest(), task.path, task.function, *task.arguments)
+        return self.client(archives).submit(run_task, *arguments, key=key, pure=False)
+
+    def completed(self, futures: Iterable[Future]) -> Iterator[Future]:
+        """Yield futures when they are done, in any order, and keep none of them.
+
+        Raises:
+            ClusterError: the scheduler does not answer any more, or has no worker left.
+            CacheError: the cache cannot be written.
+        """
+        done: SimpleQueue[Future] = SimpleQueue()
+        count = 0
+        future: Future | None = None
+        for future in futures:
+            future.add_done_callback(done.put)
+            count += 1
+        del future
+        since = time.monotonic()
+        while count:
+            try:
+                future = done.get(timeout=_WATCH)
+            except Empty:
+                since = self._watch(since)
+                continue
+            since = time.monotonic()
+            count -= 1
+            if future.cancelled():
+                place = self._scheduler or "of this PC"
+                raise ClusterError(
+                    f"the Dask scheduler {place} does not answer any more; start it and run the"
+                    " command again: what was computed is in the cache"
+                )
+            if future.status == "error" and not died(future):
+                raise _unexpected(future.exception())
+            yield future
+            del future
+
+    def _watch(self, since: float) -> float:
+        """Return since when there is a worker, or raise a `ClusterError` after `PATIENCE`."""
+        if self._client is None or self._scheduler is None:
+            return time.monotonic()  # processes of this PC are started again
+        if self._client.scheduler_info(n_workers=-1)["workers"]:
+            return time.monotonic()
+        if time.monotonic() - since > PATIENCE:
+            raise self._without_workers()
+        return since
+
+    def results(
+        self,
+        tasks: Sequence[Task[T]],
+        done: Callable[[int], None] | None = None,
+        *,
+        archives: int | None = None,
+    ) -> list[T | Unused]:
+        """Return the results of tasks in their order.
+
+        A task that fails gives an `Unused`, as does one that ends its process, again when it runs
+        alone. `done` is called with 1 for each result; `archives` are read, by default one a task.
+
+        Raises:
+            ClusterError: the scheduler does not answer any more, or has no worker left.
+            CacheError: the cache cannot be written.
+        """
+        if not tasks:
+            return []
+        count = len(tasks) if archives is None else archives
+        places: dict[str, int] = {}
+        results: dict[int, T | Unused] = {}
+        deaths: list[int] = []
+
+        def submitted() -> Iterator[Future]:
+            for number, task in enumerate(tasks):
+                future = self.submit(task, archives=count)
+                places[future.key] = number
+                yield future
+
+        for future in self.completed(submitted()):
+            number = places[future.key]
+            if died(future):
+                deaths.append(number)
+            else:
+                results[number] = future.result()
+            if done is not None:
+                done(1)
+        for number in deaths:  # another task of the process may have ended it
+            results[number] = self._alone(tasks[number], count)
+        return [results[number] for number in range(len(tasks))]
+
+    def _alone(self, task: Task[T], archives: int) -> T | Unused:
+        (future,) = self.completed(iter([self.submit(task, archives=archives)]))
+        if died(future):
+            return Unused(task.path, "ended the process that read it, twice")
+        result: T | Unused = future.result()
+        return result
+
+
+def _unexpected(error: BaseException) -> BaseException:
+    """Return an error of the cluster or its cache, or that about a worker that has no hil."""
+    if isinstance(error, HilError):
+        return error
+    return ClusterError(
+        f"a Dask worker cannot run the tasks of hil ({type(error).__name__}: {error}); install the"
+        " same version of hil there and start it again"
+    )
+
+
+def died(future: Future) -> bool:
+    """Return whether a task, or one that it depends on, repeatedly ended its process."""
+    from distributed import KilledWorker
+
+    return future.status == "error" and isinstance(future.exception(), KilledWorker)
+
+
+def run_task(code: str, path: str, function: Callable[..., T], *arguments: Any) -> T | Unused:
+    """Return the result of a task, or why there is none.
+
+    Raises:
+        ClusterError: this worker has other programs than the client, of this digest.
+        CacheError: the cache cannot be written, which affects every task.
+    """
+    if code != code_digest():
+        from distributed import get_worker
+
+        raise other_version(get_worker().address)
+    try:
+        return function(*arguments)
+    except CacheError:
+        raise
+    except Exception as error:
+        return Unused(path, reason_of(error))
+
+
+def other_version(address: str) -> ClusterError:
+    """Return the error about a worker with other programs."""
+    versions = ", ".join(f"{name} {number}" for name, number in software().items())
+    return ClusterError(
+        f"the Dask worker {address} has another version of hil, numpy, scipy or pin, so that its"
+        f" numbers would differ; install the same there and start it again: {versions}"
+    )
+
+
+def reason_of(error: Exception) -> str:
+    """Return the text of an error; an internal one costs an archive, not the batch."""
+    expected = isinstance(error, HilError | IdentificationError)
+    return str(error) if expected else f"{type(error).__name__}: {error}"

@@ -1,0 +1,368 @@
+"""Estimates of a batch from reduced archives: by repetition, by campaign, and by arm."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.cell import Cell
+from hil.identify.estimating import Posterior, fit_of
+from hil.identify.prepared import Settings
+from identification import IdentificationError
+from identification.estimators.consistent import SolverError
+from identification.estimators.covariance import solve_with_prior
+from identification.estimators.delay import with_uncertain_delay
+from identification.estimators.least_squares import no_narrower
+from identification.factor.factor import QR_CONDITION, Estimate, Factor, require_rows
+
+from .cluster import Unused
+from .discovery import ArchiveRef, cell_from
+from .reduction import Reduction, Summary, added, plus, settings_digest
+
+Array = NDArray[np.float64]
+
+Level = Literal["repetition", "campaign", "pooled"]
+BatchEstimator = Literal["auto", "wls", "consistent"]
+"""Estimators that need factors only, and no samples."""
+
+_NAMED: Final = 12  # different warnings that are listed
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """A robot by its digest, see :class:`GroupKey`, with one of its cells."""
+
+    digest: str
+    cell: Cell
+
+    @property
+    def name(self) -> str:
+        """The cell's name with the begin of the digest, since names may be equal."""
+        return f"{self.cell.name}-{self.digest[:8]}"
+
+
+@dataclass(frozen=True, eq=False)
+class BatchEstimate:
+    """An estimate from one repetition, one campaign, or all campaigns of an arm."""
+
+    level: Level
+    arm: str  #: digest of the arm, a key of `BatchResult.arms`
+    campaign: str  #: folder; "" if pooled
+    when: str  #: time of the (first) recording, ISO 8601, "" if unknown
+    repetitions: int  #: archives that were fitted
+    estimate: Estimate
+    torque_rms: Array  #: of the fitted rows per joint (n,) [N·m or N]
+    unseen_rms: Array  #: torque error per joint (n,) on the campaign's validation runs; NaN if none
+    unseen_torque_rms: Array  #: torque per joint (n,) there; NaN if none
+    settings: str  #: digest of the settings; "" where campaigns with different ones are pooled
+    warnings: tuple[str, ...] = ()  #: about the archives and the estimate
+    #: payload and delay that the cell states, as text; "" if neither, or if campaigns with
+    #: different ones are pooled
+    setup: str = ""
+    #: location and digest of the archive of a repetition; "" otherwise
+    archive: str = ""
+    sha256: str = ""
+
+
+@dataclass(frozen=True)
+class ArmModel:
+    """Everything that an estimate of an arm needs beside factors; pickled to workers."""
+
+    digest: str
+    cell: str  #: text of its cell file
+    urdf: str
+    settings: Settings
+    estimator: BatchEstimator
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Archives that are fitted together: the sums that predict and are predicted."""
+
+    refs: tuple[ArchiveRef, ...] = ()  #: archives that were fitted
+    total: Factor | None = None  #: sum of their factors; None if there are none
+    values: tuple[Array, ...] = ()  #: parameters (p,) from each of them
+    unseen: Factor | None = None  #: sum of the totals of validation runs; None if none
+    products: Array | None = None  #: sum of those of the archives, see :attr:`Summary.products`
+    #: every archive, with the warnings about it
+    warned: tuple[tuple[ArchiveRef, tuple[str, ...]], ...] = ()
+    settings: frozenset[str] = frozenset()  #: digests
+    setups: frozenset[str] = frozenset()  #: payloads and delays that the cells state
+
+    @classmethod
+    def of(cls, reduction: Reduction, settings: Settings) -> Group:
+        """Return the group of one campaign, without the estimates from each archive."""
+        fitted = [one for one in reduction.summaries if one.ref.use == "excitation"]
+        group = cls(
+            refs=tuple(summary.ref for summary in fitted),
+            total=reduction.total,
+            warned=tuple((summary.ref, summary.warnings) for summary in reduction.summaries),
+            settings=frozenset({settings_digest(settings)}),
+            setups=frozenset(summary.ref.setup for summary in fitted),
+        )
+        for summary in reduction.summaries:
+            if summary.ref.use == "excitation":
+                group = replace(group, products=plus(group.products, summary.products))
+            else:
+                group = replace(group, unseen=plus(group.unseen, summary.total))
+        return group
+
+    def __add__(self, other: Group) -> Group:
+        """Return both groups together."""
+        return Group(
+            refs=self.refs + other.refs,
+            total=plus(self.total, other.total),
+            values=self.values + other.values,
+            unseen=plus(self.unseen, other.unseen),
+            products=plus(self.products, other.products),
+            warned=self.warned + other.warned,
+            settings=self.settings | other.settings,
+            setups=self.setups | other.setups,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CampaignResult:
+    """Estimates of a campaign, which the client receives."""
+
+    estimates: tuple[BatchEstimate, ...]  #: of its repetitions, then of itself; none if it failed
+    broken: tuple[Unused, ...]
+    read: int  #: archives whose factor was computed
+    cached: int  #: archives whose factor was cached
+
+
+# Tasks
+
+
+def estimate_campaign(
+    parts: Sequence[Reduction | Unused], arm: ArmModel, settings: Settings, campaign: str
+) -> tuple[CampaignResult, Group]:
+    """Estimate one campaign from its reduced archives; return also what a pooled estimate needs.
+
+    `settings` are those of the campaign, with its own noise.
+    """
+    reduction = added(part for part in parts if isinstance(part, Reduction))
+    estimator = Estimator(arm)
+    group = Group.of(reduction, settings)
+    estimates: list[BatchEstimate] = []
+    broken = [*reduction.broken, *(part for part in parts if isinstance(part, Unused))]
+    if group.total is not None:
+        try:
+            posterior, notes = estimator.posterior(group.total)
+            share = 1.0 / len(group.refs)
+            digest = settings_digest(settings)
+            repetitions = [
+                estimator.repetition(summary, digest, posterior, share)
+                for summary in reduction.summaries
+                if summary.ref.use == "excitation"
+            ]
+            group = replace(group, values=tuple(each.estimate.values for each in repetitions))
+            estimates = [*repetitions, estimator.sum("campaign", group, posterior, notes)]
+        except IdentificationError as error:
+            broken.append(Unused(campaign, str(error)))
+    result = CampaignResult(tuple(estimates), tuple(broken), reduction.read, reduction.cached)
+    return result, group
+
+
+def result_of(pair: tuple[CampaignResult, Group] | Unused) -> CampaignResult | Unused:
+    """Return what the client receives of a campaign."""
+    return pair if isinstance(pair, Unused) else pair[0]
+
+
+def group_of(pairs: Sequence[tuple[CampaignResult, Group] | Unused]) -> Group:
+    """Return the campaigns with an excitation as one group."""
+    groups = [pair[1] for pair in pairs if not isinstance(pair, Unused)]
+    return sum((group for group in groups if group.total is not None), Group())
+
+
+def estimate_arm(parts: Sequence[Group], arm: ArmModel) -> BatchEstimate | Unused | None:
+    """Estimate an arm from sums over its campaigns; None if there is no excitation."""
+    group = sum(parts, Group())
+    if group.total is None:
+        return None
+    notes: list[str] = []
+    if len(group.setups) > 1:
+        setups = "; ".join(sorted(setup or "nothing" for setup in group.setups))
+        notes = [
+            "pooled over campaigns whose cells state different payloads or delays, which are"
+            f" compensated: {setups}"
+        ]
+    estimator = Estimator(arm)
+    try:
+        posterior, others = estimator.posterior(group.total)
+        return estimator.sum("pooled", group, posterior, [*others, *notes])
+    except IdentificationError as error:
+        return Unused(f"arm {arm.digest[:8]}", str(error))
+
+
+# Estimates
+
+
+class Estimator:
+    """An estimator for one arm."""
+
+    def __init__(self, arm: ArmModel) -> None:
+        settings = arm.settings
+        self.name = arm.estimator
+        self.cell = cell_from(arm.cell, arm.urdf, *settings.friction.items())
+        self.model = self.cell.model
+        self._delay_variance = settings.delay_variance
+        self._strength = settings.strength
+
+    def posterior(self, total: Factor) -> tuple[Posterior | None, list[str]]:
+        """Return the posterior of a sum and its archives, and notes; None: there is no prior.
+
+        Raises:
+            IdentificationError: there is no usable row.
+        """
+        require_rows(self.model, total)
+        if self.name != "auto":
+            return None, []
+        prior = Posterior.of(self.cell, total, self.name, self._strength)
+        posterior, _, notes = prior.solved(total)
+        return posterior, notes
+
+    def of_archive(self, summary: Summary, posterior: Posterior | None, share: float) -> Estimate:
+        """Return the estimate from one archive, this share of those of the posterior.
+
+        That of the consistent estimator is unconstrained, as in `hil identify`. The scatter of the
+        scores is that of the archive by itself.
+        """
+        fit, scatter = summary.fit, summary.scatter
+        assert fit is not None and scatter is not None, "it was fitted"
+        if posterior is None:
+            return fit
+        # A copy: the total itself does not cache what is computed here.
+        total = replace(summary.total)
+        try:
+            result = posterior.fit(total, share)
+        except SolverError:
+            result = posterior.free(total, share)
+        precision = share * posterior.precision
+        weights = posterior.weights(total, share)
+        solution = solve_with_prior(total.weighted(weights), precision)
+        return replace(
+            result.estimate,
+            covariance=scatter.covariance(solution.root, precision, result.design_effect),
+            interval_factor=scatter.interval_factor,
+            method=f"{result.estimate.method.partition('; ')[0]}; {scatter.words}",
+        )
+
+    def of_group(self, group: Group, posterior: Posterior | None) -> Estimate:
+        """Return the estimate from a sum over archives, with the posterior of that sum.
+
+        Its intervals are at least as wide as the scatter of repetitions of one motion.
+
+        Raises:
+            IdentificationError: there is no consistent solution.
+        """
+        assert group.total is not None
+        if posterior is None:
+            estimate = fit_of(self.model, self.name)((), group.total)
+        else:
+            estimate = posterior.fit(group.total).estimate
+        motions = {ref.motion for ref in group.refs}
+        if len(motions) == 1 and "" not in motions:
+            covariance = no_narrower(estimate.covariance, np.array(group.values))
+            estimate = replace(estimate, covariance=covariance)
+        if group.products is None:
+            return estimate
+        precision = None if posterior is None else posterior.precision
+        return with_uncertain_delay(
+            estimate, group.total, group.products, self._delay_variance, precision
+        )
+
+    def repetition(
+        self, summary: Summary, settings: str, posterior: Posterior | None, share: float
+    ) -> BatchEstimate:
+        """Return the estimate of one archive, this share of its campaign."""
+        ref = summary.ref
+        nothing = np.full(self.model.n_joints, np.nan)
+        estimate = self.of_archive(summary, posterior, share)
+        return BatchEstimate(
+            level="repetition",
+            arm=ref.arm,
+            campaign=ref.campaign,
+            when=ref.when,
+            repetitions=1,
+            estimate=estimate,
+            torque_rms=_rms(replace(summary.total)),
+            unseen_rms=nothing,
+            unseen_torque_rms=nothing,
+            settings=settings,
+            warnings=summary.warnings,
+            setup=ref.setup,
+            archive=ref.location,
+            sha256=ref.sha256,
+        )
+
+    def sum(
+        self, level: Level, group: Group, posterior: Posterior | None, warnings: Sequence[str]
+    ) -> BatchEstimate:
+        """Return the estimate of a campaign, or of all campaigns of the arm.
+
+        Raises:
+            IdentificationError: there is no estimate.
+        """
+        assert group.total is not None
+        refs, estimate = group.refs, self.of_group(group, posterior)
+        unseen = Factor.zero(self.model) if group.unseen is None else group.unseen
+        is_poor = not estimate.undetermined and estimate.condition > QR_CONDITION
+        if posterior is None and is_poor:
+            conditioning = (
+                f"the scaled condition number is {estimate.condition:.2g}: the motion separates"
+                " some parameters poorly, and sums of squares lose digits there; `hil identify` on"
+                " these archives uses QR"
+            )
+            warnings = (conditioning, *warnings)
+        return BatchEstimate(
+            level=level,
+            arm=refs[0].arm,
+            campaign=refs[0].campaign if level == "campaign" else "",
+            when=min((ref.when for ref in refs if ref.when), default=""),
+            repetitions=len(refs),
+            estimate=estimate,
+            torque_rms=_rms(group.total),
+            unseen_rms=_rms(unseen, unseen.squared_errors(estimate.values)),
+            unseen_torque_rms=_rms(unseen),
+            settings=next(iter(group.settings)) if len(group.settings) == 1 else "",
+            warnings=(*warnings, *warning_lines(group.warned)),
+            setup=next(iter(group.setups)) if len(group.setups) == 1 else "",
+        )
+
+
+def warning_lines(warned: Sequence[tuple[ArchiveRef, Sequence[str]]]) -> tuple[str, ...]:
+    """Return warnings with the archives they concern, most frequent first."""
+    counts = Counter(text for _, warnings in warned for text in warnings)
+    first = {text: ref for ref, warnings in reversed(warned) for text in warnings}
+    lines = []
+    for text, count in counts.most_common(_NAMED):
+        name = f"{first[text].campaign.rsplit('/', 1)[-1]}/{first[text].name}"
+        some = f"{count} of {len(warned)} archives, such as {name}: {text}"
+        lines.append(text if count == len(warned) else some)
+    if len(counts) > _NAMED:
+        lines.append(f"{len(counts) - _NAMED} more warnings are listed with the repetitions")
+    return tuple(lines)
+
+
+def _rms(factor: Factor, squares: Array | None = None) -> Array:
+    """Return the RMS per joint (n,) of sums over rows, by default of the torque; NaN of none."""
+    squares = factor.gram[:, -1, -1] if squares is None else squares
+    return np.asarray(np.sqrt(squares / np.where(factor.samples > 0, factor.samples, np.nan)))
+
+
+def relative_error(error: Array, torque: Array, rows: NDArray[np.intp] | None = None) -> float:
+    """Return the RMS error over the RMS torque of all joints; NaN where unknown.
+
+    Both are given per joint (n,), for `rows` (n,) rows or equally many.
+    """
+    count = np.ones(len(error)) if rows is None else rows.astype(np.float64)
+    known = (count > 0.0) & np.isfinite(error) & np.isfinite(torque)
+    whole = float(count[known] @ torque[known] ** 2)
+    return math.sqrt(float(count[known] @ error[known] ** 2) / whole) if whole > 0.0 else math.nan
