@@ -4,8 +4,9 @@ Run with ``python -m benchmarks.batch FOLDER... [--workers N] [--json]`` on fold
 with ``python -m benchmarks.batch --archives 1000 [--seconds 12] [--json]`` on archives made for it:
 campaigns of 25 repetitions at 1 kHz with 6 joints, each with a noise of its own, so that no two
 hold the same. They lie in a temporary folder (0.45 MB per second of motion) and are deleted, unless
-``--folder`` names a folder for them. A hundred, four hundred and all of them are run, each in a
-process of its own, whose memory is then that of so many.
+``--folder`` names a folder for them, where those that are there are used. A hundred, four hundred,
+a thousand and all of them are run, each in a process of its own, whose memory is then that of so
+many. ``--archives 4000 --seconds 2`` shows how memory and time grow.
 
 The first run begins with an empty cache, the second estimates from the cache of the first. Wall
 times are those of the machine as it is; the processor time, of this process and its children, does
@@ -21,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -30,25 +31,21 @@ from typing import Any
 from benchmarks import parser_of, show
 from benchmarks.archive_files import PERIOD, repetitions
 from hil.batch.cache import CacheLocation
+from hil.batch.cluster import Cluster
 from hil.batch.run import BatchResult, reidentify
-from hil.batch.workers import ArchiveTask, Workers, run_task
 from hil.identify.options import FIXED
 from hil.progress import Silent
 
 _CAMPAIGN = 25  # repetitions
 
 
-class InThisProcess(Workers):
-    """One core and no child: what the work itself takes."""
+class InThisProcess(Cluster):
+    """A thread of this process, however many archives there are: what the work itself takes."""
 
-    def results(
-        self, tasks: Sequence[ArchiveTask[Any]], done: Callable[[int], None] | None = None
-    ) -> Iterator[Any]:
-        """Run tasks one after the other."""
-        for task in tasks:
-            yield run_task(task)
-            if done is not None:
-                done(1)
+    def client(self, archives: int) -> Any:
+        """Return the client for few archives."""
+        del archives
+        return super().client(1)
 
 
 def archives_to_estimate(paths: Sequence[Path]) -> float:
@@ -59,8 +56,8 @@ def archives_to_estimate(paths: Sequence[Path]) -> float:
     """
     with tempfile.TemporaryDirectory() as cache:
         start = time.process_time()
-        with InThisProcess() as workers:
-            found = _run([str(path) for path in paths], Path(cache), "wls", workers)
+        with InThisProcess() as cluster:
+            found = _run([str(path) for path in paths], Path(cache), "wls", cluster)
         end = time.process_time()
     if found.broken or found.pooled[0].repetitions != len(paths):
         raise SystemExit(f"the archives were not all fitted: {found.broken}")
@@ -70,11 +67,11 @@ def archives_to_estimate(paths: Sequence[Path]) -> float:
 def measure(places: Sequence[str], workers: int | None) -> dict[str, Any]:
     """A first and a second run on some folders."""
     with tempfile.TemporaryDirectory() as cache:
-        with Workers(workers) as hands:
-            first, first_wall, first_own = _timed(places, Path(cache), "wls", hands)
+        with Cluster(workers) as cluster:
+            first, first_wall, first_own = _timed(places, Path(cache), "wls", cluster)
         first_cpu = first_own + _children()
-        with Workers(workers) as hands:
-            second, second_wall, second_own = _timed(places, Path(cache), "wls", hands)
+        with Cluster() as cluster:  # nothing is read, so that it starts no process
+            second, second_wall, second_own = _timed(places, Path(cache), "wls", cluster)
         second_cpu = first_own + second_own + _children() - first_cpu
         cached = sum(path.stat().st_size for path in Path(cache).rglob("*") if path.is_file())
     count = first.read
@@ -85,7 +82,7 @@ def measure(places: Sequence[str], workers: int | None) -> dict[str, Any]:
     return {
         "archives": count,
         "campaigns": len(first.campaigns),
-        "workers": hands.count,
+        "workers": workers or len(os.sched_getaffinity(0)),
         "first_wall_s": round(first_wall, 2),
         "first_wall_ms_per_archive": round(first_wall / count * 1e3, 2),
         "first_processor_ms_per_archive": round(first_cpu / count * 1e3, 2),
@@ -110,7 +107,7 @@ def measure_made(
         root = folder or Path(temporary)
         campaigns = _make(root, archives, seconds)
         size = sum(path.stat().st_size for one in campaigns for path in one.glob("*.mcap"))
-        counts = sorted({count for count in (100, 400, archives) if count <= archives})
+        counts = sorted({count for count in (100, 400, 1000, archives) if count <= archives})
         steps = [_measured(campaigns[: -(-count // _CAMPAIGN)], workers) for count in counts]
     return steps[-1] | {
         "seconds_per_archive": seconds,
@@ -145,16 +142,16 @@ def _measured(campaigns: Sequence[Path], workers: int | None) -> dict[str, Any]:
     return found
 
 
-def _run(places: Sequence[str], cache: Path, estimator: Any, workers: Workers) -> BatchResult:
+def _run(places: Sequence[str], cache: Path, estimator: Any, cluster: Cluster) -> BatchResult:
     options, location = replace(FIXED, estimator=estimator), CacheLocation(str(cache))
-    return reidentify(places, options, workers, Silent(), cache=location)
+    return reidentify(places, options, cluster, Silent(), cache=location)
 
 
 def _timed(
-    places: Sequence[str], cache: Path, estimator: Any, workers: Workers
+    places: Sequence[str], cache: Path, estimator: Any, cluster: Cluster
 ) -> tuple[BatchResult, float, float]:
     wall, cpu = time.perf_counter(), time.process_time()
-    found = _run(places, cache, estimator, workers)
+    found = _run(places, cache, estimator, cluster)
     return found, time.perf_counter() - wall, time.process_time() - cpu
 
 

@@ -10,8 +10,8 @@ from tempfile import TemporaryDirectory
 import matplotlib.pyplot as plt
 
 from hil import Campaign, Cell
+from hil.batch.cluster import Cluster
 from hil.batch.run import reidentify
-from hil.batch.workers import Workers
 from hil.campaign import design
 from hil.identify.options import Options
 from hil.progress import Silent
@@ -33,13 +33,14 @@ def record(root: Path) -> None:
 
 def main() -> None:
     """Record, re-identify, draw."""
-    with TemporaryDirectory() as folder, Workers(2) as workers:
+    with TemporaryDirectory() as folder, Cluster() as cluster:
         record(Path(folder))
-        result = reidentify([folder], Options(), workers, Silent())
+        result = reidentify([folder], Options(), cluster, Silent())
     figure, axes = plt.subplots(figsize=(8, 3.5), layout="constrained")
     for level in result.campaigns:
         month = Path(level.campaign).name
-        for name, value, std in zip(level.names, level.values, level.std, strict=True):
+        estimate = level.estimate
+        for name, value, std in zip(estimate.names, estimate.values, estimate.std, strict=True):
             if name.startswith("f0"):
                 print(f"{month:6s} {name}: {value:6.2f} ± {1.96 * std:.2f} N·m")
                 style = {"f0_1": "ko", "f0_2": "C1s"}[name]

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
@@ -25,7 +27,7 @@ from identification import IdentificationError
 from .cache import CacheError, code_digest
 
 if TYPE_CHECKING:  # half a second, only for those who use it
-    from distributed import Client, Future
+    from distributed import Client, Future, Worker
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
@@ -37,8 +39,16 @@ CONNECT_TIMEOUT: Final = 10.0  # s, for a scheduler to answer
 PATIENCE: Final = 60.0  # s, for a worker of a scheduler to be there
 _WATCH: Final = 1.0  # s between looks at the workers while no task ends
 
+_LOGGERS: Final = ("distributed", "tornado.application")
+"""Loggers of what a `Cluster` reports in a sentence, or of heartbeats while a worker ends."""
+_THIS_PC: Final = "127.0.0.1:0"  # by default the dashboard is open to the network
 _CONFIGURATION: Final = {
+    "distributed.nanny.pre-spawn-environ": {
+        **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), 1),
+        "MALLOC_TRIM_THRESHOLD_": 65536,
+    },
     "distributed.scheduler.allowed-failures": 1,  # another task may have ended the process first
+    "distributed.worker.preload": [__name__],
     "distributed.worker.profile.enabled": False,
     "distributed.comm.retry.count": 3,
 }
@@ -112,9 +122,9 @@ class Cluster:
         if self._client is not None and self._in_process and not few:
             self._close()
         if self._client is None:
-            logger = logging.getLogger("distributed")
-            self._open.callback(logger.setLevel, logger.level)
-            logger.setLevel(logging.CRITICAL)
+            for logger in map(logging.getLogger, _LOGGERS):
+                self._open.callback(logger.setLevel, logger.level)
+                logger.setLevel(logging.CRITICAL)
             self._in_process = few
             if self._scheduler is not None:
                 self._client = self._connected(self._scheduler)
@@ -124,19 +134,32 @@ class Cluster:
 
     def _started(self, few: bool) -> Client:
         import dask
-        from distributed import Client, LocalCluster
+        from distributed import Client, LocalCluster, Scheduler, SpecCluster, Worker
 
         count = self._workers or len(os.sched_getaffinity(0))
         self._open.enter_context(dask.config.set(_CONFIGURATION))
-        cluster = LocalCluster(
-            n_workers=1 if few else count,
-            threads_per_worker=1,
-            processes=not few,
-            dashboard_address=None if few else "127.0.0.1:0",
-            silence_logs=logging.CRITICAL,
-        )
+        if few:
+            options = {"dashboard": False, "dashboard_address": _THIS_PC}
+            cluster = SpecCluster(
+                scheduler={"cls": Scheduler, "options": {"protocol": "inproc://", **options}},
+                workers={0: {"cls": Worker, "options": {"nthreads": 1, **options}}},
+                silence_logs=logging.CRITICAL,
+            )
+        else:
+            try:
+                cluster = LocalCluster(
+                    n_workers=count,
+                    threads_per_worker=1,
+                    dashboard_address=_THIS_PC,
+                    silence_logs=logging.CRITICAL,
+                )
+            except RuntimeError as error:
+                raise ClusterError(
+                    f"{count} workers of Dask did not start ({error}); try fewer with --workers"
+                ) from error
         self._open.enter_context(cluster)
-        client = self._open.enter_context(Client(cluster))
+        client = Client(cluster, set_as_default=False)
+        self._open.callback(client.close)
         if not few:
             self._reporter.say(f"{count} workers on this PC; dashboard {cluster.dashboard_link}")
         return client
@@ -145,7 +168,7 @@ class Cluster:
         from distributed import Client
 
         try:
-            client = self._open.enter_context(Client(address, timeout=CONNECT_TIMEOUT))
+            client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
         except (OSError, ValueError) as error:
             raise InputError(
                 None,
@@ -154,6 +177,7 @@ class Cluster:
                 remedy="start one with `dask scheduler`, or name the address that it prints, such"
                 " as tcp://host:8786",
             ) from error
+        self._open.callback(client.close)
         try:
             client.wait_for_workers(1, timeout=PATIENCE)
         except TimeoutError as error:
@@ -296,6 +320,15 @@ def died(future: Future) -> bool:
     from distributed import KilledWorker
 
     return future.status == "error" and isinstance(future.exception(), KilledWorker)
+
+
+def dask_setup(worker: Worker) -> None:
+    """Leave Ctrl-C and errors to the client; called in the workers that a `Cluster` starts."""
+    del worker
+    if threading.current_thread() is threading.main_thread():  # else it is in the client's process
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for logger in map(logging.getLogger, _LOGGERS):
+            logger.setLevel(logging.CRITICAL)
 
 
 def run_task(code: str, path: str, function: Callable[..., T], *arguments: Any) -> T | Unused:

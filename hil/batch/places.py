@@ -95,8 +95,8 @@ def archives_at(url: str) -> list[str]:
         return [url]
     with _access(url):
         paths = filesystem.find(path)
-        if not paths and not filesystem.exists(path):
-            raise FileNotFoundError(url)
+        if not paths:
+            filesystem.info(path)  # raises an error if there is no folder either
     places = [str(filesystem.unstrip_protocol(inside)) for inside in paths]
     return [place for place in places if name_of(place).endswith(SUFFIX)]
 

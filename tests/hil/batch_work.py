@@ -7,9 +7,11 @@ import re
 import signal
 import subprocess
 import sys
-import threading
+import time
 from contextlib import ExitStack
 from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 from distributed import WorkerPlugin
@@ -57,25 +59,23 @@ class Deadly(WorkerPlugin):
 
 
 class Process:
-    """A process of Dask's own command line; its log is read until it is ready."""
+    """A process of Dask's own command line, started until its log says that it is ready."""
 
     def __init__(self, *arguments, ready, environment=()):
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "distributed.cli." + arguments[0], *arguments[1:]],
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1", **dict(environment)},
-            start_new_session=True,
-        )
-        self.log = ""
-        self.found = ""
-        for line in self.process.stderr:
-            self.log += line
-            if match := re.search(ready, line):
-                self.found = match[1]
-                break
-        # Else the pipe fills up and the process stops.
-        threading.Thread(target=self.process.stderr.read, daemon=True).start()
+        with TemporaryDirectory() as folder:
+            log = Path(folder, "log")
+            with log.open("w") as file:
+                self.process = subprocess.Popen(
+                    [sys.executable, "-P", "-m", f"distributed.cli.{arguments[0]}", *arguments[1:]],
+                    stderr=file,
+                    env={**os.environ, "OMP_NUM_THREADS": "1", **dict(environment)},
+                    start_new_session=True,
+                )
+            deadline = time.monotonic() + 60.0
+            while (match := re.search(ready, log.read_text())) is None:
+                assert self.process.poll() is None and time.monotonic() < deadline, log.read_text()
+                time.sleep(0.05)
+            self.ready = match[1]
 
     def kill(self):
         if self.process.poll() is None:
@@ -89,7 +89,7 @@ class HandMade:
     def __init__(self, workers=2):
         self.open = ExitStack()
         self.scheduler = self.run("dask_scheduler", *_QUIET, ready=r"Scheduler at: +(tcp://\S+)")
-        self.address = self.scheduler.found
+        self.address = self.scheduler.ready
         self.workers = [self.add_worker() for _ in range(workers)]
 
     def add_worker(self, **environment):
