@@ -86,6 +86,9 @@ class CacheLocation:
                 open_file(self.path(location, key)) as file,
                 np.load(file, allow_pickle=False) as entry,
             ):
+                size = os.fstat(file.fileno()).st_size
+                if sum(member.file_size for member in entry.zip.infolist()) > size:
+                    return None  # compressed, which `write` never does
                 header = json.loads(entry[HEADER].tobytes())
                 if header["key"] != key:
                     return None

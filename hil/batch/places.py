@@ -97,8 +97,18 @@ def archives_at(url: str) -> list[str]:
         paths = filesystem.find(path)
         if not paths:
             filesystem.info(path)  # raises an error if there is no folder either
+    root = str(filesystem.unstrip_protocol(path)).rstrip("/") + "/"
     places = [str(filesystem.unstrip_protocol(inside)) for inside in paths]
-    return [place for place in places if name_of(place).endswith(SUFFIX)]
+    return [
+        place
+        for place in places
+        if name_of(place).endswith(SUFFIX) and place.startswith(root) and _is_plain(place)
+    ]
+
+
+def _is_plain(place: str) -> bool:
+    """Return whether a URL of a listing cannot lead elsewhere: `::` would chain another protocol."""
+    return "::" not in place and ".." not in place.split("/")
 
 
 def text_at(url: str) -> str | None:

@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 import hil
 from hil.batch import cluster as cluster_module
+from hil.batch import places
 from hil.batch import run as batch_run
 from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster, ClusterError
@@ -234,6 +235,17 @@ class TestUrls:
         assert unused.path == f"memory://{name}"
         assert "repair it where it is stored" in unused.reason
         assert "/tmp" not in unused.reason
+
+    def test_of_a_listing_stay_below_its_address(self, monkeypatch):
+        """Whatever a server lists: a chained protocol would read files of this PC."""
+        inside = "memory:///line/a.mcap"
+        hostile = ["memory:///line/zip::file:///etc/b.mcap", "memory:///line/../c.mcap"]
+        listed = [inside, *hostile, "memory:///other/d.mcap", "memory:///line/e.txt"]
+        memory = fsspec.filesystem("memory")
+        monkeypatch.setattr(type(memory), "find", lambda *_, **__: listed)
+        monkeypatch.setattr(type(memory), "unstrip_protocol", lambda _, place: place)
+        monkeypatch.setattr(type(memory), "_strip_protocol", lambda place: place)
+        assert places.archives_at("memory:///line") == [inside]
 
     @pytest.mark.parametrize(
         ("place", "why"),

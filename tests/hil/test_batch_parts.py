@@ -117,6 +117,16 @@ class TestCache:
         np.savez(path, **{HEADER: header, "values": np.array([{"an": "object"}])})
         assert cache.read(place, KEY) is None
 
+    def test_compressed_entries_are_not_read(self, tmp_path):
+        """They may be a thousand times as large in memory."""
+        cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
+        header = json.dumps({"key": KEY, "content": {}, "arrays": ["values"]}).encode()
+        path = cache.path(place, KEY)
+        path.parent.mkdir(parents=True)
+        arrays = {HEADER: np.frombuffer(header, np.uint8), "values": np.zeros(100_000)}
+        np.savez_compressed(path, **arrays)
+        assert cache.read(place, KEY) is None
+
     def test_entries_of_two_writers_are_intact(self, tmp_path):
         cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
         contents = [{"values": np.full(20_000, number)} for number in (1.0, 2.0)]
