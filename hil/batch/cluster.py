@@ -50,6 +50,11 @@ _CONFIGURATION: Final = {
     "distributed.scheduler.allowed-failures": 1,  # another task may have ended the process first
     "distributed.worker.preload": [__name__],
     "distributed.worker.profile.enabled": False,
+    # Looks at clocks and memory many times a second, which take some per cent of a core each.
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.tick.limit": "30s",
+    "distributed.admin.system-monitor.interval": "2s",
+    "distributed.worker.memory.monitor-interval": "1s",
     "distributed.comm.retry.count": 3,
 }
 
