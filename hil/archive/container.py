@@ -22,6 +22,7 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import EndOfFile
 from mcap.records import (
     Attachment,
+    AttachmentIndex,
     Channel,
     Chunk,
     ChunkIndex,
@@ -29,6 +30,7 @@ from mcap.records import (
     Header,
     McapRecord,
     Metadata,
+    MetadataIndex,
     Schema,
 )
 
@@ -54,6 +56,8 @@ _KINDS: dict[int, type[McapRecord]] = {
     CHANNEL: Channel,
     METADATA: Metadata,
     CHUNK_INDEX: ChunkIndex,
+    ATTACHMENT_INDEX: AttachmentIndex,
+    METADATA_INDEX: MetadataIndex,
 }
 _Parsed = TypeVar("_Parsed", bound=McapRecord)
 
@@ -225,6 +229,21 @@ def read_summary(stream: BinaryIO, size: int, *kinds: int, start: int | None = N
         return [parse_item(one) for one in split_records(summary, 0) if one.opcode in kinds]
     except Damage:
         return []
+
+
+def indexed(stream: BinaryIO, size: int) -> list[Head]:
+    """Return the heads of the chunks, attachments and metadata that the summary lists, in order."""
+    heads = []
+    for index in read_summary(stream, size, CHUNK_INDEX, ATTACHMENT_INDEX, METADATA_INDEX):
+        if isinstance(index, ChunkIndex):
+            begin, end = index.chunk_start_offset, index.chunk_start_offset + index.chunk_length
+            head = Head(CHUNK, begin, end)
+        else:
+            opcode = ATTACHMENT if isinstance(index, AttachmentIndex) else METADATA
+            head = Head(opcode, index.offset, index.offset + index.length)
+        if head.offset + RECORD.size <= head.end <= size:
+            heads.append(head)
+    return sorted(heads, key=lambda head: head.offset)
 
 
 def _footer(tail: bytes) -> Footer | None:

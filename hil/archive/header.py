@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-import struct
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -44,7 +43,7 @@ METADATA = "hil"  # Name of the metadata record with the header
 OUTCOME = "hil.outcome"  # Name of the metadata record with the outcome
 DESCRIPTION = "description"
 """Entry of the outcome: checksum of the header it belongs to. Older files have none."""
-CHUNKS = "chunks"  # Entry of the outcome: checksums of all chunks in order. Older files have none
+CHUNKS = "chunks"  # Entry of the outcome in files of earlier versions; not read
 SEALS = (DESCRIPTION, CHUNKS)  # Entries of the outcome that only serve to verify the file
 CONTROLLER_PROGRAM = "controller"
 """Entry ``motion`` of an archive whose motion was made by a program of the controller."""
@@ -249,7 +248,6 @@ class ArchiveOutcome(BaseModel):
         repaired: whether the file was repaired with loss.
         samples_lost, losses: by repairs, None where unknown; a sentence each.
         description: checksum of the header, None in older files.
-        chunks: checksums of all chunks in order; None in older files, or where invalid.
         record: all entries as texts, without the checksum of the record.
     """
 
@@ -270,9 +268,6 @@ class ArchiveOutcome(BaseModel):
         _Names, WrapValidator(_readable_or_default), Field(alias="repaired.losses")
     ] = ()
     description: str | None = None
-    chunks: Annotated[
-        tuple[int, ...] | None, BeforeValidator(lambda text: parse_chunk_list(text))
-    ] = None
     record: Mapping[str, str] = Field(default_factory=dict)
 
     @classmethod
@@ -293,22 +288,6 @@ class ArchiveOutcome(BaseModel):
 def is_supported(entries: Mapping[str, str]) -> bool:
     """Return whether the entries of a header are of the version that this software reads."""
     return entries.get("format_version") == str(FORMAT_VERSION)
-
-
-def format_chunk_list(chunks: Iterable[int]) -> str:
-    """Return the checksums of chunks as text of the outcome."""
-    return "".join(f"{crc:08x}" for crc in chunks)
-
-
-def parse_chunk_list(text: str) -> tuple[int, ...] | None:
-    """Return the checksums in such a text; None where it is invalid."""
-    try:
-        data = bytes.fromhex(text)
-    except ValueError:
-        return None
-    if len(text) != 2 * len(data) or len(text) % _DIGITS:
-        return None
-    return struct.unpack(f">{len(data) // 4}I", data)
 
 
 def checksum(entries: Mapping[str, str]) -> str:

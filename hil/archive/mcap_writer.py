@@ -79,12 +79,10 @@ class McapWriter:
 
     Attributes:
         position: where the next record begins.
-        checksums: of the chunks written so far, CRC-32 of their records.
     """
 
     def __init__(self, write: Callable[[bytes], object], profile: str, library: str) -> None:
         self.position = 0
-        self.checksums: list[int] = []
         self._write = write
         self._parts: list[bytes] = []  # of the chunk in progress
         self._size = 0
@@ -193,7 +191,6 @@ class McapWriter:
             head = _MESSAGE_INDEX.pack(container.MESSAGE_INDEX, length, channel, len(data))
             self._put(head + data)
         first, last = span(entries)
-        self.checksums.append(chunk.uncompressed_crc)
         self._chunks.append(
             ChunkIndex(
                 chunk_length=len(record),

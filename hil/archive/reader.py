@@ -1,9 +1,8 @@
 """Reading of archives: of a truncated or damaged one all that is whole, also behind damage.
 
-Each record is verified. The checksum of a chunk does not show that it belongs to this recording: a
-file system may put a chunk of another archive in its place. The outcome therefore lists the
-checksums of all chunks in order; where this list is missing, cycle numbers must increase, behind
-damage by as much as samples are missing.
+Each record is verified by its length and checksum. Where the length of one does not lead to the
+next, those behind it are found by the index in the summary, if the file has one. Messages are
+numbered, and cycles must increase.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 import numpy as np
-from mcap.records import Channel, Header, Schema
+from mcap.records import Channel, Metadata, Schema
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
@@ -33,10 +32,10 @@ from hil.archive.header import (
     ArchiveHeader,
     ArchiveOutcome,
     HeaderError,
+    checksum,
     is_supported,
 )
 from hil.archive.schema import ArchivedEvent
-from hil.archive.search import find_records, verified_metadata, verify
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import open_file, parse_json, remedy_for_missing
 
@@ -47,7 +46,6 @@ ALWAYS: Final = -(1 << 63), 1 << 63  # ns, before and after every stamp
 _BATCH: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
 _SEQUENCES = 1 << 32  # message numbers are modulo this
 _MOST_DAMAGES = 1000  # of one file; what follows is not read
-_LOST_PACKETS = 10  # that a gap may have beside one for each missing sample
 _MOST_SHOWN = 5  # faults in one message
 _LEAST = 8  # bytes of a file for one sample, of an arm at rest
 _COLUMN_OF: Final = {"effort": "torque"}  # names of message fields that differ from the column's
@@ -104,15 +102,12 @@ class Scan:
         self.lost = False
         self._stream = stream
         self._data_end: int | None = None  # None where a length does not lead to it
-        self._searched = self.size  # from here on records were found by search
-        self._library = schema.LIBRARY  # that wrote the file
         self._fields, self._times, self._all_channels = fields, times, all_channels
         self._left_out: set[int] = set()
         self._gap = False  # whether something was left out behind the last chunk
         self._skipped = False  # whether chunks were left out: channels continue at any number
         self._buffer = memoryview(bytearray(_BATCH))
         self._pending: list[tuple[int, slice]] = []  # offset of each chunk, its place in the buffer
-        self._place = 0  # of the next chunk in the list of checksums
         self._next: dict[str, int] = {}
         self._numbers: set[str] = set()
         self._newest = -1  # stamp of a cycle [ns]
@@ -120,11 +115,10 @@ class Scan:
         self._raw: dict[tuple[str, str], Rows] = {}  # columns as bytes, which are copied faster
         self._stamps = np.zeros(0, np.int64)
         self._count = 0
-        found = self._find_heads()
-        self._chunk_list = self._read_metadata()
-        if self.mixed and found:  # what was found behind damage is of another recording
-            del self.heads[-found:]
-            self.mixed = False
+        self._find_heads()
+        for head in self.heads:
+            if head.opcode == container.METADATA:
+                self._try(self._add_metadata, head)
         stated = self.outcome or ArchiveOutcome()
         self._repaired = stated.repaired
         expected = min(stated.samples or 0, self.size // _LEAST)
@@ -171,11 +165,6 @@ class Scan:
         start = self._data_end
         return container.read_summary(self._stream, self.size, *_DEFINITIONS, start=start)
 
-    @property
-    def _damaged_from(self) -> int:
-        """The place from which chunks lie behind damage, the end of a file without."""
-        return min((self._searched, *self.damages))
-
     def _find_shortfalls(self) -> Iterator[str]:
         """Yield a sentence for what the file states to contain and does not."""
         for name in self.header.attachments if self.header else ():
@@ -189,22 +178,23 @@ class Scan:
             "samples": (outcome.samples, self.samples),
             "events": (outcome.events, self.counts.get(schema.EVENTS, 0)),
         }
-        if self._chunk_list is not None:
-            found["chunks"] = len(self._chunk_list), self.chunks
         for key, (stated, count) in found.items():
             if stated != count:
                 yield f"{stated} {key} were written, {count} are there"
 
-    def _find_heads(self) -> int:
-        """Find the records with content; return how many of them were found by search."""
+    def _find_heads(self) -> None:
+        """Find the records with content, behind damage by the index of the summary."""
         stream, heads = self._stream, self.heads
         try:
             heads += container.heads(stream, self.size, _CONTENT)
             self._data_end = heads.pop().end
             container.check_end(stream, self.size, self._data_end)
-            return 0
+            return
         except Damage as damage:
             lost = damage
+        if self._data_end is not None:
+            self.damages[lost.offset] = lost.reason
+            return
         while heads:  # lengths are right up to the last record that is whole
             try:
                 verify(container.read_record(stream, heads[-1]))
@@ -213,30 +203,12 @@ class Scan:
                 lost = damage
                 heads.pop()
         self.damages[lost.offset] = lost.reason
-        self._searched = heads[-1].end if heads else len(container.MAGIC)
-        found = [*find_records(stream, self._searched, self.size)]
-        heads += found
-        return len(found)
-
-    def _read_metadata(self) -> NDArray[np.uint32] | None:
-        """Read header and outcome; return the list of chunks, None where there is none.
-
-        Older files have none, nor have those that another program has copied, maybe into other
-        chunks: it has written its own name.
-        """
-        for head in self.heads:
-            if head.opcode in (container.HEADER, container.METADATA):
-                self._try(self._add_metadata, head)
-        own = self._library == schema.LIBRARY
-        checksums = self.outcome.chunks if self.outcome and own else None
-        return None if checksums is None else np.array(checksums, np.uint32)
+        begin = heads[-1].end if heads else len(container.MAGIC)
+        heads += (head for head in container.indexed(stream, self.size) if head.offset >= begin)
 
     def _add_metadata(self, record: Record) -> None:
         """Add header or outcome: one each, of this version and of the same recording."""
         offset = record.offset
-        if record.opcode == container.HEADER:
-            self._library = container.parse(Header, record).library
-            return
         name, entries = verified_metadata(record)
         if name == METADATA and self.metadata is None:
             self.metadata = entries
@@ -259,11 +231,13 @@ class Scan:
 
     def _read(self) -> None:
         """Read the wanted records in order."""
-        outside = _chunks_outside(self._stream, self.size, self._times)
+        outside, inside = _chunks_by_time(self._stream, self.size, self._times)
+        if inside - {head.offset for head in self.heads}:
+            self.shortfalls = ["a chunk is missing"]
         for place, head in enumerate(self.heads):
             if head.opcode == container.CHUNK and head.offset in outside:
                 self._flush()
-                self._place, self._skipped = self._place + 1, True
+                self._skipped = True
                 self._next.clear()
                 continue
             self._try(self._add, head)
@@ -272,9 +246,6 @@ class Scan:
                 break
         self._flush()
         self.heads = [head for head in self.heads if head.offset not in self._left_out]
-        chunks = self._chunk_list
-        if outside and chunks is not None and self._place < len(chunks):
-            self.shortfalls = ["a chunk is missing"]
         if not outside and self.header is not None:  # else some other MCAP file
             self.shortfalls = [*self._find_shortfalls()]
         self.lost |= bool(self.shortfalls)
@@ -308,7 +279,6 @@ class Scan:
                 return  # some other MCAP file, or of either of two recordings
             head = container.parse_chunk(record)
             data = container.chunk_data(head, offset)
-            self._check_order(head.uncompressed_crc, offset)
             self._add_chunk(data, offset)
         elif record.opcode == container.ATTACHMENT:
             attachment = container.parse_attachment(record)
@@ -317,21 +287,6 @@ class Scan:
             self.attachments[attachment.name] = attachment.data
         elif record.opcode in _DEFINITIONS:
             self.parser.define(record)
-
-    def _check_order(self, crc: int, offset: int) -> None:
-        """Check that the chunk with this checksum is one that was written behind those before."""
-        chunks = self._chunk_list
-        if chunks is None:
-            return
-        if not (self._place < len(chunks) and chunks[self._place] == crc):
-            later = np.flatnonzero(chunks[self._place :] == crc)
-            if not len(later):
-                why = "is out of order" if crc in chunks else "is of another recording"
-                raise Damage(offset, f"(chunk) {why}, by the outcome's list")
-            self._note_gap(offset)
-            self._place += int(later[0])
-        self._place += 1
-        self._gap = False
 
     def _add_chunk(self, data: bytes, offset: int) -> None:
         """Decode the content of a chunk, or buffer it to decode several at once."""
@@ -351,7 +306,7 @@ class Scan:
     def _flush(self) -> None:
         """Decode the buffered chunks: all at once, or one by one where that fails."""
         pending, self._pending = self._pending, []
-        if len(pending) > 1 and pending[-1][0] < self._damaged_from:
+        if len(pending) > 1:
             try:
                 self._decode(self._buffer[: pending[-1][1].stop], pending[0][0], several=True)
                 self.chunks += len(pending)
@@ -390,14 +345,13 @@ class Scan:
             verified = found if self._all_channels else {topic: found[topic] for topic in wanted}
             missing = self._missing_messages(verified, offset)
             newest = self._check_times(verified, offset)
-            damaged = offset >= self._damaged_from
-            if self._chunk_list is None and (damaged or (missing and not self._repaired)):
-                self._check_gap(verified, missing, offset)
             layouts = self._check_layouts(verified, offset)
             events = self._decode_events(verified, offset)
         except Damage:
             parser.schemas, parser.channels = before
             raise
+        if missing and not self._repaired:
+            self._note_gap(offset)
         self._gap = False
         self._newest = max(self._newest, newest)
         self._numbers = self._numbers or numbers
@@ -488,25 +442,6 @@ class Scan:
                 missing[topic] = gap
         return missing
 
-    def _check_gap(
-        self, found: Mapping[str, Messages], missing: Mapping[str, int], offset: int
-    ) -> None:
-        """Check that a chunk that is in no list can be of this recording, behind damage or a gap.
-
-        As many cycles as samples must be missing, or up to twice as many: packets may be lost.
-        """
-        assert self.header is not None
-        period = self.header.period
-        if not self._next.keys().isdisjoint(found.keys() & set(NUMBERS)):
-            if schema.CYCLE not in found or period is None:
-                raise Damage(offset, "(chunk) follows damage: nothing shows that it belongs here")
-            elapsed = int(found[schema.CYCLE].stamps[0]) - self._newest
-            cycles, samples = round(elapsed * 1e-9 / period) - 1, missing.get(schema.CYCLE, 0)
-            if not samples <= cycles <= 2 * samples + _LOST_PACKETS:
-                raise Damage(offset, f"(chunk) follows a gap of {samples} samples, {cycles} cycles")
-        if missing:
-            self._note_gap(offset)
-
     def _check_times(self, found: Mapping[str, Messages], offset: int) -> int:
         """Check that cycles increase, and that all channels have the same times without cycles.
 
@@ -532,21 +467,44 @@ class Scan:
         return int(stamp[-1])
 
 
-def _chunks_outside(stream: BinaryIO, size: int, times: tuple[int, int]) -> Collection[int]:
-    """Return the places of chunks without messages of these times, by the index.
+def verified_metadata(record: Record) -> tuple[str, dict[str, str]]:
+    """Return name and entries, without the checksum that they must have if they are ours."""
+    metadata = container.parse(Metadata, record)
+    entries = metadata.metadata
+    is_ours = metadata.name in (METADATA, OUTCOME)
+    if is_ours and entries.pop("checksum", None) != checksum(entries):
+        raise Damage(record.offset, f"(metadata {metadata.name!r}) fails its checksum")
+    return metadata.name, entries
 
-    The first is read anyway: it defines the channels.
+
+def verify(record: Record) -> None:
+    """Raise `Damage` if a record with content fails its checksum, or cannot be parsed."""
+    if record.opcode == container.CHUNK:
+        container.chunk_data(container.parse_chunk(record), record.offset)
+    elif record.opcode == container.METADATA:
+        verified_metadata(record)
+    else:
+        container.parse_item(record)
+
+
+def _chunks_by_time(
+    stream: BinaryIO, size: int, times: tuple[int, int]
+) -> tuple[set[int], set[int]]:
+    """Return the places of chunks without and with messages of these times, by the index.
+
+    The first is read anyway: it defines the channels. Both are empty where all times are wanted.
     """
     if times == ALWAYS:
-        return ()
+        return set(), set()
     chunks = container.read_summary(stream, size, container.CHUNK_INDEX)
-    first = min((one.chunk_start_offset for one in chunks), default=0)
-    return {
-        one.chunk_start_offset
-        for one in chunks
-        if one.chunk_start_offset != first
-        and not (one.message_start_time < times[1] and one.message_end_time >= times[0])
+    first = min((chunk.chunk_start_offset for chunk in chunks), default=0)
+    outside = {
+        chunk.chunk_start_offset
+        for chunk in chunks
+        if chunk.chunk_start_offset != first
+        and not (chunk.message_start_time < times[1] and chunk.message_end_time >= times[0])
     }
+    return outside, {chunk.chunk_start_offset for chunk in chunks} - outside
 
 
 @dataclass(frozen=True, eq=False)

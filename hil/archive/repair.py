@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import stat
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -176,7 +176,7 @@ def _copy(
         item = container.parse_item(record)
         if not isinstance(item, Metadata) or item.name not in (METADATA, OUTCOME):
             writer.put(item)
-    stated = {**_outcome(found, described, writer.checksums), **(outcome or {})}
+    stated = {**_outcome(found, described), **(outcome or {})}
     writer.put(Metadata(OUTCOME, header.with_checksum(stated)))
     writer.finish()
 
@@ -198,18 +198,16 @@ def _description(found: Scan) -> dict[str, str]:
     return {**found.metadata, "attachments": json.dumps(names)}
 
 
-def _outcome(found: Scan, described: Mapping[str, str], chunks: Sequence[int]) -> dict[str, str]:
-    """Return the ``hil.outcome`` record of a file with these chunks, unchanged without loss."""
-    chunk_list = {header.CHUNKS: header.format_chunk_list(chunks)}
+def _outcome(found: Scan, described: Mapping[str, str]) -> dict[str, str]:
+    """Return the ``hil.outcome`` record, unchanged without loss."""
     unknown = ArchiveOutcome.of({"outcome": "unknown", "reason": "the outcome is lost"})
     before, lost = found.outcome or unknown, _samples_lost(found)
-    if not found.lost:  # other chunks than before if another program cut them
-        return {**before.record, **(chunk_list if header.CHUNKS in before.record else {})}
+    if not found.lost:
+        return dict(before.record)
     earlier = before.samples_lost
     return {
-        **before.record,
+        **{key: text for key, text in before.record.items() if key != header.CHUNKS},
         header.DESCRIPTION: header.checksum(described),
-        **chunk_list,
         "samples": str(found.samples),
         "events": str(found.counts.get(schema.EVENTS, 0)),
         "repaired": "yes",

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from hil.archive.cdr import Rows
 from hil.archive.header import (
-    CHUNKS,
     DESCRIPTION,
     FORMAT_VERSION,
     KINDS,
@@ -27,7 +26,6 @@ from hil.archive.header import (
     OUTCOME,
     ArchiveName,
     checksum,
-    format_chunk_list,
     with_checksum,
 )
 from hil.archive.mcap_writer import McapWriter
@@ -162,7 +160,6 @@ class ArchiveFile:
             self._writer.flush()
             seals = {
                 DESCRIPTION: self._description,
-                CHUNKS: format_chunk_list(self._writer.checksums),
             }
             self._writer.put(Metadata(OUTCOME, with_checksum({**outcome, **seals})))
             self._writer.finish()

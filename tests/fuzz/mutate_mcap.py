@@ -19,7 +19,6 @@ from mcap.records import Attachment, Chunk, Metadata
 
 from hil.archive import container, header
 from hil.archive.container import Damage, encode
-from hil.archive.header import format_chunk_list
 from tests.fuzz.draw import mutate_bytes, mutate_text
 from tests.fuzz.targets import Mutation
 from tests.hil.mcap_bytes import Indexed
@@ -96,16 +95,10 @@ def join_file(records: list[Record], *, index: bool) -> bytes:
     file = built.data
     described = _described(records)
     for one in records:
-        body = _sealed(
-            one, {header.DESCRIPTION: described, header.CHUNKS: format_chunk_list(built.checksums)}
-        )
+        body = _sealed(one, {header.DESCRIPTION: described})
         if index:
             built.put(record_of(one.opcode, body))
             continue
-        if one.opcode == container.CHUNK:
-            with contextlib.suppress(Damage):
-                head = container.parse_chunk(container.Record(0, one.opcode, body))
-                built.checksums.append(head.uncompressed_crc)
         file += record_of(one.opcode, body)
     if index:
         return built.ended()

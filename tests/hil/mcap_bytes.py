@@ -173,11 +173,6 @@ class Indexed:
         self.data[:] = container.MAGIC  # the header is among the records
         self._writer.position = len(self.data)
 
-    @property
-    def checksums(self) -> list[int]:
-        """Checksums of the chunks so far."""
-        return self._writer.checksums
-
     def put(self, data: bytes) -> None:
         """Append a record, given with its head."""
         item = Record(len(self.data), data[0], data[container.RECORD.size :])
