@@ -107,7 +107,7 @@ def archives_at(url: str) -> list[str]:
 
 
 def _is_plain(place: str) -> bool:
-    """Return whether a URL of a listing cannot lead elsewhere: `::` would chain another protocol."""
+    """Return whether a URL of a listing leads nowhere else: `::` would chain another protocol."""
     return "::" not in place and ".." not in place.split("/")
 
 
