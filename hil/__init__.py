@@ -14,8 +14,9 @@ Archives and other recordings:
 - `open_archive`, `open_recording`: open an archive; read it as samples in SI units.
 - `import_log`, `import_rosbag2`: convert text, arrays and bags to archives.
 - `Robot`, `ColumnMap`: robot and columns of an imported recording.
+- `identify`: from a log and a URDF to an `IdentifiedArm`: verdict, parameters, prediction, model.
 - `identify_archives`, `identify_campaign`: estimate, predict and judge.
-- `Options`: settings of the estimation.
+- `Options`: settings of the estimation; `ImportOptions`: what the channels of a recording are.
 - `Results`: content of `results.json`.
 - `reidentify`: identify all arms and campaigns below some folders.
 - `export_model`: file of the identified arm for simulators.
@@ -39,8 +40,10 @@ if TYPE_CHECKING:
     from hil.campaign import Campaign, Stop, stop_on_interrupt
     from hil.cell import Cell
     from hil.exporting import export_model
+    from hil.identified_arm import IdentifiedArm, identify
     from hil.identify import Options, identify_archives, identify_campaign
     from hil.importers import ColumnMap, Robot, import_log, import_rosbag2
+    from hil.importers.recording import ImportOptions
     from hil.move import plan_move, send
     from hil.progress import Silent, reporter
     from hil.recordings import open_recording
@@ -55,6 +58,8 @@ _HOME = {
     **dict.fromkeys(("send", "plan_move"), "move"),
     **dict.fromkeys(("Silent", "reporter"), "progress"),
     "Cell": "cell",
+    "IdentifiedArm": "identified_arm",
+    "ImportOptions": "importers.recording",
     "Results": "results",
     "export_model": "exporting",
     "open_archive": "archive",
@@ -68,6 +73,8 @@ __all__ = [
     "Campaign",
     "Cell",
     "ColumnMap",
+    "IdentifiedArm",
+    "ImportOptions",
     "Options",
     "Results",
     "Robot",
@@ -75,6 +82,7 @@ __all__ = [
     "Stop",
     "errors",
     "export_model",
+    "identify",
     "identify_archives",
     "identify_campaign",
     "import_log",
@@ -92,6 +100,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    if name == "identify":  # a package that can be called
+        return import_module("hil.identify")
     if name in _HOME:
         return getattr(import_module(f"hil.{_HOME[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

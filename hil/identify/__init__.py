@@ -1,7 +1,13 @@
-"""Identification from archives."""
+"""Identification from archives; called as a function, from recordings of any kind.
+
+``hil.identify("log.csv", urdf="arm.urdf")`` is :func:`hil.identified_arm.identify`.
+"""
 
 from __future__ import annotations
 
+import sys
+from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from .options import Options
@@ -30,3 +36,19 @@ def __getattr__(name: str) -> Any:
 def __dir__() -> list[str]:
     """Return all names, also those that are not loaded yet."""
     return [*globals(), *__all__]
+
+
+class _Callable(ModuleType):
+    """This package, which is also the function of the same name."""
+
+    @property
+    def __wrapped__(self) -> Any:
+        """The function, whose arguments `inspect` and notebooks show."""
+        return import_module("hil.identified_arm").identify
+
+    def __call__(self, *arguments: Any, **settings: Any) -> Any:
+        """Identify from recordings, see :func:`hil.identified_arm.identify`."""
+        return self.__wrapped__(*arguments, **settings)
+
+
+sys.modules[__name__].__class__ = _Callable

@@ -193,15 +193,12 @@ def urdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     return write_urdf(arm.urdf, arm.model, arm.standard, friction, remarks, arm.load)
 
 
-def pinocchio_archive(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
-    """Return the arm as the text archive of pinocchio's model.
+def pinocchio_arm(arm: Arm, name: str) -> pin.Model:
+    """Return the arm as pinocchio's model, with armature, damping and dry friction.
 
-    ``model = pinocchio.Model(); model.loadFromString(text)`` reads it, with armature, damping and
-    dry friction. It has no place for remarks.
+    It is read from the arm's URDF, so that limits and frames are those of the user's file.
     """
-    del remarks
-    described = urdf(arm, name)
-    model = pinocchio_model(described, arm.model.locked)
+    model = pinocchio_model(urdf(arm, name), arm.model.locked)
     model.name = name
     model.gravity.linear = arm.model.gravity
     dry = np.array([max(0.0, row.get("f0", 0.0)) for row in arm.friction[: arm.model.n_joints]])
@@ -209,7 +206,16 @@ def pinocchio_archive(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     model.damping[:] = [row.get("f1", 0.0) for row in arm.friction[: arm.model.n_joints]]
     model.friction[:] = dry
     model.upperDryFrictionLimit[:], model.lowerDryFrictionLimit[:] = dry, -dry
-    return str(model.saveToString())
+    return model
+
+
+def pinocchio_archive(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
+    """Return :func:`pinocchio_arm` as the text archive of a model, which has no place for remarks.
+
+    ``model = pinocchio.Model(); model.loadFromString(text)`` reads it.
+    """
+    del remarks
+    return str(pinocchio_arm(arm, name).saveToString())
 
 
 class Format(NamedTuple):

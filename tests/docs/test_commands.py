@@ -8,9 +8,11 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -223,11 +225,34 @@ def test_every_page_with_something_to_type_is_typed() -> None:
     assert to_type <= {*FAST, *SLOW, *TYPED_ELSEWHERE}
 
 
-@pytest.mark.slow
-def test_the_python_of_the_readme_runs(workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """As it stands, and again in the folder that it left: nothing moves a second time."""
+def python_of_the_readme() -> list[str]:
+    """The blocks: from a log, and a campaign."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    return re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+def test_ten_lines_of_the_readme_identify_a_log(
+    workplace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In less than ten seconds, loading all libraries apart; the log is simulated."""
+    code = python_of_the_readme()[0]
+    assert len([line for line in code.splitlines() if line]) <= 10
+    names: dict[str, Any] = {}
+    begin = time.process_time()
+    exec(compile(code, "README.md", "exec"), names)
+    assert time.process_time() - begin < 10.0
+    assert capsys.readouterr().out.startswith("The model predicts the rest of the same motion well")
+    assert np.abs(names["holding"]).max() > 0.0
+    assert (workplace / "result" / "report.html").exists()
+    assert (workplace / "torques.png").stat().st_size > 5_000
+
+
+@pytest.mark.slow
+def test_the_campaign_of_the_readme_runs(
+    workplace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As it stands, and again in the folder that it left: nothing moves a second time."""
+    _, code = python_of_the_readme()
     names: dict[str, Any] = {}
     (workplace / "examples").mkdir(exist_ok=True)
     if not (workplace / "examples" / "two_joints").exists():

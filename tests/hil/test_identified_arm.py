@@ -1,0 +1,184 @@
+"""`hil.identify(...)`: the pipeline of the command, as an object. All recordings are simulated."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from typer.testing import CliRunner
+
+import hil
+from hil.cli import app
+from hil.errors import InputError, SourceError
+from hil.results import Results
+from tests.hil.browser import OpenedPage, chromium
+from tests.hil.simulated_logs import write_moving_log
+from tests.hil.test_log_kinds import URDF
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log, another motion of the same arm, and its URDF."""
+    place = tmp_path_factory.mktemp("logs")
+    (place / "three.urdf").write_text(URDF)
+    write_moving_log(place / "a.csv", URDF)
+    write_moving_log(place / "b.csv", URDF, seed=1)
+    return place
+
+
+@pytest.fixture(scope="module")
+def result(folder: Path) -> Any:
+    return hil.identify(folder / "a.csv", urdf=folder / "three.urdf", predict=str(folder / "b.csv"))
+
+
+class TestResult:
+    def test_the_verdict_is_of_the_other_motion(self, result: Any) -> None:
+        assert result.verdict.good
+        assert result.verdict.line.startswith("The model predicts unseen motion well")
+        assert result.verdict.line in repr(result)
+        assert len(repr(result)) < 300
+
+    def test_parameters_are_a_table_with_intervals(self, result: Any) -> None:
+        """Coulomb friction of 0.4 N·m and viscous friction of 0.2 N·m·s/rad were planted."""
+        table = result.parameters
+        assert list(table.columns[:4]) == ["estimate", "lower", "upper", "std"]
+        friction = table.loc[["f0_1", "f0_2", "f0_3", "f1_1", "f1_2", "f1_3"]]
+        truth = np.repeat([0.4, 0.2], 3)
+        assert ((friction["lower"] < truth) & (truth < friction["upper"])).all()
+        assert table.loc["f0_1", "unit"] == "N·m"
+        assert [*table.index] == [one.name for one in result.results.parameters]
+
+    def test_prediction_is_the_torque_that_was_simulated(self, result: Any) -> None:
+        """Of Newton and Euler with the friction that was planted, at 100 random states."""
+        model = pin.buildModelFromXML(URDF)
+        data, rng = model.createData(), np.random.default_rng(5)
+        q, v, a = rng.uniform(-1.0, 1.0, (3, 100, 3)) * np.array([1.0, 3.0, 10.0])[:, None, None]
+        rigid = np.array([pin.rnea(model, data, *row) for row in zip(q, v, a, strict=True)])
+        truth = rigid + 0.4 * np.sign(v) + 0.2 * v
+        error = result.predict(q, v, a) - truth
+        assert np.linalg.norm(error) < 0.01 * np.linalg.norm(truth)
+        assert np.allclose(result.predict(q[3], v[3], a[3]), result.predict(q, v, a)[3])
+
+    def test_prediction_of_another_number_of_joints_is_refused(self, result: Any) -> None:
+        with pytest.raises(ValueError, match="shape"):
+            result.predict([0.0, 0.0], [0.0, 0.0], [0.0, 0.0])
+
+    def test_the_model_of_pinocchio_has_friction_and_the_same_torque(self, result: Any) -> None:
+        model = result.model
+        assert isinstance(model, pin.Model)
+        q, v, a = (np.array(row) for row in ([0.3, -0.5, 0.2], [1.0, -2.0, 0.5], [3.0, 1.0, -8.0]))
+        dry = np.asarray(model.friction)
+        assert np.allclose(dry, 0.4, atol=0.02)
+        assert np.allclose(model.upperDryFrictionLimit, dry)
+        torque = pin.rnea(model, model.createData(), q, v, a)  # armature included
+        torque += np.asarray(model.damping) * v + dry * np.sign(v)
+        assert np.allclose(torque, result.predict(q, v, a), rtol=1e-3, atol=0.02)
+
+    def test_a_figure_has_a_panel_for_each_joint(self, result: Any) -> None:
+        axes = result.plot().axes
+        assert [panel.get_title() for panel in axes] == ["hip", "knee", "ankle"]
+        assert all(len(panel.lines) == 4 for panel in axes)
+
+    def test_a_notebook_shows_it(self, result: Any, tmp_path: Path) -> None:
+        page = tmp_path / "cell.html"
+        text = result._repr_html_()
+        page.write_text(f"<meta charset=utf-8>{text}")
+        assert result.verdict.line in text
+        assert "a.csv: tau1 .. tau3: torque, by the name" in text
+        with chromium() as browser:
+            opened = OpenedPage(browser, page)
+            assert opened.page.locator("img").evaluate("image => image.naturalWidth") > 500
+            assert opened.page.locator("td").count() == 12
+            assert opened.errors == []
+
+    def test_names_of_channels_are_no_markup(self, folder: Path, tmp_path: Path) -> None:
+        text = (folder / "a.csv").read_text().replace("tau", "<b>tau", 3)
+        (tmp_path / "x.csv").write_text(text)
+        result = hil.identify(tmp_path / "x.csv", urdf=folder / "three.urdf",
+                              reading=hil.ImportOptions(chosen={"torque": "<b>tau{}"}))  # fmt: skip
+        assert "<b>" not in result._repr_html_()
+        assert "&lt;b&gt;tau{}" in result._repr_html_()
+
+
+class TestSaved:
+    def test_nothing_is_written_before(self, folder: Path, result: Any) -> None:
+        assert result.verdict.good
+        assert sorted(path.name for path in folder.iterdir()) == ["a.csv", "b.csv", "three.urdf"]
+
+    def test_it_is_what_the_command_writes(self, folder: Path, result: Any, tmp_path: Path) -> None:
+        saved = result.save(tmp_path / "python")
+        arguments = ("identify", "a.csv", "--urdf", "three.urdf", "--predict", "b.csv", "--quiet")
+        words = [str(folder / word) if "." in word else word for word in arguments]
+        done = CliRunner().invoke(app, [*words, "--output", str(tmp_path / "command")])
+        assert done.exit_code == 0, done.output
+        assert saved == tmp_path / "python"
+        for name in ("a.mcap", "b.mcap", "map.toml", "sources.json", "report_series.npz"):
+            files = [tmp_path / place / name for place in ("python", "command")]
+            assert files[0].read_bytes() == files[1].read_bytes(), name
+        parts = [Results.load(tmp_path / place / "results.json") for place in ("python", "command")]
+        assert parts[0].parameters == parts[1].parameters
+        assert parts[0].verdict == parts[1].verdict
+        assert {path.name for path in saved.iterdir()} == {
+            path.name for path in (tmp_path / "command").iterdir()
+        }
+
+    def test_without_a_folder_it_is_that_of_the_log(self, folder: Path, tmp_path: Path) -> None:
+        log = tmp_path / "a.csv"
+        log.write_bytes((folder / "a.csv").read_bytes())
+        result = hil.identify([log, folder / "b.csv"], urdf=folder / "three.urdf")
+        assert result.save() == tmp_path / "a"
+        assert result.save() == tmp_path / "a"  # renewed
+        again = hil.identify(tmp_path / "a")
+        assert again.verdict.line == result.verdict.line
+        assert hil.identify(
+            tmp_path / "a" / "a.mcap", predict=tmp_path / "a" / "b.mcap"
+        ).verdict.good
+
+    def test_temporary_archives_go_with_the_result(self, folder: Path) -> None:
+        result = hil.identify(folder / "a.csv", urdf=folder / "three.urdf")
+        (archive,) = result.identification.paths
+        assert archive.exists()
+        del result
+        assert not archive.parent.exists()
+
+
+class TestRefused:
+    def test_a_log_without_its_arm(self, folder: Path) -> None:
+        with pytest.raises(InputError, match="needs the description of its arm"):
+            hil.identify(folder / "a.csv")
+
+    def test_two_descriptions(self, folder: Path) -> None:
+        robot = hil.Robot.from_urdf(folder / "three.urdf")
+        with pytest.raises(InputError, match="exclude each other"):
+            hil.identify(folder / "a.csv", urdf=folder / "three.urdf", robot=robot)
+
+    def test_no_recording(self) -> None:
+        with pytest.raises(InputError, match="there is no recording"):
+            hil.identify([])
+
+    def test_a_log_that_leaves_a_quantity_open(self, folder: Path, tmp_path: Path) -> None:
+        text = (folder / "a.csv").read_text().replace("tau", "load", 3)
+        (tmp_path / "x.csv").write_text(text)
+        with pytest.raises(SourceError, match="--columns 'torque=load"):
+            hil.identify(tmp_path / "x.csv", urdf=folder / "three.urdf")
+
+
+def test_the_package_is_a_function_and_stays_a_package() -> None:
+    from hil.identify import Options
+
+    assert hil.identify.Options is Options
+    names = [*inspect.signature(hil.identify).parameters]
+    assert names[:2] == ["recordings", "urdf"]
+    assert {"identify", "IdentifiedArm", "ImportOptions"} <= set(dir(hil))
+
+
+def test_import_hil_loads_no_library() -> None:
+    libraries = "{'numpy', 'pinocchio', 'pandas', 'matplotlib', 'scipy', 'hil.identify'}"
+    code = f"import sys, hil; sys.exit(bool({libraries} & sys.modules.keys()))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
