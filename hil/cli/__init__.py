@@ -14,17 +14,18 @@ import os
 import re
 import sys
 from collections import UserDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 from rich.console import Console
 from rich.text import Text
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperCommand, TyperGroup, TyperOption
 
+from hil.cli.suggestions import OTHER_COMMANDS, improve
 from hil.errors import DISK_REFUSES, HilError, InputError, OperatorStopError
 from hil.importing import leave_if_interrupted
 from hil.terminal_text import printable
@@ -100,6 +101,7 @@ def errors_as_json(asked: bool) -> Iterator[None]:
         _print(stopped, asked)
         raise stopped from interrupt
     except Exception as error:
+        improve(error)
         if isinstance(error, typer.BadParameter):  # typer checks choices by pydantic
             error.message = error.message.removeprefix("Value error, ")
         _print(error, asked)
@@ -135,7 +137,11 @@ class LazyCommands(UserDict[str, Any]):
 
     def by_purpose(self) -> dict[str, Any]:
         """Return commands that have only a purpose, for help and completion."""
-        return {name: TyperCommand(name, help=self.purpose(name)) for name in self}
+        return {
+            name: TyperCommand(name, help=self.purpose(name), rich_help_panel=panel)
+            for panel, names in GROUPS.items()
+            for name in names
+        }
 
 
 def _module(name: str) -> str:
@@ -171,19 +177,36 @@ def presented(command: Any) -> Any:
         if getattr(option, "is_flag", False):
             option.metavar = ""
             option.secondary_opts = option.secondary_opts if option.default else []
+        elif isinstance(option, TyperOption):
+            _shorten(option)
     return command
 
 
-COMMANDS = LazyCommands(
-    dict.fromkeys(
-        (
-            "demo", "design", "rehearse", "status", "report", "identify", "reidentify",
-            "compare", "export", "rollout", "gains", "payload", "plan", "plot", "new", "move",
-            "run", "record", "simulate", "study", "doctor", "import", "archive",
-        )
-    )
-)  # fmt: skip
-"""Commands in the order of the help."""
+def _shorten(option: TyperOption) -> None:
+    """Put the default of an option into its text, and N in place of "<int range>"."""
+    if option.metavar is None and (option.min is not None or option.max is not None):
+        option.metavar = "N"
+    default = option.default
+    if isinstance(default, str | int | float | Path) and "Default:" not in (option.help or ""):
+        option.help = f"{option.help} Default: {default}."
+    option.show_default = False
+
+
+GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
+    "Start": ("demo", "new"),
+    "Identify": (
+        "identify", "payload", "gains", "reidentify", "compare", "export", "rollout", "report",
+    ),
+    "On the controller": (
+        "doctor", "rehearse", "run", "status", "move", "record", "simulate",
+    ),
+    "Archives": ("import", "archive", "plot"),
+    "Method": ("design", "plan", "study"),
+}  # fmt: skip
+"""Commands in the order of the help, by its panels."""
+
+COMMANDS = LazyCommands(dict.fromkeys(name for names in GROUPS.values() for name in names))
+"""All commands by name."""
 
 _JSON = "hil.cli.json"
 
@@ -205,6 +228,12 @@ class Group(TyperGroup):
         """Complete the name of a command, without importing one."""
         self.commands = COMMANDS.by_purpose()
         return super().shell_complete(ctx, incomplete)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command that the first argument names, or suggest one."""
+        if args[0] in OTHER_COMMANDS and args[0] not in COMMANDS:
+            ctx.fail(f"No such command {args[0]!r}. Did you mean 'hil {OTHER_COMMANDS[args[0]]}'?")
+        return super().resolve_command(ctx, args)
 
     def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> Any:
         """Return the context of one call; it records whether JSON is requested."""

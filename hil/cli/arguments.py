@@ -13,12 +13,15 @@ import typer
 
 from hil.errors import InputError
 
+ARM, CHANNELS, ESTIMATION = "Arm", "Channels of logs and bags", "Estimation"
+"""Panels of options in help texts."""
+
 CampaignArgument = Annotated[Path, typer.Argument(help="Campaign folder (`hil design -o`).")]
 ArchivesArgument = Annotated[
     list[Path],
     typer.Argument(
         help="Archives (*.mcap), or one campaign folder.",
-        metavar="ARCHIVE...",
+        metavar="ARCHIVE",
     ),
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print only the result.")]
@@ -27,15 +30,17 @@ DhOption = Annotated[
     Path | None,
     typer.Option(
         metavar="TABLE",
-        help="CSV table of DH parameters in place of --urdf: joint, type, a, alpha, d, "
-        "theta_offset (m, rad; or a_mm, alpha_deg, …), one row per joint. Needs --convention.",
+        help="CSV table of Denavit-Hartenberg parameters in place of --urdf, a row per joint. "
+        "Needs --convention.",
+        rich_help_panel=ARM,
     ),
 ]
 ConventionOption = Annotated[
     str | None,
     typer.Option(
-        help="Convention of --dh: standard (Rz(q + theta_offset) Tz(d) Tx(a) Rx(alpha)) or "
-        "modified (Craig: Rx(alpha) Tx(a) Rz(q + theta_offset) Tz(d)).",
+        metavar="NAME",
+        help="Convention of --dh: standard or modified (Craig).",
+        rich_help_panel=ARM,
     ),
 ]
 

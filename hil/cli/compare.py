@@ -19,7 +19,7 @@ CHANGED: Final = 5
 
 
 def compare(
-    campaigns: Annotated[list[str], typer.Argument(metavar="CAMPAIGN...")],
+    campaigns: Annotated[list[str], typer.Argument(metavar="CAMPAIGN")],
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
     fail_on_change: bool = False,
     quiet: QuietOption = False,

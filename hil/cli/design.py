@@ -7,7 +7,7 @@ import os
 import shlex
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import typer
 
@@ -26,8 +26,6 @@ from hil.plots import save
 from hil.progress import reporter as make_reporter
 from hil.progress import say
 from hil.terminal_text import printable
-
-_METHODS: Final = ". ".join(f"{name}: {method.help}" for name, method in METHODS.items())
 
 
 def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
@@ -64,10 +62,11 @@ def design(
     cell: Annotated[Path | None, typer.Argument()] = None,
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/design"),
     method: Annotated[
-        Method | None, typer.Option(help=f"Search method. {_METHODS}. Default: front.")
+        Method | None,
+        typer.Option(help=f"Search method: {', '.join(METHODS)}. Default: front.", metavar="NAME"),
     ] = None,
     settings: Path | None = None,
-    show_settings: Method | None = None,
+    show_settings: Annotated[Method | None, typer.Option(metavar="NAME")] = None,
     quick: bool = False,
     repetitions: Annotated[int | None, typer.Option(min=1, max=1000)] = None,
     seed: Annotated[int | None, typer.Option(min=0)] = None,

@@ -33,7 +33,7 @@ from hil.progress import say
 @with_options(Identifying, "how", but=FEW)
 def export(
     archives: ArchivesArgument,
-    to: Annotated[FormatName, typer.Option()],
+    to: Annotated[FormatName, typer.Option(metavar="FORMAT")],
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
     estimator: EstimatorOption = "auto",
     *,
@@ -56,13 +56,10 @@ def export(
     **Example:** `hil export runs/demo --to mjcf`
 
     Options:
-        to: mjcf: MuJoCo XML; urdf: other tools; sdf: Gazebo and Drake (read back by Drake, extra
-            `sdf`); pinocchio: text archive of pinocchio's model.
-        output: File to write. Default: identified.xml, .urdf, .sdf or .pinocchio in the campaign
-            folder or the working directory. With --ensemble a folder, by default
-            identified_ensemble, or an .npz file of all parameters.
-        ensemble: Write so many physically consistent arms drawn from the posterior, whose torques
-            vary as the stated intervals say.
+        to: mjcf (MuJoCo XML), urdf, sdf (Gazebo, Drake) or pinocchio (text archive of its model).
+        output: File to write; with --ensemble a folder, or an .npz file of all parameters.
+            Default: identified.* in the campaign folder or the working directory.
+        ensemble: Write so many arms drawn from the posterior, all of them physically consistent.
         seed: Of the draws.
         again: Identify again even if results.json and parameters.json are there.
     """

@@ -21,7 +21,7 @@ from identification.model.payload import Payload
 
 
 def gains(
-    archives: Annotated[list[Path], typer.Argument(metavar="ARCHIVE...")],
+    archives: Annotated[list[Path], typer.Argument(metavar="ARCHIVE")],
     loaded: list[Path] | None = None,
     mass: float | None = None,
     centre: str | None = None,

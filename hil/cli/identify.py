@@ -21,7 +21,7 @@ from hil.reading import path_exists
 RecordingsArgument = Annotated[
     list[Path],
     typer.Argument(
-        metavar="RECORDING...",
+        metavar="RECORDING",
         help="Logs or bags, with --urdf; or archives (*.mcap), or one campaign folder.",
     ),
 ]
@@ -53,20 +53,17 @@ def identify(
     URDF, friction law, drive train. Validation runs are predicted and never fitted. Exit status 0
     if the model is good, 5 if it is not.
 
-    **Example:** `hil identify log.csv --urdf arm.urdf`
+    **Examples:** `hil identify log.csv --urdf arm.urdf`, `hil identify runs/demo`
 
     Options:
-        output: Folder for results.json, report.html, the files for other tools, and the archives
-            and the column map of imported logs. Default: the campaign folder (with --paper its
-            subfolder paper), else a folder named after the first recording, beside it.
+        output: Folder for all files. Default: the campaign folder (with --paper its subfolder
+            paper), else one beside the first recording, named after it.
         predict: Recording to predict and not to fit, of any kind (repeatable).
         paper: Preprocess as in the paper: filter positions, torques and regressor alike.
-        split: Fraction of the recording that is fitted if there is no validation run; the rest is
-            predicted.
-        in_sample: Fit all recordings and hold nothing out. All errors are then in-sample, and the
-            model cannot be judged good.
-        annotate: Also write copies of the archives for viewers, with the predicted torque and the
-            residual as channels, in the subfolder annotated of the output.
+        split: Fraction that is fitted if there is no validation run; the rest is predicted.
+        in_sample: Fit all recordings and hold nothing out: no model can then be judged good.
+        annotate: Also write copies of the archives for viewers, with predicted torque and
+            residual, into the subfolder annotated.
     """
     reporter = make_reporter(quiet=quiet or json)
     method = "paper" if paper else "default"

@@ -9,8 +9,9 @@ from typing import Annotated, Any, Final, Literal, cast
 import numpy as np
 import typer
 
+from hil.cli.arguments import ESTIMATION
 from hil.errors import InputError
-from hil.identify.options import ESTIMATORS, FRICTION_TERMS, Estimator, Options, friction_from
+from hil.identify.options import ESTIMATORS, Estimator, Options, friction_from
 from identification.rollout.servo import Servo
 
 LONGEST_DELAY: Final = 0.5
@@ -18,14 +19,17 @@ LONGEST_DELAY: Final = 0.5
 
 EstimatorOption = Annotated[
     Estimator,
-    typer.Option(help="; ".join(f"{name}: {words}" for name, words in ESTIMATORS.items()) + "."),
+    typer.Option(
+        metavar="NAME", help=f"One of {', '.join(ESTIMATORS)}.", rich_help_panel=ESTIMATION
+    ),
 ]
 DelayOption = Annotated[
     str | None,
     typer.Option(
-        metavar="SECONDS|auto|stated",
-        help="Delay of the torque relative to the position, s. stated: that of the cell. auto: "
-        "estimated for each axis. Default: that of the cell, unless the recordings contradict it.",
+        metavar="SECONDS",
+        help="Delay of the torque relative to the position, s; or auto, stated. Default: that of "
+        "the cell, unless the recordings contradict it.",
+        rich_help_panel=ESTIMATION,
     ),
 ]
 
@@ -40,39 +44,43 @@ class Identifying:
     friction: Annotated[
         str,
         typer.Option(
-            metavar="TERMS|auto",
-            help=f"Friction law in place of the archive's: terms of {FRICTION_TERMS}, separated "
-            "by commas. auto: the archive's, extended by the terms that predict clearly better "
-            "near reversals (for imported recordings also at speed and under load).",
+            metavar="TERMS",
+            help="Friction law in place of the archive's, such as coulomb,viscous,offset; or auto.",
+            rich_help_panel=ESTIMATION,
         ),
     ] = "auto"
     delay: DelayOption = None
     bandwidth: Annotated[
         str,
         typer.Option(
-            metavar="HZ|auto",
-            help="Largest bandwidth of the position smoothing. auto: 14 Hz, unless another value "
-            "predicts parts of a long recording clearly better.",
+            metavar="HZ",
+            help="Largest bandwidth of the position smoothing; or auto.",
+            rich_help_panel=ESTIMATION,
         ),
     ] = "auto"
     velocity: Annotated[
         Literal["auto", "position", "measured"],
-        typer.Option(help="Source of the velocity: smoothed positions, or as measured."),
+        typer.Option(
+            metavar="SOURCE",
+            help="Source of the velocity: position (smoothed), measured or auto.",
+            rich_help_panel=ESTIMATION,
+        ),
     ] = "auto"
     standstill: Annotated[
         Literal["auto", "rests", "halts", "slow", "none"],
         typer.Option(
-            help="Rows excluded from the fit. rests: rests of the whole arm longer than 0.25 s. "
-            "halts: those of each joint. slow: all rows below the standstill speed or near a "
-            "velocity reversal. auto: rests, unless another predicts parts of the fitted "
-            "recordings clearly better."
+            metavar="ROWS",
+            help="Rows excluded from the fit: rests, halts, slow, none or auto.",
+            rich_help_panel=ESTIMATION,
         ),
     ] = "auto"
     torque_bandwidth: Annotated[
         str,
         typer.Option(
-            help="Bandwidth of a low-pass filter that the recorded torque passed through, Hz; the "
-            "model is filtered alike. none: no filter. auto: estimated, for imported torques.",
+            metavar="HZ",
+            help="Bandwidth of a low-pass filter that the recorded torque passed through; or none, "
+            "auto. The model is filtered alike.",
+            rich_help_panel=ESTIMATION,
         ),
     ] = "auto"
 

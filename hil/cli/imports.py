@@ -12,6 +12,8 @@ import typer
 
 from hil.archive import open_archive
 from hil.cli.arguments import (
+    ARM,
+    CHANNELS,
     ConventionOption,
     DhOption,
     JsonOption,
@@ -23,7 +25,7 @@ from hil.cli.arguments import (
 )
 from hil.errors import InputError
 from hil.files import write_output
-from hil.identify.options import FRICTION_TERMS, friction_from
+from hil.identify.options import friction_from
 from hil.importers import (
     STANDARD_GRAVITY,
     Clock,
@@ -55,8 +57,7 @@ Held = Annotated[
 Kind = Annotated[
     Use,
     typer.Option(
-        help="Use of the recording. excitation: fitted. validation: predicted only. standstill: "
-        "noise of the positions."
+        metavar="USE", help="excitation (fitted), validation (predicted) or standstill (noise)."
     ),
 ]
 ForceOption = Annotated[
@@ -67,6 +68,7 @@ OutsideOption = Annotated[
     typer.Option(
         "--outside-limits",
         help="Write the archive even if no row is within the limits of the URDF.",
+        rich_help_panel=CHANNELS,
     ),
 ]
 
@@ -75,9 +77,12 @@ OutsideOption = Annotated[
 class Described:
     """Options that describe the robot of a recording."""
 
-    urdf: Annotated[Path | None, typer.Option(help="URDF of the robot.")] = None
+    urdf: Annotated[Path | None, typer.Option(help="URDF of the robot.", rich_help_panel=ARM)] = (
+        None
+    )
     cell: Annotated[
-        Path | None, typer.Option(help="Cell file, in place of --urdf and --friction.")
+        Path | None,
+        typer.Option(help="Cell file, in place of --urdf and --friction.", rich_help_panel=ARM),
     ] = None
     dh: DhOption = None
     convention: ConventionOption = None
@@ -85,31 +90,40 @@ class Described:
         tuple[float, float, float] | None,
         typer.Option(
             metavar="X Y Z",
-            help="Gravity in the base frame of the robot, m/s²: 0 0 9.81 for an arm mounted upside "
-            "down, 0 0 0 for torques without gravity. Default: that of the cell, else upright.",
+            help="Gravity in the base frame, m/s²: 0 0 9.81 if mounted upside down, 0 0 0 for "
+            "torques without gravity. Default: that of the cell, else upright.",
+            rich_help_panel=ARM,
         ),
     ] = None
     friction: Annotated[
         str,
-        typer.Option(help=f"Friction law: terms of {FRICTION_TERMS}, separated by commas."),
+        typer.Option(
+            metavar="TERMS", help="Friction law, terms separated by commas.", rich_help_panel=ARM
+        ),
     ] = "coulomb,viscous,offset"
     standstill: Annotated[
         float,
-        typer.Option(min=0.0, help="Joint speed below which rows are not fitted, rad/s."),
+        typer.Option(
+            min=0.0,
+            help="Joint speed below which rows are not fitted, rad/s.",
+            rich_help_panel=ARM,
+        ),
     ] = 0.01
     locked: Annotated[
         list[str] | None,
         typer.Option(
-            help="Joint of the URDF that was not recorded, NAME (fixed at 0) or NAME=POSITION (rad "
-            "or m; repeatable)."
+            metavar="NAME[=POSITION]",
+            help="Joint of the URDF that was not recorded, fixed at 0 or at a position in rad or m "
+            "(repeatable).",
+            rich_help_panel=ARM,
         ),
     ] = None
     lock_others: Annotated[
         bool,
         typer.Option(
-            help="Fix all joints of the URDF that were not recorded, at 0 or at the middle of a "
-            "range without 0, and list them. For a log, `joints` of the map names the recorded "
-            "ones."
+            help="Fix all joints of the URDF that were not recorded and list them. For a log, "
+            "joints of the map names those that were.",
+            rich_help_panel=ARM,
         ),
     ] = False
 
@@ -153,8 +167,9 @@ class Reading:
         Path | None,
         typer.Option(
             "--map",
-            help="TOML file with the column map, or a ready one by name (`hil import maps`). "
-            "Default: concluded from the names and units of the channels, and printed.",
+            help="Column map, a TOML file or a ready one by name (`hil import maps`). Default: "
+            "concluded from names and units, and printed.",
+            rich_help_panel=CHANNELS,
         ),
     ] = None
     channels: Annotated[
@@ -162,22 +177,32 @@ class Reading:
         typer.Option(
             "--columns",
             metavar="QUANTITY=NAME",
-            help="Channels of a quantity (time, position, velocity, torque, motor_current): a name "
-            "with {} for the joint, or names separated by commas (repeatable).",
+            help="Channels of a quantity, such as torque=tau{} with {} for the joint, or names "
+            "separated by commas (repeatable).",
+            rich_help_panel=CHANNELS,
         ),
     ] = None
     sample_rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Sampling rate of a log without a time.")
+        float | None,
+        typer.Option(
+            metavar="HZ",
+            help="Sampling rate of a log without a time.",
+            rich_help_panel=CHANNELS,
+        ),
     ] = None
     topic: Annotated[
         str | None,
-        typer.Option(help="Topic of the joint states of a bag; needed if it has several."),
+        typer.Option(
+            help="Topic of the joint states of a bag; needed if it has several.",
+            rich_help_panel=CHANNELS,
+        ),
     ] = None
     rename: Annotated[
         list[str] | None,
         typer.Option(
             metavar="RECORDED=URDF",
             help="Joint whose name in a bag differs from the URDF (repeatable).",
+            rich_help_panel=CHANNELS,
         ),
     ] = None
     outside_limits: OutsideOption = False
@@ -223,8 +248,8 @@ def rosbag2(
     *,
     arm: Described,
     topic: str | None = None,
-    effort: Effort = "torque",
-    clock: Clock = "auto",
+    effort: Annotated[Effort, typer.Option(metavar="QUANTITY")] = "torque",
+    clock: Annotated[Clock, typer.Option(metavar="STAMPS")] = "auto",
     rename: Annotated[list[str] | None, typer.Option(metavar="RECORDED=URDF")] = None,
     held: Held = None,
     kind: Kind = "excitation",
@@ -243,9 +268,8 @@ def rosbag2(
 
     Options:
         topic: Topic of the joint states; needed if the bag has several.
-        effort: Content of the effort field: torque (N·m), motor_current (A) or ignore.
-        clock: Stamps to use: header (of the messages), bag (time of receipt) or auto (header unless
-            empty).
+        effort: Content of the effort field: torque, motor_current or ignore.
+        clock: Stamps to use: header (of the messages), bag (time of receipt) or auto.
         rename: Joint whose name in the bag differs from the URDF (repeatable).
     """
     names = _names(rename or [])
@@ -295,7 +319,7 @@ def log(
 
     Options:
         uncoupled: Leave the inertia and friction of coupled motors out of the model, to measure
-            their contribution. Angles and torques remain those of the map.
+            what they contribute.
     """
     recording = import_recording(
         source,

@@ -30,7 +30,7 @@ from hil.terminal_text import printable
 
 def move(
     where: Annotated[Path, typer.Argument(metavar="CELL|CAMPAIGN")] = Path("cell.toml"),
-    to: Annotated[str | None, typer.Option(metavar="start|home|POSTURE")] = None,
+    to: Annotated[str | None, typer.Option(metavar="POSTURE")] = None,
     joint: str | None = None,
     by: float | None = None,
     speed: Annotated[float | None, typer.Option(min=0.1, max=100.0)] = None,
@@ -55,15 +55,15 @@ def move(
 
     Options:
         where: A cell file or a campaign folder.
-        to: home_deg of the cell; the start of the excitation of the campaign (of a cell: home); or
-            angles in degrees in the frame of [limits], such as "0,-20,-90,0,60,0".
+        to: home; start (of the excitation of the campaign); or angles in degrees in the frame of
+            [limits], such as "0,-20,-90,0,60,0".
         joint: Move one joint only, by name or number from 1; with --by, in place of --to.
         by: Displacement of that joint, degrees.
         speed: Percent of the joint speed limits. Default: approach_speed of the cell.
         output: The archive (*.mcap), or a folder for numbered archives. Default: runs/move, or the
             archives of the campaign.
-        yes: Do not ask for confirmation: the path is clear and an operator watches. A controller
-            that may be real then moves at most at approach_speed of the cell.
+        yes: Do not ask for confirmation: the path is clear and an operator watches. At most at
+            approach_speed of the cell, unless simulated.
         only_axis: With --joint: the controller's program opens the axis of that joint only; the
             others must remain closed.
     """

@@ -70,14 +70,14 @@ def new(
     Options:
         urdf: URDF of the arm.
         output: The cell file to write.
-        from_controller: Read gears, calibration, coupling, current limits, following errors and
-            cycle from the init packet of the controller at HOST; this PC listens on PORT (1000).
+        from_controller: Read drive train, limits and cycle from the init packet of the controller
+            at HOST; this PC listens on PORT (1000).
         from_archive_file: Read the cell and the init packet of an archive of this arm.
         bind: Local address to listen on; 0.0.0.0 for all.
         arm: Arm number of the controller.
         wait: Time to wait for the controller, s.
-        base: Link from which the arm starts, of a robot with several arms. Joints that do not lie
-            between it and the tip are fixed. Default: the root of the URDF.
+        base: Link from which the arm starts, of a robot with several arms; joints outside it are
+            fixed. Default: the root of the URDF.
         tip: Last link of the arm, such as the flange before a gripper. Default: every end.
         fix: Joint that does not move, at a position in rad or m (default 0; repeatable). Prismatic
             joints are always fixed.

@@ -18,7 +18,7 @@ from hil.progress import reporter as make_reporter
 
 
 def payload(
-    bare: Annotated[list[Path], typer.Argument(metavar="BARE...")],
+    bare: Annotated[list[Path], typer.Argument(metavar="BARE")],
     loaded: list[Path] | None = None,
     frame: str | None = None,
     check: Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE")] = None,

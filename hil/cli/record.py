@@ -31,7 +31,9 @@ def record(
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/record"),
     duration: Annotated[float | None, typer.Option(min=0.001)] = None,
     wait: Annotated[float | None, typer.Option(min=0.0)] = None,
-    kind: Literal["excitation", "validation", "standstill"] = "excitation",
+    kind: Annotated[
+        Literal["excitation", "validation", "standstill"], typer.Option(metavar="USE")
+    ] = "excitation",
     live: Annotated[str | None, typer.Option(metavar="HOST:PORT")] = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -58,8 +60,7 @@ def record(
         output: The archive (*.mcap), or a folder for numbered archives.
         duration: Time to record, s. Default: until Ctrl-C.
         wait: Time to wait for the controller, s. Default: unlimited.
-        kind: Use of the recording: excitation is fitted, validation predicted, standstill gives the
-            noise.
+        kind: excitation (fitted), validation (predicted) or standstill (noise).
         live: Stream to Foxglove at this address, such as 127.0.0.1:8765.
     """
     loaded = Cell.load(cell)

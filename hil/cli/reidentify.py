@@ -32,7 +32,7 @@ _MOST_LINES: Final = 20
 
 @with_options(Identifying, "how")
 def reidentify(
-    places: Annotated[list[str], typer.Argument(metavar="FOLDER...")],
+    places: Annotated[list[str], typer.Argument(metavar="FOLDER")],
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
     estimator: BatchEstimator = "auto",
     workers: Annotated[int | None, typer.Option(min=1)] = None,

@@ -33,7 +33,7 @@ def rollout(
     samples: Annotated[int, typer.Option(min=3, max=1000)] = 50,
     seed: Annotated[int, typer.Option(min=0)] = 1,
     feedback: Annotated[float, typer.Option(min=0.0, max=20.0, metavar="HZ")] = 1.0,
-    servo: Annotated[str | None, typer.Option(metavar="KP,KD,DELAY|identified")] = None,
+    servo: Annotated[str | None, typer.Option(metavar="KP,KD,DELAY")] = None,
     split: Annotated[float, typer.Option(min=0.1, max=0.9)] = 0.7,
     estimator: EstimatorOption = "auto",
     *,

@@ -104,7 +104,7 @@ REOPENING: Final = 1.0
 def simulate(
     cell: Path,
     udp: Annotated[str | None, typer.Option(metavar="HOST:PORT")] = None,
-    can: Annotated[str | None, typer.Option(metavar="INTERFACE:CHANNEL[:fd|classic]")] = None,
+    can: Annotated[str | None, typer.Option(metavar="NAME:CHANNEL")] = None,
     link: Annotated[str | None, typer.Option(metavar="NAME:ADDRESS")] = None,
     cycle: Annotated[int | None, typer.Option(min=1, max=4)] = None,
     mode: int | None = None,
@@ -112,7 +112,9 @@ def simulate(
     only_axis: Annotated[int | None, typer.Option(min=1)] = None,
     missed: Annotated[int, typer.Option(min=1)] = 1,
     patience: Annotated[float, typer.Option(min=0.0, max=10.0)] = 0.0,
-    while_silent: Literal["hold", "continue", "drive-off"] = "hold",
+    while_silent: Annotated[
+        Literal["hold", "continue", "drive-off"], typer.Option(metavar="MOTION")
+    ] = "hold",
     warm_start: bool = False,
     intervals: Annotated[int | None, typer.Option(min=1)] = None,
     own_motion: bool = False,
@@ -159,7 +161,8 @@ def simulate(
         missed: Consecutive missing replies that end open mode (unknown for a real controller).
         patience: Largest extension of a cycle to wait for its reply, s. A real controller does not
             wait.
-        while_silent: Motion of the arm in a cycle of open mode without a reply.
+        while_silent: Motion of the arm in a cycle of open mode without a reply: hold, continue or
+            drive-off.
         warm_start: Start with the init packet, as after 506.
         intervals: Number of intervals of open mode before the session ends. Default: unlimited.
         own_motion: In mode 0 the controller's own program moves the arm.

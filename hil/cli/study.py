@@ -44,8 +44,7 @@ def study(
         repetitions: Repetitions of each excitation. Default: 30, with --quick 4.
         motions: Held-out motions. Default: 30, with --quick 10.
         seed: Seed of the study; the result depends on nothing else. Default: 1.
-        effects: Repeat everything with effects that the model does not contain: torque ripple,
-            friction drift, elasticity, delay.
+        effects: Repeat everything with effects that the model does not contain.
         workers: Number of processes. Default: one per processor.
     """
     reporter = make_reporter(quiet=quiet or json)

@@ -1,0 +1,90 @@
+"""What a misspelt command or option, or a missing argument, is answered with."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping
+from typing import Any, Final
+
+SYNONYMS: Final[Mapping[str, tuple[str, ...]]] = {
+    "--override": ("--speed",),
+    "--velocity": ("--speed",),
+    "--out": ("--output",),
+    "--outdir": ("--output",),
+    "--folder": ("--output",),
+    "--robot": ("--urdf",),
+    "--model": ("--urdf",),
+    "--validate": ("--predict",),
+    "--validation": ("--predict",),
+    "--test": ("--predict",),
+    "--rate": ("--sample-rate",),
+    "--frequency": ("--sample-rate",),
+    "--fs": ("--sample-rate",),
+    "--lock": ("--locked", "--fix"),
+    "--filter": ("--bandwidth", "--torque-bandwidth"),
+    "--cutoff": ("--bandwidth", "--torque-bandwidth"),
+    "--lowpass": ("--torque-bandwidth",),
+    "--format": ("--to",),
+    "--overwrite": ("--force",),
+    "--processes": ("--workers",),
+    "--jobs": ("--workers",),
+    "--payload": ("--loaded",),
+    "--time": ("--duration",),
+    "--silent": ("--quiet",),
+}
+"""Options by other words for them; the first that a command has is suggested."""
+
+OTHER_COMMANDS: Final[Mapping[str, str]] = {
+    **dict.fromkeys(("fit", "estimate", "identification", "sysid"), "identify"),
+    **dict.fromkeys(("convert", "log", "csv"), "import log"),
+    **dict.fromkeys(("rosbag", "rosbag2", "bag"), "import rosbag2"),
+    **dict.fromkeys(("load", "gripper", "tool"), "payload"),
+    **dict.fromkeys(("mujoco", "mjcf", "urdf", "sdf", "pinocchio"), "export"),
+    **dict.fromkeys(("sim", "controller"), "simulate"),
+    **dict.fromkeys(("info", "check", "repair"), "archive"),
+    **dict.fromkeys(("jog", "goto"), "move"),
+    **dict.fromkeys(("execute", "start"), "run"),
+    **dict.fromkeys(("excitation", "optimize", "optimise"), "design"),
+    **dict.fromkeys(("diff",), "compare"),
+    **dict.fromkeys(("init",), "new"),
+    **dict.fromkeys(("latency", "realtime"), "doctor"),
+}
+"""Commands by other words for them."""
+
+_EXAMPLES: Final = re.compile(r"\*\*Examples?:?\*\*(.*?)(?:\n\n(?!- )|\Z)", re.DOTALL)
+_COMMAND: Final = re.compile(r"`(hil [^`]+)`")
+_MOST: Final = 2  # examples of one error
+
+
+def improve(error: BaseException) -> None:
+    """Add to an error of the command line what was probably meant, or what is missing."""
+    context: Any = getattr(error, "ctx", None)
+    if context is None:
+        return
+    refusal: Any = error
+    if hasattr(error, "possibilities"):
+        refusal.message += _nearest(refusal, context.command)
+        refusal.possibilities = None
+    parameter: Any = getattr(error, "param", None)
+    if type(error).__name__ == "MissingParameter" and parameter is not None:
+        described = (getattr(parameter, "help", None) or "").rstrip(".")
+        lines = [f"It takes: {described}."] if described else []
+        lines += [f"Example: {example}" for example in examples(context.command)[:_MOST]]
+        refusal.message = "\n".join(lines)
+
+
+def _nearest(error: Any, command: Any) -> str:
+    """Return the question whether an option of the command was meant."""
+    options = {name for parameter in command.params for name in parameter.opts}
+    synonyms = [name for name in SYNONYMS.get(error.option_name, ()) if name in options]
+    bare = {name.strip("-"): name for name in options if name.startswith("--")}
+    alike = difflib.get_close_matches(error.option_name.strip("-"), bare, n=1)
+    nearest = [*synonyms, *(bare[name] for name in alike)]
+    return f". Did you mean {nearest[0]}?" if nearest else ""
+
+
+def examples(command: Any) -> list[str]:
+    """Return the examples in the help of a command, each in one line."""
+    found = _EXAMPLES.search(command.help or "")
+    return [" ".join(line.split()) for line in _COMMAND.findall(found[1])] if found else []

@@ -1,0 +1,159 @@
+"""Help that teaches: groups, short options, examples, and the nearest name of a misspelt one."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import pytest
+from typer.testing import CliRunner
+
+from hil.cli import COMMANDS, GROUPS, app
+from hil.cli.suggestions import OTHER_COMMANDS, SYNONYMS, examples
+from hil.identify.options import FRICTION_TERMS
+
+WIDTH = "100"
+MOST_LINES = 3
+
+
+def invoke(*words: str) -> Any:
+    return CliRunner().invoke(app, [*words], env={"COLUMNS": WIDTH, "NO_COLOR": "1"})
+
+
+def paths(name: str) -> Iterator[tuple[str, ...]]:
+    """A command, and those below it, as typed."""
+    yield (name,)
+    for below in getattr(COMMANDS[name], "commands", {}):
+        yield (name, below)
+
+
+EVERY = [path for name in COMMANDS for path in paths(name)]
+
+
+def entries(text: str) -> dict[str, list[str]]:
+    """The lines of each option in a help text, by its long name."""
+    found: dict[str, list[str]] = {}
+    lines: list[str] = []
+    for line in text.splitlines():
+        if not line.startswith("│"):
+            lines = []
+        elif start := re.match(r"│ [* ]{0,3}\s*(--[a-z][\w-]*|-\w\b)", line):
+            lines = found[start[1]] = [line]
+        else:
+            lines.append(line)
+    return found
+
+
+@pytest.mark.parametrize("path", EVERY, ids=" ".join)
+def test_an_option_has_at_most_three_lines(path: tuple[str, ...]) -> None:
+    shown = invoke(*path, "--help")
+    assert shown.exit_code == 0
+    long = {k: len(v) for k, v in entries(shown.stdout).items() if len(v) > MOST_LINES}
+    assert not long, "\n".join("\n".join(entries(shown.stdout)[name]) for name in long)
+
+
+def test_commands_are_in_groups() -> None:
+    shown = invoke("--help").stdout
+    panels = re.findall(r"^╭─ ([A-Z][a-z ]+?) ─", shown, re.MULTILINE)
+    assert panels == ["Options", *GROUPS]
+    below = shown.split("╭─ ")
+    for panel, names in GROUPS.items():
+        (text,) = [part for part in below if part.startswith(panel)]
+        assert re.findall(r"^│ ([a-z][\w-]*)", text, re.MULTILINE) == [*names]
+
+
+def alternatives(option: Any) -> Iterator[str]:
+    """The values of a choice."""
+    annotation = option.type_descriptor.annotation
+    for kind in (annotation, *get_args(annotation)):
+        if get_origin(kind) is Literal:
+            yield from get_args(kind)
+
+
+@pytest.mark.parametrize("path", EVERY, ids=" ".join)
+def test_alternatives_are_in_the_page_of_commands(path: tuple[str, ...]) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "commands.md").read_text("utf-8")
+    command = COMMANDS[path[0]] if len(path) == 1 else COMMANDS[path[0]].commands[path[1]]
+    for option in command.params:
+        if getattr(option, "metavar", None):  # in place of the values
+            missing = [value for value in alternatives(option) if f"`{value}`" not in page]
+            assert not missing, option.name
+    assert all(f"`{term.strip()}`" in page for term in FRICTION_TERMS.split(","))
+
+
+class TestMissing:
+    def test_identify_says_what_it_takes_with_two_examples(self) -> None:
+        refused = invoke("identify")
+        assert refused.exit_code == 2
+        for words in ("Logs or bags, with --urdf", "archives (*.mcap)", "campaign folder",
+                      "Example: hil identify log.csv --urdf arm.urdf",
+                      "Example: hil identify runs/demo"):  # fmt: skip
+            assert words in refused.stderr
+
+    def test_as_json_too(self) -> None:
+        assert "hil identify log.csv --urdf arm.urdf" in invoke("identify", "--json").stdout
+
+    @pytest.mark.parametrize("path", EVERY, ids=" ".join)
+    def test_examples_are_read_from_the_help(self, path: tuple[str, ...]) -> None:
+        command = COMMANDS[path[0]] if len(path) == 1 else COMMANDS[path[0]].commands[path[1]]
+        if "**Example" in (command.help or ""):
+            assert examples(command)[0].startswith(f"hil {' '.join(path)}")
+
+
+class TestMisspelt:
+    @pytest.mark.parametrize(
+        ("words", "meant"),
+        [
+            (("move", "cell.toml", "--override", "10"), "--speed"),
+            (("identify", "a.csv", "--urfd", "arm.urdf"), "--urdf"),
+            (("identify", "a.csv", "--robot", "arm.urdf"), "--urdf"),
+            (("identify", "a.csv", "--validation", "b.csv"), "--predict"),
+            (("identify", "a.csv", "--torque-bandwith", "5"), "--torque-bandwidth"),
+            (("export", "runs/demo", "--format", "mjcf"), "--to"),
+            (("import", "log", "a.csv", "--rate", "100"), "--sample-rate"),
+        ],
+    )
+    def test_an_option(self, words: tuple[str, ...], meant: str) -> None:
+        refused = invoke(*words)
+        assert refused.exit_code == 2
+        assert f"Did you mean {meant}?" in " ".join(refused.stderr.split())
+
+    def test_an_option_like_no_other(self) -> None:
+        refused = invoke("identify", "a.csv", "--zzzz")
+        assert "No such option: --zzzz" in refused.stderr
+        assert "mean" not in refused.stderr
+
+    @pytest.mark.parametrize(
+        ("word", "meant"),
+        [("identfy", "'identify'"), ("fit", "'hil identify'"), ("gripper", "'hil payload'")],
+    )
+    def test_a_command(self, word: str, meant: str) -> None:
+        refused = invoke(word, "x")
+        assert refused.exit_code == 2
+        assert f"Did you mean {meant}" in refused.stderr
+
+    def test_a_file(self, tmp_path: Path) -> None:
+        (tmp_path / "arm.urdf").write_text("<robot/>")
+        (tmp_path / "log.csv").write_text("t\n0\n")
+        log, urdf = str(tmp_path / "log.csv"), str(tmp_path / "amr.urdf")
+        assert "arm.urdf" in str(invoke("identify", log, "--urdf", urdf).exception)
+        urdf = str(tmp_path / "arm.urdf")
+        (tmp_path / "arm.urdf").write_text((Path(__file__).parents[2] / "sim_fixtures" / "ns16"
+                                            / "ns16.urdf").read_text())  # fmt: skip
+        wrong = str(tmp_path / "lgo.csv")
+        assert "log.csv" in str(invoke("identify", wrong, "--urdf", urdf).exception)
+
+    def test_what_is_suggested_exists(self) -> None:
+        options = {
+            name
+            for path in EVERY
+            for option in (
+                COMMANDS[path[0]] if len(path) == 1 else COMMANDS[path[0]].commands[path[1]]
+            ).params
+            for name in option.opts
+        }
+        assert {name for names in SYNONYMS.values() for name in names} <= options
+        assert {tuple(command.split()) for command in OTHER_COMMANDS.values()} <= set(EVERY)
+        assert not OTHER_COMMANDS.keys() & COMMANDS.keys()
