@@ -1,7 +1,7 @@
 """Many archives at once: three campaigns of one arm, with more shoulder friction in the last.
 
 Prints the friction of every campaign with its 95 % interval, from the folders with archives. The
-picture shows it over time. The same on the command line: `hil reidentify FOLDER...`.
+picture shows it over time. The same on the command line: `hil batch FOLDER...`.
 """
 
 from pathlib import Path

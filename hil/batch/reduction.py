@@ -81,7 +81,7 @@ def load_source(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Sourc
         raise ArchiveError(
             ref.location,
             "has motor currents and no torques",
-            remedy="find the torque constants with `hil gains` and import it again",
+            remedy="find the torque constants with `hil torque-constants` and import it again",
         )
     return archive, source
 

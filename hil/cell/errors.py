@@ -122,8 +122,8 @@ WHERE: Final[Mapping[str, str]] = {
     "increases for a positive rotation about the axis of the URDF, else -1. With a wrong sign "
     "the arm moves in the opposite direction, and no check applies to its motion",
     "drive_train.joint_offset_deg": "reading of the pendant with all URDF angles at zero",
-    "drive_train.torque_constant": "plates or data sheets of the motors, or hil gains with a known "
-    "payload",
+    "drive_train.torque_constant": "plates or data sheets of the motors, or hil torque-constants "
+    "with a known payload",
     "drive_train.current_limit": "the controller's init packet (hil new --from-controller)",
     "drive_train.following_error": "the controller's init packet (hil new --from-controller)",
     "drive_train.encoder_counts_per_revolution": "data sheets of the motors",

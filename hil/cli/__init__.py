@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
-from hil.cli.suggestions import OTHER_COMMANDS, improve
+from hil.cli.suggestions import OTHER_COMMANDS, improve, with_present_names
 from hil.errors import DISK_REFUSES, HilError, InputError, OperatorStopError
 from hil.importing import leave_if_interrupted
 from hil.terminal_text import printable
@@ -145,7 +145,7 @@ class LazyCommands(UserDict[str, Any]):
 
 
 def _module(name: str) -> str:
-    return "imports" if name == "import" else name  # a Python keyword
+    return "imports" if name == "import" else name.replace("-", "_")  # a Python keyword
 
 
 def _command(name: str) -> Any:
@@ -155,7 +155,7 @@ def _command(name: str) -> Any:
     if hasattr(found, "app"):
         alone.add_typer(found.app, name=name)
     else:
-        alone.command(name)(getattr(found, name))
+        alone.command(name)(getattr(found, _module(name)))
     group = typer.main.get_command(alone)
     assert isinstance(group, TyperGroup)
     return presented(group.commands[name])
@@ -195,7 +195,8 @@ def _shorten(option: TyperOption) -> None:
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "Start": ("demo", "new"),
     "Identify": (
-        "identify", "payload", "gains", "reidentify", "compare", "export", "rollout", "report",
+        "identify", "payload", "torque-constants", "batch", "compare", "export", "rollout",
+        "report",
     ),
     "On the controller": (
         "doctor", "rehearse", "run", "status", "move", "record", "simulate",
@@ -238,6 +239,9 @@ class Group(TyperGroup):
     def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> Any:
         """Return the context of one call; it records whether JSON is requested."""
         asked = asks_for_json(args)
+        args, notes = with_present_names(args)
+        for note in notes:
+            typer.echo(f"note: {note}", err=True)
         with errors_as_json(asked):
             context = super().make_context(info_name, args, *more, **extra)
         context.meta[_JSON] = asked

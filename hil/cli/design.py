@@ -71,7 +71,7 @@ def design(
     repetitions: Annotated[int | None, typer.Option(min=1, max=1000)] = None,
     seed: Annotated[int | None, typer.Option(min=0)] = None,
     workers: Annotated[int | None, typer.Option(min=1, max=256)] = None,
-    kinematic: bool = False,
+    limits_only: bool = False,
     resume: bool = False,
     force: bool = False,
     quiet: QuietOption = False,
@@ -109,7 +109,7 @@ def design(
         repetitions: Number of repetitions of the motion. Default: that of [campaign].
         seed: Seed of the search; the result depends on nothing else. Default: that of the settings.
         workers: Number of processes; the result does not depend on it. Default: one per processor.
-        kinematic: Check joint limits only and do not return to the home posture; for comparison
+        limits_only: Check joint limits only and do not return to the home posture; for comparison
             with the paper, not for a robot.
         resume: Continue an interrupted search in OUTPUT.
         force: Replace an earlier design in OUTPUT.
@@ -133,7 +133,7 @@ def design(
         asked = preset(method or "front") if method or there is None else there
     if seed is not None:
         asked = asked.replaced(seed=seed)
-    if kinematic:
+    if limits_only:
         asked = asked.kinematic()
 
     def finish(done: Designed) -> None:

@@ -36,7 +36,7 @@ def identify(
     predict: Annotated[list[Path] | None, typer.Option(metavar="RECORDING")] = None,
     paper: bool = False,
     split: Annotated[float, typer.Option(min=0.1, max=0.9)] = 0.7,
-    in_sample: bool = False,
+    fit_all: bool = False,
     estimator: EstimatorOption = "auto",
     annotate: bool = False,
     *,
@@ -61,13 +61,13 @@ def identify(
         predict: Recording to predict and not to fit, of any kind (repeatable).
         paper: Preprocess as in the paper: filter positions, torques and regressor alike.
         split: Fraction that is fitted if there is no validation run; the rest is predicted.
-        in_sample: Fit all recordings and hold nothing out: no model can then be judged good.
+        fit_all: Fit all recordings and hold nothing out: no model can then be judged good.
         annotate: Also write copies of the archives for viewers, with predicted torque and
             residual, into the subfolder annotated.
     """
     reporter = make_reporter(quiet=quiet or json)
     method = "paper" if paper else "default"
-    options = how.options(method=method, split=split, in_sample=in_sample, estimator=estimator)
+    options = how.options(method=method, split=split, in_sample=fit_all, estimator=estimator)
     if paper and len(recordings) == 1 and recordings[0].is_dir() and is_archive(recordings[0]):
         output = output or recordings[0] / "paper"
     if output is not None or path_exists(recordings[0]):

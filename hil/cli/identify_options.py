@@ -33,7 +33,7 @@ DelayOption = Annotated[
     ),
 ]
 
-FEW: Final = ("bandwidth", "velocity", "standstill", "torque_bandwidth")
+FEW: Final = ("bandwidth", "velocity", "exclude_rows", "torque_bandwidth")
 """Options that `hil export` does not have."""
 
 
@@ -66,7 +66,7 @@ class Identifying:
             rich_help_panel=ESTIMATION,
         ),
     ] = "auto"
-    standstill: Annotated[
+    exclude_rows: Annotated[
         Literal["auto", "rests", "halts", "slow", "none"],
         typer.Option(
             metavar="ROWS",
@@ -92,7 +92,7 @@ class Identifying:
             delay=delay_from(self.delay),
             bandwidth=_bandwidth(self.bandwidth, "--bandwidth"),
             velocity=self.velocity,
-            standstill=self.standstill,
+            standstill=self.exclude_rows,
             torque_bandwidth=None
             if low_pass == "none"
             else _bandwidth(low_pass, "--torque-bandwidth"),

@@ -1,10 +1,10 @@
-"""What a misspelt command or option, or a missing argument, is answered with."""
+"""Former names of commands and options, and what is said of misspelt and missing ones."""
 
 from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final
 
 SYNONYMS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -52,9 +52,38 @@ OTHER_COMMANDS: Final[Mapping[str, str]] = {
 }
 """Commands by other words for them."""
 
+FORMER_COMMANDS: Final[Mapping[str, str]] = {"gains": "torque-constants", "reidentify": "batch"}
+"""Commands by their names in version 0.1, which work in 0.2 as well."""
+
+FORMER_OPTIONS: Final[Mapping[str, tuple[str, Collection[str]]]] = {
+    "--standstill": ("--exclude-rows", ("identify", "rollout", "batch")),
+    "--in-sample": ("--fit-all", ("identify",)),
+    "--kinematic": ("--limits-only", ("design",)),
+}
+"""Options by their names in version 0.1: present name, and the commands that have it."""
+
 _EXAMPLES: Final = re.compile(r"\*\*Examples?:?\*\*(.*?)(?:\n\n(?!- )|\Z)", re.DOTALL)
 _COMMAND: Final = re.compile(r"`(hil [^`]+)`")
 _MOST: Final = 2  # examples of one error
+
+
+def with_present_names(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return arguments of the command line with present names, and a note for each former one."""
+    present, notes = list(arguments), list[str]()
+    place = next((k for k, word in enumerate(present) if not word.startswith("-")), None)
+    if place is None:
+        return present, notes
+    if new := FORMER_COMMANDS.get(present[place]):
+        notes.append(f"hil {present[place]} is now called hil {new}")
+        present[place] = new
+    end = present.index("--") if "--" in present else len(present)
+    for k in range(place + 1, end):
+        name, equals, value = present[k].partition("=")
+        option, commands = FORMER_OPTIONS.get(name, ("", ()))
+        if present[place] in commands:
+            notes.append(f"{name} is now called {option}")
+            present[k] = option + equals + value
+    return present, notes
 
 
 def improve(error: BaseException) -> None:

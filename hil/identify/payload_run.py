@@ -133,7 +133,7 @@ class PayloadFound:
             for name, factor, value in zip(NAMES, factors, self.figures, strict=True)
         }
         centre = ",".join(f"{figures[name]:.4f}" for name in NAMES[1:4])
-        words = ["hil", "gains", *map(str, bare)]
+        words = ["hil", "torque-constants", *map(str, bare)]
         for path in loaded:
             words += ["--loaded", str(path)]
         words += ["--mass", f"{figures['mass']:g}", f"--centre={centre}", "--frame", self.frame]

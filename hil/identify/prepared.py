@@ -515,7 +515,8 @@ def _require_torques(sources: Sources) -> None:
             None,
             "the recordings contain no torques",
             field="torque",
-            remedy="give drive.torque_constant in the column map, or identify it by `hil gains`",
+            remedy="give drive.torque_constant in the column map, or identify it by "
+            "`hil torque-constants`",
         )
 
 

@@ -124,7 +124,7 @@ def gather_sources(
     """
     if in_sample and predict:
         raise InputError(
-            predict[0], "cannot be held out if everything is fitted", remedy="omit --in-sample"
+            predict[0], "cannot be held out if everything is fitted", remedy="omit --fit-all"
         )
     refuse_duplicates([*paths, *predict])
     archives = [open_archive(path) for path in [*paths, *predict]]

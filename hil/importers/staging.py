@@ -145,7 +145,7 @@ def _require_usable(archive: Path, recording: Path) -> None:
         remedy = (
             "`hil import log` writes its column map: add [drive] torque_constant = [...] (N.m/A, "
             "gears included, one for each joint) and give it with --map; or measure the constants "
-            "(`hil gains`)"
+            "(`hil torque-constants`)"
         )
         raise SourceError(recording, problem, field="torque", remedy=remedy)
     torque = np.asarray(columns["torque"])

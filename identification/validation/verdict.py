@@ -432,7 +432,7 @@ _CAUSES: Final[dict[Kind, _CauseRow]] = {
         "torque constant",
         "the torque of {joints} is {size} times the value consistent with the other axes",
         "check torque constant and gear ratio of {joints}; recordings with and without a known"
-        " payload determine the constant (`hil gains --loaded`)", offset=1.0),
+        " payload determine the constant (`hil torque-constants --loaded`)", offset=1.0),
     "load friction": _CauseRow(
         "friction over load", "friction grows with the load, by {size} of the transmitted torque"
         " (median axis)",
@@ -643,8 +643,9 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
     _Row("systematic error", {"doubtful": "systematic_small"},
          "the torque error on {on} beyond noise exceeds {limit.noticeable:.1%}:"
          " <{systematic:.1%}>",
-         "check the torque constant of {joints} with a known payload (`hil gains`), or without"
-         " gravity load against the drive's data sheet", "symptom"),
+         "check the torque constant of {joints} with a known payload"
+         " (`hil torque-constants`), or without gravity load against the drive's data sheet",
+         "symptom"),
     _Row("repetitions", {"wrong": "disagree"},
          "the estimates of single repetitions differ by more than {limit.inconsistency:.0%} of the"
          " torque: <{disagreement:.0%}>",

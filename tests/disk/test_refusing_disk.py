@@ -204,7 +204,7 @@ STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
     "rehearse": ("rehearse campaign --again", ("campaign",)),
     "identify": ("identify campaign --quiet", ("campaign",)),
     "report": ("report campaign", ("campaign",)),
-    "reidentify": ("reidentify campaign --output batch --quiet", ("batch", "campaign")),
+    "batch": ("batch campaign --output batch --quiet", ("batch", "campaign")),
     "plot": ("plot campaign/archives/excitation_000_a1.mcap --output plot.png", ("plot.png",)),
     "repair": ("archive repair excitation_000_a1.mcap", ("excitation_000_a1_repaired.mcap",)),
     "new": ("new --urdf campaign/robot.urdf --output new.toml --force", ("new.toml",)),

@@ -66,10 +66,10 @@ NOT_TYPED = {
     "hil run campaigns/october --live": "needs a campaign on a real link",
     "hil import rosbag2": "needs a recording; tests/hil/test_importers_rosbag2.py",
     "hil import log log.csv --map columns.toml": "typed in bring-your-own-robot.md",
-    "hil gains empty.mcap": "typed in bring-your-own-robot.md",
+    "hil torque-constants empty.mcap": "typed in bring-your-own-robot.md",
     "hil payload bare --loaded gripper": "typed in payload.md",
     "hil identify ur10": "needs a recording; tests/hil/test_one_command.py reads it",
-    "hil reidentify /data": "needs other people's archives",
+    "hil batch /data": "needs other people's archives",
     "hil study --quick": "minutes; tests/hil/test_study.py runs a shorter one",
     "hil study --output": "an hour; tests/hil/test_study.py runs a short one",
 }  # Beginnings of commands that are read and not run, and why

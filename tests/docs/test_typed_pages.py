@@ -89,7 +89,7 @@ class TestBringYourOwnRobot:
                 saved(block)
             else:
                 ran += typed(block, (0, 5))
-        assert ran == ["demo", "import", "import", "identify", "gains"]
+        assert ran == ["demo", "import", "import", "identify", "torque-constants"]
         (run,) = Results.load(workplace / "result" / "results.json").validation
         assert run.archive == "other.mcap"
         assert run.overall_relative_error < 0.1  # of a motion of seconds, with its noise

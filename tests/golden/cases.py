@@ -49,7 +49,7 @@ def campaign(scratch: Path) -> dict[str, Any]:
 
 def batch(scratch: Path) -> dict[str, Any]:
     """The same archives by a batch."""
-    arguments = ["reidentify", str(FAST), "--json", "--quiet", "--cache", "none", "--workers", "1"]
+    arguments = ["batch", str(FAST), "--json", "--quiet", "--cache", "none", "--workers", "1"]
     found = CliRunner().invoke(app, arguments)
     (arm,) = json.loads(found.stdout)["arms"].values()
     return {**next(iter(arm["campaigns"].values()))["parameters"], "status": found.exit_code}
@@ -69,7 +69,7 @@ def recording(name: str) -> Callable[[Path], dict[str, Any]]:
         robot = Published.named(name)
         log = next(iter(robot.logs))
         archive = robot.imported(log, RECORDINGS / (robot.folder or name), scratch / "log.mcap")
-        return identify(scratch / "found", str(archive), "--in-sample")
+        return identify(scratch / "found", str(archive), "--fit-all")
 
     return case
 

@@ -22,9 +22,9 @@ from hil.errors import ArchiveError
 
 NOTHING_OPEN: Final = (
     *("--bandwidth", "40", "--velocity", "position", "--friction", "coulomb,viscous"),
-    *("--standstill", "slow", "--delay", "stated", "--estimator", "wls"),
+    *("--exclude-rows", "slow", "--delay", "stated", "--estimator", "wls"),
 )
-"""Options of `hil reidentify` that leave nothing to be chosen of a controller's archives."""
+"""Options of `hil batch` that leave nothing to be chosen of a controller's archives."""
 
 
 @cache

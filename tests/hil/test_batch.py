@@ -342,7 +342,7 @@ class TestBroken:
 
 
 def test_the_command_exits_with_5_if_archives_are_broken(folder, tmp_path):
-    command = ["reidentify", str(folder), "--workers", "1", "-o", str(tmp_path / "out")]
+    command = ["batch", str(folder), "--workers", "1", "-o", str(tmp_path / "out")]
     command += NOTHING_OPEN
     ran = CliRunner().invoke(app, command)
     assert ran.exit_code == 0, ran.output
@@ -384,7 +384,7 @@ class TestWarnings:
         record(tmp_path / "bare", 2, first=0)
         findings = json.dumps({"lines": [], "doubts": [CLOCK]})
         record(tmp_path / "warned", 2, first=2, findings=findings)
-        command = ["reidentify", str(tmp_path), "--workers", "1", "-o", str(tmp_path / "out")]
+        command = ["batch", str(tmp_path), "--workers", "1", "-o", str(tmp_path / "out")]
         ran = CliRunner().invoke(app, [*command, "--cache", "none", *NOTHING_OPEN])
         assert ran.exit_code == 0, ran.output
         assert f"note: {ASSUMED}" in ran.output
@@ -409,7 +409,7 @@ class TestWarnings:
         (pooled,) = found.pooled
         assert (pooled.repetitions, pooled.setup) == (2, "")
         assert "cells state different payloads" in pooled.warnings[0]
-        command = ["reidentify", str(tmp_path), "--cache", "none", "--json", *NOTHING_OPEN]
+        command = ["batch", str(tmp_path), "--cache", "none", "--json", *NOTHING_OPEN]
         (arm,) = json.loads(CliRunner().invoke(app, command).stdout)["arms"].values()
         for setups in (
             [one.setup for one in found.campaigns],

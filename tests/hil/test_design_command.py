@@ -64,7 +64,7 @@ def bare(invoke, tmp_path_factory):
     """A design with joint limits only and its JSON output, read only."""
     root = tmp_path_factory.mktemp("bare")
     (root / "my.toml").write_text(SETTINGS)
-    arguments = ("--settings", root / "my.toml", "--kinematic", "-o", root / "out", "--json")
+    arguments = ("--settings", root / "my.toml", "--limits-only", "-o", root / "out", "--json")
     return root / "out", invoke(CELL_PATH, *arguments).stdout
 
 
@@ -129,7 +129,7 @@ def test_the_result_does_not_depend_on_the_number_of_processes(invoke, made, set
 
 def test_an_earlier_design_is_only_overwritten_with_force(invoke, settings, copied):
     """Other files are never removed."""
-    arguments = (CELL_PATH, "--settings", settings, "--kinematic", "-o", copied, "--seed", 5)
+    arguments = (CELL_PATH, "--settings", settings, "--limits-only", "-o", copied, "--seed", 5)
     before = (copied / "excitation.toml").read_bytes()
     with pytest.raises(InputError, match=r"has a design already.*--resume.*--force"):
         invoke(*arguments)
@@ -151,7 +151,7 @@ def test_a_locked_folder_is_refused(invoke, settings, copied, option):
         return {path.name: path.read_bytes() for path in copied.iterdir()}
 
     before = content()
-    given = () if option == ("--resume",) else ("--settings", settings, "--kinematic")
+    given = () if option == ("--resume",) else ("--settings", settings, "--limits-only")
     with (
         lock_folder(copied, "search", "-o"),
         pytest.raises(InputError, match=r"copied: a search is running in it; wait") as caught,
@@ -212,7 +212,7 @@ def test_what_was_not_checked_is_reported(invoke, bare, copied, tmp_path):
     assert json.loads(bare[1])["unchecked"] == unchecked
     path = tmp_path / "bare.toml"
     path.write_text('method = "a"\n[search]\npopulation = 8\ngenerations = 1\n[sines]\nramp = 0\n')
-    output = invoke(CELL_PATH, "--settings", path, "--kinematic", "-o", tmp_path / "o").output
+    output = invoke(CELL_PATH, "--settings", path, "--limits-only", "-o", tmp_path / "o").output
     assert f"not checked: {', '.join(unchecked)}, rest at both ends" in output
 
 
@@ -220,7 +220,7 @@ def test_no_feasible_motion_names_constraints_and_remedies(invoke, settings, tmp
     settings.write_text(SETTINGS + "[constraints]\nmax_duration = 0.5\n")
     words = r"duration excludes 16.* 0\.5 s.*\[constraints\] max_duration"
     with pytest.raises(NoExcitationError, match=words) as caught:
-        invoke(CELL_PATH, "--settings", settings, "--kinematic", "-o", tmp_path / "out")
+        invoke(CELL_PATH, "--settings", settings, "--limits-only", "-o", tmp_path / "out")
     assert caught.value.exit_code == 3
     assert not (tmp_path / "out" / "excitation.toml").exists()
 
@@ -310,7 +310,7 @@ def interrupted(command: list[str], journal: Path) -> tuple[int, str]:
 def test_ctrl_c_writes_the_best_motion_and_resume_continues(invoke, tmp_path):
     settings = tmp_path / "my.toml"
     settings.write_text(SETTINGS.replace("generations = 2", "generations = 25"))
-    arguments = [str(CELL_PATH), "--settings", str(settings), "--kinematic"]
+    arguments = [str(CELL_PATH), "--settings", str(settings), "--limits-only"]
     out = tmp_path / "out"
     command = [sys.executable, "-m", "hil", "design", *arguments, "-o", str(out)]
     code, text = interrupted(command, out / "search.journal")

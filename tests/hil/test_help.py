@@ -11,7 +11,13 @@ import pytest
 from typer.testing import CliRunner
 
 from hil.cli import COMMANDS, GROUPS, app
-from hil.cli.suggestions import OTHER_COMMANDS, SYNONYMS, examples
+from hil.cli.suggestions import (
+    FORMER_OPTIONS,
+    OTHER_COMMANDS,
+    SYNONYMS,
+    examples,
+    with_present_names,
+)
 from hil.identify.options import FRICTION_TERMS
 
 WIDTH = "100"
@@ -157,3 +163,45 @@ class TestMisspelt:
         assert {name for names in SYNONYMS.values() for name in names} <= options
         assert {tuple(command.split()) for command in OTHER_COMMANDS.values()} <= set(EVERY)
         assert not OTHER_COMMANDS.keys() & COMMANDS.keys()
+
+
+class TestFormerNames:
+    """Of version 0.1; they work in 0.2 and say so."""
+
+    @pytest.mark.parametrize(
+        ("words", "notes"),
+        [
+            (("gains", "none.mcap"), ["hil gains is now called hil torque-constants"]),
+            (("reidentify", "none", "--standstill=slow"),
+             ["hil reidentify is now called hil batch",
+              "--standstill is now called --exclude-rows"]),
+            (("identify", "none.mcap", "--in-sample", "--standstill", "slow"),
+             ["--in-sample is now called --fit-all",
+              "--standstill is now called --exclude-rows"]),
+            (("design", "none.toml", "--kinematic"),
+             ["--kinematic is now called --limits-only"]),
+        ],
+    )  # fmt: skip
+    def test_they_are_the_present_ones(self, words: tuple[str, ...], notes: list[str]) -> None:
+        done = invoke(*words)
+        assert [line for line in done.stderr.splitlines() if "now called" in line] == [
+            f"note: {note}" for note in notes
+        ]
+        present = invoke(*with_present_names(words)[0])
+        assert (str(done.exception), done.stdout) == (str(present.exception), present.stdout)
+        assert "none" in str(present.exception)
+
+    def test_an_import_has_a_standstill_speed(self) -> None:
+        words = ("import", "log", "a.csv", "--standstill", "0.02")
+        assert with_present_names(words) == (list(words), [])
+
+    def test_what_follows_two_dashes_is_no_option(self) -> None:
+        words = ("identify", "--", "--in-sample")
+        assert with_present_names(words) == (list(words), [])
+
+    def test_they_are_not_in_the_help(self) -> None:
+        assert "gains" not in invoke("--help").stdout
+        assert "--standstill" not in invoke("identify", "--help").stdout
+        for name, commands in FORMER_OPTIONS.values():
+            for command in commands:
+                assert name in entries(invoke(command, "--help").stdout)

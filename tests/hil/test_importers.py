@@ -1116,11 +1116,11 @@ class TestImportCommand:
         assert found == Findings(lines=("a",), warnings=("b",))
 
 
-LOADED = "gains a.mcap --loaded b.mcap --mass 4"
+LOADED = "torque-constants a.mcap --loaded b.mcap --mass 4"
 INVALID = {
-    "gains a.mcap --delay nan": "--delay",
-    "gains a.mcap --delay 20": "--delay",
-    "gains a.mcap --loaded a.mcap --mass 4": "listed twice",
+    "torque-constants a.mcap --delay nan": "--delay",
+    "torque-constants a.mcap --delay 20": "--delay",
+    "torque-constants a.mcap --loaded a.mcap --mass 4": "listed twice",
     f"{LOADED} --inertia=-1,0,0,-1,0,-1": "no body",
     f"{LOADED} --inertia=1,0,0,1,0,3": "no body",
     "import log a.csv -o a.mcap --map m.toml --cell c.toml --friction none": "not a friction term",

@@ -1,4 +1,4 @@
-"""`hil payload`, with the commands of `docs/payload.md`, and `hil gains`; what both refuse."""
+"""`hil payload`, by the commands of `docs/payload.md`; `hil torque-constants`; refusals of both."""
 
 from __future__ import annotations
 
@@ -213,8 +213,8 @@ class TestTorqueScale:
             wrong, "empty_assumed.mcap", "--loaded", "full_assumed.mcap", "--check", "mass=4"
         )
         assert status == 5
-        (line,) = [line for line in text.splitlines() if "hil gains" in line]
-        program, *words = shlex.split(line[line.index("hil gains") :])
+        (line,) = [line for line in text.splitlines() if "hil torque-constants" in line]
+        program, *words = shlex.split(line[line.index("hil torque-constants") :])
         assert program == "hil"
         result = CliRunner().invoke(app, [*words, "--quiet"])
         assert result.exit_code == 0, result.output
@@ -226,7 +226,7 @@ class TestTorqueScale:
     def test_torques_without_currents_get_the_scale_to_correct(self, folder: Path) -> None:
         status, text = run(folder, "empty.mcap", "--loaded", "full.mcap", "--check", "mass=5")
         assert status == 5
-        assert "hil gains" not in text
+        assert "hil torque-constants" not in text
         assert "scale of [torque] in the column map" in text
 
 
@@ -307,7 +307,9 @@ def test_an_inertia_that_is_not_determined_is_not_typed_in(tmp_path: Path) -> No
 
 
 def gains(folder: Path, *arguments: str) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(run(folder, *arguments, "--json", command="gains")[1])
+    found: dict[str, Any] = json.loads(
+        run(folder, *arguments, "--json", command="torque-constants")[1]
+    )
     return found
 
 
@@ -329,12 +331,12 @@ def test_the_constants_lie_in_their_intervals(currents: Path) -> None:
 def test_a_load_without_centre_is_assumed_at_the_flange_and_said(currents: Path) -> None:
     assert gains(currents, "empty.mcap", *BOTH)["assumed"] is None
     assert "--centre" in gains(currents, "empty.mcap", *BOTH[:4])["assumed"]
-    text = run(currents, "empty.mcap", *BOTH[:4], "--quiet", command="gains")[1]
+    text = run(currents, "empty.mcap", *BOTH[:4], "--quiet", command="torque-constants")[1]
     assert "the load's centre of mass is assumed at the origin" in text
 
 
 def test_the_output_is_an_entry_of_the_column_map(currents: Path) -> None:
-    status, text = run(currents, "empty.mcap", *BOTH, "--quiet", command="gains")
+    status, text = run(currents, "empty.mcap", *BOTH, "--quiet", command="torque-constants")
     pasted = tomllib.loads(text)["torque_constant"]
     assert (len(pasted) == len(CONSTANTS)) == (status == 0)
     assert "# shoulder_lift_joint ±" in text
@@ -348,7 +350,7 @@ def test_a_vertical_axis_in_slow_motion_has_no_constant(tmp_path: Path) -> None:
         slow = simulate("ur5_robot.urdf", time, seed=seed, pace=0.03, load=body)
         noise = 0.1 * np.random.default_rng(seed).standard_normal(slow.torque.shape)  # N·m
         archive_of_currents(tmp_path, name, replace(slow, torque=slow.torque + noise))
-    status, text = run(tmp_path, "empty.mcap", *BOTH, "-q", command="gains")
+    status, text = run(tmp_path, "empty.mcap", *BOTH, "-q", command="torque-constants")
     assert status == 5
     assert "nan, # shoulder_pan_joint: not determined; " in text
     assert "shoulder_lift_joint ±" in text
@@ -363,10 +365,10 @@ def test_a_vertical_axis_in_slow_motion_has_no_constant(tmp_path: Path) -> None:
     [
         ("payload", (), "give both: hil payload BARE"),
         ("payload", (*BOTH[:2], "--check", "mass"), "'mass' is not NAME=NUMBER"),
-        ("gains", BOTH[:2], "--mass: the payload needs a mass above 0"),
-        ("gains", ("--mass", "4"), "has no recording with this payload"),
-        ("gains", (*BOTH[:4], "--centre", "1,2"), "--centre: '1,2' is not 3 numbers"),
-        ("gains", (), r"without a known payload.*--loaded ARCHIVE"),
+        ("torque-constants", BOTH[:2], "--mass: the payload needs a mass above 0"),
+        ("torque-constants", ("--mass", "4"), "has no recording with this payload"),
+        ("torque-constants", (*BOTH[:4], "--centre", "1,2"), "--centre: '1,2' is not 3 numbers"),
+        ("torque-constants", (), r"without a known payload.*--loaded ARCHIVE"),
     ],
 )
 def test_incomplete_arguments_are_refused(

@@ -61,7 +61,7 @@ def computed(loop: ast.AST) -> Iterator[str]:
 
 
 FIGURES = {
-    "gains.py": {"computes gains.interval_factor * std in a loop"},
+    "torque_constants.py": {"computes gains.interval_factor * std in a loop"},
     "plan.py": {"computes getattr(extrema, q) / getattr(plan.limits, q) in a loop"},
 }
 """Exceptions: values computed for output only."""

@@ -142,7 +142,7 @@ class TestEntries:
         path = forged(written.data, tmp_path / NAME, attachments={name: b"\xff\xfe"})
         with pytest.raises(ArchiveError, match=f"{name}: is not UTF-8 text"):
             cell_of(open_archive(path))
-        arguments = ["identify", str(path), "--in-sample", "-o", str(tmp_path)]
+        arguments = ["identify", str(path), "--fit-all", "-o", str(tmp_path)]
         assert isinstance(CliRunner().invoke(app, arguments).exception, ArchiveError)
         with pytest.raises(ArchiveError, match=name):
             gather_sources([path], 0.3, in_sample=True)

@@ -1,4 +1,4 @@
-"""`hil gains`: estimate torque constants from recordings with a known payload."""
+"""`hil torque-constants`: estimate torque constants from recordings with a known payload."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hil.toml_text import comment_lines, inline
 from identification.model.payload import Payload
 
 
-def gains(
+def torque_constants(
     archives: Annotated[list[Path], typer.Argument(metavar="ARCHIVE")],
     loaded: list[Path] | None = None,
     mass: float | None = None,

@@ -1,4 +1,4 @@
-"""`hil reidentify`: estimate parameters by arm, campaign and repetition."""
+"""`hil batch`: estimate parameters by arm, campaign and repetition."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _MOST_LINES: Final = 20
 
 
 @with_options(Identifying, "how")
-def reidentify(
+def batch(
     places: Annotated[list[str], typer.Argument(metavar="FOLDER")],
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
     estimator: BatchEstimator = "auto",
