@@ -18,7 +18,8 @@ from hil.cli.suggestions import (
     examples,
     with_present_names,
 )
-from hil.identify.options import FRICTION_TERMS
+from hil.design import METHODS
+from hil.identify.options import ESTIMATORS, FRICTION_TERMS
 
 WIDTH = "100"
 MOST_LINES = 3
@@ -87,6 +88,9 @@ def test_alternatives_are_in_the_page_of_commands(path: tuple[str, ...]) -> None
             missing = [value for value in alternatives(option) if f"`{value}`" not in page]
             assert not missing, option.name
     assert all(f"`{term.strip()}`" in page for term in FRICTION_TERMS.split(","))
+    descriptions = ESTIMATORS | {name: method.help for name, method in METHODS.items()}
+    for name, words in descriptions.items():
+        assert f"| `{name}` | {words} |" in page
 
 
 class TestMissing:

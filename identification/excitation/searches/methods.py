@@ -17,7 +17,7 @@ Method = Literal["a", "b", "balanced", "front"]
 class SearchMethod(NamedTuple):
     """A search method; its default settings are `hil/design/presets/NAME.toml`."""
 
-    help: str  #: in the help of `hil design`
+    help: str  #: in `docs/commands.md`
     label: str  #: in the report
     #: fitness (m,) to maximise, for finite values (m,) of `criteria` by name, the weights of the
     #: settings, and the number of parameters; it must not fall where one of the criteria improves.
