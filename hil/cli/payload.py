@@ -29,9 +29,11 @@ def payload(
     """Identify the payload: mass, centre of mass and inertia with 95 % intervals.
 
     Fits the difference between recordings without and with the payload, on one model of the arm.
-    Prints the values in the form that COMAU, UR and Franka controllers expect. Exit status 5 if a
-    value of --check lies outside its interval, or if another mounting of the arm explains the bare
-    recordings much better.
+    Prints the values in the form that controllers of COMAU, UR, Franka, KUKA, ABB and FANUC expect.
+    Exit status 5 if a value of --check lies outside its interval, or if another mounting of the arm
+    explains the bare recordings much better.
+
+    **Example:** `hil payload empty.mcap --loaded full.mcap`
 
     Options:
         bare: Archives (*.mcap) recorded without the payload, or campaign folders.

@@ -30,6 +30,7 @@ from identification.validation.evidence import find_gravity
 from identification.validation.finding import Thresholds
 
 from .options import Options
+from .payload_settings import NOT_DETERMINED, Load, controller_settings
 from .prepared import prepare_sources, samples_of
 from .sources import (
     Source,
@@ -44,7 +45,6 @@ from .torque_scale import TorqueScale, torque_scale
 Array = NDArray[np.float64]
 
 _FLANGES: Final = ("tool0", "flange")  # flange frames of controllers, by their ROS-Industrial names
-NOT_DETERMINED: Final = "not determined: enter the maker's, or record faster motion"
 _LEAST_DISTANCE: Final = 0.5  # m, of a hand tool on an arm that is shorter itself
 _FITTED: Final = 0.7  # of each bare recording, when the direction of gravity is tried
 _MOST_RECORDINGS: Final = 3  # enough to determine gravity
@@ -197,35 +197,8 @@ class PayloadFound:
         """
         if self.mounting is not None:
             return {}
-        mass, centre = f"{self.body.mass:.3f}", self.body.centre
-        millimetres = ", ".join(f"{1e3 * part:.2f}" for part in centre)
-        metres = ", ".join(f"{part:.5f}" for part in centre)
-        xx, xy, xz, yy, yz, zz = (f"{part:.5f}" for part in self.figures[4:])
-        six, nine = (xx, yy, zz, xy, xz, yz), (xx, xy, xz, xy, yy, yz, xz, yz, zz)
         with_centre, with_inertia = self.determines(*NAMES[1:4]), self.determines(*NAMES[4:])
-        comau = [f"$TOOL_MASS := {mass}"]
-        comau.append(
-            f"$TOOL_CNTR := POS({millimetres}, 0, 0, 0, '')"
-            if with_centre
-            else f"-- $TOOL_CNTR {NOT_DETERMINED}"
-        )
-        if with_inertia:
-            comau += [f"$TOOL_INERTIA[{k}] := {figure}" for k, figure in enumerate(six, 1)]
-        else:
-            comau.append(f"-- $TOOL_INERTIA {NOT_DETERMINED}")
-        if not with_centre:
-            robot, franka = f"# centre of mass {NOT_DETERMINED}", f"// centre {NOT_DETERMINED}"
-        elif not with_inertia:
-            robot = f"set_target_payload({mass}, [{metres}])\n# inertia {NOT_DETERMINED}"
-            franka = (
-                f"// inertia {NOT_DETERMINED}:\n"
-                f"// robot.setLoad({mass}, {{{metres}}}, {{Ixx, Ixy, Ixz, Ixy, Iyy, Iyz, Ixz, Iyz,"
-                " Izz});"
-            )
-        else:
-            robot = f"set_target_payload({mass}, [{metres}], [{', '.join(six)}])"
-            franka = f"robot.setLoad({mass}, {{{metres}}}, {{{', '.join(nine)}}});"
-        return {"COMAU": "\n".join(comau), "UR": robot, "Franka": franka}
+        return controller_settings(Load(self.body, with_centre, with_inertia))
 
     def as_json(self) -> dict[str, Any]:
         """Return all values as JSON data; infinite ends and undetermined values are null."""
