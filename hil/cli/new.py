@@ -10,6 +10,7 @@ import typer
 
 from hil.campaign import stop_on_interrupt
 from hil.cli.arguments import (
+    ARM,
     ConventionOption,
     DhOption,
     JsonOption,
@@ -37,7 +38,7 @@ PORT = 1000
 
 
 def new(
-    urdf: Path | None = None,
+    urdf: Annotated[Path | None, typer.Option(rich_help_panel=ARM)] = None,
     dh: DhOption = None,
     convention: ConventionOption = None,
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("cell.toml"),

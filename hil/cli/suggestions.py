@@ -46,6 +46,7 @@ OTHER_COMMANDS: Final[Mapping[str, str]] = {
     **dict.fromkeys(("jog", "goto"), "move"),
     **dict.fromkeys(("execute", "start"), "run"),
     **dict.fromkeys(("excitation", "optimize", "optimise"), "design"),
+    **dict.fromkeys(("torque", "constants", "current"), "torque-constants"),
     **dict.fromkeys(("diff",), "compare"),
     **dict.fromkeys(("init",), "new"),
     **dict.fromkeys(("latency", "realtime"), "doctor"),
