@@ -1,7 +1,10 @@
 """Identification with default settings and an ordinary fit, on real and on degraded recordings.
 
 Run with ``python -m benchmarks.board [--data FOLDER] [--only NAME] [--short] [--degraded]
-[--json]``, where FOLDER holds the folders of recordings that `benchmarks/recordings` describes.
+[--json] [--page FILE]``, where FOLDER holds the folders of recordings that `benchmarks/recordings`
+describes. ``--fetch [FROM ...]`` collects these in FOLDER instead (`benchmarks.fetch`); ``--page
+docs/board.md`` writes the page (`benchmarks.board_page`), with ``--rows FILE`` from a saved line of
+JSON instead of measuring.
 With ``--short`` the first and the last 40 % of each log are fitted and its rest is predicted.
 
 Errors are ||tau - tau_hat|| / ||tau|| over all joints and every row of what is predicted, of the
@@ -22,6 +25,7 @@ copy without a fault, and the causes that the verdict names only with the fault.
 
 from __future__ import annotations
 
+import json
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -31,7 +35,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from benchmarks import parser_of, plain_fit, show
+from benchmarks.board_page import commit, write_page
 from benchmarks.degradations import CAUSES, DEGRADATIONS, EXPECTED, FITTED_ONLY, HARMLESS
+from benchmarks.fetch import FETCHED, fetch, show_fetched
 from benchmarks.identification_study import recorded, study
 from benchmarks.joint_log import JointLog
 from benchmarks.published import FITTED_SHARE, Published, Split, known
@@ -325,14 +331,30 @@ def summary_lines(figures: Mapping[str, Any]) -> Iterator[str]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, and print each row as it comes, then the line of JSON."""
     parser = parser_of(__doc__)
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of recordings")
+    parser.add_argument("--data", type=Path, help="folder of recordings")
     parser.add_argument(
         "--only", action="append", choices=[*known(), SIMULATED], help="may be repeated"
     )
     parser.add_argument("--short", action="store_true", help="fit 40 %% of a log, predict the rest")
     parser.add_argument("--degraded", action="store_true", help="spoilt copies as well")
+    parser.add_argument(
+        "--fetch", nargs="*", type=Path, metavar="FROM",
+        help="collect the recordings in the folder of --data, from these folders and packages",
+    )  # fmt: skip
+    parser.add_argument("--page", type=Path, help="write the page of all arms to this file")
+    parser.add_argument("--rows", type=Path, help="with --page: a saved line of JSON")
     options = parser.parse_args(arguments)
+    if options.rows is not None:
+        if options.page is None:
+            parser.error("--rows needs --page FILE")
+        write_page(options.page, json.loads(options.rows.read_text("utf-8")))
+        return
     wanted = options.only or [*known(), SIMULATED]
+    if options.fetch is not None:
+        names = [name for name in wanted if name != SIMULATED]
+        show_fetched(fetch(names, options.fetch, options.data or FETCHED), options.json)
+        return
+    options.data = options.data or (DATA if DATA.is_dir() else FETCHED)
     rows: list[Row] = []
     degraded: list[Row] = []
     for name in wanted:
@@ -345,9 +367,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
             degraded.append(one)
             if not options.json:
                 print(_line(one), flush=True)
-    figures = summary(rows, degraded)
+    figures = summary(rows, degraded) | {"commit": commit()}
     if not options.json:
         print("\n".join(summary_lines(figures)))
+    if options.page is not None:
+        write_page(options.page, figures)
     show(figures, only_json=True)
 
 

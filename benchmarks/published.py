@@ -59,6 +59,24 @@ class Split(_Table):
         return f"{self.fitted}: {self.part} {mine} % to {other} {rest} %"
 
 
+class Source(_Table):
+    """Where the recordings of a robot are from.
+
+    Attributes:
+        arm: its name, axes, rate and kind of torque.
+        repository: of its publishers on GitHub.
+        licence: by its SPDX name.
+        converted: whether the files are not as published, but tables made from those.
+        sha256: digest of each file that is needed, by name; also of a URDF in a package.
+    """
+
+    arm: str
+    repository: str
+    licence: str
+    converted: bool = False
+    sha256: dict[str, str]
+
+
 class Published(_Table):
     """One robot and its logs.
 
@@ -73,6 +91,7 @@ class Published(_Table):
         joint_names: name in a bag by name in the URDF, where they differ.
         locked: position of joints that were not recorded [rad or m].
         smooth_bandwidth: see `benchmarks.real_data` [Hz].
+        source: where the recordings are from.
     """
 
     folder: str | None = None
@@ -85,6 +104,7 @@ class Published(_Table):
     joint_names: dict[str, str] = {}
     locked: dict[str, float] = {}
     smooth_bandwidth: float | None = None
+    source: Source
 
     @classmethod
     def named(cls, name: str) -> Self:
@@ -113,13 +133,16 @@ class Published(_Table):
         Raises:
             SystemExit: the package is not installed, or has no such file.
         """
-        path = folder / self.urdf if self.urdf_package is None else self._packaged()
+        path = folder / self.urdf
+        if self.urdf_package is not None and not path.exists():
+            path = self._packaged()
         text = path.read_text(encoding="utf-8")
         for ours, theirs in self.joint_names.items():
             text = text.replace(f'"{ours}"', f'"{theirs}"')
         return text
 
-    def _packaged(self) -> Path:
+    def installed_urdf(self) -> Path | None:
+        """The URDF in an installed package; None if it has none, or is not installed."""
         try:
             files = importlib.metadata.files(str(self.urdf_package)) or ()
         except importlib.metadata.PackageNotFoundError:
@@ -127,6 +150,12 @@ class Published(_Table):
         for file in files:
             if file.name == self.urdf:
                 return Path(str(file.locate()))
+        return None
+
+    def _packaged(self) -> Path:
+        found = self.installed_urdf()
+        if found is not None:
+            return found
         raise SystemExit(f"{self.urdf} is not in the package {self.urdf_package}; is it installed?")
 
     def imported(self, log: str, folder: Path, output: Path) -> Path:

@@ -22,6 +22,7 @@ from hil.progress import say
 from hil.recording import archive_path
 from hil.recording import record as record_motion
 
+Kind = Annotated[Literal["excitation", "validation", "standstill"], typer.Option(metavar="USE")]
 LINE_PERIOD = 5.0
 """Time between two lines, s."""
 
@@ -31,9 +32,7 @@ def record(
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/record"),
     duration: Annotated[float | None, typer.Option(min=0.001)] = None,
     wait: Annotated[float | None, typer.Option(min=0.0)] = None,
-    kind: Annotated[
-        Literal["excitation", "validation", "standstill"], typer.Option(metavar="USE")
-    ] = "excitation",
+    kind: Kind = "excitation",
     live: Annotated[str | None, typer.Option(metavar="HOST:PORT")] = None,
     quiet: QuietOption = False,
     json: JsonOption = False,

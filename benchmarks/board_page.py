@@ -1,0 +1,204 @@
+"""The page of all real arms, `docs/board.md`, from the rows of `benchmarks.board` and a table.
+
+Arms whose recordings are not here are in `benchmarks/elsewhere.toml`, with the figures that others
+measured.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import textwrap
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from benchmarks.published import Published
+
+ELSEWHERE: Final = Path(__file__).with_name("elsewhere.toml")
+BEHIND: Final = 1.0  # ratio to an ordinary fit from which a row is a loss
+_HEAD: Final = (
+    "| arm, source | split | ordinary | nominal | hil | ratio | inside | s |\n"
+    "|---|---|---|---|---|---|---|---|"
+)
+
+
+class Line(BaseModel):
+    """A row of the page; errors are shares of the torque, over all joints and every row.
+
+    Attributes:
+        arm: name, axes, rate, kind of torque.
+        source: repository and licence.
+        split: what is fitted and what is predicted.
+        plain: error of an ordinary fit.
+        nominal: of the URDF's model as it is; None if it has no masses, or was not measured.
+        nominal_friction: the same with rotor inertia, friction and offset fitted.
+        hil: by default settings.
+        inside: share of held-out means inside their 95 % intervals, or words for it.
+        seconds: of the processor, or words for it.
+        commit: at which it was measured elsewhere; None: here.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    arm: str
+    source: str
+    split: str
+    plain: float
+    nominal: float | None = None
+    nominal_friction: float | None = None
+    hil: float
+    inside: float | str | None = None
+    seconds: float | str | None = None
+    commit: str | None = None
+
+    @property
+    def ratio(self) -> float:
+        """Error over that of an ordinary fit."""
+        return self.hil / self.plain
+
+    @property
+    def is_loss(self) -> bool:
+        """Whether an ordinary fit, or the nominal model with or without friction, was better."""
+        others = [one for one in (self.nominal, self.nominal_friction) if one is not None]
+        return self.ratio > BEHIND or any(self.hil > one for one in others)
+
+    def text(self) -> str:
+        """The row in Markdown."""
+        nominal = [_percent(one) for one in (self.nominal, self.nominal_friction) if one]
+        mark = "" if self.commit is None else f" (measured elsewhere, {self.commit})"
+        inside = _percent(self.inside) if isinstance(self.inside, float) else self.inside
+        seconds = f"{self.seconds:.0f}" if isinstance(self.seconds, float) else self.seconds
+        cells = (
+            f"{self.arm}; {self.source}{mark}",
+            self.split,
+            _percent(self.plain),
+            " / ".join(nominal) or "-",
+            _percent(self.hil),
+            f"{self.ratio:.2f}",
+            inside or "-",
+            seconds or "-",
+        )
+        return f"| {' | '.join(cells)} |"
+
+
+def line_of(row: Mapping[str, Any]) -> Line:
+    """The line of a row of the board."""
+    source = Published.named(row["data"]).source
+    return Line(
+        arm=source.arm,
+        source=f"{source.repository}, {source.licence}",
+        split=row["split"],
+        plain=row["plain"],
+        nominal=row["nominal"],
+        nominal_friction=row["nominal + friction"],
+        hil=row["hil"],
+        inside=row["inside"],
+        seconds=row["seconds"]["hil"],
+    )
+
+
+def elsewhere() -> list[Line]:
+    """The lines of arms that others measured."""
+    table = tomllib.loads(ELSEWHERE.read_text("utf-8"))
+    return [Line(**{"commit": table["commit"], **entry}) for entry in table["row"]]
+
+
+def page_text(rows: Sequence[Mapping[str, Any]], commit: str) -> str:
+    """The page, of rows that were measured at a commit."""
+    here = [line_of(row) for row in rows]
+    every = sorted([*here, *elsewhere()], key=lambda line: -line.ratio)
+    losses = [line for line in every if line.is_loss]
+    others = [line for line in every if not line.is_loss]
+    return "\n".join([*_introduction(here, losses, commit), *_tables(losses, others)])
+
+
+_TEXT: Final = """\
+Every recording of a real arm that was ever tried, losses first. An error is ‖τ - τ̂‖ / ‖τ‖ over
+all joints and every row of what was predicted, of the torque as it was recorded.
+
+*hil* has its default settings. *Ordinary* is an ordinary fit (`benchmarks/plain_fit.py`: base
+parameters, Coulomb and viscous friction, offset, rotor inertia; its cut-off chosen on the fitted
+part). *Nominal* is the URDF's model as it is, and behind the stroke with fitted rotor inertia and
+friction. *Ratio* is hil over ordinary: above 1 is a loss. *Inside* is the share of held-out means
+of torque in their 95 % intervals, *s* seconds of processor.
+
+Measured at {commit} on {splits} splits of real arms ({arms} arms): geometric mean of the ratios
+{mean:.2f}, {behind} of {splits} behind an ordinary fit or the nominal model. The page is renewed by
+"""
+_AFTER: Final = """\
+`--fetch` takes what the named folders and the package index offer, by SHA-256
+(`benchmarks/recordings/*.toml`), and names the repository of what it cannot reach. The index
+offers only URDFs (`example-robot-data`): recordings come from a folder.
+
+Rows *measured elsewhere* are of arms whose recordings are reserved for acceptance and are not
+here. Their figures are those reported for the commit in the row (`benchmarks/elsewhere.toml`),
+which is older than the prior on the bodies, and were not repeated since; ranges are those of a
+group of rows. Sources that the report does not name are *not named*.
+"""
+_COMMANDS: Final = """\
+```text
+python -m benchmarks.board --fetch FROM --data DIR   # collects the recordings
+python -m benchmarks.board --data DIR --page docs/board.md
+```"""
+_WIDTH: Final = 110
+
+
+def _introduction(here: Sequence[Line], losses: Sequence[Line], commit: str) -> Iterator[str]:
+    yield "# All real arms"
+    yield ""
+    yield from _wrapped(
+        _TEXT.format(
+            commit=commit,
+            arms=len({line.arm for line in here}),
+            splits=len(here),
+            mean=float(np.exp(np.mean([np.log(line.ratio) for line in here]))),
+            behind=sum(line.commit is None for line in losses),
+        )
+    )
+    yield _COMMANDS
+    yield ""
+    yield from _wrapped(_AFTER)
+
+
+def _wrapped(text: str) -> Iterator[str]:
+    for paragraph in text.strip().split("\n\n"):
+        yield textwrap.fill(paragraph, _WIDTH, break_on_hyphens=False)
+        yield ""
+
+
+def _tables(losses: Sequence[Line], others: Sequence[Line]) -> Iterator[str]:
+    for title, lines in (
+        ("## Behind an ordinary fit or the nominal model", losses),
+        ("## Not behind", others),
+    ):
+        yield title
+        yield ""
+        if lines:
+            yield _HEAD
+            yield from (line.text() for line in lines)
+        else:
+            yield "None."
+        yield ""
+
+
+def _percent(share: float) -> str:
+    percent = 100.0 * share
+    return f"{percent:.3g} %" if percent < 1e4 else f"{percent:.0e} %"
+
+
+def write_page(path: Path, figures: Mapping[str, Any]) -> None:
+    """Write the page of what the line of JSON holds."""
+    path.write_text(page_text(figures["rows"], figures["commit"]), encoding="utf-8")
+
+
+def commit() -> str:
+    """The commit of this checkout, with + if files differ from it."""
+    command = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=Path(__file__).parent, check=False
+    )
+    return done.stdout.strip() or "an unknown commit"
