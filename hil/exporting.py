@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from hil.archive import open_archive
@@ -40,6 +41,7 @@ from identification.export.simulators import (
     Format,
     Ranges,
     compare,
+    pinocchio_arm,
     read_back,
 )
 from identification.model.motion import Motion
@@ -126,6 +128,16 @@ def _arm(cell: Cell, standard: Array, values: Array, load: Array) -> Arm:
     limits = described if cell.file.limits is None else cell.joint_limits
     ranges = Ranges(limits.lower, limits.upper, limits.velocity, efforts)
     return Arm(cell.urdf, cell.model, standard, values, ranges, load)
+
+
+def pinocchio_of(found: Identification) -> pin.Model:
+    """Return the arm of an identification as pinocchio's model, with armature and friction.
+
+    Raises:
+        InputError: there are no physically consistent parameters.
+    """
+    arm = arm_of(found.cell, consistent_of(found), found.prepared.fitted)
+    return pinocchio_arm(arm, found.cell.name)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from hil.annotate import annotate as write_annotated
 from hil.errors import InputError
-from hil.exporting import arm_of, consistent_of
 from hil.files import make_folder, write_output
 from hil.identify.options import Options
 from hil.identify.run import Identification, identify_paths
@@ -30,7 +29,6 @@ from hil.outcome import write_outcome
 from hil.output_folder import SOURCES, folder_beside, sources_text
 from hil.progress import Reporter, Silent
 from hil.results import Results
-from identification.export.simulators import pinocchio_arm
 from identification.validation.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -124,9 +122,9 @@ class IdentifiedArm:
         Raises:
             InputError: there are no physically consistent parameters.
         """
-        found = self.identification
-        arm = arm_of(found.cell, consistent_of(found), found.prepared.fitted)
-        return pinocchio_arm(arm, found.cell.name)
+        from hil.exporting import pinocchio_of  # its formats take time to load
+
+        return pinocchio_of(self.identification)
 
     def plot(self) -> Figure:
         """Draw measured torque of the held-out motion, and that of identified and nominal model."""
