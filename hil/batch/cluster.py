@@ -86,7 +86,7 @@ class Cluster:
         workers: number of local processes; by default one for each core that this process may use,
             and none for few archives.
         scheduler: address of a running scheduler, whose workers are used.
-        reporter: is told which workers there are, and the address of the dashboard.
+        reporter: reports which workers there are, and the address of the dashboard.
     """
 
     def __init__(
