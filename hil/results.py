@@ -18,6 +18,7 @@ from hil.reading import parse_json, read_text
 from identification.excitation.criteria import Criteria
 from identification.selection.essential import EliminationStep
 from identification.selection.inner_prediction import Choice
+from identification.text import percentage
 from identification.validation.finding import Finding
 
 
@@ -344,11 +345,11 @@ class FittedResult(Frozen):
         smoothed = self.smoothed_overall_relative_error
         text = (
             "on the fitted motion (in-sample) the torque error is"
-            f" {self.overall_relative_error:.2%} over all joints,"
-            f" {self.all_rows_relative_error:.2%} over all rows including standstill"
+            f" {percentage(self.overall_relative_error, 2)} over all joints,"
+            f" {percentage(self.all_rows_relative_error, 2)} over all rows including standstill"
         )
         if smoothed is not None:
-            text += f", and {smoothed:.2%} of the smoothed torque over all rows"
+            text += f", and {percentage(smoothed, 2)} of the smoothed torque over all rows"
         return text
 
 
@@ -366,9 +367,10 @@ class CalibrationResult(Frozen):
     def words(self) -> str:
         """Summary, without full stop."""
         return (
-            f"{self.inside:.1%} of {self.means} held-out means of torque ({self.block:g} s, per"
-            f" joint) are inside their 95% intervals; with intervals for white residuals"
-            f" {self.white_inside:.0%}"
+            f"{percentage(self.inside, 1)} of {self.means} held-out means of torque "
+            f"({self.block:g} s, per"
+            f" joint) are inside their 95 % intervals; with intervals for white residuals"
+            f" {percentage(self.white_inside)}"
         )
 
 

@@ -44,6 +44,7 @@ from identification.rollout.comparison import (
 from identification.rollout.servo import NoServoError, Servo, identify_servo
 from identification.rollout.simulation import Feedback
 from identification.rollout.windows import STEP, windows_of
+from identification.text import percentage
 
 Array = NDArray[np.float64]
 
@@ -184,12 +185,13 @@ class RolloutResult(Frozen):
             unstable = sum(arm.unstable for arm in self.sample_errors)
             if unstable:
                 lines.append(f"samples: {unstable} of their windows are unstable")
-            shares = "".join(f"{float(np.mean(at)):>10.1%}" for at in self.inside)
+            shares = "".join(f"{percentage(float(np.mean(at)), 1):>10}" for at in self.inside)
             lines.append(_row("measured positions in their 95 % band", shares))
             if not _WANTED[0] <= self.band <= _WANTED[1]:
                 lines.append(
-                    f"warning: {self.band:.1%} at {self.horizons[_BAND]:g} s is not"
-                    f" {_WANTED[0]:.0%} to {_WANTED[1]:.0%}: do not rely on this band"
+                    f"warning: {percentage(self.band, 1)} at {self.horizons[_BAND]:g} s is not"
+                    f" {percentage(_WANTED[0])} to {percentage(_WANTED[1])}: do not rely on this "
+                    "band"
                 )
         return [*lines, self.message]
 

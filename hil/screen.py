@@ -34,6 +34,7 @@ from hil.campaign.operator import REFUSED, MotionProgress, OperatorRequest, RunS
 from hil.cell import Cell
 from hil.progress import Silent, Task, put
 from hil.terminal_text import plural, printable
+from identification.text import percentage
 
 # --- keys
 
@@ -174,11 +175,11 @@ def status_line(status: RunStatus) -> str:
     """Return the progress of a run in one line."""
     parts, motion = [f"{status.phase} {status.number} of {status.total}"], status.motion
     if motion is not None:
-        held = "held" if motion.held else f"override {motion.override:.0%}"
+        held = "held" if motion.held else f"override {percentage(motion.override)}"
         parts += [_times(motion), held, _packets(motion)]
         shares = {"following error": motion.following_share, "current": motion.current_share}
         parts += [
-            f"{what} {share.max():.0%} of its limit"
+            f"{what} {percentage(share.max())} of its limit"
             for what, share in shares.items()
             if share is not None
         ]
@@ -231,7 +232,7 @@ def _joint_cells(motion: MotionProgress, joint: int) -> tuple[str | Text, ...]:
 
 def _share(share: float) -> Text:
     colour = "bold red" if share > 1.0 else "yellow" if share > WARNING else "green"
-    return Text(f"{share:.0%}", style=colour)
+    return Text(percentage(share), style=colour)
 
 
 def clock(seconds: float) -> str:
@@ -269,8 +270,8 @@ def ask(console: Console, title: str, found: DryRunRecord, stop: Stop) -> bool:
     word = " ".join(found.against_gravity) or "yes"
     known = f"If you know the cause, type {word}" if found.against_gravity else "Type yes"
     question = (
-        f"Did {what} move as it should, with nothing in its way at {found.override:.0%} of full "
-        f"speed? {known} to accept; anything else ends the run: "
+        f"Did {what} move as it should, with nothing in its way at {percentage(found.override)} of "
+        f"full speed? {known} to accept; anything else ends the run: "
     )
     return confirmed(console, question, word, stop)
 
@@ -448,9 +449,11 @@ class Screen:
             reason = f": {self._messages[-1]}" if self._messages else ""
             state.append(printable(f"no news for {self.age:.0f} s{reason}  "), style="bold red")
             motion = None
-        state.append(f"override {request.override if motion is None else motion.override:.0%}")
+        state.append(
+            f"override {percentage(request.override if motion is None else motion.override)}"
+        )
         if motion is not None and motion.rate is not None:
-            state.append(f", now {motion.rate:.0%}")
+            state.append(f", now {percentage(motion.rate)}")
         if motion is not None:
             state.append(f"   {motion.state.name.lower().replace('_', ' ')}", style="dim")
         rows: list[RenderableType] = [top, state]

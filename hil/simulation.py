@@ -14,6 +14,7 @@ from drivers.transports.simulated import SimulatedTransport
 from hil.campaign.link import VirtualLink
 from hil.cell import Cell, CellError
 from hil.motion_checks import collision_checker
+from identification.text import percentage
 from sim_fixtures import (
     ControllerSettings,
     PlantTruth,
@@ -208,9 +209,10 @@ def simulated_provenance(cell: Cell, effects: bool) -> dict[str, str]:
     """Return the metadata of a simulated archive."""
     sizes = unmodelled_effects(cell) if effects else UnmodelledEffects()
     elasticity = ", ".join(f"{compliance:g}" for compliance in sizes.elasticity)
+    ripple, drift = percentage(sizes.torque_ripple), percentage(sizes.friction_drift)
     described = {
-        f"torque ripple of {sizes.torque_ripple:.0%} of the Coulomb torque": sizes.torque_ripple,
-        f"friction drift of {sizes.friction_drift:.0%} from cold to hot": sizes.friction_drift,
+        f"torque ripple of {ripple} of the Coulomb torque": sizes.torque_ripple,
+        f"friction drift of {drift} from cold to hot": sizes.friction_drift,
         f"elasticity of {elasticity} rad/(N·m)": any(sizes.elasticity),
         f"delay of {1e3 * sizes.delay:g} ms": sizes.delay,
     }

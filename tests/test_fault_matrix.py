@@ -19,6 +19,7 @@ from hil.campaign.intervals import START_TOLERANCE, player_of
 from hil.cell import Cell
 from hil.cell.text import with_values
 from hil.simulation import controller_settings, simulated_controller
+from identification.text import percentage
 from planner import PiecewiseCubic, plan
 from sim_fixtures.faults import parse_fault, split_faults
 from sim_fixtures.ns16 import CELL_PATH
@@ -37,7 +38,7 @@ from tests.fault_matrix.faulty_runs import (
 )
 
 EXPECTED = expected(SITUATIONS[0])
-SHARES = [f"{share:.0%}".replace("%", " %") for share in SPEEDS]
+SHARES = [percentage(share) for share in SPEEDS]
 AT_SPEED = expected(SHARES[0])
 
 

@@ -25,6 +25,7 @@ from hil.cell import Cell
 from hil.errors import ArchiveError
 from identification.signals.recording import stuck
 from identification.signals.smoothing import STANDSTILL_WINDOW
+from identification.text import percentage
 from planner import FourierSeries, PiecewiseCubic
 
 from .folder import CampaignFolder
@@ -117,7 +118,8 @@ def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> Problem | 
     wanted = int(np.ceil(trajectory.duration / cell.period - 1e-6))
     if executed.missed > MISSED_SHARE * wanted:
         return Problem(
-            f"{executed.missed} of {wanted} packets were missed; {MISSED_SHARE:.0%} are allowed"
+            f"{executed.missed} of {wanted} packets were missed; {percentage(MISSED_SHARE)} are "
+            "allowed"
         )
     high = np.abs(executed.current) >= SATURATED * cell.drive_train.current_limit
     for joint, name in enumerate(cell.joint_names):
@@ -214,8 +216,8 @@ class RepetitionCheck:
             if new[row, joint] > bound[joint]:
                 return Problem(
                     f"the {what} of {self._cell.joint_names[joint]} differs from that of the "
-                    f"{len(self._earlier)} repetitions before by {new[row, joint]:.2%} of {scale} "
-                    f"(rms); {bound[joint]:.2%} are allowed",
+                    f"{len(self._earlier)} repetitions before by {percentage(new[row, joint], 2)} "
+                    f"of {scale} (rms); {percentage(bound[joint], 2)} are allowed",
                     differs=True,
                 )
         return None

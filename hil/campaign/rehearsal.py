@@ -38,6 +38,7 @@ from hil.version import software
 from identification.distributions import normal_limit
 from identification.errors import IdentificationError
 from identification.signals.recording import RecordingError
+from identification.text import percentage
 from identification.validation.prediction import pooled_error, prediction_error
 from sim_fixtures import ServoSettings, SimulationError, UnmodelledEffects
 
@@ -256,7 +257,8 @@ def too_far_without_a_packet(cell: Cell) -> str | None:
     return (
         f"no packet is lost: at full speed the motor of {cell.joint_names[motor]} turns by "
         f"{steps[motor]:.2g} revolutions in a cycle of {cell.controller.cycle_ms} ms; the guard "
-        f"allows {share[motor]:.2g} ({LEAP_FRACTION:.0%} of following_error in [drive_train]), so "
+        f"allows {share[motor]:.2g} ({percentage(LEAP_FRACTION)} of following_error in "
+        "[drive_train]), so "
         "that a packet lost at that speed ends the motion on the real arm; a shorter cycle or a "
         "lower velocity_deg in [limits] avoids this"
     )
@@ -294,8 +296,8 @@ def _simulation(
         table["current_resolution"] = RESOLUTION_SHARE * weakest
         assumed.append(
             f"the current has a noise of {table['current_noise']:.3g} A rms and a resolution of "
-            f"{table['current_resolution']:.3g} A ({NOISE_SHARE:.1%} and {RESOLUTION_SHARE:.1%} of "
-            "the weakest motor's limit)"
+            f"{table['current_resolution']:.3g} A ({percentage(NOISE_SHARE, 1)} and "
+            f"{percentage(RESOLUTION_SHARE, 1)} of the weakest motor's limit)"
         )
     if given is None or not (
         given.torque_ripple or given.friction_drift or any(given.elasticity) or given.delay
@@ -303,9 +305,10 @@ def _simulation(
         effects = _ordinary_effects(cell, np.array(planted["rotor_inertia"]))
         table |= asdict(effects) | {"elasticity": list(effects.elasticity)}
         assumed.append(
-            f"effects that the model leaves out have default sizes: torque ripple of "
-            f"{effects.torque_ripple:.0%} of the Coulomb torque, friction that falls by "
-            f"{effects.friction_drift:.0%}, springs in the main axes, {1e3 * effects.delay:g} ms "
+            "effects that the model leaves out have default sizes: torque ripple of "
+            f"{percentage(effects.torque_ripple)} of the Coulomb torque, friction that falls by "
+            f"{percentage(effects.friction_drift)}, springs in the main axes, "
+            f"{1e3 * effects.delay:g} ms "
             "of delay"
         )
     unknown = [key for key in ("rotor_inertia", "coulomb", "viscous") if not any(planted[key])]
@@ -377,8 +380,8 @@ def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> 
         f"current ({name})",
         worst,
         bound,
-        f"{name}: the largest current is {worst:.0%} of its limit (motor of "
-        f"{cell.joint_names[motor]}, {where}), at most {bound:.0%} is allowed",
+        f"{name}: the largest current is {percentage(worst)} of its limit (motor of "
+        f"{cell.joint_names[motor]}, {where}), at most {percentage(bound)} is allowed",
         _motion_remedy(
             cell,
             folder.archives / where,
@@ -401,14 +404,14 @@ def of_motions(cell: Cell, folder: CampaignFolder, name: str, failure: str) -> C
     joint = int(np.argmax(shares[fastest]))
     share, where = float(shares[fastest][joint]), entries[fastest].name
     if share <= MOST_SPEED:
-        text = f"{name}: every motion was completed, at up to {share:.0%} of a speed limit"
+        text = f"{name}: every motion was completed, at up to {percentage(share)} of a speed limit"
         return criterion(f"motions ({name})", 0.0, 0.0, text)
     return criterion(
         f"motions ({name})",
         1.0,
         0.0,
-        f"{name}: {cell.joint_names[joint]} moved at {share:.0%} of its speed limit ({where}), at "
-        f"most {MOST_SPEED:.0%} is allowed",
+        f"{name}: {cell.joint_names[joint]} moved at {percentage(share)} of its speed limit "
+        f"({where}), at most {percentage(MOST_SPEED)} is allowed",
         _motion_remedy(
             cell,
             folder.archives / where,

@@ -14,6 +14,7 @@ from hil.errors import HilError
 from hil.reading import path_exists
 from hil.results import ConductResult, Results, StepResult
 from hil.terminal_text import plural
+from identification.text import percentage
 
 from .dry_run import DryRunRecord
 from .folder import CampaignFolder
@@ -162,13 +163,14 @@ def _accepted(found: DryRunRecord | None) -> Step:
         words = f"done ({found.duration:.0f} s), but not accepted{but}"
         return Step("next", words, f"run {{}} --accept-dry-run{names}")
     shares = zip(found.joint_names, found.current_share, strict=True)
-    currents = ", ".join(f"{joint} {share:.0%}" for joint, share in shares)
+    currents = ", ".join(f"{joint} {percentage(share)}" for joint, share in shares)
     return Step(
         "done",
         f"accepted by {found.accepted.by} at {found.accepted.at}",
         details=(
             f"largest current, of its limit: {currents}",
-            f"{plural(len(found.archives), 'motion')} at {found.override:.0%} of their speed",
+            f"{plural(len(found.archives), 'motion')} at {percentage(found.override)} of their "
+            "speed",
             f"{plural(found.missed, 'packet')} missed, {plural(found.late, 'reply')} late",
             *(f"{warning}; it was accepted by name" for warning in found.warnings),
         ),

@@ -20,6 +20,7 @@ from hil.cell import Cell
 from hil.files import write_files
 from hil.version import software
 from identification.excitation import Excitation
+from identification.text import percentage
 from planner import Trajectory, to_csv
 
 from .plan import CampaignPlan, plan_around
@@ -99,7 +100,7 @@ def trajectory_files(cell: Cell, plan: CampaignPlan) -> dict[str, str]:
 def header_of(arm: str, name: str, motion: Trajectory) -> tuple[str, ...]:
     """Return arm, duration and origin of a motion, one line each."""
     versions = software()
-    at = f" at {motion.speed:.0%} of the speed" if isinstance(motion, SlowedMotion) else ""
+    at = f" at {percentage(motion.speed)} of the speed" if isinstance(motion, SlowedMotion) else ""
     return (
         f"{name}: a motion for {' '.join(arm.split())}",
         f"duration: {motion.duration:.2f} s{at}",

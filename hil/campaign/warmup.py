@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.cell import Cell
+from identification.text import percentage
 from planner import FourierSeries, PiecewiseCubic
 
 from .folder import load_record, save_record
@@ -134,8 +135,8 @@ class WarmUpRecord:
         """Its state in a sentence; it has had a motion."""
         done, change = len(self.motions), self.changes[-1]
         return (
-            f"warm-up: friction changes by {change:.2%} a motion after {done} motions, below "
-            f"{self.threshold:.2%} the arm is warm: {self.outcome}"
+            f"warm-up: friction changes by {percentage(change, 2)} a motion after {done} motions, "
+            f"below {percentage(self.threshold, 2)} the arm is warm: {self.outcome}"
         )
 
     def rested(self, now: float) -> str:

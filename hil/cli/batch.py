@@ -23,6 +23,7 @@ from hil.errors import InputError
 from hil.files import convert_write_errors, make_folder
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import plural, printable
+from identification.text import percentage
 
 SOME_BROKEN: Final = 5
 """Exit status if some archives could not be used."""
@@ -115,8 +116,9 @@ def _line(one: BatchEstimate) -> str:
     named = ", ".join(text for text in (one.campaign, one.setup, one.when[:10]) if text)
     error = relative_error(one.estimate.noise_std, one.torque_rms, one.estimate.samples)
     unseen = relative_error(one.unseen_rms, one.unseen_torque_rms)
-    held_out = "" if math.isnan(unseen) else f", held out {unseen:.1%}"
-    return f"  {named}: {plural(one.repetitions, 'repetition')}, torque error {error:.1%}{held_out}"
+    held_out = "" if math.isnan(unseen) else f", held out {percentage(unseen, 1)}"
+    repetitions = plural(one.repetitions, "repetition")
+    return f"  {named}: {repetitions}, torque error {percentage(error, 1)}{held_out}"
 
 
 def _last(lines: Sequence[str]) -> Iterator[str]:

@@ -13,6 +13,7 @@ from hil.cli.arguments import JsonOption, QuietOption, print_json
 from hil.files import make_folder, write_files
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import printable
+from identification.text import unit_text
 
 CHANGED: Final = 5
 """Exit status with --fail-on-change: something has changed."""
@@ -52,7 +53,7 @@ def compare(
             for one in found.changed:
                 line = (
                     f"{one.parameter} in {one.campaign}:"
-                    f" {one.after:.4g} instead of {one.before:.4g} {one.unit}, change"
+                    f" {one.after:.4g} instead of {one.before:.4g} {unit_text(one.unit)}, change"
                     f" {one.change:+.3g} ± {one.half:.2g} (95 %), p {one.p_value:.1g}"
                 )
                 typer.echo(printable(line), err=True)

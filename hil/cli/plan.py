@@ -150,7 +150,7 @@ def _table(summary: Mapping[str, Any], start: Array, joint_names: Sequence[str])
     for number, target in enumerate([at_start, *summary["targets"]]):
         angles = "".join(f"{angle:{width}.2f}" for angle in target["target_deg"])
         how = target["how"]
-        fly = f", fly {target['fly_percent']:.0f}%" if how not in ("start", "stopped") else ""
+        fly = f", fly {target['fly_percent']:.0f} %" if how not in ("start", "stopped") else ""
         lines.append(
             f"{number:6d}{angles}{target['time']:9.3f}{target['distance_deg']:10.3f}  {how}{fly}"
         )

@@ -12,6 +12,7 @@ import typer
 
 from hil.progress import say
 from hil.results import JointJudgement, Results
+from identification.text import percentage
 
 NOT_GOOD = 5
 """Exit status of a command whose model is not good."""
@@ -99,4 +100,4 @@ def sentences(results: Results, *, quiet: bool = False) -> list[str]:
 def _percent(share: float | None) -> str:
     if share is None or math.isnan(share):
         return _MISSING
-    return f"{share:.2%}" if abs(share) < 0.1 else f"{share:.1%}"
+    return f"{percentage(share, 2)}" if abs(share) < 0.1 else f"{percentage(share, 1)}"

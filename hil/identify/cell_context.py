@@ -20,6 +20,7 @@ from identification.selection.inner_prediction import LOW_PASS
 from identification.signals.masks import SATURATED
 from identification.signals.recording import UNWRAPPED
 from identification.signals.samples import Samples
+from identification.text import percentage
 from identification.validation.evidence import CellContext
 from identification.validation.finding import Finding, joined
 from identification.validation.plausibility import (
@@ -244,7 +245,7 @@ def _resolution(prepared: Prepared) -> Iterator[Finding]:
         yield _condition(
             "resolution",
             f"the positions have a coarse resolution [rad or m]: {each}; more than"
-            f" {_MAX_ROUNDING:.0%} of the accelerations is rounding error",
+            f" {percentage(_MAX_ROUNDING)} of the accelerations is rounding error",
             "record positions with more digits, or identify with a lower --bandwidth",
         )
 

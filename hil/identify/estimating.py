@@ -59,6 +59,7 @@ from identification.factor.factor import (
 )
 from identification.selection.inner_prediction import Strength
 from identification.signals.samples import Samples
+from identification.text import percentage
 from identification.validation.calibration import Refit
 from identification.validation.finding import joined
 
@@ -131,7 +132,8 @@ def with_transmitted_load(prepared: Prepared) -> Prepared:
     notes = prepared.notes
     if not loaded.converged:
         notes += (
-            f"the friction that grows with load still changed the torque by {loaded.change:.1%} in"
+            "the friction that grows with load still changed the torque by "
+            f"{percentage(loaded.change, 1)} in"
             f" pass {loaded.passes}",
         )
     return replace(
@@ -392,7 +394,8 @@ def _robust(
 
     result, found = estimate_repetitions(model, fitted, fit), fits[-1]  # the last: all samples
     warnings = [
-        f"{found.outlying[joint]:.0%} of the rows of {model.joint_names[joint]} deviate by more "
+        f"{percentage(found.outlying[joint])} of the rows of {model.joint_names[joint]} deviate by "
+        "more "
         "than four standard deviations: an unmodelled effect rather than outliers, which a robust "
         "loss would hide; use --estimator wls"
         for joint in np.flatnonzero(found.doubtful)

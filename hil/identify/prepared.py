@@ -39,6 +39,7 @@ from identification.signals.samples import (
     Smoothed,
     prepare,
 )
+from identification.text import percentage
 from identification.validation.finding import Thresholds
 from planner.arrays import numbers
 
@@ -495,10 +496,10 @@ def _excluded(sources: Sources, masked: Mapping[str, NDArray[np.intp]], rows: in
     }
     if not shares:
         return []
-    parts = ", ".join(f"{share:.2%} {reason}" for reason, share in shares.items())
+    parts = ", ".join(f"{percentage(share, 2)} {reason}" for reason, share in shares.items())
     return [
-        f"of {total} rows (one joint at one sample) {1.0 - sum(shares.values()):.1%} were fitted; "
-        f"excluded: {parts}"
+        f"of {total} rows (one joint at one sample) {percentage(1.0 - sum(shares.values()), 1)} "
+        f"were fitted; excluded: {parts}"
     ]
 
 
@@ -532,7 +533,8 @@ def _require_slow_rows(stated: RobotModel, fitted: Sequence[Samples]) -> None:
         slow = np.concatenate(speeds) < 2.0 * (law.stribeck or math.inf)
         if slow.size and slow.mean() < 0.01:
             problem = (
-                f"{slow.mean():.2%} of the fitted rows of {stated.joint_names[joint]} are slower "
+                f"{percentage(slow.mean(), 2)} of the fitted rows of {stated.joint_names[joint]} "
+                "are slower "
                 f"than twice {law.stribeck:g} rad/s, too few to determine the Stribeck term"
             )
             remedy = "state a larger speed, or leave the term out: --friction coulomb,viscous"

@@ -30,6 +30,7 @@ from identification.signals.recording import (
     without_repeats,
 )
 from identification.signals.smoothing import standstill_variance
+from identification.text import percentage
 
 Array = NDArray[np.float64]
 
@@ -168,8 +169,8 @@ def gather_sources(
         tested_on = "the rest of the same motion"
         training, held_out = _split(training[0], split)
         warnings.append(
-            f"the first {split:.0%} of one recording were fitted and the rest was predicted;"
-            " another motion would be a stronger test"
+            f"the first {percentage(split)} of one recording were fitted and the rest was "
+            "predicted; another motion would be a stronger test"
         )
     elif not held_out:
         repeated = every.same_motion

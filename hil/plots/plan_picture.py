@@ -17,6 +17,7 @@ from hil.errors import InputError
 from hil.files import write_atomically
 from hil.plots import style
 from hil.report.drawing import label, thinned
+from identification.text import percentage
 from planner import JointLimits, Trajectory
 from planner.moves import MotionPlan
 
@@ -116,7 +117,11 @@ def draw_plan(
                 )  # fmt: skip
         figure.align_ylabels([row[0] for row in rows])
         duration, stopping = plan.duration, plan.duration_with_stops
-        share = f" ({duration / stopping:.1%} of the time with stops)" if stopping > 0.0 else ""
+        share = (
+            f" ({percentage(duration / stopping, 1)} of the time with stops)"
+            if stopping > 0.0
+            else ""
+        )
         count = np.unique([target.how for target in plan.targets[:-1]], return_counts=True)
         passed = ", ".join(f"{number} {how}" for how, number in zip(*count, strict=True))
         headline = " · ".join(filter(None, (title, f"{duration:.3f} s{share}", passed)))

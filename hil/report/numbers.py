@@ -67,14 +67,9 @@ def with_std(value: float | None, std: float | None) -> str:
     return f"{beside(value, std)} ± {significant(std, 2)}" if std > 0.0 else significant(value)
 
 
-def unit_text(unit: str) -> str:
-    """Replace blanks of a unit: N·m for `N m`."""
-    return unit.replace(" ", "·")
-
-
 def prose(text: str) -> str:
-    """Separate the per cent signs of a message from their numbers, as in the tables of a page."""
-    return re.sub(r"(?<=\d)%", "\u00a0%", text)
+    """Keep the per cent signs of a message on the line of their numbers."""
+    return re.sub(r"(?<=\d) ?%", "\u00a0%", text)
 
 
 def moments(text: str) -> str:

@@ -25,13 +25,14 @@ from markupsafe import Markup
 from hil.files import digest, user_cache
 from hil.report import numbers
 from hil.terminal_text import escape
+from identification.text import unit_text
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
 _STYLE: Final = "report.css"
 _SCRIPT: Final = "page.js"
 _FORMATS: Final = (
     *("significant", "fixed", "beside", "percent", "with_std"),
-    *("unit_text", "capitalised", "moments", "prose"),
+    *("capitalised", "moments", "prose"),
 )
 _STEERING: Final = re.compile(
     r"[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]"
@@ -66,6 +67,7 @@ def environment(*scripts: str) -> Environment:
     found.globals |= {"numbers": numbers, "numbering": numbering}
     for name in _FORMATS:
         found.filters[name] = getattr(numbers, name)
+    found.filters["unit_text"] = unit_text
     return found
 
 

@@ -35,6 +35,7 @@ from identification.factor.factor import (
     solve,
 )
 from identification.model.robot import RobotModel
+from identification.text import percentage
 
 Array = NDArray[np.float64]
 
@@ -163,7 +164,8 @@ def _reasons(
     return tuple(
         next(
             (words for holds, words in checks if holds[m]),
-            f"its relative standard deviation is {relative[m]:.0%}, limit {WORST_RELATIVE_STD:.0%}",
+            f"its relative standard deviation is {percentage(relative[m])}, limit "
+            f"{percentage(WORST_RELATIVE_STD)}",
         )
         for m in range(len(total))
     )

@@ -13,6 +13,7 @@ from identification.excitation.collision import CollisionChecker, Contact
 from identification.excitation.violation import Kind, Violation
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
+from identification.text import percentage
 from planner import FourierSeries, JointLimits, NotSmooth, PiecewiseCubic, Trajectory, check_rest
 from planner.limits import position_rounding
 from planner.piecewise_cubic import Extrema
@@ -159,7 +160,7 @@ class CurrentModel:
         usable = self.usable * self.current_limit
         found = _beyond("current", motors, self.current(torque), usable, motion)
         if self.usable < 1.0:
-            remedy = f"a motion may use {self.usable:.0%} of the motor's limit"
+            remedy = f"a motion may use {percentage(self.usable)} of the motor's limit"
             found = [replace(violation, remedy=remedy) for violation in found]
         if self.torque_limit is not None:
             found += _beyond("torque", joints, torque, self.torque_limit, motion)

@@ -29,6 +29,7 @@ from identification.factor.factor import (
     solve,
 )
 from identification.model.robot import RobotModel
+from identification.text import percentage
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -280,6 +281,6 @@ def _reason(steps: list[EliminationStep], cut: int, refused: tuple[str, ...], ru
     elif chosen.spread < rule.spread:
         text += f", less than {rule.spread:g}"
     return (
-        f"{text}. Error on the motion used for the choice: {full.held_out:.2%} with all"
-        f" parameters, {chosen.held_out:.2%} with these"
+        f"{text}. Error on the motion used for the choice: {percentage(full.held_out, 2)} with all"
+        f" parameters, {percentage(chosen.held_out, 2)} with these"
     )

@@ -15,6 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.signals.recording import GAP_STEPS, Recording, RecordingError
+from identification.text import percentage
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -70,8 +71,8 @@ class TimeBase:
         lines = [f"{self.samples} samples in {self.duration:.6g} s, {self.rate:.6g} Hz"]
         if self.largest_deviation > UNIFORM:
             lines.append(
-                f"uneven: steps scatter by {self.jitter:.1%} of the usual one, at most"
-                f" {self.largest_deviation:.0%}"
+                f"uneven: steps scatter by {percentage(self.jitter, 1)} of the usual one, at most"
+                f" {percentage(self.largest_deviation)}"
             )
         if self.repeated:
             lines.append(f"{self.repeated} samples repeat the time stamp before them")
@@ -211,7 +212,8 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
         if not certain or (share < 0.5 and not is_even):
             used += " (positions are inconclusive)"
         words.append(
-            f"the time stamps scatter by {0.0 if base.uniform else scattered.std():.1%} of a step;"
+            f"the time stamps scatter by {percentage(0.0 if base.uniform else scattered.std(), 1)} "
+            "of a step;"
             f" share confirmed by the positions: {share:.2f} ± {deviation:.1g}; high-frequency"
             f" residual in multiples of noise: {residuals[0]:.3g} with the stamps,"
             f" {residuals[1]:.3g} with even times; used: {used}"

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.text import filled, percentage
 from identification.validation.causes import Kind
 from identification.validation.evidence import SIGMAS, Evidence
 from identification.validation.finding import (
@@ -107,14 +108,14 @@ def _measure(names: Sequence[str], evidence: Evidence) -> str:
         return "no torque error was measured"
     worst = int(np.nanargmax(error.relative))
     text = (
-        f"{'in-sample ' if evidence.in_sample else ''}torque error {error.overall:.1%} over all"
-        f" axes, {error.relative[worst]:.1%} at worst ({names[worst]})"
+        f"{'in-sample ' if evidence.in_sample else ''}torque error {percentage(error.overall, 1)} "
+        f"over all axes, {percentage(error.relative[worst], 1)} at worst ({names[worst]})"
     )
     if floor := evidence.floor:
         times = error.overall / floor
         # The floor is an estimate, from the fast part of the residual.
         ratio = f"{times:.1f} times the" if times >= 1.05 else "within the estimated"
-        text += f"; {ratio} noise floor of {floor:.1%}"
+        text += f"; {ratio} noise floor of {percentage(floor, 1)}"
     return text
 
 
@@ -340,7 +341,8 @@ def _residual_facts(checks: ResidualChecks, facts: Facts, evidence: Evidence) ->
             angle = ("rad" if turns else "m") + ("/s" if name == "speed" else "")
             unit = "N·m" if turns else "N"
             worst.append(
-                f"({error:+.3g} {unit} about {at:.2g} {angle}, {share[j]:.1%} of its torque)"
+                f"({error:+.3g} {unit} about {at:.2g} {angle}, {percentage(share[j], 1)} of its "
+                "torque)"
             )
         found |= {f"over_{name}": joints, f"not_over_{name}": not joints.any()}
         found[f"worst_{name}"] = np.array(worst, dtype=np.object_)
@@ -394,9 +396,9 @@ def _filled(template: str, facts: Facts, names: Sequence[str], joints: Sequence[
                 for j in joints
             )
             texts = zip(joints, each, strict=True)
-            parts[k] = joined([f"{names[j]} {part.format(**values)}" for j, values in texts])
+            parts[k] = joined([f"{names[j]} {filled(part, **values)}" for j, values in texts])
         else:
-            parts[k] = part.format(**facts)
+            parts[k] = filled(part, **facts)
     return "".join(parts)
 
 
@@ -589,7 +591,7 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
          " the torque, drive settings; identify the recordings of each state separately", "cause"),
     _Row("friction", {"wrong": "much_warmer"},
          "friction on {on} differs from the estimate: <{change:+.0%}>, beyond the"
-         f" {FRICTION_CHANGE:.0%} that gear temperature causes; this explains the error of"
+         f" {percentage(FRICTION_CHANGE)} that gear temperature causes; this explains the error of"
          " {friction_axes}",
          _WARMER, "cause"),
     _Row("friction", {"doubtful": "warmer"},

@@ -92,6 +92,35 @@ class TestWords:
         assert not INDEX.search(page.read_text("utf-8"))
 
 
+def fields_with_percent(tree: ast.AST) -> Iterator[ast.FormattedValue]:
+    """Fields of f-strings with a per cent sign at once behind the number."""
+    for text in (node for node in ast.walk(tree) if isinstance(node, ast.JoinedStr)):
+        for part, after in zip(text.values, [*text.values[1:], None], strict=True):
+            if isinstance(part, ast.FormattedValue):
+                spec = ast.unparse(part.format_spec) if part.format_spec is not None else ""
+                is_sign = isinstance(after, ast.Constant) and str(after.value).startswith("%")
+                if is_sign or spec.rstrip("'\"").endswith("%"):
+                    yield part
+
+
+class TestPercentages:
+    @pytest.mark.parametrize("package", PACKAGES)
+    def test_messages_have_a_space_before_the_sign(self, package: str) -> None:
+        wrong: list[str] = []
+        for module in (path for path in MODULES if path.is_relative_to(ROOT / package)):
+            tree = ast.parse(module.read_text("utf-8"))
+            wrong += [f"{module}:{field.lineno}" for field in fields_with_percent(tree)]
+            literals = ((k, text) for k, text, inner in texts(module) if not inner)
+            wrong += found(module, literals, re.compile(r"[^.{}]\d%(?!})"))
+        assert not wrong, "use identification.text.percentage:\n" + "\n".join(wrong)
+
+    @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+    def test_pages_have_one_too(self, page: Path) -> None:
+        lines = enumerate(page.read_text("utf-8").splitlines(), 1)
+        wrong = found(page, iter(lines), re.compile(r"\d%(?!\w)"))
+        assert not wrong, "\n".join(wrong)
+
+
 class TestGlossary:
     def test_is_one_page_in_alphabetical_order(self) -> None:
         rows = (ROOT / "docs" / "glossary.md").read_text("utf-8").split("|---|---|\n")[1]

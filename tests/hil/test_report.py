@@ -356,7 +356,7 @@ CONSISTENCY = {
 
 class TestPage:
     def test_has_the_verdict_first_and_details_folded(self, html):
-        order = ["predicts unseen motion to 1.5 % of the torque", "SIMULATED", 'id="torque"',
+        order = ["predicts unseen motion to 1.5\u00a0% of the torque", "SIMULATED", 'id="torque"',
                  'id="friction"', 'id="parameters"', 'id="judgement"',
                  "Torque error over all joints", 'id="trust"', '<details id="appendix">',
                  'id="run"', 'id="excitation"', 'id="estimation"', 'id="correlation"']  # fmt: skip

@@ -83,16 +83,16 @@ class TestPicture:
         text = "\n".join(rows)
         for words in (
             "10.2.12.150", "repetition 7 of 30", "19:05 left", "6.2 of 18.6 s",
-            "override 80%", "now 75%", "cycles 123456, 2 missed, 1 late, 0 not accepted",
+            "override 80 %", "now 75 %", "cycles 123456, 2 missed, 1 late, 0 not accepted",
             "repetition 5 rejected: its current differs", layout.HELP,
         ):  # fmt: skip
             assert words in text
         (second,) = [line for line in rows if line.startswith("joint_2")]
-        assert second.split() == ["joint_2", "0.150°", "31%", "-7.10", "A", "72%"]
+        assert second.split() == ["joint_2", "0.150°", "31", "%", "-7.10", "A", "72", "%"]
         line = layout.status_line(status())
         for words in (
-            "repetition 7 of 30", "6.2 of 18.6 s", "override 80%", "2 missed", "1 late",
-            "following error 130% of its limit", "current 88% of its limit", ", 19:05 left",
+            "repetition 7 of 30", "6.2 of 18.6 s", "override 80 %", "2 missed", "1 late",
+            "following error 130 % of its limit", "current 88 % of its limit", ", 19:05 left",
         ):  # fmt: skip
             assert words in line
 

@@ -306,7 +306,7 @@ class TestCurrents:
         generous = make_currents([100.0, 100.0])
         assert check_motion(swing, ROD_LIMITS, currents=generous) == ()
         current = np.abs(generous.current(generous.torque(motion)))[:, 1]
-        for share, remedy in ((1.0, ""), (0.8, "a motion may use 80% of the motor's limit")):
+        for share, remedy in ((1.0, ""), (0.8, "a motion may use 80 % of the motor's limit")):
             tight = make_currents([100.0, 0.9 / share * current.max()], usable=share)
             (violation,) = check_motion(swing, ROD_LIMITS, currents=tight)
             assert (violation.kind, violation.subject) == ("current", "motor of elbow")

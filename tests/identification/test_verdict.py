@@ -14,6 +14,7 @@ from identification.factor.factor import Estimate, Factor, estimate
 from identification.model.motion import Motion
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
+from identification.text import percentage
 from identification.validation.causes import Cause, Fault, Kind, find_causes
 from identification.validation.changes import Change
 from identification.validation.evidence import CarriedLoad, CellContext, Evidence, gather
@@ -101,7 +102,7 @@ class TestValidCampaign:
         verdict, evidence = campaign()
         assert verdict.good, verdict.reasons
         assert "predicts unseen motion well" in verdict.line
-        assert f"{evidence.held_out.overall:.1%}" in verdict.line
+        assert percentage(evidence.held_out.overall, 1) in verdict.line
         assert evidence.systematic.max() < 0.5 * Thresholds().systematic
         assert not {"gravity", "load", "outliers"} & {one.check for one in verdict.findings}
         assert np.degrees(evidence.gravity.angle) < 0.5
@@ -192,7 +193,7 @@ class TestUnseenMotion:
 
         verdict, _ = campaign(unseen_disturbance=warmer)
         assert not verdict.good
-        assert "joint_1 +20%" in verdict.reasons[0] and "temperature" in verdict.reasons[0]
+        assert "joint_1 +20 %" in verdict.reasons[0] and "temperature" in verdict.reasons[0]
         assert verdict.next_steps == ("warm the arm up by moving it before recording",)
 
     @pytest.mark.parametrize("share", [0.01, 0.001])
@@ -261,16 +262,16 @@ class TestJudgement:
     def test_a_recording_with_a_small_error_is_good(self):
         assert judged().good
         assert judged().line == (
-            "The model predicts unseen motion well: torque error 5.0% over all axes, 5.0% at worst"
-            " (one)."
+            "The model predicts unseen motion well: torque error 5.0 % over all axes, 5.0 % at "
+            "worst (one)."
         )
 
     @pytest.mark.parametrize(
         ("changes", "words"),
         [
-            ({"held_out": an_error(0.2)}, "over all axes, limit 12%"),
-            ({"held_out": an_error(np.array([0.01, 0.4]))}, "exceeds 35%: two 40%"),
-            ({"training": an_error(0.05), "held_out": an_error(0.2)}, "one 4.0 times, 20.0%"),
+            ({"held_out": an_error(0.2)}, "over all axes, limit 12 %"),
+            ({"held_out": an_error(np.array([0.01, 0.4]))}, "exceeds 35 %: two 40 %"),
+            ({"training": an_error(0.05), "held_out": an_error(0.2)}, "one 4.0 times, 20.0 %"),
             ({"held_out": replace(an_error(0.05), rows=np.array([1000, 3]))}, "two moved in fewer"),
             ({"held_out": HEAVY}, "model of one predicts no better than the mean torque"),
             ({"estimate": an_estimate(undetermined=MANY)}, ", ".join(MANY)),
@@ -284,11 +285,11 @@ class TestJudgement:
             ({"causes": caused("joint order", 0, 1)}, "positions and torques of one and two"),
             ({"causes": caused("delay")}, "of all axes lags the position by 10 ± 2 ms more"),
             ({"causes": caused("gain", 1)}, "the torque of two is 1.01 ± 0.002 times"),
-            ({"disagreement": np.array([0.2, 0.0])}, "single repetitions differ by more than 10%"),
+            ({"disagreement": np.array([0.2, 0.0])}, "single repetitions differ by more than 10 %"),
             ({"implausible": Implausible(("m1 is negative",), ())}, "m1 is negative"),
             (
                 {"held_out": an_error(0.1), "noise_floor": np.full(2, 0.1), "causes": ()},
-                "is 10.0%, 10.0 times the noise floor of 1.0%; none",
+                "is 10.0 %, 10.0 times the noise floor of 1.0 %; none",
             ),
         ],
     )
@@ -303,12 +304,12 @@ class TestJudgement:
         [
             ({"causes": caused("gain", 1, ratio=0.85)}, "torque of two is 1.01"),
             ({"controller": an_error(0.02)}, "controller's own dynamic model predicts better"),
-            ({"saturated": np.array([0.0, 0.04])}, "two in 4.0% of its samples"),
+            ({"saturated": np.array([0.0, 0.04])}, "two in 4.0 % of its samples"),
             ({"estimate": an_estimate(condition=450.0)}, "excites the parameters poorly"),
             ({"implausible": Implausible((), ("I2m is negative",))}, "I2m is negative"),
             ({"training": an_error(0.01)}, "one 5.0 times"),
-            ({"friction_change": np.array([0.0, -0.05])}, "two -5%"),
-            ({"systematic": np.array([0.025, 0.0])}, "exceeds 2.0%: one 2.5%"),
+            ({"friction_change": np.array([0.0, -0.05])}, "two -5 %"),
+            ({"systematic": np.array([0.025, 0.0])}, "exceeds 2.0 %: one 2.5 %"),
             ({}, "cannot be distinguished from noise"),
         ],
     )
@@ -343,21 +344,21 @@ class TestJudgement:
 
         assert not axes(0.03).good
         assert axes(0.01).good
-        assert any("two 60% of 0.1 N·m" in one for one in axes(0.01).warnings)
+        assert any("two 60 % of 0.1 N·m" in one for one in axes(0.01).warnings)
         assert axes(0.03, noise_floor=np.array([0.1, 0.2])).good
         assert axes(0.03, torque_limit=np.array([30.0, 100.0])).good
 
     def test_a_joint_several_times_worse_than_its_fit_is_not_good(self):
         changes = {"training": an_error(np.array([0.05, 0.015])), "held_out": an_error(0.1)}
-        assert any("two 6.7 times, 10.0%" in reason for reason in judged(**changes).reasons)
+        assert any("two 6.7 times, 10.0 %" in reason for reason in judged(**changes).reasons)
 
     @pytest.mark.parametrize(
         ("change", "error", "level", "words"),
         [
             (Change("gain", 1, 0.91, 0.001, 0.01), 0.1, "wrong", "two 0.91 ± 0.002"),
             (Change("gain", 1, 0.95, 0.001, 0.01), 0.05, "doubtful", "two 0.95 ± 0.002"),
-            (Change("friction", 0, 1.3, 0.01, 0.01), 0.1, "wrong", "one +30%"),
-            (Change("friction", 0, 0.92, 0.01, 0.01), 0.1, "doubtful", "one -8%"),
+            (Change("friction", 0, 1.3, 0.01, 0.01), 0.1, "wrong", "one +30 %"),
+            (Change("friction", 0, 0.92, 0.01, 0.01), 0.1, "doubtful", "one -8 %"),
         ],
     )
     def test_what_changed_is_named(self, change, error, level, words):
@@ -369,7 +370,7 @@ class TestJudgement:
         changes = {"held_out": an_error(0.1), "noise_floor": np.full(2, 0.1), "causes": ()}
         load = CarriedLoad(mass=2.0, explained=0.98, axes=2, half_interval=0.1)
         words = " ".join(judged(**changes, load=load).reasons)
-        assert "explains 98%" in words and "none of the tested faults" not in words
+        assert "explains 98 %" in words and "none of the tested faults" not in words
 
     def test_a_motion_in_one_direction_is_said(self):
         verdict = judged(one_way=np.array([False, True]))
@@ -399,7 +400,7 @@ class TestJudgement:
 
     def test_good_findings(self):
         found = finding_of("against the controller's model", controller=an_error(0.09))
-        assert found.level == "good" and "is 9.0%, of the identified model 5.0%" in found.words
+        assert found.level == "good" and "is 9.0 %, of the identified model 5.0 %" in found.words
         verdict = judged(systematic=np.array([0.019, 0.0]))
         assert not any("beyond noise" in one for one in verdict.warnings)
 
@@ -415,7 +416,7 @@ class TestJudgement:
 
     def test_joint_names_may_contain_braces(self):
         verdict = judged(("{one}", "<two>"), held_out=an_error(0.4), training=an_error(0.4))
-        assert "{one} 40%, <two> 40%" in " ".join(verdict.reasons)
+        assert "{one} 40 %, <two> 40 %" in " ".join(verdict.reasons)
         assert any("torque constant of {one}, <two>," in one for one in verdict.next_steps)
 
 
@@ -468,16 +469,16 @@ class TestPatternsOfTheResidual:
         found = finding_of("torque ripple", residuals=changed)
         assert found.level == level
         assert "one" not in found.words
-        expected = f"two (4 per motor turn, {size:.1%} of its torque)"
+        expected = f"two (4 per motor turn, {percentage(size, 1)} of its torque)"
         assert (expected in found.words) == (level != "good")
 
     @pytest.mark.parametrize(
         ("change", "share", "level", "words"),
         [
             ((1e-5, -1e-5), 1.0, "good", "did not change"),
-            ((0.02, 0.0), 1.0, "information", "one by +2.0%, at most 2.0% of an axis"),
-            ((0.1, 0.0), 0.2, "information", "at most 2.0%"),
-            ((0.02, -0.2), 1.0, "doubtful", "during the recordings: two by -20.0%"),
+            ((0.02, 0.0), 1.0, "information", "one by +2.0 %, at most 2.0 % of an axis"),
+            ((0.1, 0.0), 0.2, "information", "at most 2.0 %"),
+            ((0.02, -0.2), 1.0, "doubtful", "during the recordings: two by -20.0 %"),
         ],
     )
     def test_drift_is_judged_by_its_torque(self, clean, change, share, level, words):
