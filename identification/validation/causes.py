@@ -54,8 +54,11 @@ _EXPLAINED: Final = 0.5
 # 70 % of the squared error. True faults of simulated and real arms, without noise known: at most
 # 0.5, a payload in half of a recording 0.66; false ones: at least 0.9.
 _EXPLAINS: Final = 0.55
-# Relative error of each joint without which no axis or column has a wrong sign or place.
+# Relative error of each joint without which no columns are interchanged.
 _SMALL_ERROR: Final = 0.02
+# Noise floors without which no axis turns the other way. An arm whose base turns the other way is
+# nearly its own mirror image, which other parameters fit to some per cent.
+_LITTLE_MORE: Final = 1.05
 _STANDS_OUT: Final = 0.7  # the same, if the joint then is as good as the others
 _SAME_PART: Final = 0.85  # the same, if separate parameters for the part do no better
 _NEAR_NOISE: Final = 2.0  # noise floors; those of coloured noise are underestimated by a third
@@ -74,7 +77,7 @@ _FEWEST_BLOCKS: Final = 2
 _RIDGE: Final = 1e-6
 _LOAD: Final = len(LINK_SYMBOLS)
 _MASS: Final = LINK_SYMBOLS.index("m")
-_OF_MOTION: Final = ("axis sign", "position order", "joint order")
+_OF_MOTION: Final[tuple[Kind, ...]] = ("axis sign", "position order", "joint order")
 _OF_TORQUE: Final = ("torque sign", "torque order")
 
 
@@ -211,7 +214,7 @@ class _Search:
         usual = _score(tables, before, target)
         noise = self._noise**2 * tables.rows.sum(axis=0)
         separate: dict[Part | None, _Score] = {}
-        in_order = bool(np.all(usual.shares(usual.fitted) < _SMALL_ERROR**2))
+        excluded = self._excluded(usual, noise)
         trials = []
         for fault in self._faults(tables):
             own, measured, seen, joints = none, target.copy(), tables, list(fault.joints)
@@ -224,7 +227,7 @@ class _Search:
                 if separate[fault.part].fit_ratio_to(usual) > 1.0 - LEAST_GAIN:
                     continue
             if fault.kind in _OF_MOTION:
-                if in_order or not self._few.improved_by(fault):
+                if fault.kind in excluded or not self._few.improved_by(fault):
                     continue
                 if fault not in self._motion_tables:
                     moved = [_corrected(model, one, fault) for one in self._recordings]
@@ -256,6 +259,13 @@ class _Search:
                 )
             )
         return trials
+
+    def _excluded(self, usual: _Score, noise: Array) -> tuple[Kind, ...]:
+        """Return the kinds of faults of positions that would leave more error."""
+        if np.all(usual.fitted <= _LITTLE_MORE**2 * noise):
+            return _OF_MOTION
+        in_order = np.all(usual.shares(usual.fitted) < _SMALL_ERROR**2)
+        return ("position order", "joint order") if in_order else ()
 
     def resized(self, trial: _Trial) -> Cause:
         """Return the cause of a trial; the load of friction is that of the parameters beside it."""
