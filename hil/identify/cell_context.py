@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.cell.text import urdf_limits
-from identification.estimators.prior import NOMINAL_SHARE, without_masses
+from identification.estimators.prior import without_masses
 from identification.estimators.torque_channel import torque_noiseless_above
 from identification.factor.factor import Estimate
 from identification.model.friction import TERMS
@@ -268,7 +268,7 @@ class Nominal(NamedTuple):
     values: Array  #: parameters (p,)
     label: str  #: description
     rotors_known: bool
-    share: float  #: relative uncertainty of its torque
+    share: float | None = None  #: relative uncertainty of its torque, None: of its bodies
 
 
 def nominal_of(cell: Cell) -> Nominal | None:
@@ -284,7 +284,7 @@ def nominal_of(cell: Cell) -> Nominal | None:
     values[: model.base.rank] = model.base.grouping @ standard
     values[model.element_part] = model.elements.nominal
     label = "the URDF's inertias, without friction and rotors"
-    return Nominal(values, label, False, NOMINAL_SHARE)
+    return Nominal(values, label, False)
 
 
 def torque_limits(cell: Cell) -> Array | None:

@@ -382,11 +382,7 @@ def body_prior(
         masses = np.where(masses > 0.0, masses, np.median(masses[masses > 0.0]))
     else:
         share = 1.0
-    deviation = share * masses
-    scales = np.repeat(
-        np.column_stack([deviation * length**2, deviation * length, deviation]), [6, 3, 1], axis=1
-    )
-    std[layout.links] = scales
+    std[layout.links] = _body_deviations(share * masses, length)
     std[layout.rotors] = _outboard_inertia(model, masses, length)
     words = f"nominal bodies to {100.0 * share:g} %"
     if reason:
@@ -404,6 +400,19 @@ def body_prior(
     if known:
         words += f", {len(known)} given"
     return BodyPrior(mean, std, combinations, words, bool(reason))
+
+
+def nominal_deviations(model: RobotModel, share: float = BODY_SHARE) -> Array:
+    """Return deviations of the nominal bodies as inertial parameters (rank, 10 n), one each."""
+    links = model.layout.links
+    std = _body_deviations(share * model.nominal[links][:, _MASS], body_lengths(model))
+    return np.asarray(model.base.grouping[:, links.ravel()] * std.ravel())
+
+
+def _body_deviations(mass: Array, length: Array) -> Array:
+    """Return those of inertia, moment and mass (n, 10) of deviating masses of these lengths."""
+    sizes = np.column_stack([mass * length**2, mass * length, mass])
+    return np.repeat(sizes, [6, 3, 1], axis=1)
 
 
 def body_lengths(model: RobotModel) -> Array:

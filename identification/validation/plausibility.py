@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from identification.distributions import student_limit
 from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
-from identification.estimators.prior import NOMINAL_SHARE, BodyPrior
+from identification.estimators.prior import BodyPrior, nominal_deviations
 from identification.factor.factor import Estimate, Factor
 from identification.model.friction import COULOMB
 from identification.model.pseudo_inertia import pseudo_inertia, reference_bodies
@@ -362,7 +362,7 @@ def _gravity_loaded(model: RobotModel, motion: Factor, values: Array) -> NDArray
 _BLOCKS: Final = 20  # parts of the recordings whose scatter gives the standard deviation
 # Model error of friction laws relative to the friction (Bittencourt and Gunnarsson 2012).
 _FRICTION_SHARE: Final = 0.03
-_WIDEST: Final = 0.5  # relative tolerance above which a scale is unknown
+_WIDEST: Final = 0.5  # relative tolerance for noise and friction above which a scale is unknown
 # Weight of independent errors of links, where friction dominates the torque. On a simulated UR5
 # with link errors up to 10 % all scales were within 7 %.
 _LINKS_APART: Final = 0.05
@@ -381,7 +381,7 @@ class NominalScale(NamedTuple):
     def off(self) -> NDArray[np.bool_]:
         """Whether the scale of each axis differs significantly from 1 (n,)."""
         # A factor that may be zero does not determine the nominal torque.
-        known = (self.tolerance < _WIDEST) & (np.abs(self.scale) > self.tolerance)
+        known = np.abs(self.scale) > self.tolerance
         return known & (np.abs(self.scale - 1.0) > self.tolerance)
 
     @property
@@ -398,10 +398,10 @@ class NominalScale(NamedTuple):
 
     @property
     def negated(self) -> bool:
-        """Whether all known scales are significantly negative."""
-        known = np.isfinite(self.scale)
-        enough = np.count_nonzero(known) >= min(2, len(known))
-        return bool(enough and np.all(self.scale[known] + self.tolerance[known] < 0.0))
+        """Whether all known scales are negative, two of them or that of one joint significantly."""
+        known = self.scale[np.isfinite(self.scale)]
+        sure = np.count_nonzero(self.scale + self.tolerance < 0.0)
+        return bool(sure >= min(2, len(self.scale)) and np.all(known < 0.0))
 
     def without(self, joints: Iterable[int]) -> NominalScale:
         """Return the scales with those of some axes unknown."""
@@ -416,13 +416,15 @@ def nominal_scale(
     runs: Sequence[Samples],
     *,
     rotors_known: bool = False,
-    share: float = NOMINAL_SHARE,
+    share: float | None = None,
 ) -> NominalScale:
     """Compare measured torque with that of nominal parameters (p,) per axis, without friction.
 
     `rotors_known`: the nominal parameters include rotor inertias; `share`: relative standard
-    deviation of the nominal torque.
+    deviation of the nominal torque, by default that of bodies as uncertain as in
+    :func:`identification.estimators.prior.body_prior`.
     """
+    bodies = nominal_deviations(model) if share is None else np.zeros((model.base.rank, 0))
     if all(run.torque_bandwidth is None for run in runs):
         step = max(1, sum(len(run.torque) for run in runs) // _MOST_ROWS)
         runs = [run.thinned(step) for run in runs]
@@ -433,7 +435,7 @@ def nominal_scale(
         if model.coupling is not None:
             turns = model.coupling.motor_from_joint
             turning = sorted({joint, *np.flatnonzero((turns.T @ turns)[joint]).tolist()})
-        tables, torques = [], []
+        tables, torques, deviations = [], [], []
         for run, (blocks, _) in zip(runs, regressors, strict=True):
             rows, block = run.usable[:, joint], blocks[joint]
             table = [block[:, inertial] @ nominal[columns[inertial]], block[:, ~inertial]]
@@ -441,12 +443,17 @@ def nominal_scale(
                 table.append(run.as_measured(joint, run.motion.acceleration[:, turning]))
             tables.append(np.column_stack(table)[rows])
             torques.append(run.torque[rows, joint])
-        found.append(_scale(np.concatenate(tables), np.concatenate(torques), share))
+            deviations.append((block[:, inertial] @ bodies[columns[inertial]])[rows])
+        whole = (np.concatenate(parts) for parts in (tables, torques, deviations))
+        found.append(_scale(*whole, share=share or 0.0))
     return NominalScale(*np.array(found).T)
 
 
-def _scale(table: Array, torque: Array, share: float) -> tuple[float, float]:
-    """Return the coefficient of the first column and its tolerance; NaN if uncertain."""
+def _scale(table: Array, torque: Array, deviations: Array, *, share: float) -> tuple[float, float]:
+    """Return the coefficient of the first column and its tolerance; NaN if uncertain.
+
+    The first column deviates by a share of itself and by each of `deviations`.
+    """
     rigid, others = table[:, 0], table[:, 1:]
     if len(torque) < 10 * _BLOCKS or not rigid.any():
         return np.nan, np.inf
@@ -464,10 +471,14 @@ def _scale(table: Array, torque: Array, share: float) -> tuple[float, float]:
     std = np.sqrt(scatter * _BLOCKS / (_BLOCKS - 1)) / power
     lost = float(rigid @ rigid) / power - 1.0
     misfit = _FRICTION_SHARE * np.linalg.norm(friction) / np.sqrt(power)
-    model_error = _SURE * float(np.sqrt(share**2 * (1.0 + _LINKS_APART * lost) + misfit**2))
-    tolerance = student_limit(0.025, _BLOCKS - 1) * std + model_error
-    # Tolerances scale with the unit of the torque.
-    known = tolerance < _WIDEST * max(1.0, abs(scale))
+    bodies = float(np.linalg.norm(alone @ deviations)) / power
+    of_torque = share**2 * (1.0 + _LINKS_APART * lost)
+    model_error = _SURE * float(np.sqrt(of_torque + bodies**2 + misfit**2))
+    noise = student_limit(0.025, _BLOCKS - 1) * std
+    tolerance = noise + model_error
+    # Tolerances scale with the unit of the torque. Uncertain bodies alone leave a scale known.
+    unit = max(1.0, abs(scale))
+    known = noise + _SURE * misfit < _WIDEST * unit and tolerance < unit
     return (scale, float(tolerance)) if known else (np.nan, np.inf)
 
 

@@ -13,6 +13,7 @@ from scipy.signal import lfilter
 
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import estimate_repetitions
+from identification.estimators.prior import NOMINAL_SHARE
 from identification.factor.factor import Estimate, Factor, estimate, joint_weights, solve
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
@@ -780,8 +781,19 @@ class TestNominalScale:
     @pytest.mark.parametrize("seed", range(10))
     def test_links_off_by_a_tenth_are_no_finding(self, model, seed):
         found = nominal_scale(
-            model, nominal(model), runs_of(model, standard(model, 0.1, seed), seed)
+            model,
+            nominal(model),
+            runs_of(model, standard(model, 0.1, seed), seed),
+            share=NOMINAL_SHARE,
         )
+        assert np.isfinite(found.scale[2])
+        assert findings(model, nominal_scale=found) == []
+
+    @pytest.mark.parametrize("seed", range(10))
+    def test_links_as_uncertain_as_a_makers_description_are_none(self, model, seed):
+        """Masses and inertias of neighbouring links deviate by a quarter, in one direction."""
+        heavier = standard(model, 0.1, seed) * np.where(seed % 2, 1.25, 0.75)
+        found = nominal_scale(model, nominal(model), runs_of(model, heavier, seed))
         assert np.isfinite(found.scale[2])
         assert findings(model, nominal_scale=found) == []
 
@@ -793,7 +805,7 @@ class TestNominalScale:
             torque = run.torque.copy()
             torque[:, axis] *= factor
             scaled.append(replace(run, torque=torque))
-        found = nominal_scale(model, nominal(model), scaled)
+        found = nominal_scale(model, nominal(model), scaled, share=NOMINAL_SHARE)
         assert np.flatnonzero(found.off).tolist() == [axis]
         assert found.scale[axis] == pytest.approx(factor, rel=0.1)
         (finding,) = findings(model, nominal_scale=found)
