@@ -81,7 +81,8 @@ def new(
             fixed. Default: the root of the URDF.
         tip: Last link of the arm, such as the flange before a gripper. Default: every end.
         fix: Joint that does not move, at a position in rad or m (default 0; repeatable). Prismatic
-            joints are always fixed.
+            joints are fixed, but for those along gravity without --design-only and --from-...,
+            which make a cell for recordings.
         design_only: For an arm moved by another controller: no drive train and no link; values that
             a design needs beyond the URDF are assumed and listed.
         force: Replace an earlier file.
@@ -96,7 +97,8 @@ def new(
     _require_free(output, force=force)
     fixed = figures(fix or [], "--fix", "--fix finger=0.02 (rad or m)")
     if urdf is not None:
-        made = cell_of_urdf(urdf, fixed, base=base, tip=tip)
+        moved = design_only or from_controller is not None or from_archive_file is not None
+        made = cell_of_urdf(urdf, fixed, base=base, tip=tip, moved=moved)
     else:
         assert dh is not None
         made = cell_of_dh(dh, convention_of(convention), fixed)
@@ -128,6 +130,8 @@ def new(
         say(f'unknown, marked "?": {", ".join(unknown)}')
         after = "design" if design_only else "doctor"
         say(f"fill them in, then `hil {after} {output}`, which lists what is still missing")
+    elif made.lifting:
+        say(f"then `hil import log LOG --cell {output} --map MAP.toml`")
     elif design_only:
         say(f"check the assumed values in it, then `hil design {output}`")
 

@@ -7,7 +7,7 @@ import re
 import sys
 import textwrap
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -129,6 +129,9 @@ Lists have one entry per joint, in this order:
 Units are SI, except where a name says degrees (_deg) or milliseconds (_ms), or a comment
 revolutions.
 """
+_OF_RECORDINGS: Final = ("cell", "robot")
+"""Tables of a cell whose arm is identified from recordings, not moved."""
+_ALONG: Final = 0.99  # cosine of the angle between an axis and gravity
 _ASSUMED: Final = ("nominal.uncertainty", "controller.current_delay_cycles")
 """Fields whose default is written as an assumption."""
 _MESH: Final = re.compile(r"""filename\s*=\s*["'](package://[^"']+)["']""")
@@ -146,6 +149,9 @@ class NewCell:
     meshes: tuple[str, ...]  #: `package://` mesh paths of the collision shapes
     known: Known
     design_only: bool = False
+    #: prismatic joints along gravity that are identified; from recordings only, as no controller
+    #: moves them
+    lifting: tuple[str, ...] = ()
 
     def text(self, path: Path) -> tuple[str, tuple[str, ...]]:
         """Return the text of the cell file at `path`, and its unknown fields."""
@@ -163,7 +169,9 @@ class NewCell:
             **self.known.values,
         }
         document, unknown = self._head(), list[str]()
-        without = ("drive_train", "controller") if self.design_only else ()
+        without: Collection[str] = ("drive_train", "controller") if self.design_only else ()
+        if self.lifting:
+            without = {*CellFile.model_fields} - {*_OF_RECORDINGS}
         tables = [*CellFile.model_fields, *(name.partition(".")[0] for name in values)]
         for name in dict.fromkeys(tables):
             if name not in without:
@@ -216,6 +224,8 @@ class NewCell:
     def _assumed(self) -> list[str]:
         """Return the names of assumed fields."""
         names = [name for name in _ASSUMED if name not in self.known.values]
+        if self.lifting:
+            return []
         if self.design_only:
             names = [name for name in names if not name.startswith("controller.")]
         found = [name for name, origin in self.known.origin.items() if origin == ASSUMED]
@@ -277,7 +287,7 @@ def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -
     """Return the cell of a table of DH parameters, with a URDF to write, or raise InputError."""
     text = urdf_of_dh(path, convention)
     note = "the URDF contains the geometry of the DH parameters only: no masses, no limits"
-    made = _cell_of(path, text, fixed)
+    made = _cell_of(path, text, fixed, moved=True)
     return replace(made, urdf=made.urdf or text, known=Known(notes=(note,)) | made.known)
 
 
@@ -287,16 +297,18 @@ def cell_of_urdf(
     *,
     base: str | None = None,
     tip: str | None = None,
+    moved: bool = False,
 ) -> NewCell:
     """Return the cell of the URDF of an open chain (else InputError).
 
     Joints in `fixed` are fixed at these positions [rad or m], prismatic joints at zero (or the
-    nearest position in their range), mimic joints at their offset; notes report this. With links
-    `base` and `tip`, all joints that do not lie between them are fixed as well.
+    nearest position in their range), mimic joints at their offset; notes report this. A prismatic
+    joint along gravity is not fixed, unless the arm is to be `moved` or the joint is of a gripper.
+    With links `base` and `tip`, all joints that do not lie between them are fixed as well.
     """
     text = read_input(path, "name a URDF")
     if base is None and tip is None:
-        return _cell_of(path, text, fixed)
+        return _cell_of(path, text, fixed, moved=moved)
     between = set(_joints_between(path, text, base, tip))
     names = _chain(path, text).joint_names
     others = [name for name in names if name not in between and name not in fixed]
@@ -305,7 +317,8 @@ def cell_of_urdf(
         raise InputError(path, problem, field="--base, --tip", remedy=_LINKS_REMEDY)
     limits = urdf_limits(text, others)
     nearest = np.clip(0.0, limits.lower, limits.upper).tolist()
-    made = _cell_of(path, text, {**dict(zip(others, nearest, strict=True)), **fixed})
+    every = {**dict(zip(others, nearest, strict=True)), **fixed}
+    made = _cell_of(path, text, every, moved=moved)
     if not others:
         return made
     note = (
@@ -359,19 +372,29 @@ def _branches(chain: Chain) -> list[str]:
     return [name for k, name in enumerate(chain.joint_names) if k not in parents]
 
 
-def _note_on_branches(text: str, chain: Chain) -> list[str]:
-    """Return a note on a gripper or further arms among the joints that move."""
-    notes = []
-    links = {
+def _links_of(text: str) -> dict[str, str]:
+    """Return the link that each joint moves."""
+    return {
         joint.get("name", ""): child.get("link", "")
         for joint in urdf_tree(text).findall("joint")
         for child in joint.findall("child")
     }
-    fingers = [
+
+
+def _of_gripper(text: str, chain: Chain) -> list[str]:
+    """Return the joints that are of a gripper or hand by their names or those of their links."""
+    links = _links_of(text)
+    return [
         name
         for name in chain.joint_names
         if _GRIPPER.search(name) or _GRIPPER.search(links.get(name, ""))
     ]
+
+
+def _note_on_branches(text: str, chain: Chain) -> list[str]:
+    """Return a note on a gripper or further arms among the joints that move."""
+    notes = []
+    links, fingers = _links_of(text), _of_gripper(text, chain)
     if fingers:
         fixing = " ".join(f"--fix {name}" for name in fingers[:_MOST_NAMES])
         notes.append(
@@ -388,7 +411,22 @@ def _note_on_branches(text: str, chain: Chain) -> list[str]:
     return notes
 
 
-def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
+def _lifting(text: str, chain: Chain) -> list[str]:
+    """Return the prismatic joints along gravity with all joints at zero, without grippers'."""
+    gripper = _of_gripper(text, chain)
+    rotations = list[Array]()
+    found = []
+    for joint, name in enumerate(chain.joint_names):
+        parent = chain.parents[joint]
+        outer = rotations[parent] if parent >= 0 else np.eye(3)
+        rotations.append(outer @ chain.rotation[joint])
+        vertical = abs((rotations[joint] @ chain.axis[joint])[2])
+        if not chain.revolute[joint] and vertical > _ALONG and name not in gripper:
+            found.append(name)
+    return found
+
+
+def _cell_of(path: Path, text: str, fixed: Mapping[str, float], *, moved: bool) -> NewCell:
     """Return the cell of the URDF text read from `path`."""
     chain = _chain(path, text)
     names = chain.joint_names
@@ -397,13 +435,15 @@ def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
         raise InputError(path, f"has no moving joint {unknown[0]}", remedy=remedy)
     limits = urdf_limits(text, names)
     nearest = dict(zip(names, np.clip(0.0, limits.lower, limits.upper).tolist(), strict=True))
+    led = mimics(text)
+    lifting = [name for name in _lifting(text, chain) if name not in fixed and name not in led]
     sliding = {
         name: nearest[name]
         for name, turns in zip(names, chain.revolute, strict=True)
-        if not turns and name not in fixed
+        if not turns and name not in fixed and (moved or name not in lifting)
     }
     following = {
-        name: led for name, led in mimics(text).items() if name in names and name not in sliding
+        name: leader for name, leader in led.items() if name in names and name not in sliding
     }
     positions = sliding | {name: offset for name, (_, offset) in following.items()} | {**fixed}
     notes = [
@@ -411,6 +451,16 @@ def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
         f"--fix {name}=… for another position"
         for name, position in sliding.items()
     ]
+    if lifting and not moved:
+        slides = (
+            f"{', '.join(lifting)} slides" if len(lifting) == 1 else f"{', '.join(lifting)} slide"
+        )
+        fixing = " ".join(f"--fix {name}" for name in lifting)
+        notes.append(
+            f"{slides} along gravity: its weight and the offset of its friction are estimated "
+            "together, from recordings (`hil import log --cell`). The cell has no tables for "
+            f"motion, which are in degrees; {fixing} writes them for the other joints"
+        )
     notes += [
         f"{name} follows {leader} (<mimic>), which the model does not support: it is fixed at "
         f"{positions[name]:g} rad in the cell's copy of the URDF, --fix {name}=… for another "
@@ -436,6 +486,7 @@ def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
         urdf_path=path,
         meshes=tuple(sorted({mesh for shape in shapes for mesh in _MESH.findall(shape)})),
         known=from_urdf(used, moving) | Known(notes=tuple(notes)),
+        lifting=() if moved else tuple(lifting),
     )
 
 

@@ -305,6 +305,45 @@ def test_prismatic_joints_are_fixed_with_a_note(tmp_path: Path) -> None:
     assert (tmp_path / "panda.urdf").exists()
 
 
+def scara(folder: Path) -> Path:
+    """A SCARA arm whose quill slides along gravity."""
+    limit = '<limit lower="0" upper="0.2" velocity="1" effort="100"/>'
+    links = "".join(
+        f'<link name="{name}"><inertial><mass value="2"/><inertia ixx="0.1" iyy="0.1" izz="0.1" '
+        'ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        for name in ("base", "upper", "fore", "quill")
+    )
+    joints = "".join(
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="0.3 0 0" rpy="{roll} 0 0"/><axis xyz="0 0 1"/>{limit}</joint>'
+        for name, kind, parent, child, roll in (
+            ("shoulder", "revolute", "base", "upper", 0.0),
+            ("elbow", "revolute", "upper", "fore", 0.0),
+            ("lift", "prismatic", "fore", "quill", np.pi),
+        )
+    )
+    path = folder / "scara.urdf"
+    path.write_text(f'<robot name="scara">{links}{joints}</robot>')
+    return path
+
+
+def test_a_prismatic_joint_along_gravity_is_identified(tmp_path: Path) -> None:
+    """Its cell is for recordings: it needs nothing else, and has no table for motion."""
+    summary = new(scara(tmp_path), tmp_path / "cell.toml")
+    assert summary["joints"] == ["shoulder", "elbow", "lift"] and summary["unknown"] == []
+    assert "lift slides along gravity" in summary["notes"][0]
+    assert "--fix lift" in summary["notes"][0]
+    cell = Cell.load(tmp_path / "cell.toml")
+    assert cell.joint_names == ("shoulder", "elbow", "lift") and cell.file.limits is None
+
+
+@pytest.mark.parametrize("option", [("--fix", "lift=0.1"), ("--design-only",)])
+def test_it_is_fixed_where_the_arm_is_to_be_moved(tmp_path: Path, option: tuple[str]) -> None:
+    summary = new(scara(tmp_path), tmp_path / "cell.toml", *option)
+    assert summary["joints"] == ["shoulder", "elbow"]
+    assert "[campaign]" in (tmp_path / "cell.toml").read_text()
+
+
 def test_pipes_and_other_encodings_are_refused(tmp_path: Path, two_joints: Path) -> None:
     """As `hil new --urdf <(xacro robot.xacro)` does."""
     reading, writing = os.pipe()
