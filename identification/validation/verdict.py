@@ -139,7 +139,6 @@ def _facts(names: tuple[str, ...], evidence: Evidence, limit: Thresholds) -> Fac
         "everything": evidence.in_sample,
         "still": error.rows < limit.rows,
         "silent": (error.rows > 0) & (error.torque_squared == 0.0),
-        "undetermined": ", ".join(estimate.undetermined),
         "poor": not estimate.undetermined and estimate.condition > limit.condition,
         "rich": not estimate.undetermined and not estimate.condition > limit.condition,
         "overall_covered": overall and not error.overall > covered,
@@ -151,8 +150,8 @@ def _facts(names: tuple[str, ...], evidence: Evidence, limit: Thresholds) -> Fac
         "much": any_explained and not little.any(),
         "least": explained[worst], "least_explained": names[worst],
         "grown_far": grown & far & ~minor, "grown_little": grown & ~(far & ~minor),
-        "one_way": evidence.one_way,
     }  # fmt: skip
+    facts |= _undetermined_facts(evidence)
     if (share := evidence.disagreement) is not None and not estimate.undetermined:
         # Undetermined parameters vary between repetitions.
         facts |= {"disagreement": share, "disagree": share > limit.inconsistency}
@@ -165,6 +164,23 @@ def _facts(names: tuple[str, ...], evidence: Evidence, limit: Thresholds) -> Fac
     facts |= _cause_facts(evidence, limit)
     facts |= _change_facts(names, evidence, facts)
     return facts if checks is None else facts | _residual_facts(checks, facts, evidence)
+
+
+def _undetermined_facts(evidence: Evidence) -> Facts:
+    """Facts on parameters without an estimate, and on joints that moved in one direction only."""
+    labels, one_way = evidence.estimate.undetermined, evidence.one_way
+    if one_way is None:
+        return {"undetermined": ", ".join(labels)}
+    # Of a joint that moved in one direction both are the same column.
+    pairs = [(f"f0_{joint}", f"fo_{joint}") for joint in range(1, len(one_way) + 1)]
+    apart = np.array([{*pair} <= {*labels} for pair in pairs]) & one_way
+    explained = {label for joint in np.flatnonzero(apart) for label in pairs[joint]}
+    return {
+        "undetermined": ", ".join(label for label in labels if label not in explained),
+        "only_sum": apart,
+        "one_way": one_way & ~apart,
+        "friction_pair": np.array([" and ".join(pair) for pair in pairs], dtype=np.object_),
+    }
 
 
 def _unit(evidence: Evidence, joint: int) -> str:
@@ -541,6 +557,10 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
          " before the jump", "cause"),
     _Row("excitation", {"wrong": "undetermined"},
          "the motion does not determine {undetermined}", _RICHER),
+    _Row("excitation", {"wrong": "only_sum"},
+         "the motion determines only the sum of Coulomb friction and offset of the torque of"
+         " {joints}, which moved in one direction only: <{friction_pair}>",
+         "record a motion in which {joints} moves in both directions"),
     _Row("excitation", {"doubtful": "poor"},
          "the motion excites the parameters poorly: condition number {condition:.0f} of the"
          " regressor with unit columns, limit {limit.condition:.0f}; predictions are"

@@ -378,6 +378,17 @@ class TestJudgement:
         assert found.level == "doubtful" and found.words.startswith("two moved in one direction")
         assert found.next_step == "record a motion in which two moves in both directions"
 
+    def test_it_explains_what_is_not_determined(self):
+        estimate = an_estimate(undetermined=("f0_2", "fo_2", "m1"))
+        verdict = judged(estimate=estimate, one_way=np.array([False, True]))
+        direction, others = (one for one in verdict.findings if one.check == "excitation")
+        if "m1" in direction.words:
+            direction, others = others, direction
+        assert direction.level == others.level == "wrong"
+        assert "two, which moved in one direction only: two f0_2 and fo_2" in direction.words
+        assert direction.next_step == "record a motion in which two moves in both directions"
+        assert others.words == "the motion does not determine m1"
+
     def test_all_negated_torques_are_one_cause(self):
         """By the nominal model, or by friction that would drive every axis."""
         signs = Implausible(("m1 is negative", "I2m is negative"), ())
