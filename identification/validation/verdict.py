@@ -621,7 +621,8 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
     _Row("error on unseen motion", {"wrong": "overall_covered"},
          "the torque error on {on} is {error.overall:.1%} over all axes, limit"
          " {limit.overall:.0%}",
-         "check gear ratios, signs, torque constants and the delay between torque and position",
+         f"describe {ELEMENTS}, if the arm has one, in [[robot.elements]] of the cell file; else"
+         " check gear ratios, signs, torque constants and the delay between torque and position",
          "symptom"),
     _Row("error on unseen motion", {"wrong": "overall_grown"},
          "the torque error on {on} is {error.overall:.1%} over all axes, limit"
