@@ -8,18 +8,23 @@ beginning are left out.
 With enough cycles for it, the cost of the first and of the last `--window` cycles are compared,
 and a further run measures what memory was allocated in between and not released.
 
-    python -m benchmarks.session [--json] [--cycles N] [--runs N] [--window N]
+`--profile` prints instead where the processor's time of a cycle goes: shares of `Session.reply`,
+each with the calls inside it. Python's profiler makes short calls count too much.
+
+    python -m benchmarks.session [--json] [--cycles N] [--runs N] [--window N] [--profile]
 """
 
 from __future__ import annotations
 
 import argparse
+import cProfile
 import gc
 import struct
 import time
 import tracemalloc
 from collections.abc import Iterator
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +47,9 @@ FADE = 1_000
 LOOP = 50_000
 """Cycles after which all of them, being multiples of 0.01 Hz, begin again."""
 START = np.array([0.1, -0.2, 0.3, -0.4, 0.5, -0.6])
+
+
+_LEAST_SHARE: Final = 0.03  # of a cycle
 
 
 def sines(t: Array, start: Array, fade_time: float) -> tuple[Array, Array]:
@@ -221,6 +229,28 @@ def allocated(packets: list[bytes], cycles: int, warm: int) -> int:
     return growth
 
 
+def profile(cycles: int) -> dict[str, Any]:
+    """Shares of the processor's time of `Session.reply`, the largest first."""
+    packets = record()
+    session = begun(packets)
+    profiler = cProfile.Profile(time.process_time)
+    for index, packet in enumerate(stream(packets, cycles)):
+        now = index * PERIOD_MS / 1000.0
+        profiler.runcall(session.reply, packet, now)
+    assert session.state is State.OPEN, session.events()[-1]
+    entries = profiler.getstats()
+    calls = sum(entry.callcount for entry in entries)
+    shares = {}
+    for entry in entries:
+        code = entry.code
+        if not isinstance(code, str) and "drivers" in Path(code.co_filename).parts:
+            shares[f"{Path(code.co_filename).stem}.{code.co_name}"] = entry.totaltime
+    whole = shares["session.reply"]
+    shares = {name: round(t / whole, 3) for name, t in shares.items() if t > _LEAST_SHARE * whole}
+    ordered = sorted(shares.items(), key=lambda item: -item[1])
+    return {"calls_per_cycle": round(calls / cycles), **dict(ordered)}
+
+
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """All figures."""
     packets = record()
@@ -248,10 +278,12 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--warm", type=int, default=1_000)
     parser.add_argument("--window", type=int, default=100_000)
+    parser.add_argument("--profile", action="store_true", help="where the time goes")
     options = parser.parse_args()
     if options.cycles <= options.warm:
         parser.error(f"--cycles must be more than the {options.warm} of --warm")
-    show(measure(options), only_json=options.json)
+    figures = profile(options.cycles) if options.profile else measure(options)
+    show(figures, only_json=options.json)
 
 
 if __name__ == "__main__":
