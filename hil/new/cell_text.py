@@ -7,7 +7,7 @@ import re
 import sys
 import textwrap
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -426,6 +426,16 @@ def _lifting(text: str, chain: Chain) -> list[str]:
     return found
 
 
+def _note_on_lifting(names: Sequence[str]) -> str:
+    slides = "slides" if len(names) == 1 else "slide"
+    fixing = " ".join(f"--fix {name}" for name in names)
+    return (
+        f"{', '.join(names)} {slides} along gravity: its weight and the offset of its friction are "
+        "estimated together, from recordings (`hil import log --cell`). The cell has no tables for "
+        f"motion, which are in degrees; {fixing} writes them for the other joints"
+    )
+
+
 def _cell_of(path: Path, text: str, fixed: Mapping[str, float], *, moved: bool) -> NewCell:
     """Return the cell of the URDF text read from `path`."""
     chain = _chain(path, text)
@@ -452,15 +462,7 @@ def _cell_of(path: Path, text: str, fixed: Mapping[str, float], *, moved: bool) 
         for name, position in sliding.items()
     ]
     if lifting and not moved:
-        slides = (
-            f"{', '.join(lifting)} slides" if len(lifting) == 1 else f"{', '.join(lifting)} slide"
-        )
-        fixing = " ".join(f"--fix {name}" for name in lifting)
-        notes.append(
-            f"{slides} along gravity: its weight and the offset of its friction are estimated "
-            "together, from recordings (`hil import log --cell`). The cell has no tables for "
-            f"motion, which are in degrees; {fixing} writes them for the other joints"
-        )
+        notes.append(_note_on_lifting(lifting))
     notes += [
         f"{name} follows {leader} (<mimic>), which the model does not support: it is fixed at "
         f"{positions[name]:g} rad in the cell's copy of the URDF, --fix {name}=… for another "

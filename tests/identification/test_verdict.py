@@ -378,7 +378,7 @@ class TestJudgement:
         assert found.level == "doubtful" and found.words.startswith("two moved in one direction")
         assert found.next_step == "record a motion in which two moves in both directions"
 
-    def test_springs_and_balancers_of_a_heavy_arm_are_named_before_faults(self):
+    def test_springs_and_balancers_are_named_before_faults(self):
         verdict = judged(held_out=an_error(0.2), training=an_error(0.2))
         (step,) = (one for one in verdict.next_steps if "[[robot.elements]]" in one)
         assert step.startswith("describe a spring, a balancer or a hydraulic counterweight")
