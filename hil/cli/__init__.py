@@ -195,7 +195,7 @@ def _shorten(option: TyperOption) -> None:
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "Start": ("demo", "new"),
     "Identify": (
-        "identify", "payload", "torque-constants", "batch", "compare", "export", "rollout",
+        "look", "identify", "payload", "torque-constants", "batch", "compare", "export", "rollout",
         "report",
     ),
     "On the controller": (

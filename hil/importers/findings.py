@@ -143,6 +143,12 @@ def _percent(share: float) -> str:
     return f"{min(100.0 * share, 99.9):.3g} %"
 
 
+def outside_limits(position: Array, names: Sequence[str], urdf: str) -> tuple[str, str] | None:
+    """Return how positions (m, n) leave the limits of the URDF and what would not; None if not."""
+    outside = _outside(position, names, urdf_limits(urdf, names), _turning(urdf, names))
+    return None if outside is None else (outside.problem, outside.remedy)
+
+
 def check_positions(position: Array, names: Sequence[str], urdf: str, path: Path) -> None:
     """Check that some row of positions (m, n) [rad or m] is within the limits of the URDF.
 
@@ -176,7 +182,7 @@ def has_degrees_per_second(time: Array, position: Array, velocity: Array) -> boo
     moving = np.ptp(position, axis=0) >= _LEAST_TRAVEL
     if not moving.any():
         return False
-    factor, correlation = _against_position(time, position[:, moving], velocity[:, moving])
+    factor, correlation = against_position(time, position[:, moving], velocity[:, moving])
     per_degree = math.radians(1.0) * factor
     itself = np.diag(correlation)
     return bool((itself >= _CORRELATED).all() and (abs(per_degree - 1.0) < _SCALE_TOLERANCE).all())
@@ -221,7 +227,7 @@ def _velocities(
     moving = [joint for joint in range(len(names)) if np.ptp(position[:, joint]) >= _LEAST_TRAVEL]
     if not moving:
         return
-    factor, correlation = _against_position(time, position[:, moving], velocity[:, moving])
+    factor, correlation = against_position(time, position[:, moving], velocity[:, moving])
     itself = np.diag(correlation)
     columns = scipy.optimize.linear_sum_assignment(-correlation)[1]
     best = correlation[np.arange(len(moving)), columns]
@@ -256,7 +262,7 @@ def _missed(correlation: Array) -> float:
     return 100.0 * float(np.sqrt(np.mean(1.0 - np.minimum(correlation, 1.0) ** 2)))
 
 
-def _against_position(time: Array, position: Array, velocity: Array) -> tuple[Array, Array]:
+def against_position(time: Array, position: Array, velocity: Array) -> tuple[Array, Array]:
     """Return scales of the velocities (n,), and absolute correlations with positions (n, n).
 
     Rows are positions, columns velocities. Integrals are compared instead of slopes: less noise.

@@ -197,7 +197,7 @@ class _Search:
     def correct(self, fault: Fault) -> None:
         """Correct a fault in all following trials."""
         if fault.discrete:
-            self._recordings = [_corrected(self._model, one, fault) for one in self._recordings]
+            self._recordings = [corrected(self._model, one, fault) for one in self._recordings]
             self._few = _Few.of(self._model, self._recordings)
             self._motion_tables.clear()
         else:
@@ -230,7 +230,7 @@ class _Search:
                 if fault.kind in excluded or not self._few.improved_by(fault):
                     continue
                 if fault not in self._motion_tables:
-                    moved = [_corrected(model, one, fault) for one in self._recordings]
+                    moved = [corrected(model, one, fault) for one in self._recordings]
                     self._motion_tables[fault] = _Tables.of(model, moved, values)
                 seen = self._motion_tables[fault]
             elif fault.kind == "torque sign":
@@ -403,8 +403,8 @@ class _Few:
 
     def improved_by(self, fault: Fault) -> bool:
         """Return whether the correction of a fault predicts parts of these rows better."""
-        corrected = [_corrected(self.model, samples, fault) for samples in self.recordings]
-        return self._score(self.model, corrected).ratio_to(self.usual)[0] < 1.0
+        recordings = [corrected(self.model, samples, fault) for samples in self.recordings]
+        return self._score(self.model, recordings).ratio_to(self.usual)[0] < 1.0
 
     @staticmethod
     def _score(model: RobotModel, recordings: Sequence[Samples]) -> _Score:
@@ -667,7 +667,7 @@ def _columns_of(tables: _Tables, model: RobotModel, values: Array, fault: Fault)
     return np.asarray(mask[:, None, None, None] * columns)
 
 
-def _corrected(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
+def corrected(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
     """Return samples with a wrong sign or order corrected."""
     n = model.n_joints
     sign, order = np.ones(n), np.arange(n)
@@ -683,8 +683,8 @@ def _corrected(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
         usable = usable[:, order]
     if fault.kind != "position order":
         torque = torque[:, order] * sign
-    corrected = replace(samples, motion=motion, torque=torque, usable=usable, mask=None)
+    result = replace(samples, motion=motion, torque=torque, usable=usable, mask=None)
     if samples.parent is not None:
         parent, part = samples.parent
-        corrected = replace(corrected, parent=(_corrected(model, parent, fault), part))
-    return corrected.with_friction_direction(model)
+        result = replace(result, parent=(corrected(model, parent, fault), part))
+    return result.with_friction_direction(model)

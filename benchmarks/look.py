@@ -1,0 +1,264 @@
+"""Twelve meanings planted in real recordings, and what `hil look` says of them.
+
+Run with ``python -m benchmarks.look --data DIR [--arm NAME] [--json]``, where DIR has ``ur10_unisa``,
+``kr300``, ``lwr4`` and ``gen3``, whose torques are of the joint side. Each recording is read as it is
+and with one meaning planted; *right*: the meaning is named, alone or as one of two readings that
+fit alike; *wrong*: a row that is called sure says something else of any aspect.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from benchmarks import parser_of, show
+from benchmarks.arms import urdf as arm_urdf
+from hil.archive import open_archive
+from hil.errors import HilError
+from hil.identify.sources import cell_of, source_of
+from hil.importers import Robot
+from hil.importers.recording import ImportOptions, RobotOf, import_recording
+from hil.look import Look, look_at
+from identification.estimators.prior import body_prior, fit_posterior
+from identification.factor.factor import Factor
+from identification.model.robot import RobotModel
+from identification.signals.recording import Recording
+from identification.signals.samples import Preprocessing, prepare
+
+Array = NDArray[np.float64]
+
+_SEED: Final = 20261126
+_CUT: Final = 3.0  # Hz
+_LATE: Final = 0.03  # s
+_AHEAD: Final = 0.025  # s
+_EXPECTED: Final = {
+    "order": "joints in the order of the URDF",
+    "signs": "as the URDF's axes",
+    "angle unit": "unit as read",
+    "zero": "as the URDF",
+    "gravity": "torque with gravity",
+    "mounting": "as stated, else upright",
+    "side": "joint side",
+}
+"""What a sure row says of a recording as it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """A recording of the joint side, and its robot."""
+
+    name: str
+    log: Path
+    robot_of: RobotOf
+    recording: Recording
+    weight: Array  #: torque of gravity by a fit (m, n) [N·m]
+
+
+@dataclass(frozen=True, eq=False)
+class Planted:
+    """Arrays of a log with one meaning planted.
+
+    `aspect` is that of the row that must name it, and `words` what the row or a choice contains.
+    """
+
+    meaning: str
+    aspect: str
+    words: tuple[str, ...]
+    time: Array
+    position: Array
+    velocity: Array | None
+    torque: Array
+
+
+def arms(data: Path, folder: Path, only: str | None = None) -> Iterator[Arm]:
+    """Yield the arms whose recordings are in a folder."""
+    logs: Mapping[str, tuple[Path, Path]] = {
+        "ur10": (
+            data / "ur10_unisa/ur10_exciting_trajectory.db3",
+            arm_urdf("ur_description/urdf/ur10_robot.urdf"),
+        ),
+        "kr300": (data / "kr300/Abal.csv", data / "kr300/robot.urdf"),
+        "lwr4": (data / "lwr4/measurements_1.npz", data / "lwr4/kuka_lwr4.urdf"),
+        "gen3": (data / "gen3/a_sensor.csv", data / "gen3/robot.urdf"),
+    }
+    for name, (log, urdf) in logs.items():
+        if not log.exists() or only not in (None, name):
+            continue
+
+        def robot_of(recorded: object, urdf: Path = urdf) -> Robot:
+            return Robot.from_urdf(urdf)
+
+        path = folder / f"{name}.mcap"
+        import_recording(log, path, robot_of, ImportOptions(outside_limits=True))
+        archive = open_archive(path)
+        cell = cell_of(archive)
+        recording = source_of(archive, cell).recording
+        yield Arm(name, log, robot_of, recording, _weight(recording, cell.model))
+
+
+def _weight(recording: Recording, model: RobotModel) -> Array:
+    samples = prepare(recording, model, options=Preprocessing(14.0, left_out="rests"))
+    factor = Factor.by_time(model, samples)
+    values = fit_posterior(model, factor, body_prior(model, factor).gaussian).estimate.values
+    still = np.zeros_like(recording.position)
+    rigid = np.where(model.friction_columns, 0.0, values)
+    return np.asarray(model.torque(rigid, recording.position, still, still))
+
+
+def plants(arm: Arm) -> Iterator[Planted]:
+    """Yield the recording as it is and with each meaning."""
+    recording, rng = arm.recording, np.random.default_rng(_SEED)
+    names, n = recording.joint_names, recording.n_joints
+    t, q, v, tau = recording.time, recording.position, recording.velocity, recording.torque
+    assert tau is not None
+
+    def of(meaning: str, aspect: str, *words: str, **arrays: Array | None) -> Planted:
+        usual: dict[str, Array | None] = {"time": t, "position": q, "velocity": v, "torque": tau}
+        return Planted(meaning, aspect, words, **{**usual, **arrays})  # type: ignore[arg-type]
+
+    yield of("as it is", "gravity", "with gravity")
+    yield of("gravity removed", "gravity", "without gravity", torque=tau - arm.weight)
+    yield of("motor side", "side", "motor", torque=tau / rng.uniform(50.0, 160.0, n))
+    yield of("current", "side", "current", torque=tau / rng.uniform(8.0, 60.0, n))
+    yield of("negated", "signs", "torque negated: all", torque=-tau)
+    yield from _signs(of, names, q, v, tau)
+    order = rng.permutation(n)
+    while np.any(order == np.arange(n)):
+        order = rng.permutation(n)
+    listing = ", ".join(names[k] for k in order)
+    yield of("torques permuted", "order", f"torque columns are of {listing}", torque=tau[:, order])
+    yield of(
+        "joints permuted", "order", listing,
+        position=q[:, order], velocity=None if v is None else v[:, order], torque=tau[:, order],
+    )  # fmt: skip
+    degrees = None if v is None else np.degrees(v)
+    yield of("degrees", "position, angle unit", "deg", position=np.degrees(q), velocity=degrees)
+    yield of("low-passed", "low-pass", "low-passed at", torque=_low_passed(t, tau))
+    yield of("delayed", "delay", "behind", torque=_shifted(t, tau, -_LATE))
+    smooth = _shifted(t, _low_passed(t, q, both=True), _AHEAD)
+    yield of("commanded", "positions", "commanded", position=smooth)
+    yield of("wrapped", "wraps", "wrapped", position=np.mod(q - q.mean(axis=0), 2.0 * np.pi))
+    for joint, angle in ((1, 0.6), (2, -0.6), (3, np.pi / 2.0)):
+        zero = np.zeros(n)
+        zero[joint] = angle
+        yield of(f"zero of joint {joint + 1}", "zero", names[joint], position=q + zero)
+
+
+def _signs(
+    of: Callable[..., Planted], names: tuple[str, ...], q: Array, v: Array | None, tau: Array
+) -> Iterator[Planted]:
+    for joint in (1, len(names) - 2):
+        sign = np.ones(len(names))
+        sign[joint] = -1.0
+        words = f"torque negated: {names[joint]}"
+        yield of(f"torque {joint + 1} negated", "signs", words, torque=tau * sign)
+        yield of(
+            f"position {joint + 1} negated", "signs", f"position negated: {names[joint]}",
+            position=q * sign, velocity=None if v is None else v * sign,
+        )  # fmt: skip
+
+
+def _low_passed(t: Array, values: Array, *, both: bool = False) -> Array:
+    step = float(np.median(np.diff(t)))
+    sections = scipy.signal.butter(2, _CUT if not both else 2.0 * _CUT, fs=1.0 / step, output="sos")
+    if both:
+        return np.asarray(scipy.signal.sosfiltfilt(sections, values, axis=0))
+    start = scipy.signal.sosfilt_zi(sections)[:, :, None] * values[0]
+    return np.asarray(scipy.signal.sosfilt(sections, values, axis=0, zi=start)[0])
+
+
+def _shifted(t: Array, values: Array, ahead: float) -> Array:
+    return np.column_stack([np.interp(t + ahead, t, column) for column in values.T])
+
+
+def judged(arm: Arm, planted: Planted, folder: Path) -> dict[str, object]:
+    """Return what is said of a planted log."""
+    path = folder / "planted.npz"
+    arrays = {"t": planted.time, "q": planted.position, "tau": planted.torque}
+    if planted.velocity is not None:
+        arrays["v"] = planted.velocity
+    np.savez(path, **arrays)  # type: ignore[arg-type]
+    begin = time.perf_counter()
+    row: dict[str, object] = {"arm": arm.name, "planted": planted.meaning}
+    try:
+        found = look_at(path, arm.robot_of, ImportOptions())
+    except HilError as error:
+        return {**row, "right": False, "wrong": "", "said": f"refused: {error}"}
+    said = _said(found, planted.aspect)
+    right = all(any(word in text for text in said) for word in planted.words)
+    return {
+        **row,
+        "right": right,
+        "wrong": _wrong(found, planted),
+        "seconds": round(time.perf_counter() - begin, 1),
+        "said": " | ".join(said),
+    }
+
+
+def _said(found: Look, aspect: str) -> list[str]:
+    """Return what a look says of an aspect, all readings of a doubt included."""
+    rows = [
+        f"{row.reading} ({row.certainty})" for row in found.rows if row.aspect in aspect.split(", ")
+    ]
+    return rows + [
+        choice.reading for choices in found.doubts for choice in choices if choice.aspect == aspect
+    ]
+
+
+def _wrong(found: Look, planted: Planted) -> str:
+    """Return the aspects of which a sure row says something else than what is there."""
+    wrong = []
+    for row in found.rows:
+        if row.certainty != "sure" or row.aspect not in _EXPECTED:
+            continue
+        right = [_EXPECTED[row.aspect]]
+        if row.aspect in planted.aspect and planted.meaning != "as it is":
+            right = [*planted.words, *(right if row.aspect == "angle unit" else ())]
+        if not any(word in row.reading for word in right):
+            wrong.append(row.aspect)
+    return ", ".join(wrong)
+
+
+def measure(data: Path, only: str | None = None) -> list[dict[str, object]]:
+    """Return a row for each arm and meaning."""
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        return [
+            judged(arm, planted, place)
+            for arm in arms(data, place, only)
+            for planted in plants(arm)
+        ]
+
+
+def main() -> None:
+    """Print the table and its shares."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--arm")
+    options = parser.parse_args()
+    rows = measure(options.data, options.arm)
+    count = max(1, len(rows))
+    result = {
+        "right": sum(bool(row["right"]) for row in rows) / count,
+        "wrong": sum(bool(row["wrong"]) for row in rows) / count,
+    }
+    lines = [
+        f"{row['arm']:6} {row['planted']:20} {'right' if row['right'] else 'NOT':5} "
+        f"{row['wrong'] or '-':16} {row.get('seconds', 0)!s:>5} s  {row['said']}"
+        for row in rows
+    ]
+    if not options.json:
+        print("\n".join(lines))
+    show({"readings": len(rows), **result}, only_json=options.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""`hil look`: what a recording contains, and what it can determine."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hil.cli.arguments import JsonOption, print_json, with_options
+from hil.cli.imports import Described, Reading
+from hil.files import write_output
+from hil.look import Choice, Group, Look, Row, look_at
+from hil.look.maps import with_entries
+from hil.progress import say
+from hil.terminal_text import printable
+
+IN_DOUBT = 2
+"""Exit status of a recording with two readings that fit alike."""
+
+
+@with_options(Described, "arm", but=("friction", "standstill"))
+@with_options(Reading, "reading", but=("outside_limits",))
+def look(
+    recording: Annotated[Path, typer.Argument(help="Log or bag.")],
+    output: Annotated[Path | None, typer.Option("--output", "-o", metavar="MAP")] = None,
+    *,
+    arm: Described,
+    reading: Reading,
+    json: JsonOption = False,
+) -> None:
+    """Say what each channel of a recording is, how sure that is, and what it can determine.
+
+    Names and units say a part, the slope of the positions another, and with --urdf the torque:
+    side, sign, order and zero of the joints, gravity, mounting, delay and low-pass. Where two
+    readings fit alike, both are shown with their errors; on a terminal one is asked for, else the
+    lines to choose from are printed and the exit status is 2.
+
+    **Example:** `hil look log.csv --urdf arm.urdf`
+
+    Options:
+        output: Write the column map with the sure conclusions, for `hil identify --map`.
+    """
+    found = look_at(recording, arm.robot if arm.is_given else None, reading.options)
+    asks = sys.stdin.isatty() and sys.stdout.isatty() and not json
+    if json:
+        print_json(found.as_json())
+    else:
+        _print(found)
+    text, is_open = found.map_text, False
+    for choices in found.doubts:
+        chosen = _ask(choices) if asks else None
+        if chosen is None:
+            is_open = True
+        elif text is not None and chosen.entries:
+            text = with_entries(text, dict(chosen.entries))
+    if output is not None and text is not None and not is_open:
+        write_output(output, text)
+        if not json:
+            say(f"wrote {output}")
+    if is_open:
+        raise typer.Exit(IN_DOUBT)
+
+
+def _print(found: Look) -> None:
+    for line in table(found.rows):
+        typer.echo(printable(line))
+    if found.groups:
+        typer.echo("\nthe recording determines (parameters):")
+        for line in groups_table(found.groups):
+            typer.echo(printable(line))
+    for choices in found.doubts:
+        typer.echo(f"\n{choices[0].aspect}: two readings fit alike; choose one line for the map:")
+        for number, choice in enumerate(choices, 1):
+            error = "" if choice.error is None else f" (error {choice.error:.2%})"
+            typer.echo(printable(f"  {number}  {choice.line or choice.reading}"))
+            typer.echo(printable(f"     {choice.reading}{error}"))
+    for option in found.options:
+        say(f"for `hil identify`: {option}")
+
+
+def _ask(choices: Sequence[Choice]) -> Choice | None:
+    """Ask which reading is right; None if that is not known."""
+    answer = typer.prompt(f"{choices[0].aspect}: 1 or 2, or 0 if unknown", type=int, default=0)
+    return choices[answer - 1] if 1 <= answer <= len(choices) else None
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """Return the rows as lines, and below each what would settle a doubt."""
+    width = max((len(row.aspect) for row in rows), default=0)
+    lines = []
+    for row in rows:
+        lines.append(f"{row.aspect.ljust(width)}  {row.certainty.ljust(6)}  {row.reading}")
+        lines.append(f"{' ' * width}          {row.reason}")
+        if row.settle and row.certainty != "sure":
+            lines.append(f"{' ' * width}          to settle: {row.settle}")
+    return lines
+
+
+def groups_table(groups: Sequence[Group]) -> list[str]:
+    """Return one line per body or joint."""
+    width = max(len(group.body) for group in groups)
+    lines = [f"{'joint'.ljust(width)}  of        identifiable  weak  not"]
+    lines += [
+        f"{group.body.ljust(width)}  {group.quantity.ljust(8)}  "
+        f"{group.identifiable:12d}  {group.weak:4d}  {group.missing:3d}"
+        for group in groups
+    ]
+    return lines

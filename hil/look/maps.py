@@ -1,0 +1,82 @@
+"""A column map changed by what was found in the recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.importers.channels import channels_of
+from hil.reading import parse_toml
+from hil.toml_text import to_text
+from identification.validation.readings import Axes
+
+_COMMENT = "Proposed by hil from names, units, the URDF and the motion of the recording"
+
+
+def with_entries(text: str, entries: Mapping[str, Any]) -> str:
+    """Return a map with entries replaced, by dotted key."""
+    table: dict[str, Any] = dict(parse_toml(text))
+    for key, value in entries.items():
+        place = table
+        *tables, name = key.split(".")
+        for part in tables:
+            place = place.setdefault(part, {})
+        place[name] = value
+    return to_text(table, {"": _COMMENT})
+
+
+def entries_of(axes: Axes, text: str, source: Path, joints: Sequence[str]) -> dict[str, Any]:
+    """Return the entries of a map that make an import read what `axes` say.
+
+    Angles of `zero` are in the unit of the map, before its scale.
+    """
+    table = parse_toml(text)
+    same = bool(np.array_equal(axes.position_order, axes.torque_order))
+    count = np.arange(len(joints))
+    entries: dict[str, Any] = {}
+    quantities = {
+        "position": (axes.position_order, axes.position_sign),
+        "velocity": (axes.position_order, axes.position_sign),
+        "torque": (axes.torque_order, axes.torque_sign),
+        "motor_current": (axes.torque_order, axes.torque_sign),
+    }
+    place = np.argsort(axes.position_order)
+    if same and not np.array_equal(axes.position_order, count):
+        entries["joints"] = [joints[int(joint)] for joint in place]
+    for name, (order, sign) in quantities.items():
+        if name not in table:
+            continue
+        if not same and not np.array_equal(order, count):
+            columns = _names(table[name].get("columns"), source, joints)
+            if columns is not None:
+                entries[f"{name}.columns"] = [columns[int(column)] for column in order]
+        by_column = sign[place] if same else sign
+        if np.any(sign < 0.0):
+            entries[f"{name}.scale"] = by_column.tolist()
+    if axes.factor < 1.0:
+        entries["position.unit"] = "deg"
+    if axes.factor > 1.0:
+        entries["position.unit"] = "rad"
+    if axes.zero.any():
+        factor = axes.factor if axes.factor < 1.0 else 1.0
+        offset = axes.zero / (axes.position_sign * factor)
+        entries["position.offset"] = np.round(offset[place] if same else offset, 4).tolist()
+    return entries
+
+
+def _names(columns: Any, source: Path, joints: Sequence[str]) -> list[Any] | None:
+    """Return the columns of a quantity one by one; None where they are those of one array."""
+    if isinstance(columns, list):
+        return list(columns)
+    if not isinstance(columns, str) or "{}" not in columns:
+        return None
+    names = {channel.name for channel in channels_of(source)}
+    numbers = range(len(joints) + 1)
+    for parts in ([str(k) for k in numbers[1:]], [str(k) for k in numbers[:-1]], joints):
+        series = [columns.replace("{}", part) for part in parts]
+        if names.issuperset(series):
+            return series
+    return None

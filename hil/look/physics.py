@@ -1,0 +1,387 @@
+"""Rows of a look about the torque: signs, order, zero, gravity, size, delay, low-pass."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.cell import Cell
+from hil.identify.cell_context import nominal_of
+from hil.look.maps import entries_of
+from hil.look.result import Certainty, Choice, Group, Row
+from identification.estimators.delay import DelayEstimate
+from identification.estimators.prior import LEARNED, body_prior, fit_posterior
+from identification.factor.factor import Factor
+from identification.model.regressor import LINK_SYMBOLS
+from identification.signals.recording import Recording
+from identification.signals.samples import Preprocessing
+from identification.validation.plausibility import NominalScale, nominal_scale
+from identification.validation.readings import Axes, Change, Meaning, Readings, Step
+
+Array = NDArray[np.float64]
+
+_SEPARATE: Final = 3.0  # standard errors
+_OTHER_UNIT: Final = 3.0  # factor beyond which the masses of a URDF do not explain a torque
+_THOUSAND: Final = 1000.0
+_WEAK: Final = 0.9  # posterior over prior deviation of a parameter that the recording hardly moves
+# Masses of arms over the cube of their reach, kg/m³: 11 (Gen3) to 216 (TX40).
+_DENSITY: Final = 45.0
+_DENSITY_SPREAD: Final = 3.0  # factor of one standard deviation
+_GRAVITY: Final = 9.81
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """What the torque says of a recording.
+
+    Attributes:
+        map_text: the column map of the import; None for a bag.
+    """
+
+    cell: Cell
+    recording: Recording
+    readings: Readings
+    axes: Axes
+    map_text: str | None
+    source: Path
+
+    @cached_property
+    def scale(self) -> NominalScale | None:
+        """Measured over nominal torque; None without masses."""
+        nominal = nominal_of(self.cell)
+        if nominal is None:
+            return None
+        return nominal_scale(self.readings.model, nominal.values, [self.readings.samples])
+
+    @cached_property
+    def common(self) -> float | None:
+        """Factor between measured and expected torque of the whole arm; None if unknown."""
+        if self.scale is not None and np.isfinite(self.scale.scale).any():
+            known = np.abs(self.scale.scale[np.isfinite(self.scale.scale)])
+            return float(np.median(known[known > 0.0])) if (known > 0.0).any() else None
+        return _by_size(self.readings)
+
+    @property
+    def size_is_off(self) -> bool:
+        """Whether the torque has another order of magnitude than the arm needs."""
+        if self.common is None:
+            return False
+        limit = _OTHER_UNIT if self.scale is not None else _DENSITY_SPREAD**3
+        return not 1.0 / limit < self.common < limit
+
+    def rows(self) -> list[Row]:
+        """Return the rows of the table."""
+        found = [
+            self._order(),
+            self._signs(),
+            self._unit(),
+            self._zero(),
+            self._gravity(),
+            self._mounting(),
+            self._size(),
+            self._payload(),
+        ]
+        error = self.readings.score.overall
+        found.append(
+            Row("as read", f"torque predicted to {100.0 * error:.2g} % from other parts", "sure",
+                "with free parameters, before a fit of the friction law")
+        )  # fmt: skip
+        return found
+
+    def steps(self, *meanings: Meaning) -> list[Step]:
+        """Return the changes of some meanings."""
+        return [step for step in self.readings.steps if step.change.meaning in meanings]
+
+    def names(self, change: Change) -> str:
+        """Return the names of the joints of a change."""
+        if len(change.joints) == self.cell.model.n_joints:
+            return "all joints"
+        return ", ".join(self.cell.joint_names[joint] for joint in change.joints)
+
+    def _found(self, aspect: str, steps: list[Step], text: str, settle: str) -> Row:
+        ratio = float(np.prod([step.ratio for step in steps]))
+        sigmas = min(step.sigmas for step in steps)
+        certainty: Certainty = "sure" if all(step.sure for step in steps) else "open"
+        reason = f"error {ratio:.2f} times that as recorded ({-sigmas:.0f} standard errors)"
+        if ratio > 1.0 - 0.05:
+            reason = "friction would drive the joint otherwise"
+        return Row(aspect, text, certainty, reason, settle)
+
+    def _kept(self, aspect: str, reading: str, *meanings: Meaning, settle: str = "") -> Row:
+        """Return the row of an aspect that is as recorded, and how sure that is."""
+        nearest = self.readings.nearest
+        rivals = [nearest[meaning] for meaning in meanings if meaning in nearest]
+        if not rivals:
+            return Row(aspect, reading, "likely", "not examined", settle)
+        change, against = min(rivals, key=lambda rival: rival[1].sigmas)
+        reason = f"next best: {self.described(change)}, error {against.ratio:.2f} times"
+        certainty: Certainty = "sure" if against.sigmas > _SEPARATE else "likely"
+        return Row(aspect, reading, certainty, reason, "" if certainty == "sure" else settle)
+
+    def described(self, change: Change) -> str:
+        """Return a change in words."""
+        texts: Mapping[Meaning, str] = {
+            "torque sign": "torque negated",
+            "position sign": "position negated",
+            "axis sign": "position and torque negated",
+            "torque order": "torques exchanged",
+            "position order": "positions exchanged",
+            "joint order": "joints exchanged",
+            "degrees": "degrees",
+            "radians": "radians",
+            "no gravity": "gravity removed",
+            "mounting": f"mounted {change.name}",
+            "zero": f"zero moved by {np.degrees(change.size):.0f} deg",
+        }
+        text = texts[change.meaning]
+        return f"{text}: {self.names(change)}" if change.joints else text
+
+    def _order(self) -> Row:
+        steps = self.steps("torque order", "position order", "joint order")
+        if not steps:
+            return self._kept("order", "joints in the order of the URDF", "torque order",
+                              "position order", "joint order",
+                              settle="move the joints one by one")  # fmt: skip
+        kinds = sorted({step.change.meaning for step in steps})
+        names = np.array(self.cell.joint_names)
+        texts = []
+        if "torque order" in kinds or "joint order" in kinds:
+            listing = ", ".join(names[np.argsort(self.axes.torque_order)])
+            texts.append(f"torque columns are of {listing}")
+        if "position order" in kinds or "joint order" in kinds:
+            listing = ", ".join(names[np.argsort(self.axes.position_order)])
+            texts.append(f"position columns are of {listing}")
+        return self._found("order", steps, "; ".join(texts), "name the joint of each column")
+
+    def _signs(self) -> Row:
+        steps = self.steps("torque sign", "position sign", "axis sign")
+        if steps:
+            text = "; ".join(self.described(step.change) for step in steps)
+            return self._found("signs", steps, text, "push one joint by hand and see its torque")
+        friction, share = self.readings.score.friction, self.readings.score.share
+        dissipates = (friction > _SEPARATE) & (share > 0.0)
+        if dissipates.all():
+            return Row(
+                "signs", "as the URDF's axes", "sure", "friction takes energy in every joint"
+            )
+        row = self._kept("signs", "as the URDF's axes", "torque sign", "position sign",
+                         settle="push one joint by hand and see its torque")  # fmt: skip
+        unsure = ", ".join(
+            name for name, sure in zip(self.cell.joint_names, dissipates, strict=True) if not sure
+        )
+        return Row(row.aspect, row.reading, row.certainty,
+                   f"{row.reason}; friction is not seen in {unsure}", row.settle)  # fmt: skip
+
+    def _unit(self) -> Row:
+        steps = self.steps("degrees", "radians")
+        if steps:
+            unit = "deg" if self.axes.factor < 1.0 else "rad"
+            return self._found("angle unit", steps, f"in {unit}", f'[position] unit = "{unit}"')
+        return self._kept("angle unit", "unit as read", "degrees", "radians")
+
+    def _zero(self) -> Row:
+        steps = self.steps("zero")
+        if not steps:
+            return self._kept("zero", "as the URDF", "zero",
+                              settle="compare a posture with the URDF's (viewer)")  # fmt: skip
+        text = "; ".join(self.described(step.change) for step in steps)
+        return self._found("zero", steps, text, "compare a posture with the URDF's (viewer)")
+
+    def _gravity(self) -> Row:
+        steps = self.steps("no gravity")
+        if steps:
+            return self._found("gravity", steps, "torque without gravity", "--gravity 0 0 0")
+        settle = "hold the arm still, stretched out, and see the torque"
+        return self._kept("gravity", "torque with gravity", "no gravity", settle=settle)
+
+    def _mounting(self) -> Row:
+        steps = self.steps("mounting")
+        if steps:
+            return self._found("mounting", steps, steps[-1].change.name, "state --gravity X Y Z")
+        return self._kept("mounting", "as stated, else upright", "mounting",
+                          settle="state --gravity X Y Z")  # fmt: skip
+
+    def _size(self) -> Row:
+        if self.common is None:
+            reason = "no masses in the URDF and little weight: size not tested"
+            settle = "state gear ratios or torque constants ([drive] of a map) if not"
+            return Row("side", "joint side", "likely", reason, settle)
+        basis = "the URDF's masses" if self.scale is not None else "the masses of arms of its reach"
+        reason = f"measured over expected by {basis}: {self.common:.2g}"
+        if not self.size_is_off:
+            certainty: Certainty = "sure" if self.scale is not None else "likely"
+            return Row("side", "joint side, a torque", certainty, reason)
+        if self._is_thousand:
+            unit = "mN.m" if self.common > 1.0 else "kN.m"
+            return Row("side", f"torque in {unit}", "likely", reason, f'[torque] unit = "{unit}"')
+        if self.common > 1.0:
+            return Row("side", "larger than the arm needs", "open", reason, "check the unit")
+        return Row("side", "motor side (before the gears), or a current", "open", reason,
+                   "ask for the unit of the channel")  # fmt: skip
+
+    @property
+    def _is_thousand(self) -> bool:
+        assert self.common is not None
+        return bool(abs(abs(np.log(self.common)) - np.log(_THOUSAND)) < np.log(2.0))
+
+    def _payload(self) -> Row:
+        payload = self.cell.file.robot.payload
+        if payload is not None:
+            return Row("payload", f"{payload.mass:g} kg as stated", "sure", "by the cell")
+        return Row("payload", "none stated; part of the last body", "open",
+                   "one recording does not separate it from the wrist",
+                   "record with and without it (`hil payload`)")  # fmt: skip
+
+    def doubts(self) -> tuple[tuple[Choice, ...], ...]:
+        """Return the readings that fit alike."""
+        found = []
+        for step in self.readings.steps:
+            if not step.alike:
+                continue
+            pairs = [(step.change, step.error), *step.alike]
+            found.append(tuple(self._choice(step, change, error) for change, error in pairs[:2]))
+        small = self.common is not None and self.common < 1.0
+        if self.size_is_off and not self._is_thousand and small:
+            found.append(self._sides())
+        return tuple(found)
+
+    def _choice(self, step: Step, change: Change, error: float) -> Choice:
+        others = [change if other is step else other.change for other in self.readings.steps]
+        axes = Axes.of(others, self.cell.model.n_joints)
+        entries: Mapping[str, Any] = {}
+        if self.map_text is not None:
+            entries = entries_of(axes, self.map_text, self.source, self.cell.joint_names)
+        line = "; ".join(
+            f"[{key.rpartition('.')[0]}] {key.rpartition('.')[2]} = {_toml(value)}"
+            if "." in key
+            else f"{key} = {_toml(value)}"
+            for key, value in entries.items()
+        )
+        return Choice("signs", self.described(change), error, line, tuple(entries.items()))
+
+    def _sides(self) -> tuple[Choice, ...]:
+        ratio = 1.0 / (self.common or 1.0)
+        count = self.cell.model.n_joints
+        each = ", ".join([f"{ratio:.0f}"] * count)
+        return (
+            Choice("side", "torque of the motors", None,
+                   f'[torque] side = "motor"; [drive] gear_ratio = [{each}] (about; the maker\'s)'),
+            Choice("side", "motor current", None,
+                   f"[motor_current] in place of [torque]; [drive] torque_constant = [{each}] "
+                   "(about, N.m/A with gears)"),
+        )  # fmt: skip
+
+    def entries(self) -> dict[str, Any]:
+        """Return the entries of the map for the sure conclusions."""
+        if self.map_text is None:
+            return {}
+        sure = [step.change for step in self.readings.steps if step.sure]
+        axes = Axes.of(sure, self.cell.model.n_joints)
+        entries = entries_of(axes, self.map_text, self.source, self.cell.joint_names)
+        if self.size_is_off and self._is_thousand and self.common is not None:
+            entries["torque.unit"] = "mN.m" if self.common > 1.0 else "kN.m"
+        return entries
+
+    def options(self) -> tuple[str, ...]:
+        """Return the options for `hil identify` that the sure conclusions need."""
+        if any(step.sure for step in self.steps("no gravity")):
+            return ("--gravity 0 0 0",)
+        steps = [step for step in self.steps("mounting") if step.sure]
+        if not steps:
+            return ()
+        return (f"--gravity {' '.join(f'{part:g}' for part in self.readings.model.gravity)}",)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return f"{value:g}"
+
+
+def _by_size(readings: Readings) -> float | None:
+    """Return the weight that the torque shows over that of an arm of this reach; None if none."""
+    model, samples = readings.model, readings.samples
+    if not np.any(model.gravity):
+        return None
+    factor = Factor.by_time(model, samples)
+    values = fit_posterior(model, factor, body_prior(model, factor).gaussian, 5.0).estimate.values
+    still = np.zeros_like(samples.torque)
+    rigid = np.where(model.friction_columns, 0.0, values)
+    weight = np.ptp(model.torque(rigid, samples.motion.position, still, still), axis=0).max()
+    reach = float(np.linalg.norm(model.chain.translation[1:], axis=1).sum())
+    if not weight > 0.0 or not reach > 0.0:
+        return None
+    mass = _DENSITY * reach**3
+    return float(weight / (0.3 * mass * _GRAVITY * reach))
+
+
+def current_only() -> Row:
+    """Return the row of a log with motor currents and no torque."""
+    return Row("torque", "none; motor currents", "sure", "by name or unit",
+               "[drive] torque_constant of a map (N.m/A), or `hil gains`")  # fmt: skip
+
+
+def channel_rows(delay: DelayEstimate | None, low_pass: Preprocessing | None) -> Iterator[Row]:
+    """Yield delay and low-pass of the torque."""
+    if delay is None:
+        yield Row("delay", "not determined", "open", "no usable row")
+    elif delay.significant:
+        half = 1e3 * delay.half_interval
+        yield Row("delay", f"torque {1e3 * delay.delay:.0f} ms behind the position", "sure",
+                  f"± {half:.1g} ms", "--delay auto")  # fmt: skip
+    elif delay.determined:
+        yield Row(
+            "delay", "none", "sure", f"{1e3 * delay.delay:.1f} ± {1e3 * delay.half_interval:.1g} ms"
+        )
+    else:
+        yield Row("delay", "none seen", "likely", str(delay.reason), "record faster motion")
+    if low_pass is None or low_pass.torque_bandwidth is None:
+        yield Row("low-pass", "none in the torque", "likely", "none predicts it better")
+        return
+    kind = "causal" if low_pass.torque_shape.causal else "without phase"
+    yield Row("low-pass", f"torque low-passed at {low_pass.torque_bandwidth:.2g} Hz", "likely",
+              f"order {low_pass.torque_shape.order}, {kind}, fits better",
+              "ask for the filter of the channel")  # fmt: skip
+
+
+def determined(readings: Readings) -> tuple[Group, ...]:
+    """Return how many parameters of each body and joint the recording determines.
+
+    By the posterior over the prior standard deviation of each base parameter.
+    """
+    model, samples = readings.model, readings.samples
+    factor = Factor.by_time(model, samples)
+    ratio = fit_posterior(model, factor, body_prior(model, factor).gaussian).ratio
+    groups = []
+    joints = _joints_of(readings)
+    for joint, name in enumerate(model.joint_names):
+        for quantity in ("body", "friction"):
+            own = [
+                float(ratio[k])
+                for k, (owner, kind) in enumerate(joints)
+                if owner == joint and kind == quantity
+            ]
+            if own:
+                good = sum(value < LEARNED for value in own)
+                weak = sum(LEARNED <= value < _WEAK for value in own)
+                groups.append(Group(name, quantity, good, weak, len(own) - good - weak))
+    return tuple(groups)
+
+
+def _joints_of(readings: Readings) -> list[tuple[int, str]]:
+    """Return the joint of each parameter, and whether it is of its body or its friction."""
+    model = readings.model
+    width = model.layout.width
+    found = [(min(int(pivot) // width, model.n_joints - 1), "body") for pivot in model.base.pivots]
+    assert width >= len(LINK_SYMBOLS)
+    found += [(term.owner, "friction") for term in model.friction.terms]
+    found += [(-1, "element")] * (model.n_parameters - len(found))
+    return found

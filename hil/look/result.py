@@ -1,0 +1,103 @@
+"""The result of a look at a recording: rows of one table, doubts, and what can be determined."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+Certainty = Literal["sure", "likely", "open"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one aspect of a recording is.
+
+    Attributes:
+        aspect: such as ``position`` or ``gravity``.
+        reading: what it is.
+        certainty: ``sure``: nothing else fits; ``likely``: by names or custom; ``open``: the
+            recording does not say.
+        reason: why.
+        settle: what would settle a doubt; empty if there is none.
+    """
+
+    aspect: str
+    reading: str
+    certainty: Certainty
+    reason: str
+    settle: str = ""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of two readings that fit alike.
+
+    Attributes:
+        aspect: that of a row.
+        reading: what it would be.
+        error: of the torque, predicted from other parts of the recording, as a share of it; None
+            if the motion says nothing about it.
+        line: of a column map, or an option, that states it.
+        entries: of the map, by dotted key; empty if the line is no entry of a map.
+    """
+
+    aspect: str
+    reading: str
+    error: float | None
+    line: str
+    entries: tuple[tuple[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
+class Group:
+    """How many parameters of a body or joint the recording determines."""
+
+    body: str
+    quantity: str
+    identifiable: int
+    weak: int
+    missing: int
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a recording contains.
+
+    Attributes:
+        source: its file name.
+        rows: of the table.
+        doubts: readings that fit alike, one tuple for each question.
+        groups: parameters that the recording determines; empty without masses or geometry.
+        map_text: the column map with the sure conclusions; None for a bag.
+        options: for `hil identify`, beside the map.
+    """
+
+    source: str
+    rows: tuple[Row, ...]
+    doubts: tuple[tuple[Choice, ...], ...]
+    groups: tuple[Group, ...]
+    map_text: str | None
+    options: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the result for programs."""
+        doubts = [
+            [
+                {
+                    "aspect": choice.aspect,
+                    "reading": choice.reading,
+                    "error": choice.error,
+                    "line": choice.line,
+                }
+                for choice in choices
+            ]
+            for choices in self.doubts
+        ]
+        return {
+            "source": self.source,
+            "rows": [asdict(row) for row in self.rows],
+            "doubts": doubts,
+            "determines": [asdict(group) for group in self.groups],
+            "map": self.map_text,
+            "options": list(self.options),
+        }

@@ -1,0 +1,136 @@
+"""A look at a recording: names and units, clock, slopes, limits, then the torque's physics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+import numpy as np
+
+from hil.archive import open_archive
+from hil.cell import Cell
+from hil.errors import SourceError
+from hil.identify.sources import Source, cell_of, source_of
+from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, import_recording
+from hil.look import physics, signals
+from hil.look.maps import with_entries
+from hil.look.result import Look, Row
+from hil.look.undescribed import undescribed_robot
+from identification.errors import IdentificationError
+from identification.estimators.delay import DelayEstimate, estimate_delay
+from identification.estimators.torque_channel import possible_low_passes
+from identification.model.robot import RobotModel
+from identification.signals.recording import Recording, RecordingError
+from identification.signals.samples import Preprocessing, prepare
+from identification.validation.readings import Axes, Readings, find_readings
+
+_SETTINGS: Final = Preprocessing(14.0, left_out="rests")
+_DELAY_SAMPLES: Final = 20_000
+_LEAST_MOTION: Final = 1.0  # s
+MOUNTINGS: Final = {
+    "": (0.0, 0.0, 0.0),
+    "upside down": (0.0, 0.0, 9.81),
+    "on a wall, +x down": (9.81, 0.0, 0.0),
+    "on a wall, -x down": (-9.81, 0.0, 0.0),
+    "on a wall, +y down": (0.0, 9.81, 0.0),
+    "on a wall, -y down": (0.0, -9.81, 0.0),
+    "upright": (0.0, 0.0, -9.81),
+}
+"""Gravity in the base frame by mounting [m/s²]; "" for a torque without gravity."""
+
+
+def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> Look:
+    """Return what a recording contains and, with its robot, what its torque can determine.
+
+    Raises:
+        SourceError: it cannot be read, or its names leave a quantity open.
+    """
+    with TemporaryDirectory(prefix="hil-") as folder:
+        archive = Path(folder) / "look.mcap"
+        robot = robot_of or (lambda _: undescribed_robot(source, options))
+        lenient = replace(options, outside_limits=True)
+        imported = import_recording(source, archive, robot, lenient)
+        opened = open_archive(archive)
+        notes = opened.header.findings.lines
+        cell = cell_of(opened)
+        try:
+            recorded = source_of(opened, cell)
+            recorded.recording.checked(cell.joint_names)
+        except (RecordingError, SourceError) as error:
+            raise SourceError(source, str(error)) from error
+        rows = signals.rows(recorded.recording, imported.lines, notes, cell, given=robot_of)
+        if robot_of is None:
+            rows.append(_without_robot(recorded.recording))
+            return Look(source.name, tuple(rows), (), (), imported.map_text)
+        return _with_torque(source, recorded, imported, cell, rows)
+
+
+def _without_robot(recording: Recording) -> Row:
+    quantity = "torque" if recording.torque is not None else "motor current"
+    return Row(
+        quantity,
+        "side, gravity, signs and order of the joints not examined",
+        "open",
+        "a torque says them only together with the arm's geometry",
+        "add --urdf ARM.urdf",
+    )
+
+
+def _with_torque(
+    source: Path, recorded: Source, imported: ImportedRecording, cell: Cell, rows: list[Row]
+) -> Look:
+    recording, model = recorded.recording, cell.model
+    if recording.torque is None:
+        rows.append(physics.current_only())
+        return Look(source.name, tuple(rows), (), (), imported.map_text)
+    if recording.time[-1] - recording.time[0] < _LEAST_MOTION or not recording.torque.any():
+        row = Row("torque", "not examined", "open", "less than a second, or zero throughout")
+        return Look(source.name, (*rows, row), (), (), imported.map_text)
+    readings = _readings(cell, recording, imported)
+    axes = Axes.of((step.change for step in readings.steps), model.n_joints)
+    finding = physics.Finding(cell, recording, readings, axes, imported.map_text, source)
+    delay, low_pass = _channel(axes.read(recording), readings.model)
+    rows += finding.rows()
+    rows += physics.channel_rows(delay, low_pass)
+    doubts = finding.doubts()
+    groups = physics.determined(readings)
+    text = imported.map_text
+    if text is not None:
+        text = with_entries(text, finding.entries())
+    return Look(source.name, tuple(rows), doubts, groups, text, finding.options())
+
+
+def _readings(cell: Cell, recording: Recording, imported: ImportedRecording) -> Readings:
+    samples = prepare(recording, cell.model, options=_SETTINGS)
+    stated = any("position" in line and "no unit stated" not in line for line in imported.lines)
+    mountings = {
+        name: _mounted(cell, gravity)
+        for name, gravity in MOUNTINGS.items()
+        if not np.allclose(gravity, cell.model.gravity)
+    }
+    return find_readings(
+        cell.model,
+        samples,
+        mountings=mountings,
+        unit_is_open=not stated,
+    )
+
+
+def _mounted(cell: Cell, gravity: tuple[float, float, float]) -> RobotModel:
+    robot = cell.file.robot.model_copy(update={"gravity": gravity})
+    return replace(cell, file=cell.file.model_copy(update={"robot": robot})).model
+
+
+def _channel(
+    recording: Recording, model: RobotModel
+) -> tuple[DelayEstimate | None, Preprocessing | None]:
+    """Return delay and low-pass of the torque; None where the motion does not say."""
+    some = recording.between(0, min(recording.n_samples, _DELAY_SAMPLES))
+    try:
+        delay = estimate_delay(some, model, options=_SETTINGS)
+        low_passes = possible_low_passes(some, model, options=_SETTINGS)
+    except IdentificationError:
+        return None, None
+    return delay, low_passes[-1] if low_passes else None
