@@ -1,9 +1,9 @@
 """Twelve meanings planted in real recordings, and what `hil look` says of them.
 
-Run with ``python -m benchmarks.look --data DIR [--arm NAME] [--json]``, where DIR has ``ur10_unisa``,
-``kr300``, ``lwr4`` and ``gen3``, whose torques are of the joint side. Each recording is read as it is
-and with one meaning planted; *right*: the meaning is named, alone or as one of two readings that
-fit alike; *wrong*: a row that is called sure says something else of any aspect.
+Run with ``python -m benchmarks.look --data DIR [--arm NAME]``, where DIR has ``ur10_unisa``,
+``kr300``, ``lwr4`` and ``gen3``, whose torques are of the joint side. Each recording
+is read as it is and with one meaning planted; *right*: the meaning is named, alone or as one of two
+readings that fit alike; *wrong*: a row that is called sure says something else of any aspect.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def arms(data: Path, folder: Path, only: str | None = None) -> Iterator[Arm]:
         if not log.exists() or only not in (None, name):
             continue
 
-        def robot_of(recorded: object, urdf: Path = urdf) -> Robot:
+        def robot_of(_: object, urdf: Path = urdf) -> Robot:
             return Robot.from_urdf(urdf)
 
         path = folder / f"{name}.mcap"
@@ -145,11 +145,17 @@ def plants(arm: Arm) -> Iterator[Planted]:
     yield of("delayed", "delay", "behind", torque=_shifted(t, tau, -_LATE))
     smooth = _shifted(t, _low_passed(t, q, both=True), _AHEAD)
     yield of("commanded", "positions", "commanded", position=smooth)
-    yield of("wrapped", "wraps", "wrapped", position=np.mod(q - q.mean(axis=0), 2.0 * np.pi))
+    yield of("wrapped", "wraps", "wrapped", position=_wrapped(q))
     for joint, angle in ((1, 0.6), (2, -0.6), (3, np.pi / 2.0)):
         zero = np.zeros(n)
         zero[joint] = angle
         yield of(f"zero of joint {joint + 1}", "zero", names[joint], position=q + zero)
+
+
+def _wrapped(q: Array) -> Array:
+    """Return angles of which each jumps by a turn at the middle of its range."""
+    middle = 0.5 * (q.max(axis=0) + q.min(axis=0))
+    return np.asarray(np.mod(q - middle, 2.0 * np.pi) + middle)
 
 
 def _signs(
@@ -186,7 +192,7 @@ def judged(arm: Arm, planted: Planted, folder: Path) -> dict[str, object]:
     if planted.velocity is not None:
         arrays["v"] = planted.velocity
     np.savez(path, **arrays)  # type: ignore[arg-type]
-    begin = time.perf_counter()
+    begin = time.process_time()
     row: dict[str, object] = {"arm": arm.name, "planted": planted.meaning}
     try:
         found = look_at(path, arm.robot_of, ImportOptions())
@@ -198,7 +204,7 @@ def judged(arm: Arm, planted: Planted, folder: Path) -> dict[str, object]:
         **row,
         "right": right,
         "wrong": _wrong(found, planted),
-        "seconds": round(time.perf_counter() - begin, 1),
+        "seconds": round(time.process_time() - begin, 1),
         "said": " | ".join(said),
     }
 
@@ -227,36 +233,37 @@ def _wrong(found: Look, planted: Planted) -> str:
     return ", ".join(wrong)
 
 
-def measure(data: Path, only: str | None = None) -> list[dict[str, object]]:
-    """Return a row for each arm and meaning."""
+def measure(data: Path, only: str | None = None, meaning: str = "") -> Iterator[dict[str, object]]:
+    """Yield a row for each arm and meaning."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        return [
-            judged(arm, planted, place)
-            for arm in arms(data, place, only)
-            for planted in plants(arm)
-        ]
+        for arm in arms(data, place, only):
+            for planted in plants(arm):
+                if meaning in planted.meaning:
+                    yield judged(arm, planted, place)
 
 
 def main() -> None:
     """Print the table and its shares."""
     parser = parser_of(__doc__)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--arm")
+    parser.add_argument("--arm", help="one of ur10, kr300, lwr4, gen3")
+    parser.add_argument("--meaning", default="", help="part of the name of a meaning")
     options = parser.parse_args()
-    rows = measure(options.data, options.arm)
+    rows = []
+    for row in measure(options.data, options.arm, options.meaning):
+        rows.append(row)
+        if not options.json:
+            print(
+                f"{row['arm']:6} {row['planted']:20} {'right' if row['right'] else 'NOT':5} "
+                f"{row['wrong'] or '-':12} {row.get('seconds', 0)!s:>5} s  {row['said']}",
+                flush=True,
+            )
     count = max(1, len(rows))
     result = {
         "right": sum(bool(row["right"]) for row in rows) / count,
         "wrong": sum(bool(row["wrong"]) for row in rows) / count,
     }
-    lines = [
-        f"{row['arm']:6} {row['planted']:20} {'right' if row['right'] else 'NOT':5} "
-        f"{row['wrong'] or '-':16} {row.get('seconds', 0)!s:>5} s  {row['said']}"
-        for row in rows
-    ]
-    if not options.json:
-        print("\n".join(lines))
     show({"readings": len(rows), **result}, only_json=options.json)
 
 

@@ -129,6 +129,11 @@ class Robot:
         )
         return self._checked(text, self.urdf, path)
 
+    def with_gravity(self, gravity: Sequence[float]) -> Robot:
+        """Return this robot under another gravity in the base frame [m/s²]."""
+        values = {"robot.gravity": [float(value) for value in gravity]}
+        return self._checked(with_values(self.cell, values), self.urdf, Path("cell.toml"))
+
     @classmethod
     def _checked(cls, text: str, urdf: str, path: Path) -> Robot:
         cell = Cell.from_texts(text, urdf, path)

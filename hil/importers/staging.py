@@ -26,6 +26,7 @@ from hil.importers.recording import (
     is_archive,
 )
 from hil.importers.robot import Use
+from hil.look.conclusions import concluded
 from hil.progress import Reporter
 
 MAP: Final = "map.toml"
@@ -106,6 +107,7 @@ def staged(
                 archive = _free(Path(folder), path)
                 recording = import_recording(path, archive, robot_of, options, use=use)
                 _require_usable(archive, path)
+                recording = concluded(recording, path, robot_of, options, use)
                 _report(recording, path, reporter)
                 archives.append(archive)
                 staging.recordings[archive] = recording
@@ -132,7 +134,7 @@ def _free(folder: Path, recording: Path) -> Path:
 
 def _require_usable(archive: Path, recording: Path) -> None:
     """Raise SourceError for a recording that nothing can be identified from."""
-    imported = open_archive(archive, fields=("torque",))
+    imported = open_archive(archive, fields=("position", "torque"))
     columns, stamp = imported.columns, imported.columns["stamp"]
     duration = float(stamp[-1] - stamp[0]) * 1e-9
     if duration < _SHORTEST:
@@ -148,6 +150,10 @@ def _require_usable(archive: Path, recording: Path) -> None:
             "(`hil torque-constants`)"
         )
         raise SourceError(recording, problem, field="torque", remedy=remedy)
+    if not np.ptp(np.asarray(columns["position"]), axis=0).any():
+        problem = "no joint moves: every position is constant"
+        remedy = "check which channels hold the measured positions (--columns 'position=NAME{}')"
+        raise SourceError(recording, problem, field="position", remedy=remedy)
     torque = np.asarray(columns["torque"])
     if not np.ptp(torque, axis=0).any():
         values = ", ".join(f"{value:g}" for value in torque[0])

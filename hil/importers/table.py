@@ -33,6 +33,7 @@ _WRITTEN = (
     (";", ","), ("\t", ","), ("|", ","), (None, ","), (",", ","),
 )  # fmt: skip
 _ROSTOPIC = "%time,"  # of `rostopic echo -p`
+_EMPTY: Final = "record again, or name the file that has the samples"
 _PROBED: Final = 100  # lines
 _LONGEST: Final = 1 << 31  # bytes; several times as many in memory
 _LONGEST_TIME: Final = 30  # digits before the point, more than of nanoseconds since 1970
@@ -111,7 +112,7 @@ class Table:
         numbered = [entry for entry in numbered if not entry[1].lstrip().startswith(_COMMENTS)]
         filled = [line for _, line in numbered if line.strip()]
         if not filled:
-            raise SourceError(path, "has no row of numbers")
+            raise SourceError(path, "has no row of numbers", remedy=_EMPTY)
         dialect = _dialect(filled[:_PROBED], form)
         if form.transposed:
             numbered = _transposed([entry for entry in numbered if entry[1].strip()], dialect, path)
@@ -324,7 +325,7 @@ def _layout(numbered: list[tuple[int, str]], dialect: Dialect, path: Path, form:
     if form.header is False:
         begin = 0
     if begin >= len(filled):
-        raise SourceError(path, "has no row of numbers")
+        raise SourceError(path, "has no row of numbers", remedy=_EMPTY)
     head = [dialect.cells(line) for _, line in filled[:begin]]
     units: list[str] = []
     if len(head) > 1 and _are_units(head[-1]):

@@ -27,6 +27,8 @@ from identification.validation.readings import Axes, Change, Meaning, Readings, 
 Array = NDArray[np.float64]
 
 _SEPARATE: Final = 3.0  # standard errors
+_HALF: Final = 0.5
+_ALIKE: Final = 1.02  # error ratio of readings of which the recording does not choose one
 _OTHER_UNIT: Final = 3.0  # factor beyond which the masses of a URDF do not explain a torque
 _THOUSAND: Final = 1000.0
 _WEAK: Final = 0.9  # posterior over prior deviation of a parameter that the recording hardly moves
@@ -108,6 +110,10 @@ class Finding:
         ratio = float(np.prod([step.ratio for step in steps]))
         sigmas = min(step.sigmas for step in steps)
         certainty: Certainty = "sure" if all(step.sure for step in steps) else "open"
+        nearest = self.readings.nearest
+        rivals = [nearest[step.change.meaning] for step in steps if step.change.meaning in nearest]
+        if any(rival[1].sigmas < _SEPARATE and _repeats(rival[0], steps) for rival in rivals):
+            certainty = "open"
         reason = f"error {ratio:.2f} times that as recorded ({-sigmas:.0f} standard errors)"
         if ratio > 1.0 - 0.05:
             reason = "friction would drive the joint otherwise"
@@ -121,8 +127,12 @@ class Finding:
             return Row(aspect, reading, "likely", "not examined", settle)
         change, against = min(rivals, key=lambda rival: rival[1].sigmas)
         reason = f"next best: {self.described(change)}, error {against.ratio:.2f} times"
-        certainty: Certainty = "sure" if against.sigmas > _SEPARATE else "likely"
-        return Row(aspect, reading, certainty, reason, "" if certainty == "sure" else settle)
+        if against.sigmas > _SEPARATE:
+            return Row(aspect, reading, "sure", reason)
+        if against.sigmas < _HALF * _SEPARATE or against.ratio < _ALIKE:
+            both = f"{reading}, or {self.described(change)}"
+            return Row(aspect, both, "open", reason, settle)
+        return Row(aspect, reading, "likely", reason, settle)
 
     def described(self, change: Change) -> str:
         """Return a change in words."""
@@ -296,6 +306,13 @@ class Finding:
         if not steps:
             return ()
         return (f"--gravity {' '.join(f'{part:g}' for part in self.readings.model.gravity)}",)
+
+
+def _repeats(change: Change, steps: list[Step]) -> bool:
+    """Whether a change concerns the joints of steps that are orders."""
+    return change.meaning.endswith("order") and any(
+        set(change.joints) & set(step.change.joints) for step in steps
+    )
 
 
 def _toml(value: Any) -> str:

@@ -26,7 +26,8 @@ from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Preprocessing, prepare
 from identification.validation.readings import Axes, Readings, find_readings
 
-_SETTINGS: Final = Preprocessing(14.0, left_out="rests")
+SETTINGS: Final = Preprocessing(14.0, left_out="rests")
+"""Preparation of a recording whose readings are compared."""
 _DELAY_SAMPLES: Final = 20_000
 _LEAST_MOTION: Final = 1.0  # s
 MOUNTINGS: Final = {
@@ -103,7 +104,7 @@ def _with_torque(
 
 
 def _readings(cell: Cell, recording: Recording, imported: ImportedRecording) -> Readings:
-    samples = prepare(recording, cell.model, options=_SETTINGS)
+    samples = prepare(recording, cell.model, options=SETTINGS)
     stated = any("position" in line and "no unit stated" not in line for line in imported.lines)
     mountings = {
         name: _mounted(cell, gravity)
@@ -129,8 +130,8 @@ def _channel(
     """Return delay and low-pass of the torque; None where the motion does not say."""
     some = recording.between(0, min(recording.n_samples, _DELAY_SAMPLES))
     try:
-        delay = estimate_delay(some, model, options=_SETTINGS)
-        low_passes = possible_low_passes(some, model, options=_SETTINGS)
+        delay = estimate_delay(some, model, options=SETTINGS)
+        low_passes = possible_low_passes(some, model, options=SETTINGS)
     except IdentificationError:
         return None, None
     return delay, low_passes[-1] if low_passes else None

@@ -10,7 +10,7 @@ enough and masses help where they are known.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Final, Literal, NamedTuple
@@ -53,7 +53,12 @@ _LEAST_FRICTION: Final = 0.02  # of the torque of a joint
 _ROWS: Final = 700
 _BLOCKS: Final = 20
 _FOLDS: Final = 5
-_ROWS_PER_FACT: Final = 5.0  # rows that count as one beside the prior
+# Rows that count as one beside the prior: seven in all. A wrong reading needs bodies that no arm
+# has, which a weak prior would allow.
+_ROWS_PER_FACT: Final = 100.0
+_LARGE: Final = 0.15  # relative reduction of the error that chance alone does not make
+_CLEAR: Final = 3.0  # standard errors of a reading that reduces the error so much
+_IMPROVES: Final = 0.98  # error ratio of one exchange from which a whole order is searched for
 _CLOSER: Final = 24  # changes of least error on a fifth of the blocks, which are tried on all
 _MOST_STEPS: Final = 6
 _SPEED: Final = 0.9  # quantile of the speed at which friction is judged
@@ -65,13 +70,20 @@ _DEGREE: Final = np.pi / 180.0
 class Change(NamedTuple):
     """One difference between a reading and what was recorded.
 
-    `size` is an angle [rad] to add to a position; `name` that of a mounting.
+    `size` is an angle [rad] to add to a position; `name` that of a mounting; `order` the recorded
+    place of each of the joints, by default those of a pair exchanged.
     """
 
     meaning: Meaning
     joints: tuple[int, ...] = ()
     size: float = 0.0
     name: str = ""
+    order: tuple[int, ...] = ()
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """The joints in whose place those of `joints` are read, for an order."""
+        return self.order or self.joints[::-1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +105,8 @@ class Score:
     @property
     def relative(self) -> Array:
         """Errors as shares of the torque (n,)."""
-        return np.sqrt(self.squares.sum(axis=0) / np.where(self.torque > 0.0, self.torque, 1.0))
+        torque = np.where(self.torque > 0.0, self.torque, 1.0)
+        return np.asarray(np.sqrt(self.squares.sum(axis=0) / torque))
 
     @property
     def overall(self) -> float:
@@ -182,7 +195,8 @@ def find_readings(
     def started() -> _Search:
         return _Search(model, few, mountings or {}, unit_is_open=unit_is_open)
 
-    search, steps = started(), []
+    search = started()
+    steps: list[Step] = []
     while len(steps) < _MOST_STEPS:
         step = search.by_prediction() or search.by_friction()
         if step is None:
@@ -234,11 +248,8 @@ class _Search:
     def by_prediction(self) -> Step | None:
         """Adopt the change that predicts best; None if none is significant."""
         trials = self._tried()
-        good = [
-            trial
-            for trial in trials
-            if trial.against.ratio < 1.0 - _LEAST_GAIN and trial.against.sigmas < -SURE
-        ]
+        trials = [*trials, *self._orders(trials)]
+        good = [trial for trial in trials if _is_better(trial.against)]
         good = [trial for trial in good if not self._is_spoilt(trial)]
         if not good:
             return None
@@ -267,6 +278,27 @@ class _Search:
             if meaning not in nearest or trial.against.ratio < nearest[meaning][1].ratio:
                 nearest[meaning] = trial.change, trial.against
         return nearest
+
+    def _orders(self, trials: Sequence[Trial]) -> Iterator[Trial]:
+        """Yield whole orders, by one exchange after the other while the error falls."""
+        kinds: tuple[Meaning, ...] = ("torque order", "position order", "joint order")
+        for kind in kinds:
+            own = [trial for trial in trials if trial.change.meaning == kind]
+            if not any(trial.against.ratio < _IMPROVES for trial in own):
+                continue
+            order, error = tuple(range(self.model.n_joints)), self._error_of_few(None)
+            for _ in order:
+                tried = {
+                    _exchanged(order, pair): pair for pair in combinations(range(len(order)), 2)
+                }
+                errors = {other: self._error_of_few(_order_change(kind, other)) for other in tried}
+                best = min(errors, key=errors.__getitem__)
+                if errors[best] >= error:
+                    break
+                order, error = best, errors[best]
+            change = _order_change(kind, order)
+            if len(change.joints) > 2:
+                yield self._try(change)
 
     def _is_spoilt(self, trial: Trial) -> bool:
         """Whether a change that concerns few joints predicts another one worse."""
@@ -305,9 +337,9 @@ class _Search:
             self._trials = [self._try(change) for change in closer]
         return self._trials
 
-    def _error_of_few(self, change: Change) -> float:
-        """Return the mean logarithm of the errors of one fold with a change."""
-        model, samples = self._changed(change)
+    def _error_of_few(self, change: Change | None) -> float:
+        """Return the sum of the logarithms of squared errors of one fold with a change."""
+        model, samples = (self.model, self.samples) if change is None else self._changed(change)
         prior = self._prior if model is self.model else None
         squares = score_of(model, samples, folds=1, prior=prior).squares
         tested = squares.sum(axis=0) > 0.0
@@ -357,7 +389,9 @@ def _moved(model: RobotModel, samples: Samples, change: Change) -> Samples:
     """Return samples with signs, orders, unit or zero of the joints changed."""
     meaning, joints = change.meaning, change.joints
     motion = samples.motion
-    if meaning in ("torque sign", "axis sign", "torque order", "position order", "joint order"):
+    if meaning.endswith("order"):
+        return _reordered(model, samples, change)
+    if meaning in ("torque sign", "axis sign"):
         return corrected(model, samples, Fault(meaning, joints))
     if meaning == "position sign":
         turned = corrected(model, samples, Fault("axis sign", joints))
@@ -374,6 +408,38 @@ def _moved(model: RobotModel, samples: Samples, change: Change) -> Samples:
             acceleration=factor * motion.acceleration,
         )
     return replace(samples, motion=motion, mask=None).with_friction_direction(model)
+
+
+def _reordered(model: RobotModel, samples: Samples, change: Change) -> Samples:
+    """Return samples with joints read from other places, one exchange after the other."""
+    order, now = np.arange(model.n_joints), np.arange(model.n_joints)
+    order[list(change.joints)] = change.places
+    for joint in range(model.n_joints):
+        place = int(np.flatnonzero(now == order[joint])[0])
+        if place != joint:
+            now[[joint, place]] = now[[place, joint]]
+            samples = corrected(model, samples, Fault(change.meaning, (joint, place)))
+    return samples
+
+
+def _exchanged(order: tuple[int, ...], pair: tuple[int, int]) -> tuple[int, ...]:
+    places = list(order)
+    first, second = pair
+    places[first], places[second] = places[second], places[first]
+    return tuple(places)
+
+
+def _order_change(meaning: Meaning, order: tuple[int, ...]) -> Change:
+    """Return the change to a whole order of n joints, with those that move alone."""
+    joints = tuple(joint for joint, place in enumerate(order) if joint != place)
+    return Change(meaning, joints, order=tuple(order[joint] for joint in joints))
+
+
+def _is_better(against: Comparison) -> bool:
+    """Whether a change reduces the error by more than chance, of all that are tried."""
+    if against.ratio < 1.0 - _LARGE and against.sigmas < -_CLEAR:
+        return True
+    return against.ratio < 1.0 - _LEAST_GAIN and against.sigmas < -SURE
 
 
 def _factor(model: RobotModel, samples: Samples) -> Factor:
@@ -492,7 +558,7 @@ class Axes(NamedTuple):
         meaning, own = change.meaning, list(change.joints)
         order, sign = np.arange(len(self.zero)), np.ones(len(self.zero))
         if meaning.endswith("order"):
-            order[own] = own[::-1]
+            order[own] = change.places
         elif meaning.endswith("sign"):
             sign[own] = -1.0
         axes = self

@@ -1,0 +1,133 @@
+"""What an identification concludes of a log before it is fitted, by the same search as a look."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from hil.archive import open_archive
+from hil.errors import SourceError
+from hil.identify.sources import cell_of, source_of
+from hil.importers.findings import outside_limits
+from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, import_recording
+from hil.importers.robot import Robot, Use
+from hil.look.result import Choice, Look
+from hil.look.run import SETTINGS, look_at
+from identification.errors import IdentificationError
+from identification.signals.samples import prepare
+from identification.validation.readings import score_of
+
+_SUSPECT: Final = 0.15
+"""Error of the torque, predicted from other parts, above which a log is looked at closely. Right
+logs of four real arms have 0.04 to 0.11, with URDFs of other arms 0.09 to 1.1."""
+_OTHER_ARM: Final = 0.5
+"""The same, above which no masses of this arm explain the torque."""
+_DRIVES: Final = -4.0  # standard errors of a friction that drives a joint
+_ROWS: Final = 700
+
+
+def concluded(
+    imported: ImportedRecording,
+    source: Path,
+    robot_of: RobotOf,
+    options: ImportOptions,
+    use: Use,
+) -> ImportedRecording:
+    """Return a log imported again with what its motion and torque say, if that is sure.
+
+    A log that a map describes, or whose torque follows its arm, is returned as it is.
+
+    Raises:
+        SourceError: two readings fit alike, or the URDF is that of another arm.
+    """
+    if options.columns is not None or imported.map_text is None:
+        return imported
+    error = _suspicion(imported.archive)
+    if error is None:
+        return imported
+    found = look_at(source, robot_of, options)
+    if found.doubts:
+        raise _doubt(source, found.doubts[0])
+    if found.map_text != imported.map_text or found.options:
+        return _again(imported, source, robot_of, found, use)
+    if error > _OTHER_ARM:
+        raise _other_arm(source, error)
+    return imported
+
+
+def _suspicion(archive: Path) -> float | None:
+    """Return the error of the torque if it does not follow the arm; None if it does."""
+    opened = open_archive(archive)
+    cell = cell_of(opened)
+    try:
+        recording = source_of(opened, cell).recording
+        samples = prepare(recording, cell.model, options=SETTINGS)
+        few = samples.thinned(max(1, len(samples.torque) // _ROWS))
+        score = score_of(cell.model, few)
+    except (IdentificationError, ValueError):
+        return None  # the identification says what is wrong
+    beyond = outside_limits(recording.position, cell.joint_names, cell.urdf) is not None
+    driven = bool(np.any(score.friction < _DRIVES))
+    suspect = score.overall > _SUSPECT or (beyond and driven)
+    return score.overall if suspect or driven else None
+
+
+def _again(
+    imported: ImportedRecording, source: Path, robot_of: RobotOf, found: Look, use: Use
+) -> ImportedRecording:
+    """Import a log again with a map and the gravity that were found."""
+    assert found.map_text is not None
+    column_map = imported.archive.with_suffix(".found.toml")
+    column_map.write_text(found.map_text, encoding="utf-8")
+    gravity = _gravity(found)
+
+    def robot(recorded: object) -> Robot:
+        described = robot_of(recorded)  # type: ignore[arg-type]
+        return described if gravity is None else described.with_gravity(gravity)
+
+    again = import_recording(
+        source, imported.archive, robot, ImportOptions(column_map), use=use, force=True
+    )
+    column_map.unlink()
+    aspects = ("order", "signs", "angle unit", "zero", "gravity", "mounting")
+    lines = [
+        f"{row.aspect}: {row.reading}, concluded; {row.reason}"
+        for row in found.rows
+        if row.aspect in aspects and row.certainty == "sure" and not row.reason.startswith("next")
+    ]
+    lines = [line for line in lines if "friction takes energy" not in line]
+    return replace(again, lines=(*imported.lines, *lines))
+
+
+def _gravity(found: Look) -> tuple[float, ...] | None:
+    words = " ".join(found.options).split()
+    return tuple(float(word) for word in words[1:4]) if words else None
+
+
+def _doubt(source: Path, choices: tuple[Choice, ...]) -> SourceError:
+    readings = " or ".join(
+        f"{choice.reading} (error {choice.error:.1%})" if choice.error else choice.reading
+        for choice in choices
+    )
+    lines = " or ".join(choice.line for choice in choices)
+    remedy = (
+        f"write the map with `hil look {source.name} --urdf ARM.urdf -o map.toml`, add one of the "
+        f"lines {lines}, and give it with --map"
+    )
+    problem = f"two readings fit alike: {readings}"
+    return SourceError(source, problem, field=choices[0].aspect, remedy=remedy)
+
+
+def _other_arm(source: Path, error: float) -> SourceError:
+    problem = (
+        f"its torque does not follow the arm of the URDF: whatever the masses, {error:.0%} of it "
+        "stays unexplained, and no other unit, sign or order of the joints helps"
+    )
+    remedy = (
+        "give the URDF of this arm; to identify in spite of that, give the column map "
+        "(`hil look LOG --urdf ARM.urdf -o map.toml`, --map map.toml)"
+    )
+    return SourceError(source, problem, field="--urdf", remedy=remedy)
