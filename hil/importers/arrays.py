@@ -1,4 +1,4 @@
-"""Files of named arrays: .npz and .npy of numpy, .mat and .m of MATLAB, ROS 2 messages in MCAP."""
+"""Files of named arrays: numpy's, MATLAB's, Parquet, and messages in MCAP."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hil.errors import SourceError
 from hil.importers import mcap_messages
 from hil.importers.column_map import Column
+from hil.importers.document_messages import ENCODINGS, columns_of_trees, trees
 from hil.importers.matlab import NUMBERS, mat_array, mat_shapes, script_matrices
 from hil.importers.ros_messages import MessageError, columns_of, decoded, typestore_of
 from hil.reading import open_file
@@ -238,8 +239,12 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
     Raises:
         SourceError: the file cannot be read, or has no topic that can be read this way.
     """
-    known, messages = mcap_messages.read(path, lambda _, topic: topic.is_ros2)
-    refused = {name: f"{t} is not ROS 2" for name, t in known.items() if not t.is_ros2}
+    known, messages = mcap_messages.read(path, lambda _, topic: _is_readable(topic))
+    refused = {
+        name: f"{t} is neither ROS 2 nor JSON nor Protobuf"
+        for name, t in known.items()
+        if not _is_readable(t)
+    }
     by_topic: dict[str, list[tuple[int, bytes]]] = {}
     for name, stamp, data in messages:
         by_topic.setdefault(name, []).append((stamp, data))
@@ -247,10 +252,7 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
     for name, received in by_topic.items():
         topic = known[name]
         try:
-            definition = topic.definition.decode(errors="replace")
-            store = typestore_of(topic.kind, definition, topic.schema_encoding)
-            content = [decoded(store, topic.kind, data) for _, data in received]
-            columns = columns_of([stamp for stamp, _ in received], content)
+            columns = _columns(topic, received)
         except MessageError as error:
             refused[name] = str(error)
         else:
@@ -259,10 +261,48 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
         reasons = "; ".join(f"{name}: {why}" for name, why in refused.items()) or "it has no topic"
         problem = f"has no topic whose messages can be read as columns ({reasons})"
         remedy = (
-            "record joint states and currents as ROS 2 messages with constant names and lengths"
+            "record joint states and currents as messages of ROS 2, JSON or Protobuf with "
+            "constant names and lengths"
         )
         raise SourceError(path, problem, remedy=remedy)
     return arrays
+
+
+def _is_readable(topic: mcap_messages.Topic) -> bool:
+    return topic.is_ros2 or topic.encoding in ENCODINGS
+
+
+def _columns(
+    topic: mcap_messages.Topic, received: Sequence[tuple[int, bytes]]
+) -> dict[str, NDArray[Any]]:
+    """Return the columns of the messages of a topic; MessageError."""
+    stamps = [stamp for stamp, _ in received]
+    if topic.encoding in ENCODINGS:
+        messages = [data for _, data in received]
+        content = trees(topic.kind, topic.encoding, topic.definition, messages)
+        return columns_of_trees(stamps, content)
+    definition = topic.definition.decode(errors="replace")
+    store = typestore_of(topic.kind, definition, topic.schema_encoding)
+    return columns_of(stamps, [decoded(store, topic.kind, data) for _, data in received])
+
+
+def _parquet(path: Path) -> dict[str, Stored]:
+    """Return the columns of a table; lists of numbers, as LeRobot's, are matrices."""
+    from pyarrow import parquet
+
+    table = parquet.read_table(path)
+    arrays = {}
+    for name in table.column_names:
+        values = table[name].to_numpy()
+        if values.dtype == object and len(values) and isinstance(values[0], np.ndarray):
+            values = np.stack(values)
+        arrays[name] = values
+    episodes = np.unique(arrays.get("episode_index", np.zeros(1)))
+    if len(episodes) > 1:
+        problem = f"has {len(episodes)} episodes, each with a clock that begins anew"
+        remedy = "save one of them as a file of its own"
+        raise SourceError(path, problem, field="episode_index", remedy=remedy)
+    return _in_memory(arrays)
 
 
 def _in_memory(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Stored]:
@@ -278,6 +318,7 @@ READERS: Mapping[str, Callable[[Path], dict[str, Stored]]] = {
     ".npy": _npy,
     ".mat": _mat,
     ".m": lambda path: _in_memory(script_matrices(path)),
+    ".parquet": _parquet,
     ".mcap": lambda path: _in_memory(read_mcap(path)),
 }
 """Readers of files of arrays by suffix; every other file is text in columns."""

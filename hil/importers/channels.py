@@ -33,21 +33,22 @@ CHANNEL_NAMES: Final[Mapping[Kind, tuple[str, ...]]] = {
     "position": (
         "q", "pos", "position", "positions", "actual_q", "q_actual", "q_meas", "q_act", "state.q",
         "joint_position", "joint_positions", "jointpos", "angle", "angles", "joint_angle",
-        "joint_angles", "aipos.a", "theta", "winkel", "field.position",
+        "joint_angles", "aipos.a", "theta", "winkel", "field.position", "observation.state",
+        "observation.position",
     ),
     "velocity": (
         "qd", "dq", "vel", "v", "velocity", "velocities", "actual_qd", "qd_actual", "qd_meas",
         "state.dq", "joint_velocity", "joint_velocities", "jointvel", "omega", "speed", "qdot",
-        "dtheta", "field.velocity",
+        "dtheta", "field.velocity", "observation.velocity",
     ),
     "torque": (
         "tau", "torque", "torques", "effort", "efforts", "m", "moment", "tau_j", "state.tau_j",
         "tau_meas", "tau_actual", "joint_torque", "joint_torques", "jointtorque", "geartorque.a",
-        "drehmoment", "field.effort",
+        "drehmoment", "field.effort", "observation.effort", "observation.torque",
     ),
     "motor_current": (
         "i", "iq", "cur", "curr", "current", "currents", "actual_current", "motor_current",
-        "motor_currents", "motorcurrent", "joint_current", "strom", "amp",
+        "motor_currents", "motorcurrent", "joint_current", "strom", "amp", "observation.current",
     ),
 }  # fmt: skip
 """Names of channels in the logs of the field, lower case, without number and unit."""
