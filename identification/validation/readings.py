@@ -58,6 +58,9 @@ _FOLDS: Final = 5
 _ROWS_PER_FACT: Final = 100.0
 _LARGE: Final = 0.15  # relative reduction of the error that chance alone does not make
 _CLEAR: Final = 3.0  # standard errors of a reading that reduces the error so much
+_POOR: Final = 0.15  # error of the torque from which on whole orders are always searched for
+_STARTS: Final = 8
+_FEWER_ROWS: Final = 200  # on which orders are tried
 _IMPROVES: Final = 0.98  # error ratio of one exchange from which a whole order is searched for
 _CLOSER: Final = 24  # changes of least error on a fifth of the blocks, which are tried on all
 _MOST_STEPS: Final = 6
@@ -280,25 +283,40 @@ class _Search:
         return nearest
 
     def _orders(self, trials: Sequence[Trial]) -> Iterator[Trial]:
-        """Yield whole orders, by one exchange after the other while the error falls."""
+        """Yield whole orders: from several starts, the best exchange while the error falls."""
         kinds: tuple[Meaning, ...] = ("torque order", "position order", "joint order")
+        is_poor = self.score.overall > _POOR
         for kind in kinds:
             own = [trial for trial in trials if trial.change.meaning == kind]
-            if not any(trial.against.ratio < _IMPROVES for trial in own):
+            if not is_poor and not any(trial.against.ratio < _IMPROVES for trial in own):
                 continue
-            order, error = tuple(range(self.model.n_joints)), self._error_of_few(None)
-            for _ in order:
-                tried = {
-                    _exchanged(order, pair): pair for pair in combinations(range(len(order)), 2)
-                }
-                errors = {other: self._error_of_few(_order_change(kind, other)) for other in tried}
-                best = min(errors, key=errors.__getitem__)
-                if errors[best] >= error:
-                    break
-                order, error = best, errors[best]
+            order = self._best_order(kind, _STARTS if is_poor else 1)
             change = _order_change(kind, order)
             if len(change.joints) > 2:
                 yield self._try(change)
+
+    def _best_order(self, kind: Meaning, starts: int) -> tuple[int, ...]:
+        """Return the order of least error on few rows."""
+        few = self.samples.thinned(max(1, len(self.samples.torque) // _FEWER_ROWS))
+        known: dict[tuple[int, ...], float] = {}
+
+        def error(order: tuple[int, ...]) -> float:
+            if order not in known:
+                change = _order_change(kind, order)
+                samples = _reordered(self.model, few, change) if change.joints else few
+                known[order] = _error_of(score_of(self.model, samples, folds=1, prior=self._prior))
+            return known[order]
+
+        n, rng = self.model.n_joints, np.random.default_rng(0)
+        for start in range(starts):
+            order = tuple(range(n)) if start == 0 else tuple(rng.permutation(n).tolist())
+            while True:
+                others = [_exchanged(order, pair) for pair in combinations(range(n), 2)]
+                best = min(others, key=error)
+                if error(best) >= error(order):
+                    break
+                order = best
+        return min(known, key=known.__getitem__)
 
     def _is_spoilt(self, trial: Trial) -> bool:
         """Whether a change that concerns few joints predicts another one worse."""
@@ -337,13 +355,11 @@ class _Search:
             self._trials = [self._try(change) for change in closer]
         return self._trials
 
-    def _error_of_few(self, change: Change | None) -> float:
+    def _error_of_few(self, change: Change) -> float:
         """Return the sum of the logarithms of squared errors of one fold with a change."""
-        model, samples = (self.model, self.samples) if change is None else self._changed(change)
+        model, samples = self._changed(change)
         prior = self._prior if model is self.model else None
-        squares = score_of(model, samples, folds=1, prior=prior).squares
-        tested = squares.sum(axis=0) > 0.0
-        return float(np.log(np.where(tested, squares.sum(axis=0), 1.0)).sum())
+        return _error_of(score_of(model, samples, folds=1, prior=prior))
 
     def _nearer(self, best: Trial) -> Trial:
         """Return the trial of a zero with an angle that fits better."""
@@ -420,6 +436,11 @@ def _reordered(model: RobotModel, samples: Samples, change: Change) -> Samples:
             now[[joint, place]] = now[[place, joint]]
             samples = corrected(model, samples, Fault(change.meaning, (joint, place)))
     return samples
+
+
+def _error_of(score: Score) -> float:
+    squares = score.squares.sum(axis=0)
+    return float(np.log(np.where(squares > 0.0, squares, 1.0)).sum())
 
 
 def _exchanged(order: tuple[int, ...], pair: tuple[int, int]) -> tuple[int, ...]:
