@@ -11,7 +11,6 @@ import numpy as np
 from hil.archive import open_archive
 from hil.errors import SourceError
 from hil.identify.sources import cell_of, source_of
-from hil.importers.findings import outside_limits
 from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, import_recording
 from hil.importers.robot import Robot, Use
 from hil.look.result import Choice, Look
@@ -45,21 +44,20 @@ def concluded(
     """
     if options.columns is not None or imported.map_text is None:
         return imported
-    error = _suspicion(imported.archive)
-    if error is None:
+    if not _is_suspect(imported.archive):
         return imported
     found = look_at(source, robot_of, options)
+    if found.error is not None and found.error > _OTHER_ARM:
+        raise _other_arm(source, found.error)
     if found.doubts:
         raise _doubt(source, found.doubts[0])
     if found.map_text != imported.map_text or found.options:
         return _again(imported, source, robot_of, found, use)
-    if error > _OTHER_ARM:
-        raise _other_arm(source, error)
     return imported
 
 
-def _suspicion(archive: Path) -> float | None:
-    """Return the error of the torque if it does not follow the arm; None if it does."""
+def _is_suspect(archive: Path) -> bool:
+    """Return whether the torque does not follow the arm, or friction would drive a joint."""
     opened = open_archive(archive)
     cell = cell_of(opened)
     try:
@@ -68,11 +66,8 @@ def _suspicion(archive: Path) -> float | None:
         few = samples.thinned(max(1, len(samples.torque) // _ROWS))
         score = score_of(cell.model, few)
     except (IdentificationError, ValueError):
-        return None  # the identification says what is wrong
-    beyond = outside_limits(recording.position, cell.joint_names, cell.urdf) is not None
-    driven = bool(np.any(score.friction < _DRIVES))
-    suspect = score.overall > _SUSPECT or (beyond and driven)
-    return score.overall if suspect or driven else None
+        return False  # the identification says what is wrong
+    return score.overall > _SUSPECT or bool(np.any(score.friction < _DRIVES))
 
 
 def _again(

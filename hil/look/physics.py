@@ -145,7 +145,7 @@ class Finding:
             "joint order": "joints exchanged",
             "degrees": "degrees",
             "radians": "radians",
-            "no gravity": "gravity removed",
+            "no gravity": "without gravity",
             "mounting": f"mounted {change.name}",
             "zero": f"zero moved by {np.degrees(change.size):.0f} deg",
         }

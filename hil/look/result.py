@@ -70,6 +70,8 @@ class Look:
         groups: parameters that the recording determines; empty without masses or geometry.
         map_text: the column map with the sure conclusions; None for a bag.
         options: for `hil identify`, beside the map.
+        error: of the torque as read, predicted from other parts of the recording, as a share of
+            it; None without a torque or an arm.
     """
 
     source: str
@@ -78,6 +80,7 @@ class Look:
     groups: tuple[Group, ...]
     map_text: str | None
     options: tuple[str, ...] = ()
+    error: float | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Return the result for programs."""
@@ -100,4 +103,5 @@ class Look:
             "determines": [asdict(group) for group in self.groups],
             "map": self.map_text,
             "options": list(self.options),
+            "error": self.error,
         }

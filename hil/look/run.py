@@ -100,7 +100,8 @@ def _with_torque(
     text = imported.map_text
     if text is not None:
         text = with_entries(text, finding.entries())
-    return Look(source.name, tuple(rows), doubts, groups, text, finding.options())
+    error = readings.score.overall
+    return Look(source.name, tuple(rows), doubts, groups, text, finding.options(), error)
 
 
 def _readings(cell: Cell, recording: Recording, imported: ImportedRecording) -> Readings:

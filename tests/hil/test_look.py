@@ -1,0 +1,181 @@
+"""What `hil look` says of a log: read as it is, and with one meaning planted. All simulated."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from hil.cli import app
+from hil.errors import SourceError
+from hil.importers import ColumnMap, Robot
+from hil.importers.recording import ImportOptions
+from hil.look import Look, look_at
+from hil.look.conclusions import concluded
+from hil.look.maps import entries_of
+from identification.validation.readings import Axes, Change
+from tests.hil.simulated_logs import write_log, write_moving_log
+from tests.hil.test_log_kinds import JOINTS, URDF
+
+Floats = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("arm") / "three.urdf"
+    path.write_text(URDF)
+    return path
+
+
+@pytest.fixture(scope="module")
+def table(urdf: Path) -> Mapping[str, Floats]:
+    path = write_moving_log(urdf.with_name("moving.csv"), URDF)
+    values = np.loadtxt(path, delimiter=",", skiprows=1)
+    return {"t": values[:, 0], "q": values[:, 1:4], "v": values[:, 4:7], "tau": values[:, 7:]}
+
+
+def look(urdf: Path, log: Path, table: Mapping[str, Floats], **planted: Floats) -> Look:
+    write_log(log, ["t", "q{}", "v{}", "tau{}"], *{**table, **planted}.values())
+    return look_at(log, lambda _: Robot.from_urdf(urdf), ImportOptions())
+
+
+def reading(found: Look, aspect: str) -> tuple[str, str]:
+    row = next(row for row in found.rows if row.aspect == aspect)
+    return row.reading, row.certainty
+
+
+def test_a_log_as_it_is(tmp_path: Path, urdf: Path, table: Mapping[str, Floats]) -> None:
+    found = look(urdf, tmp_path / "a.csv", table)
+    assert not found.doubts
+    assert reading(found, "signs") == ("as the URDF's axes", "sure")
+    assert reading(found, "angle unit") == ("unit as read", "sure")
+    assert reading(found, "side") == ("joint side, a torque", "sure")
+    assert reading(found, "velocity")[0] == "q1 .. q3: rad" or reading(found, "motion")
+    assert {group.body for group in found.groups} == set(JOINTS)
+
+
+def negated(table: Mapping[str, Floats]) -> dict[str, Floats]:
+    return {"tau": -table["tau"]}
+
+
+def in_degrees(table: Mapping[str, Floats]) -> dict[str, Floats]:
+    return {"q": np.degrees(table["q"]), "v": np.degrees(table["v"])}
+
+
+def exchanged(table: Mapping[str, Floats]) -> dict[str, Floats]:
+    return {"tau": table["tau"][:, [1, 0, 2]]}
+
+
+def of_motors(table: Mapping[str, Floats]) -> dict[str, Floats]:
+    return {"tau": table["tau"] / 100.0}
+
+
+def late(table: Mapping[str, Floats]) -> dict[str, Floats]:
+    time = table["t"]
+    shifted = [np.interp(time - 0.04, time, column) for column in table["tau"].T]
+    return {"tau": np.column_stack(shifted)}
+
+
+@pytest.mark.parametrize(
+    ("plant", "aspect", "words"),
+    [
+        (negated, "signs", "torque negated: all joints"),
+        (exchanged, "order", f"torque columns are of {JOINTS[1]}, {JOINTS[0]}, {JOINTS[2]}"),
+        (of_motors, "side", "motor side (before the gears), or a current"),
+        (late, "delay", "torque 4"),
+    ],
+)
+def test_a_planted_meaning_is_named(
+    tmp_path: Path,
+    urdf: Path,
+    table: Mapping[str, Floats],
+    plant: Callable[[Mapping[str, Floats]], dict[str, Floats]],
+    aspect: str,
+    words: str,
+) -> None:
+    found = look(urdf, tmp_path / "a.csv", table, **plant(table))
+    assert words in reading(found, aspect)[0]
+
+
+def test_degrees_are_concluded(tmp_path: Path, urdf: Path, table: Mapping[str, Floats]) -> None:
+    found = look(urdf, tmp_path / "a.csv", table, **in_degrees(table))
+    says = [reading(found, "angle unit")[0], reading(found, "position")[0]]
+    assert any("deg" in text for text in says)
+
+
+def hil(*arguments: object) -> Any:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+class TestCommand:
+    def test_a_doubt_ends_with_the_lines_to_choose_from(
+        self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
+    ) -> None:
+        path = tmp_path / "a.csv"
+        columns = {**table, **of_motors(table)}
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *columns.values())
+        result = hil("look", path, "--urdf", urdf)
+        assert result.exit_code == 2
+        assert "two readings fit alike" in result.output
+        assert "gear_ratio" in result.output
+        assert "torque_constant" in result.output
+        assert [*tmp_path.iterdir()] == [path]
+
+    def test_the_map_it_writes_is_read(
+        self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
+    ) -> None:
+        path, target = tmp_path / "a.csv", tmp_path / "map.toml"
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *{**table, **negated(table)}.values())
+        result = hil("look", path, "--urdf", urdf, "-o", target, "--json")
+        assert result.exit_code == 0, result.output
+        assert json.loads(result.stdout)["source"] == "a.csv"
+        torque = ColumnMap.load(target).torque
+        assert torque is not None
+        assert torque.scale == (-1.0, -1.0, -1.0)
+
+    def test_without_an_arm_names_clock_and_slopes(
+        self, tmp_path: Path, table: Mapping[str, Floats]
+    ) -> None:
+        path = write_log(tmp_path / "a.csv", ["t", "q{}", "v{}", "tau{}"], *table.values())
+        result = hil("look", path)
+        assert result.exit_code == 0, (result.output, result.exception)
+        assert "slope of the position" in result.output
+        assert "add --urdf ARM.urdf" in result.output
+
+
+class TestConclusions:
+    def test_an_identification_uses_what_is_sure(
+        self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
+    ) -> None:
+        path = tmp_path / "a.csv"
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *{**table, **negated(table)}.values())
+        result = hil("identify", path, "--urdf", urdf)
+        assert "signs: torque negated: all joints, concluded" in result.output
+        text = (tmp_path / "a" / "map.toml").read_text()
+        assert "scale = [-1.0, -1.0, -1.0]" in text
+
+    def test_the_urdf_of_another_arm_is_refused(
+        self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
+    ) -> None:
+        """Torques that follow no masses of the arm: those of another motion."""
+        path, rng = tmp_path / "a.csv", np.random.default_rng(0)
+        noise = np.cumsum(rng.normal(size=table["tau"].shape), axis=0)
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *{**table, "tau": noise}.values())
+        result = hil("identify", path, "--urdf", urdf)
+        assert isinstance(result.exception, SourceError)
+        assert [*tmp_path.iterdir()] == [path]
+
+
+def test_axes_of_changes_become_entries_of_a_map(tmp_path: Path) -> None:
+    changes = [Change("torque sign", (1,)), Change("zero", (0,), 0.5)]
+    text = '[position]\ncolumns = "q{}"\n[torque]\ncolumns = "tau{}"\n'
+    entries = entries_of(Axes.of(changes, 3), text, tmp_path / "a.csv", JOINTS)
+    assert entries["torque.scale"] == [1.0, -1.0, 1.0]
+    assert entries["position.offset"] == [0.5, 0.0, 0.0]
+    assert concluded is not None
