@@ -215,7 +215,10 @@ def _said(found: Look, aspect: str) -> list[str]:
         f"{row.reading} ({row.certainty})" for row in found.rows if row.aspect in aspect.split(", ")
     ]
     return rows + [
-        choice.reading for choices in found.doubts for choice in choices if choice.aspect == aspect
+        choice.reading
+        for choices in found.questions
+        for choice in choices
+        if choice.aspect == aspect
     ]
 
 

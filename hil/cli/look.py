@@ -50,7 +50,7 @@ def look(
     else:
         _print(found)
     text, is_open = found.map_text, False
-    for choices in found.doubts:
+    for choices in found.questions:
         chosen = _ask(choices) if asks else None
         if chosen is None:
             is_open = True
@@ -71,7 +71,7 @@ def _print(found: Look) -> None:
         typer.echo("\nthe recording determines (parameters):")
         for line in groups_table(found.groups):
             typer.echo(printable(line))
-    for choices in found.doubts:
+    for choices in found.questions:
         typer.echo(f"\n{choices[0].aspect}: two readings fit alike; choose one line for the map:")
         for number, choice in enumerate(choices, 1):
             error = "" if choice.error is None else f" (error {choice.error:.2%})"

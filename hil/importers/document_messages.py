@@ -95,7 +95,7 @@ def columns_of_trees(
 
 def _numbers(tree: Mapping[str, Any], above: str) -> Iterator[tuple[str, float | list[float]]]:
     """Yield numbers and lists of numbers by field, without stamps."""
-    labels = next((value for value in tree.values() if _are_names(value)), [])
+    labels: list[str] = next((value for value in tree.values() if _are_names(value)), [])
     for key, value in tree.items():
         name = f"{above}{key}"
         if key in (*_STAMPS, "header") or isinstance(value, bool):

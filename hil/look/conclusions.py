@@ -49,8 +49,8 @@ def concluded(
     found = look_at(source, robot_of, options)
     if found.error is not None and found.error > _OTHER_ARM:
         raise _other_arm(source, found.error)
-    if found.doubts:
-        raise _doubt(source, found.doubts[0])
+    if found.questions:
+        raise _doubt(source, found.questions[0])
     if found.map_text != imported.map_text or found.options:
         return _again(imported, source, robot_of, found, use)
     return imported

@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 _SEPARATE: Final = 3.0  # standard errors
 _HALF: Final = 0.5
 _ALIKE: Final = 1.02  # error ratio of readings of which the recording does not choose one
+_UNSEEN: Final = 0.002  # change of the error ratio of a zero that the torque does not show
 _OTHER_UNIT: Final = 3.0  # factor beyond which the masses of a URDF do not explain a torque
 _THOUSAND: Final = 1000.0
 _WEAK: Final = 0.9  # posterior over prior deviation of a parameter that the recording hardly moves
@@ -119,7 +120,7 @@ class Finding:
             reason = "friction would drive the joint otherwise"
         return Row(aspect, text, certainty, reason, settle)
 
-    def _kept(self, aspect: str, reading: str, *meanings: Meaning, settle: str = "") -> Row:
+    def _unchanged(self, aspect: str, reading: str, *meanings: Meaning, settle: str = "") -> Row:
         """Return the row of an aspect that is as recorded, and how sure that is."""
         nearest = self.readings.nearest
         rivals = [nearest[meaning] for meaning in meanings if meaning in nearest]
@@ -155,7 +156,7 @@ class Finding:
     def _order(self) -> Row:
         steps = self.steps("torque order", "position order", "joint order")
         if not steps:
-            return self._kept("order", "joints in the order of the URDF", "torque order",
+            return self._unchanged("order", "joints in the order of the URDF", "torque order",
                               "position order", "joint order",
                               settle="move the joints one by one")  # fmt: skip
         kinds = sorted({step.change.meaning for step in steps})
@@ -180,7 +181,7 @@ class Finding:
             return Row(
                 "signs", "as the URDF's axes", "sure", "friction takes energy in every joint"
             )
-        row = self._kept("signs", "as the URDF's axes", "torque sign", "position sign",
+        row = self._unchanged("signs", "as the URDF's axes", "torque sign", "position sign",
                          settle="push one joint by hand and see its torque")  # fmt: skip
         unsure = ", ".join(
             name for name, sure in zip(self.cell.joint_names, dissipates, strict=True) if not sure
@@ -193,12 +194,18 @@ class Finding:
         if steps:
             unit = "deg" if self.axes.factor < 1.0 else "rad"
             return self._found("angle unit", steps, f"in {unit}", f'[position] unit = "{unit}"')
-        return self._kept("angle unit", "unit as read", "degrees", "radians")
+        return self._unchanged("angle unit", "unit as read", "degrees", "radians")
 
     def _zero(self) -> Row:
         steps = self.steps("zero")
+        if not steps and "zero" in self.readings.nearest:
+            change, against = self.readings.nearest["zero"]
+            if abs(against.ratio - 1.0) < _UNSEEN:
+                text = f"as the URDF; the torque does not show that of {self.names(change)}"
+                settle = "compare a posture with the URDF's (viewer)"
+                return Row("zero", text, "likely", "its error is the same for other zeros", settle)
         if not steps:
-            return self._kept("zero", "as the URDF", "zero",
+            return self._unchanged("zero", "as the URDF", "zero",
                               settle="compare a posture with the URDF's (viewer)")  # fmt: skip
         text = "; ".join(self.described(step.change) for step in steps)
         return self._found("zero", steps, text, "compare a posture with the URDF's (viewer)")
@@ -208,13 +215,13 @@ class Finding:
         if steps:
             return self._found("gravity", steps, "torque without gravity", "--gravity 0 0 0")
         settle = "hold the arm still, stretched out, and see the torque"
-        return self._kept("gravity", "torque with gravity", "no gravity", settle=settle)
+        return self._unchanged("gravity", "torque with gravity", "no gravity", settle=settle)
 
     def _mounting(self) -> Row:
         steps = self.steps("mounting")
         if steps:
             return self._found("mounting", steps, steps[-1].change.name, "state --gravity X Y Z")
-        return self._kept("mounting", "as stated, else upright", "mounting",
+        return self._unchanged("mounting", "as stated, else upright", "mounting",
                           settle="state --gravity X Y Z")  # fmt: skip
 
     def _size(self) -> Row:
@@ -248,7 +255,7 @@ class Finding:
                    "one recording does not separate it from the wrist",
                    "record with and without it (`hil payload`)")  # fmt: skip
 
-    def doubts(self) -> tuple[tuple[Choice, ...], ...]:
+    def questions(self) -> tuple[tuple[Choice, ...], ...]:
         """Return the readings that fit alike."""
         found = []
         for step in self.readings.steps:

@@ -1,4 +1,4 @@
-"""The result of a look at a recording: rows of one table, doubts, and what can be determined."""
+"""The result of a look at a recording: rows of one table, questions, and what can be determined."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Look:
     Attributes:
         source: its file name.
         rows: of the table.
-        doubts: readings that fit alike, one tuple for each question.
+        questions: readings that fit alike, one tuple for each question.
         groups: parameters that the recording determines; empty without masses or geometry.
         map_text: the column map with the sure conclusions; None for a bag.
         options: for `hil identify`, beside the map.
@@ -76,7 +76,7 @@ class Look:
 
     source: str
     rows: tuple[Row, ...]
-    doubts: tuple[tuple[Choice, ...], ...]
+    questions: tuple[tuple[Choice, ...], ...]
     groups: tuple[Group, ...]
     map_text: str | None
     options: tuple[str, ...] = ()
@@ -84,7 +84,7 @@ class Look:
 
     def as_json(self) -> dict[str, Any]:
         """Return the result for programs."""
-        doubts = [
+        questions = [
             [
                 {
                     "aspect": choice.aspect,
@@ -94,12 +94,12 @@ class Look:
                 }
                 for choice in choices
             ]
-            for choices in self.doubts
+            for choices in self.questions
         ]
         return {
             "source": self.source,
             "rows": [asdict(row) for row in self.rows],
-            "doubts": doubts,
+            "questions": questions,
             "determines": [asdict(group) for group in self.groups],
             "map": self.map_text,
             "options": list(self.options),

@@ -95,13 +95,13 @@ def _with_torque(
     delay, low_pass = _channel(axes.read(recording), readings.model)
     rows += finding.rows()
     rows += physics.channel_rows(delay, low_pass)
-    doubts = finding.doubts()
+    questions = finding.questions()
     groups = physics.determined(readings)
     text = imported.map_text
     if text is not None:
         text = with_entries(text, finding.entries())
     error = readings.score.overall
-    return Look(source.name, tuple(rows), doubts, groups, text, finding.options(), error)
+    return Look(source.name, tuple(rows), questions, groups, text, finding.options(), error)
 
 
 def _readings(cell: Cell, recording: Recording, imported: ImportedRecording) -> Readings:

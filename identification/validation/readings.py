@@ -23,7 +23,7 @@ from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples
-from identification.validation.causes import Fault, corrected
+from identification.validation.causes import Fault, Kind, corrected
 from identification.validation.finding import little_torque
 
 Array = NDArray[np.float64]
@@ -239,7 +239,7 @@ class _Search:
             return None
         moved = np.abs(self.score.friction) > _DISSIPATES
         kinds: tuple[Meaning, ...] = ("torque sign", "position sign")
-        if np.count_nonzero(driven) >= max(2, np.count_nonzero(moved)):
+        if int(driven.sum()) >= max(2, int(moved.sum())):
             kinds = ("torque sign",)
             joints = tuple(range(self.model.n_joints))
         trials = [self._try(Change(kind, joints)) for kind in kinds]
@@ -316,7 +316,7 @@ class _Search:
                 if error(best) >= error(order):
                     break
                 order = best
-        return min(known, key=known.__getitem__)
+        return min(known, key=lambda order: known[order])
 
     def _is_spoilt(self, trial: Trial) -> bool:
         """Whether a change that concerns few joints predicts another one worse."""
@@ -346,9 +346,10 @@ class _Search:
         if self._trials is None:
             changes = list(self._changes())
             few = {change: self._error_of_few(change) for change in changes}
-            closer = sorted(changes, key=few.__getitem__)[:_CLOSER]
+            ranked = sorted(changes, key=lambda change: few[change])
+            closer = ranked[:_CLOSER]
             meanings = {change.meaning for change in closer}
-            for change in sorted(changes, key=few.__getitem__):
+            for change in ranked:
                 if change.meaning not in meanings:
                     meanings.add(change.meaning)
                     closer.append(change)
@@ -426,6 +427,13 @@ def _moved(model: RobotModel, samples: Samples, change: Change) -> Samples:
     return replace(samples, motion=motion, mask=None).with_friction_direction(model)
 
 
+_FAULTS: Final[Mapping[str, Kind]] = {
+    "torque order": "torque order",
+    "position order": "position order",
+    "joint order": "joint order",
+}
+
+
 def _reordered(model: RobotModel, samples: Samples, change: Change) -> Samples:
     """Return samples with joints read from other places, one exchange after the other."""
     order, now = np.arange(model.n_joints), np.arange(model.n_joints)
@@ -434,7 +442,7 @@ def _reordered(model: RobotModel, samples: Samples, change: Change) -> Samples:
         place = int(np.flatnonzero(now == order[joint])[0])
         if place != joint:
             now[[joint, place]] = now[[place, joint]]
-            samples = corrected(model, samples, Fault(change.meaning, (joint, place)))
+            samples = corrected(model, samples, Fault(_FAULTS[change.meaning], (joint, place)))
     return samples
 
 

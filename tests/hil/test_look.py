@@ -52,7 +52,7 @@ def reading(found: Look, aspect: str) -> tuple[str, str]:
 
 def test_a_log_as_it_is(tmp_path: Path, urdf: Path, table: Mapping[str, Floats]) -> None:
     found = look(urdf, tmp_path / "a.csv", table)
-    assert not found.doubts
+    assert not found.questions
     assert reading(found, "signs") == ("as the URDF's axes", "sure")
     assert reading(found, "angle unit") == ("unit as read", "sure")
     assert reading(found, "side") == ("joint side, a torque", "sure")
