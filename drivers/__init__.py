@@ -26,7 +26,6 @@ from drivers.events import (
     LinkLost,
     MotionEnded,
     MotionStarted,
-    Outcome,
     OverrideChanged,
     PacketRejected,
     Refused,
@@ -39,7 +38,7 @@ from drivers.motion_source import BoundsName, CorrectionSource, MotionSource
 from drivers.packets import MODE_FIELDS, CyclicPacket, InitPacket, Mode
 from drivers.record import CycleRing, cycle_dtype
 from drivers.session import Session
-from drivers.states import State
+from drivers.states import Outcome, State
 from drivers.transports.base import Transport, TransportError, TransportSpec
 from drivers.transports.simulated import (
     Corrupt,

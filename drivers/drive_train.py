@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drivers.errors import DriveTrainError, PacketError
 from drivers.packets import InitPacket
-from drivers.replies import D1, Floats
+from drivers.safe_reply import D1, Floats
 
 Array = NDArray[np.float64]
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import RefusalError
 from drivers.packets import InitPacket
-from drivers.states import State
-
-Outcome = Literal["completed", "stopped", "refused", "lost"]
+from drivers.states import Outcome, State
 
 
 @dataclass
@@ -20,7 +17,7 @@ class Counters:
     """Packets since the session was created.
 
     `missed` never arrived; `discarded` were dropped by the link, by kind ("foreign", "torn", ...);
-    `not_accepted` are replies that the controller did not accept, see `RepliesLost`.
+    `rejected` are replies that the controller did not accept, see `RepliesLost`.
     """
 
     replied: int = 0
@@ -30,7 +27,7 @@ class Counters:
     ended: int = 0
     missed: int = 0
     refused: int = 0
-    not_accepted: int = 0
+    rejected: int = 0
     discarded: dict[str, int] = field(default_factory=dict)
 
 

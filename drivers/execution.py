@@ -16,10 +16,9 @@ from typing import Any, Final
 import numpy as np
 
 from drivers.errors import SourceFailed, error_text
-from drivers.events import Outcome
 from drivers.guard import RANK, Array
 from drivers.motion_source import BoundsName, CorrectionSource, MotionSource, has_members
-from drivers.states import CORRECTION_MODES, POSITION_MODES
+from drivers.states import CORRECTION_MODES, POSITION_MODES, Outcome
 
 _AT_REST: Final = 1e-9
 """Rounding of standstill, rad per cycle and rad/s."""

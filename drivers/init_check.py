@@ -33,7 +33,7 @@ def float32_text(value: float) -> str:
     return str(np.float32(value)).removesuffix(".0")
 
 
-def compare(
+def verify_controller(
     drive_train: DriveTrain,
     period: float,
     init: InitPacket,

@@ -1,18 +1,58 @@
-"""One interval in open mode: set-points are computed, checked and written into the reply."""
+"""One interval in open mode: set-points are computed, checked and written into the reply.
+
+The first set-point is the target received in the packet in which the last wanted axis opened, at
+zero velocity, compared with actual position and standstill. D2 is the step of the motor from one
+sent set-point to the next, computed in float64; `drivers.packets.MODE_FIELDS` gives the fields of
+each open mode. A motion requested while the axes are open begins under the same conditions, from
+the set-point held. Without a requested motion the first set-point is held.
+
+While axes are open, following error and current are checked, and that the target received (D1) is
+within 10 % of the following-error threshold of one of the last `max_gap` + 1 set-points sent, or of
+the last one extrapolated by as many steps as packets were missed, and within 25 % of the last. An
+older target is a rejected reply: the last set-point is sent again until it is accepted, and more
+than `max_gap` rejected replies in 100 cycles stop the motion on its path.
+
+Without replies a controller may hold the last target, extrapolate it, or leave open mode, move the
+arm and come back; the next set-point at full speed would then be a jump. Hence, after a gap longer
+than `max_gap`, open mode continues only if D1 is within 10 % of the threshold of the set-point sent
+last, or of some steps more, and its velocity (D2) is zero or within half the velocity sent last or
+the standstill threshold; for an arm at rest the same is required of its own velocity (D4). The
+motion comes to rest on its path from D1 and D2, which count as sent. Where packets arrive late
+although none is missing, D4 is compared with the velocity sent last. Corrections of targets that
+the controller generates (modes 2, 7, 8, 9) are refused after such a gap unless they were zero. A
+value needed for these decisions, for the first set-point, or to be returned to an open axis is
+refused if it was not sent in this packet.
+
+The end is held for `settle_cycles`; the next reply asks for the end of open mode (status byte 1),
+and again every `EXIT_RETRY_CYCLES`; after `EXIT_TIMEOUT` that is a fault. The end is requested as
+well where a motion waits that long for the last axis to open.
+
+Nothing here changes the session: `OpenMode.reply` returns `Reply`, `Exit` or `Refuse`, which the
+session applies.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from drivers.drive_train import ArmWire
-from drivers.errors import AxisNotInMode, Check, SourceFailed
+from drivers.errors import (
+    AxisNotInMode,
+    Check,
+    ExitTimeout,
+    RefusalError,
+    SourceFailed,
+    as_refusal,
+)
 from drivers.execution import Execution
 from drivers.guard import FIRST_FRACTION, Array, CorrectionGuard, Guard, Joints, require
 from drivers.packets import MODE_FIELDS, Mode
-from drivers.replies import D1, D2, D4, D5, Reading, ReplyFrame
+from drivers.safe_reply import D1, D2, D4, D5, PacketStatus, ReplyBuilder
+from drivers.states import LossTracker, State
 
 LEAP_FRACTION: Final = 0.25
 """Share of the following-error threshold allowed between target and set-point sent last."""
@@ -21,6 +61,84 @@ SLOW: Final = 4.0
 permissible."""
 REPETITIONS: Final = 100
 """Times that a set-point is sent again, at most, to a controller that does not accept it."""
+EXIT_RETRY_CYCLES: Final = 100
+"""Cycles after which the end of open mode is requested again."""
+EXIT_TIMEOUT: Final = 10.0
+"""Time for a controller to open the last axis, and to leave open mode once asked, s."""
+
+
+@dataclass(frozen=True)
+class Reply:
+    """A reply was filled in.
+
+    Attributes:
+        rejected: replies that the controller, according to this packet, did not use.
+        begun: the requested motion began with this reply.
+    """
+
+    rejected: int = 0
+    begun: bool = False
+
+
+@dataclass(frozen=True)
+class Exit(Reply):
+    """A reply was filled in that is to ask for the end of open mode.
+
+    Attributes:
+        reason: why the motion requested cannot run, or None.
+    """
+
+    reason: str | None = None
+
+
+@dataclass(frozen=True)
+class Refuse:
+    """No set-point may be sent.
+
+    Attributes:
+        error: why.
+        rejected: replies that the controller, according to this packet, did not use.
+    """
+
+    error: RefusalError
+    rejected: int = 0
+
+
+OpenReply = Reply | Exit | Refuse
+_REPLY: Final = Reply()
+
+
+class OpenCycle(NamedTuple):
+    """One cycle in open mode: what the packet says and what the session knows.
+
+    Attributes:
+        state: to which the packet leads: opening, open or exiting.
+        cycle: of the controller.
+        entered_at: cycle in which that state was entered.
+        exit_requested_at: cycle in which the end of open mode was requested last, or in which its
+            end began.
+        packet: status and modes.
+        measured: (8, n) values of the packet in SI, joint side.
+        commanded: (2, n) record of the reply, NaN, to be filled where set-points are sent.
+        losses: before this packet.
+        motion: the requested one, or None.
+        entering: the first set-point is still to be sent.
+        in_interval: an interval in open mode continues.
+        stop_reason: why open mode is to be left, or None.
+    """
+
+    state: State
+    cycle: int
+    entered_at: int
+    exit_requested_at: int
+    packet: PacketStatus
+    measured: Array
+    commanded: Array
+    losses: LossTracker
+    motion: Execution | None
+    entering: bool
+    in_interval: bool
+    stop_reason: str | None
 
 
 class SentSetPoints:
@@ -37,8 +155,8 @@ class SentSetPoints:
     stopping it counts as late.
 
     Attributes:
-        again: the controller did not accept the last one: it is to be sent once more.
-        lag: cycles by which the controller reports its target late.
+        resend_needed: the controller did not accept the last one: it is to be sent once more.
+        target_latency: cycles by which the controller reports its target late.
     """
 
     def __init__(self, guard: Guard, depth: int) -> None:
@@ -50,32 +168,32 @@ class SentSetPoints:
         self._back = np.arange(depth + 1)
         self._ahead = np.arange(1.0, depth)[:, None]
         self._newest = 0
-        self.lag = 0
-        self._repeated = 0
-        self._repeated_before = False
-        self.again = False
+        self.target_latency = 0
+        self._resent = 0
+        self._resent_before = False
+        self.resend_needed = False
         self._every = np.ones(n, dtype=np.bool_)
 
     def begin(self, target: Array) -> None:
         """Record that the first set-point (n,), the target received, was sent."""
         self._sent[...] = target
-        self.lag = self._repeated = 0
-        self._repeated_before = self.again = False
+        self.target_latency = self._resent = 0
+        self._resent_before = self.resend_needed = False
 
     def resume_from(self, target: Array, step: Array) -> None:
         """Record that the controller extrapolated to this target (n,) by this step (n,)."""
         self._sent[(self._newest - self._back) % len(self._sent)] = (
             target - self._back[:, None] * step
         )
-        self._repeated, self._repeated_before, self.again = 0, False, False
+        self._resent, self._resent_before, self.resend_needed = 0, False, False
 
-    def repeat(self) -> None:
+    def resend(self) -> None:
         """Record that the last set-point was sent once more."""
-        self._repeated += 1
+        self._resent += 1
 
     def add(self, target: Array) -> None:
         """Record that the next set-point (n,) was sent."""
-        self._repeated_before, self._repeated = self._repeated > 0, 0
+        self._resent_before, self._resent = self._resent > 0, 0
         self._newest = newest = (self._newest + 1) % len(self._sent)
         self._sent[newest] = target
 
@@ -99,23 +217,23 @@ class SentSetPoints:
             stopping: the motion is being brought to rest.
 
         Returns:
-            Number of replies not accepted, beyond those of the cycle before. A joint that moves by
-            less than the standstill threshold per cycle does not show one.
+            Number of replies rejected, beyond those of the cycle before; those of joints slower
+            than standstill do not show.
 
         Raises:
-            GuardError: a target further than `FIRST_FRACTION` of the
-                following-error threshold from all of them, or than `LEAP_FRACTION` from the last,
-                or not the last one although this was sent `REPETITIONS` times.
+            GuardError: a target further than `FIRST_FRACTION` of the following-error threshold
+                from all of them, or than `LEAP_FRACTION` from the last, or not the last one after
+                `REPETITIONS` of it.
         """
         sent, standstill = self._sent, self._guard.limits.standstill
         newest = sent[self._newest]
-        self.again = False
+        self.resend_needed = False
         # Usual case: the set-point sent last.
         if np.abs(target - newest).max() <= standstill:
             # At standstill a target reported late is equal to it as well.
-            before = sent[self._newest - 1]
-            if self.lag and not self._repeated and np.abs(newest - before).max() > standstill:
-                self.lag = 0
+            step = newest - sent[self._newest - 1]
+            if self.target_latency and not self._resent and np.abs(step).max() > standstill:
+                self.target_latency = 0
             return 0
         rows = sent[(self._newest - self._back) % len(sent)]
         extrapolated = newest + self._ahead[:missed] * (newest - rows[1])
@@ -128,15 +246,15 @@ class SentSetPoints:
         behind = where & (late[0] > standstill)
         behind &= late.min(axis=0) <= ahead.min(axis=0, initial=np.inf)
         lag = int(late.argmin(axis=0)[behind].max(initial=0))
-        more = max(0, lag - self.lag)
-        known_late = stopping and self._repeated_before
+        more = max(0, lag - self.target_latency)
+        known_late = stopping and self._resent_before
         if not more or known_late or np.abs(newest - rows[1]).max() <= SLOW * standstill:
-            self.lag = lag
+            self.target_latency = lag
             return 0 if known_late else more
-        self.again = True
-        if self._repeated >= REPETITIONS:
+        self.resend_needed = True
+        if self._resent >= REPETITIONS:
             require(where, late[0], np.full_like(newest, standstill), Check.ACCEPTED, cycle)
-        return 1 if self._repeated else more
+        return 1 if self._resent else more
 
 
 # Rows of `ArmWire.raw`.
@@ -154,57 +272,121 @@ is needed; and the motion does not stay beside its path for as long as a gap may
 
 
 class OpenMode(ABC):
-    """Writes set-points into `frame`, which holds the safe reply, and into the cycle's record.
+    """Writes set-points into a reply, which holds the safe one, and into the cycle's record.
 
-    Methods that check or send something raise `GuardError` or `SourceFailed`.
+    Methods that check or send something raise `GuardError` or `SourceFailed`; `reply` raises
+    nothing.
 
     Attributes:
         set_point: (n,) rad, the one sent last.
-        lost: replies that were not accepted according to the last packet.
+        rejected: replies that were not used according to the last packet.
     """
 
-    def __init__(self, guard: Guard, wire: ArmWire, frame: ReplyFrame, mode: int) -> None:
+    def __init__(self, guard: Guard, wire: ArmWire, builder: ReplyBuilder, mode: int) -> None:
         n = guard.limits.n_joints
         self._guard = guard
         self._wire = wire
         self._raw = wire.raw
-        self._frame = frame
+        self._builder = builder
         self._mode = mode
         self._still = np.zeros(n)
         self._every = np.ones(n, dtype=np.bool_)
+        self._exit_cycles = round(EXIT_TIMEOUT / guard.period)
         self.set_point = self._still
-        self.lost = 0
+        self.rejected = 0
 
-    def receive(
-        self, reading: Reading, measured: Array, commanded: Array, cycle: int, missed: int
-    ) -> None:
-        """Receive the packet of `cycle`; to be called before any other method.
+    def reply(self, now: OpenCycle) -> OpenReply:
+        """Fill in the reply to the packet of a cycle in open mode."""
+        try:
+            self._now, self._packet, self._cycle = now, now.packet, now.cycle
+            self._measured, self._commanded = now.measured, now.commanded
+            self._check_losses(now)
+            self._builder.require_targets(now.packet.other_slots, now.cycle)
+            if now.state is State.OPEN:
+                return self._reply_open(now)
+            if now.state is State.EXITING and now.in_interval:
+                self.leaving()
+            else:
+                # Left before the last axis opened, axes have been sent only their own targets.
+                self.opening()
+            self._builder.require_targets(now.packet.reply.held_slots, now.cycle)
+            return self._leave(now) if now.state is State.EXITING else self._wait(now)
+        except BaseException as error:
+            return Refuse(as_refusal(error, now.cycle))
 
-        Args:
-            reading: status and modes.
-            measured: (8, n) its values in SI, joint side.
-            commanded: (2, n) record of the reply, NaN.
-            cycle: of the controller.
-            missed: packets before this one without a reply.
-        """
-        self._reading, self._measured, self._commanded = reading, measured, commanded
-        self._cycle, self._missed = cycle, missed
+    def _check_losses(self, now: OpenCycle) -> None:
+        """Require that a gap or a pause before this packet allows to continue."""
+        if not now.in_interval or now.state is State.OPENING or now.entering:
+            return
+        if now.losses.gap > now.losses.max_gap:
+            self.check_after_gap(now.motion)
+        elif now.losses.is_late:
+            self.check_after_pause()
+
+    def _reply_open(self, now: OpenCycle) -> OpenReply:
+        """Fill in the next set-point; it is the last one where the motion has settled."""
+        motion, rejected = now.motion, 0
+        moving = motion is not None and motion.started
+        if now.entering:
+            self.enter()
+        else:
+            if motion is not None and moving and now.stop_reason is not None:
+                motion.stop(now.stop_reason, now.cycle)
+            elif motion is not None and not moving:
+                self.require_start()
+            self.next(motion if moving else None)
+            rejected = self.rejected
+        if motion is None:
+            return self._outcome(now.stop_reason is not None, rejected)
+        if not moving:
+            motion.begin(self.set_point, now.cycle)
+        return self._outcome(motion.settled, rejected, not moving)
+
+    @staticmethod
+    def _outcome(is_last: bool, rejected: int, begun: bool = False) -> OpenReply:
+        if is_last:
+            return Exit(rejected, begun)
+        return Reply(rejected, begun) if rejected or begun else _REPLY
+
+    def _leave(self, now: OpenCycle) -> OpenReply:
+        """Ask for the end of open mode once more, if that is due."""
+        leaving = now.cycle - now.entered_at
+        if leaving >= self._exit_cycles:
+            message = f"open mode was asked to end {leaving} cycles ago and axes are still open"
+            return Refuse(ExitTimeout(message, now.cycle), self.rejected)
+        due = now.cycle - now.exit_requested_at >= EXIT_RETRY_CYCLES
+        return self._outcome(due, self.rejected)
+
+    def _wait(self, now: OpenCycle) -> OpenReply:
+        """Leave open mode where the last axis has not opened in time, or the motion was dropped."""
+        if now.motion is None:
+            return self._outcome(now.stop_reason is not None, 0)
+        if now.cycle - now.entered_at < self._exit_cycles:
+            return _REPLY
+        axes = np.flatnonzero(now.packet.held_joints) + 1
+        hint = f": if axis {axes[0]} alone is to open, use --only-axis" if len(axes) == 1 else ""
+        return Exit(reason=f"some axes did not open within {EXIT_TIMEOUT:g} s{hint}")
+
+    def hold_in_pause(self, packet: PacketStatus, cycle: int) -> None:
+        """Require, in a pause, that open axes can hold their targets; raises `GuardError`."""
+        self._cycle = cycle
+        self.require_holdable(packet.held_joints, packet.held_joints)
 
     def opening(self) -> None:
         """Hold the axes that are open already, by the safe reply."""
-        self.lost = 0  # set-points of an earlier interval do not matter
-        returned = self._reading.returned
-        self.require_holdable(returned, returned | self._reading.ready)
-        self._record_returned(returned)
+        self.rejected = 0  # set-points of an earlier interval do not matter
+        held = self._packet.held_joints
+        self.require_holdable(held, held | self._packet.ready)
+        self._record_held(held)
 
-    def _record_returned(self, returned: Joints) -> None:
-        """Record the targets of `returned` joints as commanded, at rest."""
-        self._commanded[0] = np.where(returned, self._measured[0], np.nan)
-        self._commanded[1] = np.where(returned, 0.0, np.nan)
+    def _record_held(self, held: Joints) -> None:
+        """Record the targets of `held` joints as commanded, at rest."""
+        self._commanded[0] = np.where(held, self._measured[0], np.nan)
+        self._commanded[1] = np.where(held, 0.0, np.nan)
 
-    def require_holdable(self, returned: Joints, where: Joints) -> None:
-        """Require new targets for joints `returned` (n,), and all of `where` near their targets."""
-        self._require_fresh((TARGET,), Check.FIRST_AGE, returned)
+    def require_holdable(self, held: Joints, where: Joints) -> None:
+        """Require new targets for joints `held` (n,), and all of `where` near their targets."""
+        self._require_fresh((TARGET,), Check.FIRST_AGE, held)
         self._guard.check_hold(self._raw[TARGET], self._raw[ACTUAL], where, self._cycle)
 
     def require_start(self) -> None:
@@ -248,19 +430,19 @@ class OpenMode(ABC):
         """Rest, while the controller closes open mode."""
 
 
-class PositionMode(OpenMode):
+class SetPointGenerator(OpenMode):
     """Modes 1, 4 and 5: the PC generates the targets."""
 
     def __init__(
-        self, guard: Guard, wire: ArmWire, frame: ReplyFrame, mode: int, max_gap: int
+        self, guard: Guard, wire: ArmWire, builder: ReplyBuilder, mode: int, max_gap: int
     ) -> None:
-        super().__init__(guard, wire, frame, mode)
+        super().__init__(guard, wire, builder, mode)
         self._history = SentSetPoints(guard, max_gap + 1)
         self._sent = self._still
         self._step = self._still
         self._velocity = self._still
         self._slots = wire.joint_slots[wire.opened]
-        self._last_reply = frame.floats[self._slots]
+        self._last_reply = builder.floats[self._slots]
         self._continuing = wire.opened.copy()
         self._feed_forward = (
             CorrectionGuard(guard, "velocity") if mode == Mode.POSITION_FEED_FORWARD else None
@@ -277,7 +459,7 @@ class PositionMode(OpenMode):
         self.set_point = position
         self._sent = target
         self._history.begin(target)
-        self.lost = 0
+        self.rejected = 0
         self._continuing[...] = self._wire.opened
         self._rest()
 
@@ -295,11 +477,11 @@ class PositionMode(OpenMode):
             self._guard.check_set_point(self.set_point, self._still, "plan", cycle)
             self._rest()
             return
-        frame = self._frame.floats
-        if self._history.again:
+        frame = self._builder.floats
+        if self._history.resend_needed:
             # The controller holds the target before the last one: send that once more.
             frame[self._slots] = self._last_reply
-            self._history.repeat()
+            self._history.resend()
             commanded[0] = self.set_point
             commanded[1] = self._velocity
             return
@@ -332,15 +514,17 @@ class PositionMode(OpenMode):
     def _check_accepted(self, where: Joints | None = None, *, stopping: bool = False) -> None:
         """Check the target received against the set-points sent, and count lost replies."""
         target, age = self._raw[TARGET], self._wire.age
-        self.lost = self._history.check(target, self._missed, self._cycle, where, stopping=stopping)
+        self.rejected = self._history.check(
+            target, self._now.losses.gap, self._cycle, where, stopping=stopping
+        )
         if age is not None and age[TARGET].any():
             # An old target does not show whether the last reply was accepted.
-            self.lost, self._history.again = 0, False
+            self.rejected, self._history.resend_needed = 0, False
 
     def _write_feed_forward(
         self, guard: CorrectionGuard, execution: Execution, step: Array
     ) -> None:
-        frame, wire = self._frame.floats, self._wire
+        frame, wire = self._builder.floats, self._wire
         if not execution.feeds_forward:
             wire.put(frame, D4, step)
             return
@@ -358,7 +542,7 @@ class PositionMode(OpenMode):
         A motion continues from the target, some steps further on its path, or at rest. Axes that
         have closed since the first set-point are left out.
         """
-        cycle, where = self._cycle, self._continuing & self._reading.ready
+        cycle, where = self._cycle, self._continuing & self._packet.ready
         self._require_fresh(_NEEDED_AFTER_GAP, Check.GAP_AGE, where)
         raw, step = self._raw, self._step
         target, velocity = np.where(where, raw[TARGET], self._sent), np.where(where, raw[1:4:2], 0)
@@ -366,8 +550,8 @@ class PositionMode(OpenMode):
             self._guard.check_after_gap(target, velocity, self._sent, step, cycle, where)
             return
         # A target that is reported late is further on by now.
-        target = target + self._history.lag * velocity[0]
-        ahead = self._sent + np.arange(self._missed + 1)[:, None] * step
+        target = target + self._history.target_latency * velocity[0]
+        ahead = self._sent + np.arange(self._now.losses.gap + 1)[:, None] * step
         steps = int(np.abs(target - ahead).max(axis=1).argmin())
         moved, moves = np.abs((step, velocity[0])).max(axis=1) > self._guard.limits.standstill
         # For a motion slower than standstill, the target shows whether the controller held it.
@@ -384,17 +568,17 @@ class PositionMode(OpenMode):
 
     def check_after_pause(self) -> None:
         """Require after a late packet that the arm moves as the set-points sent last."""
-        where = self._continuing & self._reading.ready
+        where = self._continuing & self._packet.ready
         self._require_fresh((ACTUAL_VELOCITY,), Check.GAP_AGE, where)
         velocity = self._wire.joint_difference(self._raw[ACTUAL_VELOCITY])
         self._guard.check_after_pause(velocity / self._guard.period, self._cycle, where)
 
     def leaving(self) -> None:
         """Hold axes that were always open at the last set-point, reopened ones at their target."""
-        ready, continuing, returned = self._reading.ready, self._continuing, self._reading.returned
+        ready, continuing, held = self._packet.ready, self._continuing, self._packet.held_joints
         continuing &= ready
-        self.require_holdable(returned & ~continuing, returned | ready)
-        self._record_returned(returned)
+        self.require_holdable(held & ~continuing, held | ready)
+        self._record_held(held)
         self._check_feedback(self._sent, continuing)
         self._check_accepted(continuing)
         if np.array_equal(continuing, self._wire.opened):
@@ -403,14 +587,14 @@ class PositionMode(OpenMode):
         self._history.add(self._sent)
         self._step = self._still
         slots = self._wire.joint_slots[continuing]
-        self._frame.floats[slots, D1] = self._sent[continuing]
-        self._frame.floats[slots, D2] = 0.0
+        self._builder.floats[slots, D1] = self._sent[continuing]
+        self._builder.floats[slots, D2] = 0.0
         self._commanded[0, continuing] = self.set_point[continuing]
 
     def _rest(self) -> None:
         self._step = self._still
         self._history.add(self._sent)
-        self._wire.write(self._frame.floats, self._sent, self._still)
+        self._wire.write(self._builder.floats, self._sent, self._still)
         self._commanded[0] = self.set_point
         self._commanded[1] = 0.0
 
@@ -435,8 +619,8 @@ class CorrectionMode(OpenMode):
     Following error is |D1 - D3| as received, because the PC sends no target.
     """
 
-    def __init__(self, guard: Guard, wire: ArmWire, frame: ReplyFrame, mode: int) -> None:
-        super().__init__(guard, wire, frame, mode)
+    def __init__(self, guard: Guard, wire: ArmWire, builder: ReplyBuilder, mode: int) -> None:
+        super().__init__(guard, wire, builder, mode)
         self._offset = mode == Mode.DELTA_POSITION
         self._velocity = D4 in MODE_FIELDS[mode]
         self._current = D5 in MODE_FIELDS[mode]
@@ -490,11 +674,11 @@ class CorrectionMode(OpenMode):
 
     def leaving(self) -> None:
         """Send zeros, by the safe reply; the target to an axis in a position mode."""
-        returned = self._reading.returned
-        if returned.any():
-            self.require_holdable(returned, returned)
-            self._record_returned(returned)
-        self._check_feedback(self._raw[TARGET], self._reading.ready)
+        held = self._packet.held_joints
+        if held.any():
+            self.require_holdable(held, held)
+            self._record_held(held)
+        self._check_feedback(self._raw[TARGET], self._packet.ready)
 
     def _sent_in(self) -> Array:
         """Return the cycle in which each target received was sent."""
@@ -512,7 +696,7 @@ class CorrectionMode(OpenMode):
                 raise SourceFailed(message, self._cycle)
 
     def _write(self, motion: Array, current: Array) -> None:
-        frame, wire = self._frame.floats, self._wire
+        frame, wire = self._builder.floats, self._wire
         if self._offset:
             wire.put(frame, D1, wire.motor_difference(motion))
         elif self._velocity:

@@ -306,3 +306,56 @@ class InitPacket:
                 "open_axes_map", slots, f"each slot 0..{self.n_axes - 1} for exactly one axis"
             )
         return axes
+
+
+class PacketSequence:
+    """Follows the controller's packet numbers (1..0x7FFF, then 1 again).
+
+    A number at most `window` ahead of the last is new. The window is what can be missed before
+    silence ends the session, so a number further ahead cannot belong to the same session.
+
+    Attributes:
+        last: number of the last packet replied to.
+        cycle: the controller's cycles since its init packet, missed ones included.
+        broken: a silence ended the sequence: the next number, whichever it is, is new.
+    """
+
+    def __init__(self) -> None:
+        self.last = 0
+        self.cycle = 0
+        self.broken = False
+        self._window = LAST_NUMBER // 2
+
+    def restart(self, number: int, window: float) -> None:
+        """Count from this number on, accepting at most `window` cycles ahead."""
+        self.last = number
+        self.cycle = 0
+        self.broken = False
+        # Beyond half of all numbers, ahead could not be distinguished from behind.
+        self._window = max(1, min(int(window), LAST_NUMBER // 2))
+
+    def distance(self, number: int) -> int:
+        """Return the cycles from the last packet replied to to this one, 0..0x7FFE."""
+        return (number - self.last) % LAST_NUMBER
+
+    def is_duplicate(self, number: int) -> bool:
+        """Whether this is the number of the last packet."""
+        return number == self.last and not self.broken
+
+    def is_stale(self, number: int) -> bool:
+        """Whether this cannot be a later packet of the same session."""
+        return not self.broken and not 1 <= self.distance(number) <= self._window
+
+    def leads_to(self, number: int, missed: int) -> bool:
+        """Whether this number follows the last with at most `missed` in between, or is first."""
+        return self.broken or self.last == 0 or self.distance(number) <= missed + 1
+
+    def accept(self, number: int) -> int:
+        """Advance to this number; return how many packets were missed before it."""
+        ahead = self.distance(number)
+        if not 1 <= ahead <= self._window:
+            ahead = 1  # after a silence, whose length the numbers do not give
+        self.last = number
+        self.cycle += ahead
+        self.broken = False
+        return ahead - 1

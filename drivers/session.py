@@ -23,16 +23,17 @@ faulted               open after a fault, an unknown mode,    505 (508 for a fol
 ended                 mode 504, replied to once               none
 ====================  ======================================  =====================================
 
-The state table is `drivers.states.TRANSITIONS`. Open mode is entered only from driving on, closed
-or opening: after an init packet, a drive-off, a pause or a fault the controller has to report
-closed axes first, and a new motion has to be requested.
+The state table is `drivers.states.TRANSITIONS`. `drivers.states.decide` says what an input does;
+only the session changes its state. Open mode is entered only from driving on, closed or opening:
+after an init packet, a drive-off, a pause or a fault the controller has to report closed axes
+first, and a new motion has to be requested.
 
 Each new valid packet gets exactly one reply, a duplicate (the same bytes) the same reply again;
 stale and malformed packets get none and are counted. Motion advances one period per packet replied
 to, however many were missed, and waits where a reply was not accepted. More than `max_gap` packets
 missed in a row, stale ones included, stop it on its path. A packet that arrives more than
 `PAUSE_CYCLES` later than its number accounts for gets a further set-point only if the arm moves as
-commanded. The other checks in open mode are described in `drivers.reply_policy`.
+commanded. The other checks in open mode are described in `drivers.open_mode`.
 
 In every state an axis of any arm that is open with its drive on gets its target back only if that
 is finite; otherwise drive-off is requested. In a pause an open wanted axis must also be near its
@@ -48,84 +49,63 @@ from typing import Final
 
 import numpy as np
 
+from drivers.controller import Controller, connect
 from drivers.drive_train import Ages, DriveTrain
-from drivers.errors import ModeRefused, PacketError, RefusalError, as_refusal
-from drivers.events import Event, LinkLost, PacketRejected, Refused
-from drivers.execution import execution_of
+from drivers.errors import (
+    AxisNotInMode,
+    Check,
+    GuardError,
+    ModeRefused,
+    PacketError,
+    RefusalError,
+    RequestError,
+    as_refusal,
+)
+from drivers.events import (
+    Counters,
+    Event,
+    GapSeen,
+    HoldChanged,
+    LinkLost,
+    MotionEnded,
+    MotionStarted,
+    OverrideChanged,
+    PacketRejected,
+    Refused,
+    RepliesLost,
+    StateChanged,
+)
+from drivers.execution import Execution, execution_of
 from drivers.guard import Guard
 from drivers.motion_source import CorrectionSource, MotionSource
+from drivers.open_mode import Exit, OpenCycle, OpenReply, Refuse, Reply
 from drivers.packets import (
     DRIVE_ON,
     INIT_LENGTH,
     INIT_NUMBER,
-    LAST_NUMBER,
     N_ARMS,
     CyclicPacket,
     InitPacket,
     Mode,
+    PacketSequence,
     echo,
     is_init,
     packet_number,
 )
 from drivers.record import CycleRing
-from drivers.replies import MODE, words_of
-from drivers.reply_policy import ReplyPolicy
-from drivers.state_machine import StateMachine
-from drivers.states import CORRECTION_MODES, POSITION_MODES, Input, State
-
-
-class PacketSequence:
-    """Follows the controller's packet numbers (1..0x7FFF, then 1 again).
-
-    A number at most `window` ahead of the last is new. The window is what can be missed before
-    silence ends the session, so a number further ahead cannot belong to the same session.
-
-    Attributes:
-        last: number of the last packet replied to.
-        cycle: the controller's cycles since its init packet, missed ones included.
-        broken: a silence ended the sequence: the next number, whichever it is, is new.
-    """
-
-    def __init__(self) -> None:
-        self.last = 0
-        self.cycle = 0
-        self.broken = False
-        self._window = LAST_NUMBER // 2
-
-    def restart(self, number: int, window: float) -> None:
-        """Count from this number on, accepting at most `window` cycles ahead."""
-        self.last = number
-        self.cycle = 0
-        self.broken = False
-        # Beyond half of all numbers, ahead could not be distinguished from behind.
-        self._window = max(1, min(int(window), LAST_NUMBER // 2))
-
-    def distance(self, number: int) -> int:
-        """Return the cycles from the last packet replied to to this one, 0..0x7FFE."""
-        return (number - self.last) % LAST_NUMBER
-
-    def is_duplicate(self, number: int) -> bool:
-        """Whether this is the number of the last packet."""
-        return number == self.last and not self.broken
-
-    def is_stale(self, number: int) -> bool:
-        """Whether this cannot be a later packet of the same session."""
-        return not self.broken and not 1 <= self.distance(number) <= self._window
-
-    def leads_to(self, number: int, missed: int) -> bool:
-        """Whether this number follows the last with at most `missed` in between, or is first."""
-        return self.broken or self.last == 0 or self.distance(number) <= missed + 1
-
-    def accept(self, number: int) -> int:
-        """Advance to this number; return how many packets were missed before it."""
-        ahead = self.distance(number)
-        if not 1 <= ahead <= self._window:
-            ahead = 1  # after a silence, whose length the numbers do not give
-        self.last = number
-        self.cycle += ahead
-        self.broken = False
-        return ahead - 1
-
+from drivers.safe_reply import MODE, PacketStatus, ReplyBuilder, Words, words_of
+from drivers.states import (
+    CORRECTION_MODES,
+    HAS_SET_POINTS,
+    POSITION_MODES,
+    Axes,
+    Decision,
+    Input,
+    LossTracker,
+    Outcome,
+    State,
+    decide,
+)
 
 FLIGHT_RECORDER: Final = 50
 """Records attached to a refusal."""
@@ -135,12 +115,35 @@ MAX_GAP: Final = 100
 """Largest `max_gap`."""
 SERVED_MODES: Final = tuple(sorted(POSITION_MODES | CORRECTION_MODES))
 """Open modes in which a motion can run."""
-PAUSE_CYCLES: Final = 2.0
-"""Cycles by which a packet may arrive later than its number and `max_gap` account for."""
 _SYNC_AFTER_INIT: Final = (INIT_NUMBER + 1, INIT_NUMBER + 2)
+_NO_MOTION: Final = "no motion was requested"
 
 
-class Session(StateMachine):
+def _check_arguments(
+    drive_train: DriveTrain,
+    guard: Guard,
+    ring: CycleRing,
+    mode: int,
+    max_gap: int,
+    arm: int,
+    only_axis: int | None,
+) -> None:
+    """Raise ValueError for arguments of a session that are out of range or do not fit together."""
+    n = drive_train.n_joints
+    if not n == guard.limits.n_joints == ring.n_joints:
+        raise ValueError("drive train, guard and ring differ in their number of joints")
+    if mode not in SERVED_MODES:
+        served = ", ".join(str(int(m)) for m in SERVED_MODES)
+        raise ValueError(f"motion in mode {mode} is not served; modes {served} are")
+    if not 0 <= max_gap <= MAX_GAP:
+        raise ValueError(f"a gap of {max_gap} packets is not one of 0..{MAX_GAP}")
+    if not 1 <= arm <= N_ARMS:
+        raise ValueError(f"arm {arm} is not one of 1..{N_ARMS}")
+    if only_axis is not None and not (mode in POSITION_MODES and 1 <= only_axis <= n):
+        raise ValueError(f"only axis {only_axis} of {n} is not served in mode {mode}")
+
+
+class Session:
     """One arm's session with one controller; not thread-safe.
 
     Args:
@@ -161,8 +164,15 @@ class Session(StateMachine):
         deadline: when silence becomes a fault, on the clock of `now`. Each new packet replied to
             moves it; duplicates and rejected packets do not. Infinite until the first `reply` or
             `tick`, after a silence was reported, and in state ended.
-
-    Commands and further attributes are those of `StateMachine`.
+        state: current state.
+        counters: packets by what became of them.
+        losses: packets and replies lost.
+        cycle: of the controller since its init packet, up to the packet replied to last.
+        entered_at: the cycle in which the state was entered.
+        interval: index of the last interval in open mode, -1 before the first.
+        in_interval: whether that interval continues.
+        execution: the requested motion, or None.
+        stop_reason: why open mode is to be left, or None.
     """
 
     def __init__(
@@ -180,20 +190,25 @@ class Session(StateMachine):
         other_axes: Collection[tuple[int, int]] = (),
         only_axis: int | None = None,
     ) -> None:
-        n = drive_train.n_joints
-        if not n == guard.limits.n_joints == ring.n_joints:
-            raise ValueError("drive train, guard and ring differ in their number of joints")
-        if mode not in SERVED_MODES:
-            served = ", ".join(str(int(m)) for m in SERVED_MODES)
-            raise ValueError(f"motion in mode {mode} is not served; modes {served} are")
-        if not 0 <= max_gap <= MAX_GAP:
-            raise ValueError(f"a gap of {max_gap} packets is not one of 0..{MAX_GAP}")
-        if not 1 <= arm <= N_ARMS:
-            raise ValueError(f"arm {arm} is not one of 1..{N_ARMS}")
-        if only_axis is not None and not (mode in POSITION_MODES and 1 <= only_axis <= n):
-            raise ValueError(f"only axis {only_axis} of {n} is not served in mode {mode}")
-        super().__init__(max_gap)
+        _check_arguments(drive_train, guard, ring, mode, max_gap, arm, only_axis)
         self.deadline = math.inf
+        self.state = State.SYNC
+        self.counters = Counters()
+        self.losses = LossTracker(max_gap, guard.period)
+        self.cycle = 0
+        self.entered_at = 0
+        self.interval = -1
+        self.in_interval = False
+        self.execution: Execution | None = None
+        self.stop_reason: str | None = None
+        # Open mode was reached and the first set-point is still to be sent.
+        self._entering = False
+        self._exit_requested_at = 0
+        # Joint whose following error was reported, None where drive-off is requested.
+        self._offending: int | None = None
+        self._first_interval = 0
+        self._holds_targets = True  # outside open mode, as far as it was reported
+        self._events: list[Event] = []
         self._drive_train = drive_train
         self._guard = guard
         self._ring = ring
@@ -201,8 +216,8 @@ class Session(StateMachine):
         self._settle_cycles = settle_cycles
         self._init_timeout = init_timeout
         self._silence_timeout = silence_timeout
-        self._make_policy = partial(
-            ReplyPolicy,
+        self._connect = partial(
+            connect,
             drive_train=drive_train,
             guard=guard,
             arm=arm,
@@ -212,31 +227,35 @@ class Session(StateMachine):
             only_axis=only_axis,
         )
         self._sequence = PacketSequence()
-        self._policy: ReplyPolicy | None = None
+        self._controller: Controller | None = None
         self._cold_start = False
         self._silent_since: float | None = None
         self._arrived_at = -math.inf
         self._last_packet = b""
         self._last_reply = b""
-        self._without_reply = 0
-        self._sync_packets = 0  # of a controller that restarted, since the last reply
         # Number and last reason of packets without a reply, by kind, since the last drain.
         self._unreported: dict[str, tuple[int, str]] = {}
 
     @property
     def init(self) -> InitPacket | None:
         """The controller's init packet, None before it."""
-        return None if self._policy is None else self._policy.init
+        return None if self._controller is None else self._controller.init
 
     @property
     def period(self) -> float:
         """The controller's cycle, s; before its init packet the guard's."""
-        return self._guard.period if self._policy is None else self._policy.init.period
+        init = self.init
+        return self._guard.period if init is None else init.period
 
     @property
     def drive_train(self) -> DriveTrain:
         """Drive train of the cell."""
         return self._drive_train
+
+    @property
+    def requested(self) -> bool:
+        """Whether a motion was requested and has not ended."""
+        return self.execution is not None
 
     def events(self) -> list[Event]:
         """Return the events since the last call, in order; rejected packets last, by kind."""
@@ -256,7 +275,79 @@ class Session(StateMachine):
         execution = execution_of(source, self._mode, n, self._settle_cycles, stop_cycles)
         if isinstance(execution, str):
             raise self._request_error(execution)
-        self._accept(execution, self._policy.unusable if self._policy else None)
+        reason = None
+        if self.execution is not None:
+            reason = "another motion was requested before and has not ended"
+        elif self.state is State.ENDED:
+            reason = "the controller ended the session; make a new one"
+        elif self.state is State.FAULTED:
+            reason = "the controller has to report its axes closed first"
+        elif self.state is State.EXITING or self.stop_reason is not None:
+            reason = "open mode is being left; wait for closed axes"
+        elif self._controller is not None:
+            reason = self._controller.received.unusable
+        if reason is not None:
+            raise self._request_error(reason)
+        self.execution = execution
+        # Axes may still be open in the interval of an earlier motion.
+        self._first_interval = self.interval + (self.state is not State.OPEN)
+
+    def _request_error(self, reason: str, what: str = "motion") -> RequestError:
+        return RequestError(self.state.name.lower(), reason, what)
+
+    def stop(self, reason: str = "a stop was requested") -> None:
+        """Bring the motion to rest on its path and leave open mode; drop one not begun yet."""
+        if self.execution is not None and not self.execution.started:
+            self._end("stopped", reason)
+        if self.state in (State.OPENING, State.OPEN):
+            self.stop_reason = self.stop_reason or reason
+
+    def override(self, fraction: float) -> None:
+        """Run the requested motion at this fraction (0..1) of its speed from now on.
+
+        Raises:
+            RequestError: there is none, it is being stopped, or its source has no override.
+        """
+        execution = self.execution
+        before = None if execution is None else execution.fraction
+        reason = _NO_MOTION if execution is None else execution.override(fraction)
+        if reason is not None:
+            raise self._request_error(reason, "change of override")
+        if fraction != before:
+            self._events.append(OverrideChanged(float(fraction), self.cycle))
+
+    def hold(self) -> None:
+        """Rest on the path until `resume`; a motion that cannot is stopped.
+
+        A motion that has not begun will begin at rest and wait there.
+
+        Raises:
+            RequestError: there is no motion.
+        """
+        execution = self.execution
+        if execution is None:
+            raise self._request_error(_NO_MOTION, "hold")
+        if self.stop_reason is not None:
+            return
+        before, reason = execution.held, execution.hold(self.cycle)
+        if reason is not None:
+            self.stop(reason)
+        elif execution.held is not before:
+            self._events.append(HoldChanged(True, self.cycle))
+
+    def resume(self) -> None:
+        """Continue after `hold`.
+
+        Raises:
+            RequestError: there is no motion, it is being stopped, or it cannot hold and resume.
+        """
+        execution = self.execution
+        before = execution is not None and execution.held
+        reason = _NO_MOTION if execution is None else execution.resume()
+        if reason is not None:
+            raise self._request_error(reason, "resumption")
+        if before:
+            self._events.append(HoldChanged(False, self.cycle))
 
     def discarded(self, kind: str, count: int) -> None:
         """Count and report packets that the link dropped."""
@@ -280,18 +371,10 @@ class Session(StateMachine):
             return
         assert self._silent_since is not None
         silence = now - self._silent_since
-        self._events.append(LinkLost(silence, self.state, self._without_reply))
+        self._events.append(LinkLost(silence, self.state, self.losses.stale))
         self.deadline = math.inf
         self._sequence.broken = True
-        self.apply(Input.SILENCE, self._cause_of_silence())
-
-    def _cause_of_silence(self) -> str:
-        """Return what came instead of packets that get a reply; "" if nothing did."""
-        if self._sync_packets:
-            return "the controller restarted: it sent sync packets"
-        if self._without_reply:
-            return f"only packets that do not follow the last one came ({self._without_reply})"
-        return ""
+        self._apply(Input.SILENCE)
 
     def reply(self, packet: bytes, now: float, ages: Ages | None = None) -> bytes | None:
         """Return the reply to a packet, or None if it gets none.
@@ -319,7 +402,7 @@ class Session(StateMachine):
                     return self._sync(packet, number, now, powered)
                 if number < INIT_NUMBER and not powered and self._sequence.is_stale(number):
                     # It gets a reply once silence has ended the session before.
-                    self._sync_packets += 1
+                    self.losses.restarting += 1
                 return self._cyclic(packet, number, now, ages)
         except PacketError as error:
             self.counters.malformed += 1
@@ -333,13 +416,14 @@ class Session(StateMachine):
         init = InitPacket.decode(packet)
         syncing = self.state is State.SYNC
         self._cold_start = syncing and self._sequence.last > 0
-        if syncing and not self._sequence.leads_to(INIT_NUMBER, self._max_gap):
-            self.end("lost", "the controller restarted: sync packets are missing")
-        self.apply(Input.INIT)
-        self._policy = policy = self._make_policy(init)
+        if syncing and not self._sequence.leads_to(INIT_NUMBER, self.losses.max_gap):
+            self._end("lost", "the controller restarted: sync packets are missing")
+        self._apply(Input.INIT)
+        self._controller = self._connect(init)
+        self._holds_targets = True
         self._sequence.restart(INIT_NUMBER, self._silence_timeout / max(init.period, 1e-3))
         self.cycle = 0
-        self._events.append(policy.received)
+        self._events.append(self._controller.received)
         return self._finish(packet, echo(packet), now)
 
     def _expects_sync(self, number: int, powered: bool) -> bool:
@@ -360,67 +444,247 @@ class Session(StateMachine):
             raise PacketError("status", packet[4 : 4 + N_ARMS].hex(), "no drive on before init")
         if len(packet) >= INIT_LENGTH:
             raise PacketError("length", len(packet), f"less than {INIT_LENGTH} bytes")
-        self.apply(Input.SYNC)
+        self._apply(Input.SYNC)
         if self.state is State.SYNC:
-            self._policy = None
+            self._controller = None
         self._sequence.accept(number)
         return self._finish(packet, echo(packet), now)
 
     def _cyclic(self, packet: bytes, number: int, now: float, ages: Ages | None) -> bytes | None:
         """Run one cycle: decode, record, change state, reply; an error becomes drive-off or 508."""
-        policy, ring = self._policy, self._ring
-        assert policy is not None
-        decoded = CyclicPacket.decode(packet, policy.init.n_axes)
+        controller, ring = self._controller, self._ring
+        assert controller is not None
+        decoded = CyclicPacket.decode(packet, controller.init.n_axes)
         if self._sequence.is_duplicate(number) and packet == self._last_packet:
             self.counters.duplicates += 1
             return self._last_reply
         if self._sequence.is_stale(number):
-            self._without_reply += 1
+            self.losses.stale += 1
             self.counters.stale += 1
             self._report("stale", 1, f"number {number} does not follow {self._sequence.last}")
             return None
         missed = self._sequence.accept(number)
         self.cycle = self._sequence.cycle
-        late = (now - self._arrived_at) / self._guard.period - max(missed, self._max_gap)
+        self.losses.receive(missed, now - self._arrived_at)
         words = words_of(decoded)
-        # After a corrupted number the controller's own numbers are stale for a while.
-        without_reply, self._without_reply = missed + self._without_reply, 0
-        reading = policy.reader.read(decoded.status, words[:, MODE])
+        status = controller.classifier.classify(decoded.status, words[:, MODE])
         row = ring.slot
         ring.arrival[row] = now
         ring.number[row] = number
         ring.gap[row] = missed
         ring.cycle[row] = self.cycle
-        refusal: RefusalError | None = None
-        try:
-            policy.record(ring, row, reading, words, ages)
-            self.record_gap(missed, without_reply)
-            self.require_axes(reading, self._mode)
-            before = self.state
-            self.apply(reading.input)
-            if self.state is State.FAULTED and before is not State.FAULTED:
-                refusal = ModeRefused(reading.fault, self.cycle)
-            record = ring.measured[row], ring.commanded[row]
-            status = policy.fill(self, reading, words, *record, without_reply, late > PAUSE_CYCLES)
-        except BaseException as error:
-            # Any error becomes a reply in this cycle that asks the controller to stop.
-            refusal = as_refusal(error, self.cycle)
-            ring.commanded[row] = math.nan
-            self.apply(Input.REFUSAL)
-            status = policy.refuse(self, refusal, reading, words)
-        self.in_interval = self.in_interval and reading.any_open
+        refusal = self._fill_reply(controller, status, words, ages, row)
+        self.in_interval = self.in_interval and status.any_open
         ring.interval[row] = self.interval if self.in_interval else -1
         ring.state[row] = self.state
         ring.commit()
         if refusal is not None:
             self.counters.refused += 1
             self._events.append(Refused(refusal, ring.last(FLIGHT_RECORDER)))
-            self.end("refused", str(refusal))
-        return self._finish(packet, policy.frame.finish(number, status), now)
+            self._end("refused", str(refusal))
+        return self._finish(packet, controller.builder.finish(number), now)
+
+    def _fill_reply(
+        self,
+        controller: Controller,
+        status: PacketStatus,
+        words: Words,
+        ages: Ages | None,
+        row: int,
+    ) -> RefusalError | None:
+        """Fill in the reply and row `row` of the ring; return why a set-point was refused."""
+        refusal: RefusalError | None = None
+        try:
+            self._record(controller, status, words, ages, row)
+            if self.losses.missed:
+                self.counters.missed += self.losses.missed
+                self._events.append(GapSeen(self.losses.missed, self.cycle))
+            before = self.state
+            decision = self._apply(status.input, status)
+            if decision.misplaced is not None:
+                raise self._axis_error(decision.misplaced, status)
+            if self.state is State.FAULTED and before is not State.FAULTED:
+                refusal = ModeRefused(status.fault, self.cycle)
+            answer = self._reply_in_state(controller, status, words, row)
+        except BaseException as error:
+            # Any error becomes a reply in this cycle that asks the controller to stop.
+            answer = Refuse(as_refusal(error, self.cycle))
+        if answer is not None and answer.rejected:
+            self._count_rejected(answer.rejected)
+        if isinstance(answer, Refuse):
+            refusal = answer.error
+            self._ring.commanded[row] = math.nan
+            self._apply(Input.REFUSAL)
+            self._offending = _offending(refusal)
+            self._fill_refusal(controller, self._offending, status, words)
+        elif answer is not None:
+            self._follow(answer, controller.builder)
+        return refusal
+
+    def _record(
+        self,
+        controller: Controller,
+        status: PacketStatus,
+        words: Words,
+        ages: Ages | None,
+        row: int,
+    ) -> None:
+        """Write a packet into a row of the ring; commanded values are NaN.
+
+        `words` (n_axes, 9) are its axis blocks, `ages` (n_axes, 8) cycles since its values were
+        sent; None if with this packet.
+        """
+        ring, wire = self._ring, controller.wire
+        ring.status[row] = status.status
+        ring.commanded[row] = math.nan
+        if wire is None:
+            ring.mode[row] = -1
+            ring.measured[row] = math.nan
+            ring.age[row] = 0 if ages is None else ages.max(axis=0)
+            return
+        ring.mode[row] = status.modes
+        ring.age[row] = 0 if ages is None else ages[wire.joint_slots].max(axis=0)
+        wire.read(words.view(np.float32), ring.measured[row], ages)
+
+    def _reply_in_state(
+        self, controller: Controller, status: PacketStatus, words: Words, row: int
+    ) -> OpenReply | None:
+        """Fill in the reply for the state that the packet leads to.
+
+        Returns what open mode did, None outside it. Raises RefusalError if nothing may be sent.
+        """
+        builder, state = controller.builder, self.state
+        if state is State.FAULTED and status.powered:
+            self._fill_refusal(controller, self._offending, status, words)
+            return None
+        builder.fill_safe(status.reply, words)
+        if state not in HAS_SET_POINTS:
+            self._hold_without_motion(controller, status, words)
+            return None
+        if controller.open_mode is None:
+            reason = controller.received.unusable
+            raise RefusalError(f"this arm cannot be moved: {reason}", self.cycle)
+        ring = self._ring
+        return controller.open_mode.reply(
+            OpenCycle(
+                state,
+                self.cycle,
+                self.entered_at,
+                self._exit_requested_at,
+                status,
+                ring.measured[row],
+                ring.commanded[row],
+                self.losses,
+                self.execution,
+                self._entering,
+                self.in_interval,
+                self.stop_reason,
+            )
+        )
+
+    def _hold_without_motion(
+        self, controller: Controller, status: PacketStatus, words: Words
+    ) -> None:
+        """Return open axes their target if that is possible, else request drive-off.
+
+        Raises RefusalError in the first cycle of these.
+        """
+        try:
+            controller.builder.require_targets(status.reply.held_slots, self.cycle)
+            if self.state is State.FREEZING and controller.open_mode is not None:
+                controller.open_mode.hold_in_pause(status, self.cycle)
+        except RefusalError as error:
+            if self._holds_targets:
+                self._holds_targets = False
+                raise
+            self._fill_refusal(controller, _offending(error), status, words)
+        else:
+            self._holds_targets = True
+
+    @staticmethod
+    def _fill_refusal(
+        controller: Controller, offending: int | None, status: PacketStatus, words: Words
+    ) -> None:
+        """Report a following error of joint `offending`, or request drive-off of all."""
+        slot = None
+        if offending is not None and controller.wire is not None:
+            slot = int(controller.wire.joint_slots[offending])
+        controller.builder.fill_refusal(status.reply, words, slot)
+
+    def _axis_error(self, joint: int, status: PacketStatus) -> AxisNotInMode:
+        mode, expected = int(status.modes[joint]), self._mode
+        wanted = int(Mode.CLOSED if mode == expected else expected)
+        message = f"joint {joint + 1} is in mode {mode}; the motion needs {wanted}"
+        return AxisNotInMode(message, self.cycle)
+
+    def _follow(self, answer: Reply, builder: ReplyBuilder) -> None:
+        """Apply what open mode did."""
+        if self.state is State.OPEN:
+            self._entering = False
+        if answer.begun:
+            self._events.append(MotionStarted(self.interval, self.cycle))
+        if not isinstance(answer, Exit):
+            return
+        if answer.reason is not None:
+            self.stop(answer.reason)
+        if self.state is State.OPEN and self.execution is not None:
+            self.execution.leaving = True
+        if self.state is not State.EXITING:
+            self._apply(Input.EXIT)
+        self._exit_requested_at = self.cycle
+        builder.request_exit()
+
+    def _count_rejected(self, count: int) -> None:
+        """Count replies that were not used; too many of them stop a motion on its path.
+
+        The controller's target then moves in jumps.
+        """
+        self.counters.rejected += count
+        self._events.append(RepliesLost(count, self.cycle))
+        self.losses.reject(count, self.cycle)
+        reason = self.losses.reason_to_stop_after_rejection
+        if reason is not None and self.state is State.OPEN and self.execution is not None:
+            self.stop(reason)
+
+    def _apply(self, cause: Input, axes: Axes | None = None) -> Decision:
+        """Change to the state that an input leads to; the only place where states change."""
+        decision = decide(self.state, cause, self.losses, self.execution, axes)
+        if decision.stop is not None:
+            self.stop(decision.stop)
+        if decision.state is not self.state:
+            self._enter(decision.state)
+        if cause in (Input.INIT, Input.SILENCE):
+            self.in_interval = False
+        if decision.ending is not None:
+            self._end(*decision.ending)
+        return decision
+
+    def _enter(self, after: State) -> None:
+        before, self.state = self.state, after
+        self.entered_at = self._exit_requested_at = self.cycle
+        self._events.append(StateChanged(before, after, self.cycle))
+        if after is State.OPEN:
+            self.losses.forget_rejected()
+            self._entering = True
+            self.in_interval = True
+            self.interval += 1
+        if after not in HAS_SET_POINTS:
+            self.stop_reason = None
+        self._offending = None
+
+    def _end(self, outcome: Outcome, reason: str) -> None:
+        """End the requested motion, if there is one."""
+        if self.execution is None:
+            return
+        # A motion refused at its first set-point was in the interval without having begun.
+        reached = self.in_interval and self.interval >= self._first_interval
+        interval = self.interval if self.execution.started or reached else -1
+        self.execution = None
+        self._events.append(MotionEnded(outcome, reason, interval, self.cycle))
 
     def _finish(self, packet: bytes, reply: bytes, now: float) -> bytes:
         self.counters.replied += 1
-        self._sync_packets = 0
+        self.losses.restarting = 0
         self._last_packet = packet
         self._last_reply = reply
         self._arrived_at = now
@@ -440,3 +704,10 @@ class Session(StateMachine):
             self.deadline = now + self._init_timeout
         else:
             self.deadline = now + self._silence_timeout
+
+
+def _offending(error: RefusalError) -> int | None:
+    """Return the joint with a following error, None for any other refusal."""
+    if isinstance(error, GuardError) and error.check is Check.FOLLOWING_ERROR:
+        return error.joint
+    return None

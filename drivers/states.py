@@ -1,17 +1,23 @@
-"""State table of a session.
+"""State table of a session, what it counts as lost, and its decisions.
 
 A cyclic packet is first classified as one `Input` by `read_input`; the table gives the state that
 follows. Init packets, silence, refusals and exits are inputs as well, so that every change of
-state is an entry of the table.
+state is an entry of the table. `decide` says what becomes of state and requested motion; it changes
+nothing, the session applies it.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import Final, Literal, Protocol
 
 from drivers.packets import MODE_FIELDS, Mode
+
+Outcome = Literal["completed", "stopped", "refused", "lost"]
+"""How a requested motion ended."""
 
 
 class State(IntEnum):
@@ -173,3 +179,204 @@ def keeps_request(before: State, after: State) -> bool:
     if after is State.FREEZING:
         return before is State.FREEZING
     return after in (State.OPENING, State.OPEN)
+
+
+LOSS_WINDOW: Final = 100
+"""Cycles over which rejected replies are added up."""
+PAUSE_CYCLES: Final = 2.0
+"""Cycles by which a packet may come later than its number and `max_gap` account for."""
+
+
+class LossTracker:
+    """Packets and replies that were lost, by four words, and what they mean for a motion.
+
+    ========  =====================================================  ===============================
+    word      counts                                                 consequence in open mode
+    ========  =====================================================  ===============================
+    missed    packets before this one that never came                with the stale ones more than
+    stale     packets since the last reply with an old number        `max_gap`: the motion stops
+    late      cycles by which this packet came later than its        more than `PAUSE_CYCLES`: the
+              number and `max_gap` account for                       arm must move as commanded
+    rejected  replies of the last `LOSS_WINDOW` cycles that the      more than `max_gap`: the motion
+              controller did not use                                 stops
+    ========  =====================================================  ===============================
+
+    Attributes:
+        max_gap: packets that may be missed in a row without stopping a motion.
+        missed, stale, late, rejected: as in the table.
+        gap: cycles before this packet without a reply: missed and stale ones.
+        restarting: sync packets since the last reply, of a controller that restarted.
+    """
+
+    def __init__(self, max_gap: int, period: float) -> None:
+        self.max_gap = max_gap
+        self.missed = 0
+        self.stale = 0
+        self.late = 0.0
+        self.rejected = 0
+        self.gap = 0
+        self.restarting = 0
+        self._period = period
+        self._rejections: deque[tuple[int, int]] = deque()
+
+    def receive(self, missed: int, elapsed: float) -> None:
+        """Count the losses before a new packet that came `elapsed` s after the last one."""
+        self.missed = missed
+        self.late = elapsed / self._period - max(missed, self.max_gap)
+        # After a corrupted number the controller's own numbers are stale for a while.
+        self.gap, self.stale = missed + self.stale, 0
+
+    def reject(self, count: int, cycle: int) -> None:
+        """Count replies that the controller, according to the packet of `cycle`, did not use."""
+        rejections = self._rejections
+        rejections.append((cycle, count))
+        while rejections[0][0] <= cycle - LOSS_WINDOW:
+            rejections.popleft()
+        self.rejected = sum(number for _, number in rejections)
+
+    def forget_rejected(self) -> None:
+        """Begin to count rejected replies, with open mode."""
+        self._rejections.clear()
+        self.rejected = 0
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the packet came so late that the controller may have acted meanwhile."""
+        return self.late > PAUSE_CYCLES
+
+    @property
+    def reason_to_stop(self) -> str | None:
+        """Why the losses before this packet stop a motion, or None."""
+        if self.gap > self.max_gap:
+            return f"{self.gap} packets were missed in a row"
+        return None
+
+    @property
+    def reason_to_stop_after_rejection(self) -> str | None:
+        """Why the replies that were not used stop a motion, or None."""
+        if self.rejected > self.max_gap:
+            return f"{self.rejected} replies were lost in {LOSS_WINDOW} cycles"
+        return None
+
+    @property
+    def instead_of_packets(self) -> str:
+        """What came, during a silence, instead of packets that get a reply; "" for nothing."""
+        if self.restarting:
+            return "the controller restarted: it sent sync packets"
+        if self.stale:
+            return f"only packets that do not follow the last one came ({self.stale})"
+        return ""
+
+
+_LOSS: Final = {
+    Input.SYNC: "the controller restarted: it sent a sync packet",
+    Input.INIT: "the controller restarted: it sent an init packet",
+    Input.OFF: "the drive went off",
+    Input.DRIVING_ON: "the drive was switched on again",
+    Input.CLOSED: "the controller closed open mode",
+    Input.PARTLY_OPEN: "axes were open before the controller reported them closed",
+    Input.OPEN: "axes were open before the controller reported them closed",
+    Input.PAUSE: "the controller paused the exchange",
+    Input.UNAVAILABLE: "the controller reports an unknown mode",
+    Input.END: "the controller ended the session",
+    Input.SILENCE: "nothing was received from the controller",
+}
+"""Reason for the loss of a motion."""
+
+
+class Motion(Protocol):
+    """What a decision reads of the requested motion, an `Execution`."""
+
+    @property
+    def started(self) -> bool:
+        """Whether its first set-point was sent."""
+
+    @property
+    def leaving(self) -> bool:
+        """Whether it came to rest and open mode is being left."""
+
+    @property
+    def outcome(self) -> Outcome:
+        """Outcome once open mode has been left."""
+
+    @property
+    def reason(self) -> str:
+        """Reason of that outcome."""
+
+
+class Axes(Protocol):
+    """What a decision reads of the modes of the axes, a `PacketStatus`."""
+
+    def misplaced(self, in_motion: bool) -> int | None:
+        """Return a joint that is not in the mode a requested motion needs, or None."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What an input does to a session.
+
+    Attributes:
+        state: the next one.
+        stop: why the motion is to come to rest, or is dropped if it has not begun; or None.
+        ending: outcome and reason of a motion that the next state does not allow, or None.
+        misplaced: joint, from 0, because of whose mode the motion is refused, or None.
+    """
+
+    state: State
+    stop: str | None = None
+    ending: tuple[Outcome, str] | None = None
+    misplaced: int | None = None
+
+
+_STAY: Final = {state: Decision(state) for state in State}
+
+
+def decide(
+    state: State,
+    cause: Input,
+    losses: LossTracker,
+    motion: Motion | None,
+    axes: Axes | None = None,
+) -> Decision:
+    """Return what an input does in this state; changes nothing.
+
+    Args:
+        state: before it.
+        cause: the input.
+        losses: before the packet, or before the silence.
+        motion: the requested one, or None.
+        axes: modes of a cyclic packet's axes; None for other inputs.
+    """
+    stop = None
+    if axes is not None and motion is not None:
+        if state is State.OPEN:
+            stop = losses.reason_to_stop
+        if stop is not None and not motion.started:
+            motion = None
+    if axes is not None and motion is not None:
+        joint = axes.misplaced(motion.started and state is State.OPEN)
+        if joint is not None:
+            return Decision(TRANSITIONS[state][Input.REFUSAL], stop, misplaced=joint)
+    after = TRANSITIONS[state][cause]
+    ending = None if motion is None else _ending(state, cause, after, losses, motion)
+    if after is state and stop is None and ending is None:
+        return _STAY[state]
+    return Decision(after, stop, ending)
+
+
+def _ending(
+    before: State, cause: Input, after: State, losses: LossTracker, motion: Motion
+) -> tuple[Outcome, str] | None:
+    """Return outcome and reason of a motion that this transition ends, or None."""
+    if cause in (Input.REFUSAL, Input.EXIT):
+        return None  # the session states the error, and stops before it leaves
+    if not motion.started:
+        # After such a silence the request may be outdated, whatever the controller does next.
+        if cause is not Input.SILENCE and keeps_request(before, after):
+            return None
+    elif after in HAS_SET_POINTS:
+        return None
+    elif motion.leaving:
+        return motion.outcome, motion.reason
+    reason = losses.instead_of_packets if cause is Input.SILENCE else ""
+    return "lost", reason or _LOSS[cause]

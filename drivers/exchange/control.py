@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any, ClassVar, Final, Self, TypeAlias
 
-from drivers.events import Outcome
 from drivers.record import attach_memory, create_memory
+from drivers.states import Outcome
 
 HEARTBEAT_TIMEOUT: Final = 0.5
 """Age of a heartbeat at which its process counts as dead while a motion is requested, s."""
@@ -108,7 +108,7 @@ class ControlBlock(ctypes.Structure):
         overflow: records overwritten before they were archived.
         late: packets without a reply within a cycle of their arrival: dropped for a newer one, or
             replied to late; `replied_late` of them got a reply.
-        not_accepted: replies not accepted by the controller.
+        rejected: replies not accepted by the controller.
         worst_turnaround_us: longest time from arrival (in the kernel, if the link has time stamps)
             to the departure of the reply, µs.
         finished: 1 when the exchange has ended properly.
@@ -150,7 +150,7 @@ class ControlBlock(ctypes.Structure):
     foreign: int
     late: int
     replied_late: int
-    not_accepted: int
+    rejected: int
     refused: int
     worst_turnaround_us: float
     finished: int

@@ -61,7 +61,7 @@ _POSITION: Final = MEASURED.index("position")
 _MAY_BE_OPEN: Final = frozenset(
     {State.OPENING, State.OPEN, State.EXITING, State.FREEZING, State.FAULTED}
 )
-_COUNTERS: Final = ("replied", "missed", "duplicates", "stale", "not_accepted", "refused")
+_COUNTERS: Final = ("replied", "missed", "duplicates", "stale", "rejected", "refused")
 """Counters of a session with their own field in the control block."""
 STOPPED: Final = "a stop was requested"
 _Countable = PacketRejected | GapSeen | RepliesLost

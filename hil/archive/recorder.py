@@ -19,7 +19,6 @@ from drivers.events import (
     LinkLost,
     MotionEnded,
     MotionStarted,
-    Outcome,
     OverrideChanged,
     PacketRejected,
     Refused,
@@ -35,6 +34,7 @@ from drivers.exchange.event_log import (
     ExchangeStarted,
     Leaving,
 )
+from drivers.states import Outcome
 from hil.archive.header import REPLIES_LOST
 from hil.archive.schema import Level
 from hil.archive.writer import ArchiveWriter

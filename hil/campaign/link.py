@@ -770,7 +770,7 @@ class VirtualLink(MotionLink):
     def _counts(self) -> Counts:
         counters = self.session.counters
         late = counters.discarded.get("late", 0) + counters.discarded.get("replied to late", 0)
-        return counters.replied, counters.missed, late, counters.not_accepted
+        return counters.replied, counters.missed, late, counters.rejected
 
 
 class _Archiving:

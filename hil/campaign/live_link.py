@@ -25,7 +25,6 @@ from drivers.events import (
     LinkLost,
     MotionEnded,
     MotionStarted,
-    Outcome,
     PacketRejected,
     Refused,
 )
@@ -43,7 +42,7 @@ from drivers.exchange.realtime import RealTimeSettings
 from drivers.exchange.serving import ARM_MOVED
 from drivers.motion_source import MotionSource
 from drivers.record import RingReader
-from drivers.states import State
+from drivers.states import Outcome, State
 from drivers.transports.base import TransportSpec
 from hil.archive import ArchiveSpec
 from hil.archive.live import LiveView, LiveViewError, Serve
@@ -519,7 +518,7 @@ class LiveLink(MotionLink):
 
     def _counts(self) -> Counts:
         status = self.view.status
-        return status.replied, status.missed, status.late, status.not_accepted
+        return status.replied, status.missed, status.late, status.rejected
 
     def _shut(self) -> str | None:
         """End both processes; return what was wrong with them, None if nothing was."""
@@ -746,7 +745,7 @@ class LiveLink(MotionLink):
                 State(status.state),
                 self._position,
                 late=status.late,
-                not_accepted=status.not_accepted,
+                not_accepted=status.rejected,
                 waiting="" if status.replied else self._waiting(),
                 over=over,
             )

@@ -8,9 +8,9 @@ from math import nan
 import numpy as np
 import pytest
 
-import drivers.state_machine
+import drivers.states
 from drivers import Guard, State
-from drivers.state_machine import StateMachine
+from drivers.safe_reply import PacketStatus
 from drivers.states import TRANSITIONS, Input
 from tests.drivers.sources import Breaks, ScriptedMotion, smooth
 from tests.fuzz.draw import Draw
@@ -74,7 +74,7 @@ def disturb(talk: Conversation, column: int, value: float) -> None:
 def test_check_of_an_axis_that_closes_during_a_motion(monkeypatch):
     """Without it, the axes that are still open are stopped by a jump."""
     close_an_axis(in_motion(40, Breaks()))
-    monkeypatch.setattr(StateMachine, "require_axes", skip)
+    monkeypatch.setattr(PacketStatus, "misplaced", skip)
     talk = in_motion(40, Breaks())
     with pytest.raises(AssertionError, match=r"velocity|acceleration|jerk"):
         close_an_axis(talk)
@@ -128,7 +128,7 @@ def test_missing_check_of_the_start_is_detected(monkeypatch):
     [
         (Guard, "check_set_point", skip, "velocity|acceleration|jerk|position|finite"),
         (Guard, "check_feedback", skip, "following error|current|not there|finite"),
-        (drivers.state_machine, "TRANSITIONS", OPEN_AT_ONCE, "closed axes"),
+        (drivers.states, "TRANSITIONS", OPEN_AT_ONCE, "closed axes"),
     ],
 )
 def test_missing_check_is_detected(monkeypatch, owner, check, broken, finding):

@@ -10,8 +10,7 @@ from drivers.errors import AxisNotInMode, Check
 from drivers.events import RepliesLost
 from drivers.guard import LAG
 from drivers.open_mode import REPETITIONS, SentSetPoints
-from drivers.packets import LAST_NUMBER
-from drivers.session import PacketSequence
+from drivers.packets import LAST_NUMBER, PacketSequence
 from planner import JointLimits, TrajectoryPlayer, plan
 from tests.drivers.rig import (
     MOVE,
@@ -211,7 +210,7 @@ class TestLostReplies:
             assert last == 0.0 or abs(step - last) <= PULL
             last = step
         events = rig.seen(RepliesLost)
-        assert sum(event.count for event in events) == rig.session.counters.not_accepted == lost
+        assert sum(event.count for event in events) == rig.session.counters.rejected == lost
         assert events[0].cycle == before + 2
         rig.session.stop()
         rig.run_to("stopped")
@@ -245,7 +244,7 @@ class TestLostReplies:
         rig = at_speed(0)
         report_late(rig)
         rig.cycle(600)
-        assert (rig.state, rig.session.counters.not_accepted) == (State.OPEN, 1)
+        assert (rig.state, rig.session.counters.rejected) == (State.OPEN, 1)
 
     def test_controller_that_accepts_no_reply_is_refused(self):
         rig = at_speed()
@@ -267,7 +266,7 @@ class TestLostReplies:
         for _ in range(6):
             lose(rig, 1)
             rig.cycle(49)
-        assert rig.session.counters.not_accepted == 6
+        assert rig.session.counters.rejected == 6
         assert (rig.session.stop_reason, rig.state) == (None, State.OPEN)
 
 
@@ -716,7 +715,7 @@ class TestSentAgain:
     def test_small_step_is_not_repeated(self, share, again):
         sent = Sent(share * STANDSTILL)
         assert sent.check(-1.0) == 1
-        assert sent.set_points.again is again
+        assert sent.set_points.resend_needed is again
 
     @pytest.mark.parametrize("behind", [1, 2])
     @pytest.mark.parametrize("count", [5, REPETITIONS])
@@ -724,26 +723,26 @@ class TestSentAgain:
         sent = Sent(SLOW)
         for repeated in range(count):
             assert sent.check(-behind) == (1 if repeated else behind)
-            assert sent.set_points.again
-            sent.set_points.repeat()
+            assert sent.set_points.resend_needed
+            sent.set_points.resend()
         if count == REPETITIONS:
             sent.refuse(-behind)
         assert sent.check(0.0) == 0
-        assert not sent.set_points.again
+        assert not sent.set_points.resend_needed
 
     @pytest.mark.parametrize("stopping", [False, True])
     def test_target_behind_after_a_repetition(self, stopping):
         """A set-point sent again looks accepted if the target is reported a cycle late."""
         sent = Sent(SLOW)
         sent.check(-1.0)
-        sent.set_points.repeat()
+        sent.set_points.resend()
         sent.check(0.0)
         for _ in range(3):
             sent.add(1.0)
             assert sent.check(-1.0, stopping=stopping) == (not stopping)
-            assert sent.set_points.again is not stopping
+            assert sent.set_points.resend_needed is not stopping
             if not stopping:
-                sent.set_points.repeat()
+                sent.set_points.resend()
                 sent.check(0.0)
 
     @pytest.mark.parametrize("cycles", [0, 1])
@@ -751,7 +750,7 @@ class TestSentAgain:
         """A stop after it counts the first target behind as a loss."""
         sent = Sent(SLOW)
         sent.check(-1.0)
-        sent.set_points.repeat()
+        sent.set_points.resend()
         sent.add(1.0)
         sent.set_points.resume_from(sent.last, sent.step)
         for _ in range(cycles):

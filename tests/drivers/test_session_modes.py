@@ -592,7 +592,7 @@ def test_internal_error_requests_drive_off(where, monkeypatch):
 
     owner, name = rig.guard, "check_set_point"
     if where != "guard":
-        owner, name = rig.session._policy, "record"
+        owner, name = rig.session, "_record"
     monkeypatch.setattr(owner, name, fails)
     assert all_drive_off(rig.cycle())
     assert "the session failed: MemoryError: no room" in str(rig.refusal)

@@ -14,12 +14,12 @@ from drivers import (
     RequestError,
     SourceFailed,
     State,
-    reply_policy,
+    open_mode,
 )
 from drivers.errors import Check, ExitTimeout, ModeRefused, RefusalError
 from drivers.events import RepliesLost
+from drivers.open_mode import EXIT_RETRY_CYCLES, EXIT_TIMEOUT
 from drivers.packets import DRIVE_ON, LAST_NUMBER
-from drivers.reply_policy import EXIT_RETRY_CYCLES, EXIT_TIMEOUT
 from drivers.session import FLIGHT_RECORDER, STOP_TIMEOUT
 from drivers.states import CORRECTION_MODES
 from tests.drivers.rig import (
@@ -440,7 +440,7 @@ def test_lost_reply_is_counted_in_its_interval_only():
     rig.cycle()
     rig.axes[:] = before
     rig.cycle()
-    assert rig.session.counters.not_accepted == 1
+    assert rig.session.counters.rejected == 1
     rig.axes["d"][:, [1, 3]] = 0.0
     rig.cycle(2, mode=Mode.CLOSED)
     rig.modes[:3] = rig.mode
@@ -448,7 +448,7 @@ def test_lost_reply_is_counted_in_its_interval_only():
     rig.session.stop()
     rig.cycle(5)
     assert rig.state is State.EXITING
-    assert rig.session.counters.not_accepted == 1
+    assert rig.session.counters.rejected == 1
     assert len(rig.seen(RepliesLost)) == 1
 
 
@@ -459,8 +459,8 @@ class TestExit:
 
     @pytest.fixture(autouse=True)
     def short(self, monkeypatch):
-        monkeypatch.setattr(reply_policy, "EXIT_RETRY_CYCLES", self.RETRY)
-        monkeypatch.setattr(reply_policy, "EXIT_TIMEOUT", self.TIMEOUT * PERIOD)
+        monkeypatch.setattr(open_mode, "EXIT_RETRY_CYCLES", self.RETRY)
+        monkeypatch.setattr(open_mode, "EXIT_TIMEOUT", self.TIMEOUT * PERIOD)
 
     @pytest.mark.parametrize(
         ("by_controller", "requested"), [(False, [0, RETRY, 2 * RETRY]), (True, [RETRY, 2 * RETRY])]
@@ -673,7 +673,7 @@ class TestAges:
         rig.axes[:] = before
         rig.ages[0, self.TARGET] = age
         rig.cycle()
-        assert rig.session.counters.not_accepted == lost
+        assert rig.session.counters.rejected == lost
 
     @pytest.mark.parametrize(("axis", "is_refused"), [(2, False), (3, True)])
     @pytest.mark.parametrize("column", [TARGET, TARGET_VELOCITY, VELOCITY])

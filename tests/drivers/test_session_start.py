@@ -20,7 +20,7 @@ from drivers import (
 )
 from drivers.init_check import is_narrower
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
-from drivers.replies import D1, Reader, safe_reply
+from drivers.safe_reply import D1, PacketClassifier, safe_reply
 from tests.drivers.rig import (
     START,
     N,
@@ -331,7 +331,7 @@ def test_unknown_arms_are_on_if_any_drive_is(arms, status, powered, back):
     assert answer.status == bytes(back)
     assert answer.mask[:, D1:].all() == (not powered)
     opened = np.full(2, Mode.POSITION, np.int32)
-    reading = Reader(np.arange(2), arms, 1, Mode.POSITION).read(bytes(status), opened)
+    reading = PacketClassifier(np.arange(2), arms, 1, Mode.POSITION).classify(bytes(status), opened)
     assert reading.powered == powered
 
 

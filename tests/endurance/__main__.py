@@ -49,7 +49,7 @@ TRIES: Final = 5
 NEWEST: Final = 3  # campaign folders that stay on the disk
 PERIOD: Final = 5.0  # s between two samples
 COUNTERS: Final = (
-    "replied", "missed", "late", "not_accepted", "refused", "duplicates", "malformed", "foreign",
+    "replied", "missed", "late", "rejected", "refused", "duplicates", "malformed", "foreign",
     "overflow", "ended_count", "worst_turnaround_us",
 )  # fmt: skip
 

@@ -15,7 +15,7 @@ import pinocchio as pin
 import pytest
 from typer.testing import CliRunner
 
-from drivers.init_check import compare
+from drivers.init_check import verify_controller
 from drivers.packets import InitPacket
 from drivers.transports.udp import UdpSpec
 from hil.archive import Samples, write_samples
@@ -224,7 +224,7 @@ def test_reading_the_init_packet_cannot_move_the_arm() -> None:
     init = InitPacket.build(
         6, 2, {"gear_ratio": drives.gear_ratio, "calibration": drives.calibration}
     )
-    assert compare(settings.drive_train, settings.period, init, 1)
+    assert verify_controller(settings.drive_train, settings.period, init, 1)
     assert settings.needs_archive
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from drivers.execution import Execution
 from drivers.guard import Guard
-from drivers.session import PacketSequence
-from drivers.state_machine import StateMachine
+from drivers.packets import PacketSequence
+from drivers.states import LossTracker
 from hil.archive.recorder import Recorder
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.run import Runner
@@ -40,11 +40,11 @@ def answers_duplicates_again(patch: pytest.MonkeyPatch) -> None:
 def catches_up_unguarded(patch: pytest.MonkeyPatch) -> None:
     """After a gap the motion catches up, and the guard does not check speeds."""
     advance, gap = TrajectoryPlayer.advance, [0]
-    record_gap = StateMachine.record_gap
+    receive = LossTracker.receive
 
-    def recorded(self: StateMachine, missed: int, unanswered: int) -> None:
+    def received(self: LossTracker, missed: int, elapsed: float) -> None:
         gap[0] = missed
-        record_gap(self, missed, unanswered)
+        receive(self, missed, elapsed)
 
     def advanced(self: TrajectoryPlayer) -> Any:
         for _ in range(gap[0]):
@@ -52,7 +52,7 @@ def catches_up_unguarded(patch: pytest.MonkeyPatch) -> None:
         gap[0] = 0
         return advance(self)
 
-    patch.setattr(StateMachine, "record_gap", recorded)
+    patch.setattr(LossTracker, "receive", received)
     patch.setattr(TrajectoryPlayer, "advance", advanced)
     patch.setattr(Guard, "check_set_point", lambda *arguments: None)
 

@@ -1,0 +1,181 @@
+"""What an input does to a session is decided without changing anything; losses have four words."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from drivers.states import (
+    HAS_SET_POINTS,
+    LOSS_WINDOW,
+    TRANSITIONS,
+    Decision,
+    Input,
+    LossTracker,
+    State,
+    decide,
+    keeps_request,
+)
+from tests.drivers.rig import PERIOD, moving
+
+GAP = 2
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A requested motion; frozen, so that a decision cannot change it."""
+
+    started: bool = True
+    leaving: bool = False
+    outcome: str = "completed"
+    reason: str = "the motion is complete"
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Modes of a packet: the joint that is in another mode, before and during a motion."""
+
+    waiting: int | None = None
+    moving: int | None = None
+
+    def misplaced(self, in_motion: bool) -> int | None:
+        return self.moving if in_motion else self.waiting
+
+
+def losses(missed: int = 0, stale: int = 0, elapsed: float = PERIOD) -> LossTracker:
+    tracker = LossTracker(GAP, PERIOD)
+    tracker.stale = stale
+    tracker.receive(missed, elapsed)
+    return tracker
+
+
+ENTRIES = [(state, cause) for state, row in TRANSITIONS.items() for cause in row]
+MOTIONS = [None, Motion(started=False), Motion(), Motion(leaving=True)]
+
+
+class TestDecision:
+    @pytest.mark.parametrize("motion", MOTIONS)
+    def test_the_state_is_that_of_the_table(self, motion):
+        for state, cause in ENTRIES:
+            assert decide(state, cause, losses(), motion).state is TRANSITIONS[state][cause]
+
+    def test_the_same_arguments_give_the_same_decision(self):
+        for (state, cause), motion in itertools.product(ENTRIES, MOTIONS):
+            tracker = losses(missed=GAP + 1)
+            before = vars(tracker).copy()
+            first = decide(state, cause, tracker, motion, Axes())
+            assert decide(state, cause, tracker, motion, Axes()) == first
+            assert vars(tracker) == before
+
+    def test_a_motion_goes_on_only_where_set_points_are_sent(self):
+        for state, cause in ENTRIES:
+            decision = decide(state, cause, losses(), Motion())
+            lost = decision.state not in HAS_SET_POINTS and cause is not Input.REFUSAL
+            assert (decision.ending is not None) == lost, (state, cause)
+            if decision.ending is not None:
+                assert decision.ending[0] == "lost"
+
+    def test_a_motion_that_came_to_rest_ends_as_it_was_meant_to(self):
+        decision = decide(State.EXITING, Input.CLOSED, losses(), Motion(leaving=True))
+        assert decision == Decision(State.CLOSED, None, ("completed", "the motion is complete"))
+
+    def test_a_request_waits_as_the_table_of_requests_says(self):
+        for state, cause in ENTRIES:
+            if cause in (Input.REFUSAL, Input.EXIT):
+                continue
+            decision = decide(state, cause, losses(), Motion(started=False))
+            waits = keeps_request(state, decision.state) and cause is not Input.SILENCE
+            assert (decision.ending is None) == waits, (state, cause)
+
+    @pytest.mark.parametrize(("missed", "stale"), [(GAP + 1, 0), (0, GAP + 1), (GAP, 1)])
+    def test_missed_and_stale_packets_stop_a_motion_together(self, missed, stale):
+        tracker = losses(missed, stale)
+        decision = decide(State.OPEN, Input.OPEN, tracker, Motion(), Axes())
+        assert decision.stop == f"{GAP + 1} packets were missed in a row"
+        assert decide(State.OPEN, Input.OPEN, losses(GAP), Motion(), Axes()).stop is None
+        assert decide(State.OPENING, Input.OPEN, tracker, Motion(), Axes()).stop is None
+        assert decide(State.OPEN, Input.OPEN, tracker, None, Axes()).stop is None
+
+    @pytest.mark.parametrize(
+        ("state", "motion", "joint"),
+        [
+            (State.OPEN, Motion(), 5),
+            (State.OPEN, Motion(started=False), 1),
+            (State.CLOSED, Motion(started=False), 1),
+            (State.OPENING, Motion(), 1),
+        ],
+    )
+    def test_a_joint_in_another_mode_refuses_the_motion(self, state, motion, joint):
+        decision = decide(state, Input.OPEN, losses(), motion, Axes(waiting=1, moving=5))
+        assert decision == Decision(State.FAULTED, misplaced=joint)
+
+    def test_a_motion_dropped_for_its_losses_needs_no_axes(self):
+        waiting, axes = Motion(started=False), Axes(waiting=1)
+        decision = decide(State.OPEN, Input.PARTLY_OPEN, losses(GAP + 1), waiting, axes)
+        assert (decision.state, decision.misplaced) == (State.EXITING, None)
+        assert decision.stop is not None
+
+
+class TestLosses:
+    def test_stale_packets_count_once(self):
+        tracker = losses(missed=1, stale=2)
+        assert (tracker.missed, tracker.gap, tracker.stale) == (1, 3, 0)
+        tracker.receive(0, PERIOD)
+        assert (tracker.missed, tracker.gap) == (0, 0)
+
+    @pytest.mark.parametrize("missed", [0, GAP, GAP + 3])
+    def test_late_is_two_cycles_beyond_the_number(self, missed):
+        accounted = max(missed, GAP)
+        assert not losses(missed, elapsed=(accounted + 1.99) * PERIOD).is_late
+        assert losses(missed, elapsed=(accounted + 2.01) * PERIOD).is_late
+
+    def test_rejected_replies_add_up_over_a_window(self):
+        tracker = losses()
+        tracker.reject(GAP, 1)
+        assert tracker.reason_to_stop_after_rejection is None
+        tracker.reject(1, LOSS_WINDOW)
+        assert tracker.reason_to_stop_after_rejection == "3 replies were lost in 100 cycles"
+        tracker.reject(1, LOSS_WINDOW + 1)
+        assert (tracker.rejected, tracker.reason_to_stop_after_rejection) == (2, None)
+        tracker.forget_rejected()
+        assert tracker.rejected == 0
+
+    def test_a_silence_says_what_came_instead_of_packets(self):
+        tracker = losses()
+        assert tracker.instead_of_packets == ""
+        tracker.stale = 3
+        assert tracker.instead_of_packets == "only packets that do not follow the last one came (3)"
+        tracker.restarting = 1
+        assert tracker.instead_of_packets == "the controller restarted: it sent sync packets"
+
+
+IN_THE_SESSION = {
+    "session", "packets", "safe_reply", "open_mode", "guard", "drive_train", "execution",
+}  # fmt: skip
+"""With `transports.udp` and `exchange.loop` before them the nine files from packet to reply."""
+BESIDE = {"states", "record"}
+"""The session's table, and the ring that receives the record."""
+
+
+def test_a_packet_in_motion_passes_these_files_only():
+    rig, _ = moving()
+    folder = str(Path(__file__).parents[2] / "drivers")
+    passed: set[str] = set()
+
+    def note(frame, event, _argument):
+        if event == "call" and frame.f_code.co_filename.startswith(folder):
+            passed.add(Path(frame.f_code.co_filename).stem)
+
+    packet = rig.packet()
+    sys.setprofile(note)
+    try:
+        reply = rig.session.reply(packet, rig.now)
+    finally:
+        sys.setprofile(None)
+    assert reply is not None
+    assert rig.session.execution is not None
+    assert passed == IN_THE_SESSION | BESIDE
