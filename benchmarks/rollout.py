@@ -14,7 +14,7 @@ import numpy as np
 
 from hil.cell import Cell
 from identification import Samples
-from identification.export.simulators import Arm, Ranges
+from identification.export.arm import Arm, Ranges
 from identification.model.motion import Motion
 from identification.rollout.comparison import (
     RecordedMotion,

@@ -31,15 +31,14 @@ from identification import Samples
 from identification.errors import IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
 from identification.estimators.ensemble import Ensemble, draw_ensemble
+from identification.export.arm import Arm, Ranges
 from identification.export.friction import median_load
 from identification.export.simulators import (
     FORMATS,
     MISSING,
     STATES,
-    Arm,
     Comparison,
     Format,
-    Ranges,
     compare,
     pinocchio_arm,
     read_back,

@@ -24,7 +24,7 @@ from hil.reading import read_text
 from hil.results import Frozen, Known
 from identification import IdentificationError, Samples
 from identification.estimators.ensemble import Ensemble
-from identification.export.simulators import Arm
+from identification.export.arm import Arm
 from identification.model.pseudo_inertia import margin
 from identification.rollout.comparison import (
     HORIZONS,

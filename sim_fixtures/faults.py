@@ -8,13 +8,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 from drivers.transports import simulated as link
+from sim_fixtures.arm import DisturbanceKind
 from sim_fixtures.settings import SimulationError
-
-if TYPE_CHECKING:
-    from sim_fixtures.controller import SimulatedController
 
 GRAMMAR: Final = """\
 KIND@CYCLE[xCOUNT][:OPTION]...   cycles count the controller's packets from 0; both up to 1e9
@@ -40,6 +38,33 @@ LOAD = 0.9  # load as a share of the largest motor torque
 PUSH = 0.15  # push as a share of the largest motor torque; it does not trip the drive
 
 
+class FaultyProgram(Protocol):
+    """Program of a controller, as far as faults change it."""
+
+    def axis_leaves(self, axis: int) -> None:
+        """Close one axis, from 0, while the others stay open."""
+
+    def pause(self, mode: int, cycles: int) -> None:
+        """Report a pause, mode 500 or 502, for some cycles."""
+
+
+class FaultyController(Protocol):
+    """A controller in which faults can be injected, with its arm."""
+
+    @property
+    def program(self) -> FaultyProgram:
+        """Its program."""
+
+    def restart(self, *, warm: bool) -> None:
+        """Restart, warm or cold."""
+
+    def lose_drive(self, reason: str) -> None:
+        """Switch the drive off for a reason."""
+
+    def disturb(self, kind: DisturbanceKind, axis: int, size: float, cycles: int) -> None:
+        """Disturb one axis, from 1."""
+
+
 @dataclass(frozen=True)
 class ControllerFault:
     """One fault of the controller or its robot; see `GRAMMAR` for the kinds.
@@ -54,7 +79,7 @@ class ControllerFault:
     count: int = 1
     word: str = ""
 
-    def apply_to(self, controller: SimulatedController) -> None:
+    def apply_to(self, controller: FaultyController) -> None:
         """Apply the fault."""
         match self.kind:
             case "restart":

@@ -56,7 +56,7 @@ class Sources:
 
     @cached_property
     def imports(self) -> dict[str, set[str]]:
-        """Modules of ours that each module imports when it is loaded."""
+        """Modules of ours that each module imports when it is loaded, or for its types."""
         return {
             name: {
                 target
@@ -158,10 +158,9 @@ def long_test_names() -> list[str]:
 
 
 def _loaded(tree: ast.AST) -> Iterator[ast.AST]:
-    """Nodes that run when a module is loaded."""
+    """Nodes outside functions; imports for types alone, which do not run, are among them."""
     for node in ast.iter_child_nodes(tree):
-        typing_only = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
-        if not typing_only and not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             yield node
             yield from _loaded(node)
 

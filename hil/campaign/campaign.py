@@ -2,148 +2,37 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hil.archive.live import LiveView
 from hil.cell import Cell
-from hil.design.run import DESIGN_FILES
-from hil.errors import HilError, InputError, OutputError
-from hil.files import make_folder, write_atomically
+from hil.errors import HilError, InputError
 from hil.identify.options import Options
-from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
 from identification.excitation import Excitation
 
 from .errors import CampaignFolderError
 from .folder import LOCK, CampaignFolder
-from .intervals import Interval, planned_intervals, require_runnable
 from .link import MotionLink
 from .operator import Operator, RunWatch, Stop, Unattended
-from .plan import CampaignPlan, plan_around
-from .rehearsal import SEED, Rehearsal, rehearse
-from .run import Choices, Run, RunResult, execute
+from .rehearsal import Rehearsal
+from .rehearsing import SEED, rehearse
+from .run import RunResult, run_motions
+from .runner import RunOptions
+from .state import CampaignState
 from .status import CampaignStatus, status_of
 
 if TYPE_CHECKING:
     from hil.identify import Identification
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Campaign:
-    """A campaign folder with its cell and its plan."""
-
-    folder: CampaignFolder
-    cell: Cell
-    plan: CampaignPlan
-
-    @classmethod
-    def create(
-        cls,
-        folder: Path | str,
-        cell: Cell,
-        excitation: Excitation | CampaignPlan,
-        checks: MotionChecks | None = None,
-        *,
-        exist_ok: bool = False,
-    ) -> Campaign:
-        """Create a campaign folder with its own copies of cell, URDF and plan.
-
-        Args:
-            folder: the folder to create; it may hold the design of the excitation.
-            cell: the cell.
-            excitation: an excitation, to which random validation motions are added as given in
-                `[campaign]`; or a plan with its own validation motions.
-            checks: of the cell, if available.
-            exist_ok: open the campaign of the folder if it has this cell and excitation.
-
-        Raises:
-            CampaignFolderError: the folder is not empty; with `exist_ok`, it is another campaign.
-            MotionRefusedError: the plan cannot run on the cell; no folder was created.
-            NoExcitationError: no validation motion satisfies the constraints of the cell.
-            OutputError: the disk refuses; the folder is unchanged.
-        """
-        root, plan = Path(folder), excitation
-        if exist_ok and CampaignFolder(root).plan.exists():
-            return cls.open(root)._require_same(cell, plan)
-        if isinstance(plan, Excitation):
-            checks = checks or MotionChecks.of(cell)
-            plan = plan_around(cell, plan, checks)
-        require_runnable(cell, plan, checks)
-        make_folder(root)
-        if any(path.name not in DESIGN_FILES for path in root.iterdir()):
-            raise CampaignFolderError(root, "is not empty", "name a new folder")
-        made = CampaignFolder(root)
-        own = cell.with_urdf(made.cell, made.urdf.name)
-        files = {made.urdf: own.urdf, made.cell: own.text, made.plan: plan.to_text()}
-        try:
-            make_folder(made.archives)
-            for path, text in files.items():
-                write_atomically(path, text)
-            made.seal()
-        except (OSError, CampaignFolderError) as error:
-            with suppress(OSError):
-                for path in files:
-                    path.unlink(missing_ok=True)
-                made.archives.rmdir()
-            if isinstance(error, CampaignFolderError):  # of the manifest
-                raise OutputError(root, error.problem) from error
-            raise OutputError(root, f"cannot be written to ({error.strerror})") from error
-        return cls(made, own, plan)
-
-    @classmethod
-    def open(cls, folder: Path | str) -> Campaign:
-        """Open an existing campaign folder.
-
-        Raises:
-            CampaignFolderError: it is not one.
-            InputError: its cell or plan cannot be read.
-        """
-        there = CampaignFolder(Path(folder))
-        if not there.plan.exists():
-            raise CampaignFolderError(
-                there.root, "is not a campaign folder", "name one that has plan.json"
-            )
-        return cls(there, Cell.load(there.cell), CampaignPlan.load(there.plan))
-
-    def _require_same(self, cell: Cell, wanted: Excitation | CampaignPlan) -> Campaign:
-        """Return this campaign if it has this cell and excitation (CampaignFolderError if not)."""
-        own = cell.with_urdf(self.folder.cell, self.folder.urdf.name)
-        same = (own.text, own.urdf) == (self.cell.text, self.cell.urdf)
-        if isinstance(wanted, CampaignPlan):
-            fits = self.plan.to_text() == wanted.to_text()
-        else:
-            mine = self.plan.excitation.trajectory.to_dict()
-            fits = json.dumps(mine) == json.dumps(wanted.trajectory.to_dict())
-        if not same or not fits:
-            what = "excitation" if same else "cell"
-            raise CampaignFolderError(
-                self.folder.root, f"holds a campaign with another {what}", "name a new folder"
-            )
-        return self
-
-    @cached_property
-    def motions(self) -> Sequence[Interval]:
-        """All motions of its plan in order, without the moves between them."""
-        return planned_intervals(self.cell, self.plan)
-
-    def missing(self, *kinds: str) -> list[Interval]:
-        """Return what is still to be run at full speed, of these kinds or of all."""
-        return [
-            one
-            for one in self.motions
-            if one.kind in (kinds or (one.kind,)) and self.folder.whole(one.kind, one.index) is None
-        ]
-
-    def progress(self, kind: str) -> tuple[int, int]:
-        """Return how many motions of a kind are complete, and how many there are to be."""
-        return len(self.folder.completed(kind)), sum(one.kind == kind for one in self.motions)
+class Campaign(CampaignState):
+    """A campaign: its state, and everything that is done with it."""
 
     def status(self) -> CampaignStatus:
         """Return which steps are done, and the command for the next one."""
@@ -263,7 +152,7 @@ class Campaign:
             remedy = f"the joints are {', '.join(self.cell.joint_names)}"
             raise InputError(None, f"no joint {', '.join(unknown)} to accept", remedy=remedy)
         watch = RunWatch(operator or Unattended(), stop or Stop())
-        choices = Choices(
+        options = RunOptions(
             provenance=provenance,
             durable=durable,
             unrehearsed=unrehearsed,
@@ -272,9 +161,7 @@ class Campaign:
             accept_torque=tuple(accept_torque),
             live=live,
         )
-        with self.folder.locked():
-            self.folder.require_unchanged()
-            return execute(Run(self, link, watch, reporter or Silent(), choices))
+        return run_motions(self, link, watch, reporter or Silent(), options)
 
 
 _FILES = ("manifest.json", "cell.toml", "robot.urdf", "plan.json", "rehearsal.json", LOCK)

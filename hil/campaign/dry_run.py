@@ -7,21 +7,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, Self
+from typing import Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import open_archive
-from hil.errors import ArchiveError, OperatorStopError
+from hil.errors import ArchiveError
 
 from .errors import AgainstGravityError, DryRunError
 from .folder import CampaignFolder, load_record, save_record
-from .intervals import Interval
-
-if TYPE_CHECKING:
-    from .campaign import Campaign
-    from .run import Run, Runner
+from .state import CampaignState
 
 Array = NDArray[np.float64]
 DryRunState = Literal["accepted", "to be accepted", "left out"]
@@ -161,7 +157,7 @@ class DryRunRecord:
 
     @classmethod
     def of(
-        cls, campaign: Campaign, names: Sequence[str], *, plan_hash: str, simulated: bool
+        cls, campaign: CampaignState, names: Sequence[str], *, plan_hash: str, simulated: bool
     ) -> Self:
         """Return the dry run from its archives."""
         folder, cell = campaign.folder, campaign.cell
@@ -224,94 +220,6 @@ class DryRunRecord:
             user = "unknown"
         at = datetime.now(UTC).isoformat(timespec="seconds")
         return replace(self, accepted=Acceptance(user, at))
-
-
-class DryRunStage:
-    """Runs every motion that is to be sent at full speed once slowly, and has it accepted.
-
-    `state` is "accepted", "to be accepted", or "left out" where the caller did without.
-    """
-
-    def __init__(self, run: Run) -> None:
-        self._run, self._folder, self._choices = run, run.campaign.folder, run.choices
-        self.state: DryRunState = "left out" if run.choices.unrehearsed else "to be accepted"
-        motions = [
-            one for one in run.campaign.motions
-            if one.kind == "validation" or (one.kind, one.index) == ("excitation", 0)
-        ]  # fmt: skip
-        self.intervals = [replace(one, kind="dryrun", index=k) for k, one in enumerate(motions)]
-        # Only what an earlier run measured can be accepted, not what this one is going to.
-        named = run.choices.accept_torque
-        self._known = named if named and self.found() else ()
-
-    def found(self) -> DryRunRecord | None:
-        """Return the dry run of this plan and kind of arm; None without a valid one."""
-        run, motions = self._run, len(self.intervals)
-        if self._choices.unrehearsed:
-            return None
-        return DryRunRecord.that_counts(
-            self._folder, plan_hash=run.plan_hash, motions=motions, simulated=run.simulated
-        )
-
-    def missing(self) -> list[Interval]:
-        """Return the motions that were not run slowly yet."""
-        intervals = [] if self._choices.unrehearsed else self.intervals
-        return [one for one in intervals if self._complete(one) is None]
-
-    def run(self, runner: Runner) -> None:
-        """Run what is missing slowly, and have it accepted; see `accept`."""
-        missing = self.missing()
-        for slow in missing:
-            name = runner.run_motion(slow, slow.index + 1, len(self.intervals), OVERRIDE)
-            self._run.archives.review.enter(slow, name)
-        if missing:
-            self.accept()
-
-    def accept(self) -> None:
-        """Write `dry_run.json` once all motions are done, and have it accepted.
-
-        Raises:
-            DryRunError: it must be accepted now and is not.
-            OperatorStopError: the operator stopped instead of answering.
-        """
-        run, found = self._run, self.found()
-        if self._choices.unrehearsed:
-            return
-        if found is None:
-            names = [name for slow in self.intervals if (name := self._complete(slow)) is not None]
-            if len(names) < len(self.intervals):
-                return
-            found = DryRunRecord.of(
-                run.campaign, names, plan_hash=run.plan_hash, simulated=run.simulated
-            )
-            found.save(self._folder.dry_run)
-        if found.accepted is None:
-            unknown = [joint for joint in found.against_gravity if joint not in self._known]
-            if not self._agreed(found, unknown):
-                if not self._choices.dry_run_only:
-                    raise not_accepted(self._folder, unknown)
-                return
-            found.accepted_now().save(self._folder.dry_run)
-        self.state = "accepted"
-
-    def _agreed(self, found: DryRunRecord, unknown: Sequence[str]) -> bool:
-        """Return whether caller or operator accepts it; unknown joints only the operator can."""
-        operator, stop = self._run.watch.operator, self._run.watch.stop
-        if self._choices.accept_dry_run and not unknown:
-            return True
-        agreed = operator.can_answer and operator.accept_dry_run(found)
-        if operator.can_answer and not agreed and stop.requested:
-            raise OperatorStopError(
-                f"{self._folder.root}: stopped by the operator; its dry run was done, and is not "
-                "accepted."
-            )
-        return agreed
-
-    def _complete(self, slow: Interval) -> str | None:
-        """Return the name of its complete archive, if it is of this kind of arm."""
-        name = self._folder.whole(slow.kind, slow.index)
-        made = name is not None and made_by(self._folder.archives / name, self._run.simulated)
-        return name if made else None
 
 
 def not_accepted(folder: CampaignFolder, against: Sequence[str] = ()) -> DryRunError:

@@ -3,57 +3,77 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError
 
-from .dry_run import not_accepted, yes_or_no
+from .dry_run import DryRunRecord, not_accepted, yes_or_no
 from .errors import CampaignFolderError, DryRunError, NotRehearsedError
 from .folder import CampaignFolder
-from .link import Connection, narrower_limits
+from .link import Connection, MotionLink, narrower_limits
 from .rehearsal import Rehearsal
-
-if TYPE_CHECKING:
-    from .run import Run
+from .runner import RunOptions
+from .state import CampaignState
 
 _ADDRESS: Final = {"transport", "host", "port", "bind", "can"}
 """Keys of `[controller]` with its address, which do not affect what is exchanged."""
 
 
-def require_gates(run: Run) -> None:
-    """Require a passed rehearsal, and a dry run that is accepted or can be, before anything moves.
+def require_gates(
+    campaign: CampaignState,
+    link: MotionLink | None,
+    plan_hash: str,
+    *,
+    simulated: bool,
+    unrehearsed: bool,
+) -> None:
+    """Require the arm and the link of this campaign and a passed rehearsal, before anything moves.
 
     Raises:
-        NotRehearsedError, DryRunError: with the remedy.
+        NotRehearsedError: with the remedy.
         CampaignFolderError: folder, archives or link are not those of this campaign.
     """
-    _require_one_kind_of_arm(run)
-    _require_own_link(run)
-    root = run.campaign.folder.root
-    if run.choices.unrehearsed:
-        if not run.simulated:
-            raise NotRehearsedError(
-                root,
-                "was not rehearsed, and its link leads out of this computer",
-                "only a simulated controller on this computer (127.0.0.1) is driven without a "
-                f"rehearsal: run `hil rehearse {root}`",
-            )
-        return
-    require_rehearsed(run.campaign.folder, run.plan_hash)
-    # Refused before anything moves if the dry run could not be accepted afterwards.
-    found, first = run.dry_run.found(), f"run `hil run {root} --dry-run`"
-    if found is None and run.choices.accept_dry_run and not run.simulated:
+    _require_one_kind_of_arm(campaign.folder, simulated)
+    _require_own_link(campaign, link)
+    if not unrehearsed:
+        require_rehearsed(campaign.folder, plan_hash)
+    elif not simulated:
+        root = campaign.folder.root
+        raise NotRehearsedError(
+            root,
+            "was not rehearsed, and its link leads out of this computer",
+            "only a simulated controller on this computer (127.0.0.1) is driven without a "
+            f"rehearsal: run `hil rehearse {root}`",
+        )
+
+
+def require_dry_run(
+    folder: CampaignFolder,
+    found: DryRunRecord | None,
+    options: RunOptions,
+    *,
+    simulated: bool,
+    can_answer: bool,
+) -> None:
+    """Require a dry run that is accepted or can be, before anything moves.
+
+    Raises:
+        DryRunError: with the remedy.
+    """
+    root = folder.root
+    first = f"run `hil run {root} --dry-run`"
+    if found is None and options.accept_dry_run and not simulated:
         remedy = f"{first}, watch the arm, and accept it then"
         raise DryRunError(root, "cannot be accepted before it was done", remedy)
-    if run.watch.operator.can_answer or run.choices.dry_run_only or run.choices.accept_dry_run:
+    if can_answer or options.dry_run_only or options.accept_dry_run:
         return
     if found is None:
         remedy = f"{first} and watch the arm"
         raise DryRunError(root, "was not done, and there is no operator to accept it", remedy)
     if found.accepted is None:
-        raise not_accepted(run.campaign.folder, found.against_gravity)
+        raise not_accepted(folder, found.against_gravity)
 
 
 def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> Rehearsal:
@@ -77,38 +97,38 @@ def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> R
     return found
 
 
-def _require_one_kind_of_arm(run: Run) -> None:
+def _require_one_kind_of_arm(folder: CampaignFolder, simulated: bool) -> None:
     """Refuse to mix a simulated and a real arm; unreadable archives are recorded again.
 
     A dry run of a simulated arm does not cover the surroundings of a real one, and their archives
     must not be pooled.
     """
-    own = yes_or_no(run.simulated)
-    for entry in run.campaign.folder.manifest():
-        path, made_by = run.campaign.folder.archives / entry.name, own
+    own = yes_or_no(simulated)
+    for entry in folder.manifest():
+        path, made_by = folder.archives / entry.name, own
         with suppress(ArchiveError):
             if path.is_file():
                 made_by = open_archive(path, fields=()).header.simulated or ""
         if made_by != own:
             kinds = {"yes": "a simulated arm", "no": "a real arm"}
             whose = kinds.get(made_by, "an unknown kind of arm")
-            link = "a simulated one" if run.simulated else "a real one"
+            link = "a simulated one" if simulated else "a real one"
             raise CampaignFolderError(
-                run.campaign.folder.root,
+                folder.root,
                 f"holds archives of {whose}, and its link leads to {link}",
                 "begin a new campaign folder (`hil design`), or restore the cell's [controller]",
             )
 
 
-def _require_own_link(run: Run) -> None:
+def _require_own_link(campaign: CampaignState, link: MotionLink | None) -> None:
     """Refuse a link opened for another arm; the address and the simulated arm may differ."""
-    other = getattr(run.link, "cell", None)
-    if not isinstance(other, Cell) or other is run.campaign.cell:
+    other = getattr(link, "cell", None)
+    if not isinstance(other, Cell) or other is campaign.cell:
         return
-    wanted, found = _sent_by(run.campaign.cell), _sent_by(other)
+    wanted, found = _sent_by(campaign.cell), _sent_by(other)
     if differ := [name for name in wanted if wanted[name] != found[name]]:
         raise CampaignFolderError(
-            run.campaign.folder.root,
+            campaign.folder.root,
             f"its link was opened with another cell ({', '.join(differ)} differ)",
             "open the link with the campaign's own cell (`campaign.cell`)",
         )
@@ -126,18 +146,18 @@ def _sent_by(cell: Cell) -> dict[str, Any]:
     }
 
 
-def require_as_rehearsed(run: Run, connection: Connection) -> None:
+def require_as_rehearsed(campaign: CampaignState, connection: Connection) -> None:
     """Refuse a controller whose figures are not those of the rehearsal and the checks.
 
     Raises:
         NotRehearsedError: names joints with a narrower following-error threshold in the
             controller, and both thresholds.
     """
-    below = narrower_limits(run.campaign.cell, connection, "following_error")
+    below = narrower_limits(campaign.cell, connection, "following_error")
     if not below:
         return
     raise NotRehearsedError(
-        run.campaign.folder.root,
+        campaign.folder.root,
         "was planned and rehearsed with wider following-error thresholds than those of the "
         f"controller ({'; '.join(below)})",
         "write the controller's into [drive_train] following_error of the cell file and rehearse, "

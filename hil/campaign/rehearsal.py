@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import json
 import shlex
-import shutil
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, Self
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 import pinocchio
@@ -23,9 +21,8 @@ from drivers.open_mode import LEAP_FRACTION
 from drivers.transports.simulated import Delay, Duplicate, Fault, Lose, SimulatedTransport
 from hil.archive import open_archive
 from hil.cell import Cell
-from hil.errors import ExecutionError, HilError, InputError, OperatorStopError
-from hil.files import make_folder, write_output
-from hil.motion_checks import PLANNED_CURRENT
+from hil.errors import InputError
+from hil.files import write_output
 from hil.progress import Reporter
 from hil.results import Frozen
 from hil.simulation import (
@@ -34,23 +31,16 @@ from hil.simulation import (
     simulated_controller,
     simulated_provenance,
 )
-from hil.version import software
 from identification.distributions import normal_limit
 from identification.errors import IdentificationError
 from identification.signals.recording import RecordingError
 from identification.text import percentage
 from identification.validation.prediction import pooled_error, prediction_error
-from sim_fixtures import ServoSettings, SimulationError, UnmodelledEffects
+from sim_fixtures import ServoSettings, UnmodelledEffects
 
-from .errors import CampaignFolderError, MotionFailedError, RepetitionsRejectedError
 from .folder import CampaignFolder, load_record
-from .intervals import planned_intervals, require_runnable
 from .link import VirtualLink
-from .operator import Stop
 from .oscillation import growing_oscillation
-
-if TYPE_CHECKING:
-    from .campaign import Campaign
 
 Array = NDArray[np.float64]
 
@@ -521,117 +511,3 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
             "design a better excitation (`hil design`)",
         ),
     ]
-
-
-REPETITIONS: Final = 3
-"""Repetitions of the excitation: enough for their scatter, few enough for a minute."""
-SEED: Final = 1
-
-
-def rehearse(
-    campaign: Campaign, reporter: Reporter, *, seed: int, stop: Stop, again: bool
-) -> Rehearsal:
-    """Run the plan twice on the simulated arm, and judge it; see `Campaign.rehearse`.
-
-    Changes of the cell file are accepted until the campaign has recordings, but not during the
-    rehearsal (CampaignFolderError).
-    """
-    folder = campaign.folder
-    with folder.locked():
-        plan_hash = folder.hash_of(campaign.cell, campaign.plan)
-        folder.accept_changes()
-        require_runnable(campaign.cell, campaign.plan)
-        before = None
-        with suppress(HilError):  # a file that cannot be read is replaced
-            before = Rehearsal.load(folder)
-        same = before is not None and (before.plan_hash, before.seed) == (plan_hash, seed)
-        if before is not None and same and before.passed and not again:
-            reporter.say("this plan has passed its rehearsal already")
-            return before
-        shutil.rmtree(folder.rehearsed, ignore_errors=True)
-        make_folder(folder.rehearsed)
-        found = _rehearsed(campaign, plan_hash, reporter, seed, stop)
-        if folder.hash_of(campaign.cell, campaign.plan) != plan_hash:
-            raise CampaignFolderError(
-                folder.root, "a mesh was changed during the rehearsal", "rehearse again"
-            )
-        found.save(folder.rehearsal)
-        return found
-
-
-def _rehearsed(
-    campaign: Campaign, plan_hash: str, reporter: Reporter, seed: int, stop: Stop
-) -> Rehearsal:
-    """Run the plan in the folder of the rehearsal and judge it."""
-    twin = Twin.of(campaign.cell, seed=seed, repetitions=REPETITIONS)
-    for sentence in twin.assumed:
-        reporter.say(f"assumed: {sentence}")
-    criteria: list[Criterion] = []
-    seconds = 0.0
-    for name, where, effects in ((AS_MODELLED, "plain", False), (EFFECTS, "effects", True)):
-        # One repetition shows the effects that the model leaves out.
-        cell = twin.cell.with_campaign(repetitions=1) if effects else twin.cell
-        rehearsal = campaign.create(campaign.folder.rehearsed / where, cell, campaign.plan)
-        reporter.say(f"rehearsing on a simulated arm, {name}")
-        motions = planned_intervals(rehearsal.cell, rehearsal.plan)
-        planned = sum(one.trajectory.duration for one in motions)
-        link = twin.link(planned, effects=effects)
-        failure = _failure(rehearsal, link, twin, reporter, stop)
-        seconds += link.cycles * cell.period
-        criteria.append(of_motions(twin.cell, rehearsal.folder, name, failure))
-        if rehearsal.folder.manifest():
-            bound = SATURATED if effects else PLANNED_CURRENT
-            criteria.append(of_currents(twin.cell, rehearsal.folder, name, bound))
-        if failure:
-            break  # the other criteria would fail for the same reason
-        if not effects:
-            criteria += of_estimate(twin, rehearsal.folder, reporter)
-    names = {one.name for one in criteria}
-    return Rehearsal(
-        plan_hash=plan_hash,
-        seed=seed,
-        passed=names == {*CRITERIA} and all(one.passed for one in criteria),
-        criteria=criteria,
-        assumed=[*twin.assumed],
-        not_seen=_not_seen(campaign.cell),
-        repetitions=twin.cell.campaign.repetitions,
-        motion_seconds=seconds,
-        software=software(),
-    )
-
-
-def _failure(
-    rehearsal: Campaign, link: VirtualLink, twin: Twin, reporter: Reporter, stop: Stop
-) -> str:
-    """Run what is missing; return the failure in a sentence, "" for none."""
-    try:
-        rehearsal.run(
-            link, stop, reporter, provenance=twin.provenance, durable=False, unrehearsed=True
-        )
-    except (ExecutionError, RepetitionsRejectedError, SimulationError) as error:
-        if stop.requested:
-            raise OperatorStopError("the rehearsal was stopped; rehearse again") from error
-        if isinstance(error, MotionFailedError):
-            return error.sentence
-        return str(error).rstrip(".")
-    return ""
-
-
-def _not_seen(cell: Cell) -> list[str]:
-    """Return what no simulation of this cell file can detect."""
-    known = cell.file.simulation
-    given = set() if known is None else known.drive_train.model_fields_set
-    unknown = [
-        name for name in ("gear_ratio", "joint_sign", "joint_offset_deg") if name not in given
-    ]
-    sentences = [
-        "torque constants and current limits: the simulated motors have those of the cell file",
-        "floor, walls and shapes: they are checked, but as the cell file and the URDF have them",
-    ]
-    if unknown:
-        sentences.append(
-            f"{', '.join(unknown)} of [drive_train]: the simulated arm takes them from there, so "
-            "that errors in them are not detected; the controller's init packet (gears, coupling) "
-            "and the dry run (signs) detect them, or a table [simulation.drive_train] now"
-        )
-    return sentences

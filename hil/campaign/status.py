@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 from hil.archive import ArchiveName
 from hil.cell import Cell
@@ -19,10 +19,8 @@ from identification.text import percentage
 from .dry_run import DryRunRecord
 from .folder import CampaignFolder
 from .rehearsal import Rehearsal
+from .state import CampaignState
 from .warmup import WarmUpRecord, drift_wanted
-
-if TYPE_CHECKING:
-    from .campaign import Campaign
 
 State = Literal["done", "next", "blocked"]
 NOT_WANTED: Final = "none wanted (warmup_drift)"
@@ -75,7 +73,7 @@ class CampaignStatus:
         return asdict(self) | {"complete": self.complete, "next_command": self.next_command}
 
 
-def status_of(campaign: Campaign) -> CampaignStatus:
+def status_of(campaign: CampaignState) -> CampaignStatus:
     """Return the progress of a campaign from the files in its folder; nothing is changed."""
     folder, again = replace(campaign.folder, digests={}), "rehearse {} --again"
     campaign = replace(campaign, folder=folder)
@@ -114,7 +112,7 @@ def _step(evaluate: Callable[[], Step], repair: str = "") -> Step:
         return Step("next", str(error).rstrip("."), repair)
 
 
-def _design(campaign: Campaign) -> Step:
+def _design(campaign: CampaignState) -> Step:
     excitation, folder = campaign.plan.excitation, campaign.folder
     if folder.manifest():  # before the first recording a rehearsal accepts changes
         folder.require_unchanged()
@@ -140,7 +138,7 @@ def _rehearsal(folder: CampaignFolder) -> Step:
     )
 
 
-def _dry_run(campaign: Campaign) -> Step:
+def _dry_run(campaign: CampaignState) -> Step:
     folder = campaign.folder
     found = DryRunRecord.that_counts(
         folder,
@@ -177,7 +175,7 @@ def _accepted(found: DryRunRecord | None) -> Step:
     )
 
 
-def _gate(campaign: Campaign, found: Step, record: Path) -> Step:
+def _gate(campaign: CampaignState, found: Step, record: Path) -> Step:
     """Return a step, done if a simulated arm has left it out and run everything at full speed."""
     if found.done or record.exists() or not campaign.cell.only_simulated:
         return found
@@ -186,7 +184,7 @@ def _gate(campaign: Campaign, found: Step, record: Path) -> Step:
     return found
 
 
-def _warmed(campaign: Campaign) -> Step:
+def _warmed(campaign: CampaignState) -> Step:
     if not drift_wanted(campaign.cell):
         return Step("done", NOT_WANTED)
     warm = WarmUpRecord.load(campaign.folder.warmup, campaign.folder.plan_hash)
@@ -214,7 +212,7 @@ def _conducted_warm_up(folder: CampaignFolder) -> Step:
     return _warm_up(warm)
 
 
-def _motions(campaign: Campaign, kind: str, words: str) -> Step:
+def _motions(campaign: CampaignState, kind: str, words: str) -> Step:
     whole, total = campaign.progress(kind)
     state: State = "done" if whole >= total else "next"
     return Step(state, f"{whole} of {total} {words} complete", "run {}")

@@ -11,11 +11,10 @@ median of all slopes between two of them), as a share of the friction.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, Self
+from typing import Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +25,6 @@ from identification.text import percentage
 from planner import FourierSeries, PiecewiseCubic
 
 from .folder import load_record, save_record
-from .intervals import Interval
-from .quality import Problem
-
-if TYPE_CHECKING:
-    from .run import Run, Runner
 
 Array = NDArray[np.float64]
 
@@ -187,101 +181,3 @@ class FrictionMeter:
         size = np.sqrt(np.mean(torque**2, axis=0))
         known = (self._way > _LEAST_WAY) & (np.abs(friction) > _LEAST_SHARE * size)
         return np.where(known, friction, np.nan)
-
-
-class WarmUpStage:
-    """Repeats the excitation until friction hardly changes any more."""
-
-    def __init__(self, run: Run) -> None:
-        self._run, self._cell, self._path = run, run.campaign.cell, run.campaign.folder.warmup
-        self._pauses: list[str] = []
-        self._threshold = drift_wanted(run.campaign.cell, only_simulated=run.simulated)
-
-    @property
-    def outcome(self) -> str:
-        """State of the warm-up: "none", "going on", "warm" or "not warm"."""
-        found = self._found()
-        return "none" if found is None else found.outcome
-
-    @property
-    def notes(self) -> list[str]:
-        """What a reader of the results must know."""
-        found = self._found()
-        if found is None or found.outcome != "not warm":
-            return self._pauses
-        cold = f"the arm was not warm when the repetitions began ({found.sentence})"
-        return [cold, *self._pauses]
-
-    def next_motion(self) -> list[Interval]:
-        """Return the next motion of a warm-up; none where no warm-up is wanted."""
-        return [self._interval(self._state())] if self._threshold else []
-
-    def expected(self) -> list[float]:
-        """Return the durations [s] of the motions that it runs at least."""
-        state, motions = self._state(), self.next_motion()
-        if state.outcome != "going on":
-            return []
-        missing = self._cell.campaign.warmup_least - len(state.motions)
-        return [motion.trajectory.duration for motion in motions] * max(missing, 0)
-
-    def run(self, runner: Runner) -> None:
-        """Run motions until the arm is warm, if any are missing (RepetitionsRejectedError)."""
-        if not self._threshold or not self._run.campaign.missing("excitation", "validation"):
-            return
-        run, state, settings = self._run, self._present(), self._cell.campaign
-        meter = FrictionMeter(run.campaign.cell, run.campaign.plan.excitation.trajectory)
-        while state.outcome == "going on":
-            interval, done = self._interval(state), len(state.motions)
-            if done >= settings.warmup_least:
-                run.watch.expect([interval.trajectory.duration])
-            name = runner.run_until_accepted(interval, done + 1, settings.warmup_most)
-            friction = meter.measure(run.campaign.folder.archives / name)
-            state = state.with_motion(name, friction, settings.warmup_least, settings.warmup_most)
-            state = replace(state, moved_at=time.time())
-            state.save(self._path)
-            run.reporter.say(state.sentence)
-
-    def rewarm(self, runner: Runner) -> None:
-        """Warm up again if the joints have cooled down."""
-        if self._cold(time.time()) is not None:
-            self.run(runner)
-
-    def cold_start(self, began: float) -> Problem | None:
-        """Return the problem of a repetition that began cold [s since 1970], as after a hold."""
-        found = self._cold(began)
-        if found is None:
-            return None
-        return Problem(f"{found.rested(began)} when it began and was assumed to be cold")
-
-    def motion_ended(self) -> None:
-        """Record that a motion that warms the joints has ended."""
-        found = self._found()
-        if found is not None:
-            replace(found, moved_at=time.time()).save(self._path)
-
-    def _found(self) -> WarmUpRecord | None:
-        return WarmUpRecord.load(self._path, self._run.plan_hash)
-
-    def _state(self) -> WarmUpRecord:
-        """Return the warm-up from its file, or a new one."""
-        new = WarmUpRecord(self._run.plan_hash, self._cell.joint_names, self._threshold)
-        return replace(self._found() or new, threshold=self._threshold)
-
-    def _cold(self, when: float) -> WarmUpRecord | None:
-        """Return a warm-up after which the arm has cooled down by `when` [s since 1970]."""
-        found = self._found() if self._threshold else None
-        return found if found is not None and found.motions and found.cold(when) else None
-
-    def _interval(self, state: WarmUpRecord) -> Interval:
-        plan, index = self._run.campaign.plan, len(state.earlier) + len(state.motions)
-        return Interval("warmup", index, plan.excitation.trajectory, plan.moves)
-
-    def _present(self) -> WarmUpRecord:
-        """Return the warm-up to continue; a new one if the joints have cooled down."""
-        state = self._state()
-        if state.motions and state.cold(time.time()):
-            rested = state.rested(time.time())
-            self._run.reporter.say(f"{rested} and is assumed to be cold: warming up again")
-            self._pauses.append(f"{rested} during the campaign, and was warmed up again")
-            return state.cooled()
-        return state

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,13 +12,11 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
+from identification.export.arm import Arm
 from identification.export.friction import load_remarks
 from identification.export.urdf import TENSOR, WriteBackError, as_text, comment_text
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import body
-
-if TYPE_CHECKING:
-    from identification.export.simulators import Arm
 
 Array = NDArray[np.float64]
 Node = ElementTree.Element

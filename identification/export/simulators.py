@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 from xml.etree import ElementTree
 
@@ -13,7 +12,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.export.friction import equivalent_coulomb, load_remarks
+from identification.export.arm import Arm
+from identification.export.friction import load_remarks
 from identification.export.sdf import MissingDrakeError, drake_torque, sdf
 from identification.export.urdf import WriteBackError, as_text, comment_text, rnea, write_urdf
 from identification.model.elements import TorsionSpring
@@ -28,9 +28,7 @@ from identification.model.friction import (
 )
 from identification.model.kinematics import pinocchio_model
 from identification.model.motion import Motion
-from identification.model.pseudo_inertia import Body, body
 from identification.model.regressor import RegressorPlan
-from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
 Node = ElementTree.Element
@@ -52,84 +50,6 @@ _SHORTEST: Final = 1e-3  # m, length of a capsule
 
 class MissingMujocoError(IdentificationError):
     """MuJoCo is needed and not installed."""
-
-
-class Ranges(NamedTuple):
-    """Limits of the joints (n,), rad or m, rad/s or m/s, N·m or N; infinite if unknown."""
-
-    lower: Array
-    upper: Array
-    velocity: Array
-    effort: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Arm:
-    """An arm with physically consistent parameters."""
-
-    urdf: str  # text that the model was created from
-    model: RobotModel
-    standard: Array  # consistent standard parameters (s,)
-    values: Array  # the corresponding parameters (p,) of the model
-    ranges: Ranges  # limits of its joints
-    # torque of each gear (n,) [N·m, N] at which friction that grows with it is written, see
-    # :func:`identification.export.friction.median_load`; None: zero
-    load: Array | None = field(default=None)
-    #: whether bodies that cannot exist are changed by MuJoCo, for nominal arms
-    balanced: bool = False
-
-    @property
-    def written_load(self) -> Array:
-        """The `load` (n,), zero if None."""
-        return np.zeros(self.model.n_joints) if self.load is None else self.load
-
-    @property
-    def friction(self) -> tuple[dict[str, float], ...]:
-        """Coefficients by symbol of each joint, then of each coupled motor.
-
-        Coulomb friction contains that of the `load`.
-        """
-        coefficients = self.values[self.model.friction_part]
-        return equivalent_coulomb(self.model, coefficients, self.written_load)
-
-    @property
-    def bodies(self) -> tuple[Body, ...]:
-        """Body that each joint moves, the payload included (n,)."""
-        inertial = self.standard[self.model.layout.links].copy()
-        if self.model.payload is not None:
-            joint, carried = self.model.payload.carried_by(self.model.chain)
-            inertial[joint] += carried
-        return tuple(body(one) for one in inertial)
-
-    @property
-    def rotors(self) -> Array:
-        """Inertia matrix of the rotors in joint coordinates (n, n)."""
-        return self.model.layout.rotor_matrix(self.standard)
-
-    def spring(self, joint: int) -> tuple[float, float]:
-        """Return stiffness [N·m/rad] and rest angle [rad] of all torsion springs of a joint."""
-        stiffness = moment = 0.0
-        for one in self.model.elements.placed:
-            if one.joint == joint and isinstance(one.element, TorsionSpring):
-                found = self.values[self.model.element_part][one.part]
-                k = float(found[0]) if len(found) else one.element.stiffness or 0.0
-                stiffness, moment = stiffness + k, moment + k * one.element.rest
-        return stiffness, moment / stiffness if stiffness else 0.0
-
-    def link(self, joint: int) -> str:
-        """Return the name of the link that a joint moves, different from that of any joint."""
-        frames = self.model.chain.frames
-        name = next((name for name, frame in frames.items() if frame.joint == joint), "link")
-        return f"{name}_link" if name in self.model.joint_names else name
-
-    def fixed(self, joint: int) -> dict[str, tuple[Array, Array]]:
-        """Return axes (3, 3) and origin (3,) of the links fixed to that of a joint, by name."""
-        names = {self.link(joint), *self.model.joint_names}
-        return {
-            name: (frame.rotation, frame.translation)
-            for name, frame in self.model.chain.frames.items()
-            if frame.joint == joint and name not in names
-        }
 
 
 def mjcf(arm: Arm, name: str, remarks: Sequence[str] = (), *, step: float = _TIMESTEP) -> str:

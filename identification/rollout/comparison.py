@@ -11,7 +11,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.distributions import student_limit
-from identification.export.simulators import Arm, rigid_torque, unsupported_torque
+from identification.export.arm import Arm
+from identification.export.simulators import rigid_torque, unsupported_torque
 from identification.model.kinematics import pinocchio_model
 from identification.model.robot import RobotModel
 from identification.rollout.servo import Servo, command_of

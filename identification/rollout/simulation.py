@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.export.simulators import Arm, load_mujoco, mjcf
+from identification.export.arm import Arm
+from identification.export.simulators import load_mujoco, mjcf
 
 Array = NDArray[np.float64]
 

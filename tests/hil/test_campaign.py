@@ -28,7 +28,7 @@ from hil.campaign import (
     Stop,
     VirtualLink,
 )
-from hil.campaign import campaign as campaign_module
+from hil.campaign import state as state_module
 from hil.campaign.errors import refusal_text
 from hil.campaign.intervals import (
     Interval,
@@ -353,7 +353,7 @@ def test_an_older_folder_with_a_collision_is_refused(
 ) -> None:
     raised = written(cell, "floor = 0.0", "floor = 1.0")
     with monkeypatch.context() as once:
-        once.setattr(campaign_module, "require_runnable", lambda *arguments: None)
+        once.setattr(state_module, "require_runnable", lambda *arguments: None)
         campaign = Campaign.create(tmp_path / "floor", raised, plan)
     with pytest.raises(MotionRefusedError, match=r"standstill 1 .*collision of .*floor.*home_deg"):
         execute(campaign)

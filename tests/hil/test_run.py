@@ -48,11 +48,11 @@ from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.campaign.quality import FIELDS, Executed, RepetitionCheck
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.run import RunResult
+from hil.campaign.stages import WarmUpStage
 from hil.campaign.warmup import (
     COLD_AFTER,
     FrictionMeter,
     WarmUpRecord,
-    WarmUpStage,
     change_per_motion,
 )
 from hil.cli import app
@@ -451,7 +451,7 @@ def test_the_link_decides_whether_the_arm_is_simulated(
     campaign = make(real=True)
     twin = simulated_link(campaign.cell, instead_of_hardware=True)
     if provenance is None:  # as of a version that left it to the caller
-        monkeypatch.setattr("hil.campaign.run.with_present_date", lambda _: {})
+        monkeypatch.setattr("hil.campaign.runner.with_present_date", lambda _: {})
     campaign.run(twin, provenance=provenance, dry_run_only=True)
     monkeypatch.undo()
     first = next(campaign.folder.archives.iterdir())

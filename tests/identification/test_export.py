@@ -18,17 +18,10 @@ from identification.errors import ModelError, ShapeError
 from identification.estimators.consistent import consistent_estimate
 from identification.excitation.collision import CollisionChecker, Workspace
 from identification.excitation.errors import CollisionModelError
+from identification.export.arm import Arm, Ranges
 from identification.export.friction import friction_curve, median_load
 from identification.export.parameters import parameters_csv, parameters_json
-from identification.export.simulators import (
-    AGREES,
-    FORMATS,
-    Arm,
-    Ranges,
-    compare,
-    mjcf,
-    random_states,
-)
+from identification.export.simulators import AGREES, FORMATS, compare, mjcf, random_states
 from identification.export.urdf import NotConsistentError, WriteBackError, not_in_urdf, write_urdf
 from identification.factor.factor import Factor, estimate
 from identification.model.coupling import Coupling

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from identification.export.simulators import Arm, Ranges
+from identification.export.arm import Arm, Ranges
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.rollout.comparison import (

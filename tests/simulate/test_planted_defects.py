@@ -15,7 +15,7 @@ from drivers.packets import PacketSequence
 from drivers.states import LossTracker
 from hil.archive.recorder import Recorder
 from hil.campaign.folder import CampaignFolder
-from hil.campaign.run import Runner
+from hil.campaign.runner import Runner
 from planner import TrajectoryPlayer
 from tests.simulate.many import stage_folder
 from tests.simulate.scenes import NEIGHBOURS

@@ -1,0 +1,284 @@
+"""Motions of one run of a campaign: each is moved to, run, archived and checked.
+
+Each motion is archived, judged and entered in the manifest before the next one begins: a killed run
+is resumed with the first motion that is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.archive import ArchiveHeader, ArchiveSpec, open_archive
+from hil.archive.live import LiveView
+from hil.errors import ArchiveError
+from hil.progress import Reporter, Task
+from hil.reading import parse_json
+from hil.recording import archive_spec, origin_of, with_present_date
+from hil.simulation import simulated_provenance
+from hil.version import software
+from identification.excitation.excitation import trajectory_from_dict
+
+from .dry_run import OVERRIDE, SIMULATED, yes_or_no
+from .errors import MotionFailedError, RepetitionsRejectedError
+from .folder import CampaignFolder
+from .intervals import REPEATED, Interval, StraightMoves, player_of
+from .link import NOT_STARTED, MotionLink, VirtualLink
+from .operator import RunWatch
+from .plan import moves_to_dict
+from .quality import ArchiveReview, Problem
+from .state import CampaignState
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What the caller of `Campaign.run` chose; see there."""
+
+    provenance: Mapping[str, str] | None = None
+    durable: bool | None = None
+    unrehearsed: bool = False
+    dry_run_only: bool = False
+    accept_dry_run: bool = False
+    accept_torque: tuple[str, ...] = ()
+    live: LiveView | None = None
+
+
+class RunArchives:
+    """Archives of one run: what each contains, and the check before it is entered.
+
+    Attributes:
+        names: file names so far, whatever their outcome.
+        notes: what a reader must know.
+        cycles: archived so far.
+        provenance: metadata of every archive; a date only in real time.
+        plan_hash: of this cell, URDF and plan, in memory and on the disk.
+        simulated: whether only a simulated arm can move.
+        review: judges archives and enters them in the manifest.
+    """
+
+    def __init__(
+        self, campaign: CampaignState, link: MotionLink | None, options: RunOptions, plan_hash: str
+    ) -> None:
+        given = options.provenance
+        self._campaign, self.plan_hash = campaign, plan_hash
+        self.simulated = (campaign.cell if link is None else link).only_simulated
+        self.names, self.notes, self.cycles = list[str](), list[str](), 0
+        in_file = link is None and campaign.cell.controller.transport == "simulated"
+        virtual = in_file or isinstance(link, VirtualLink)
+        self._durable = not virtual if options.durable is None else options.durable
+        # The caller knows what a link simulates; the link decides whether a real arm can move.
+        own: Mapping[str, str] = {}
+        if not virtual:
+            own = origin_of(campaign.cell, only_simulated=self.simulated, virtual=False)
+        elif given is None:
+            own = simulated_provenance(campaign.cell, effects=False)
+        self.provenance = {**own, **(given or {}), SIMULATED: yes_or_no(self.simulated)}
+        trajectory = campaign.plan.excitation.trajectory
+        self.review = ArchiveReview(campaign.folder, campaign.cell, trajectory)
+
+    def adopt(self, slow: Sequence[Interval]) -> None:
+        """Enter archives of an earlier run of the plan, and of its `slow` motions, see `review`."""
+        arm, plan_hash = self.provenance.get(SIMULATED), self.plan_hash
+
+        def made(header: ArchiveHeader) -> bool:
+            return header.plan_hash == plan_hash and header.simulated == arm
+
+        self.review.adopt([*self._campaign.motions, *slow], made)
+
+    def spec(self, interval: Interval) -> ArchiveSpec:
+        """Return the archive of the next attempt at an interval."""
+        campaign = self._campaign
+        name = campaign.folder.next_name(interval.kind, interval.index)
+        # One seed gives one campaign to the byte, whatever the name of its folder.
+        simulated = self.provenance.get(SIMULATED) == yes_or_no(True)
+        metadata = {
+            **({} if simulated else {"campaign": campaign.folder.root.resolve().name}),
+            "plan_hash": self.plan_hash,
+            **{f"software.{package}": version for package, version in software().items()},
+            **with_present_date(self.provenance),
+        }
+        plan = {"trajectory": interval.trajectory.to_dict()}
+        if interval.kind in REPEATED:  # with how it was found
+            plan = {"excitation": campaign.plan.excitation.to_dict()}
+        return archive_spec(
+            campaign.cell,
+            campaign.folder.archives / name,
+            metadata,
+            plan | moves_to_dict(interval.moves),
+            durable=self._durable,
+        )
+
+
+class Warmth(Protocol):
+    """Whether the joints are warm enough for a repetition."""
+
+    def rewarm(self, runner: Runner) -> None:
+        """Warm up again if the joints have cooled down."""
+
+    def cold_start(self, began: float) -> Problem | None:
+        """Return the problem of a repetition that began cold [s since 1970]."""
+
+    def motion_ended(self) -> None:
+        """Record that a motion that warms the joints has ended."""
+
+
+class Runner:
+    """Runs motions of a campaign on a connected link, and the straight moves to them.
+
+    Args:
+        campaign: its state.
+        link: connected.
+        archives: of this run.
+        watch: operator and stop.
+        reporter: receives what is said.
+        warmth: of the joints.
+        straight: moves between motions.
+        start: (n,) [rad], the first position of the arm, to which it returns.
+        unrehearsed: no dry run is wanted, so that no move is slow for not having been seen in one.
+
+    Attributes:
+        task: receives the seconds of motion.
+    """
+
+    task: Task
+
+    def __init__(
+        self,
+        campaign: CampaignState,
+        link: MotionLink,
+        archives: RunArchives,
+        watch: RunWatch,
+        reporter: Reporter,
+        *,
+        warmth: Warmth,
+        straight: StraightMoves,
+        start: Array,
+        unrehearsed: bool,
+    ) -> None:
+        self.campaign, self._link, self._straight, self._start = campaign, link, straight, start
+        self._archives, self._watch, self._reporter = archives, watch, reporter
+        self._warmth = warmth
+        self._position, self._moves = start, 0
+        self._seen = None if unrehearsed else seen_in_dry_run(campaign.folder)
+
+    def times(self, joined: Sequence[Interval], slow: int) -> list[float]:
+        """Return the seconds of each motion and way; the first `slow` motions are run slowly."""
+        times, watched = [], slow > 0
+        for one in joined:
+            share = OVERRIDE if slow else 1.0
+            if one.kind == "move":
+                unseen = one.from_arm if watched else self._unseen(one)
+                share = self._approach(OVERRIDE) if slow or unseen else 1.0
+            else:
+                slow = max(0, slow - 1)
+            times.append(one.trajectory.duration / share)
+        return times
+
+    def run_motion(self, interval: Interval, number: int, total: int, most: float = 1.0) -> str:
+        """Move to the start of a motion, run it, and return its archive, not yet in the manifest.
+
+        Raises:
+            MotionFailedError: it ended otherwise than planned, or was not begun after a stop.
+            ControllerFault: it was not accepted, or the link broke.
+        """
+        start, end = interval.places(self.campaign.cell.home)
+        self._go(start, most)
+        name = self._execute(interval, number, total, most)
+        self._position = end
+        return name
+
+    def run_until_accepted(self, interval: Interval, number: int, total: int) -> str:
+        """Run motion `number` (from 1) of `total` until it passes its check; return its archive.
+
+        An arm that has cooled down is warmed up before a repetition; one begun cold is rejected.
+
+        Raises:
+            RepetitionsRejectedError: it failed too often.
+        """
+        reasons = list[str]()
+        warm_up = self._warmth if interval.kind == "excitation" else None
+        while len(reasons) <= self.campaign.cell.campaign.bad_repetitions:
+            if warm_up is not None:
+                warm_up.rewarm(self)
+            name = self.run_motion(interval, number, total)
+            cold = None if warm_up is None else warm_up.cold_start(self._watch.began)
+            problem = self._archives.review.enter(interval, name, cold)
+            if warm_up is not None and cold is None:
+                warm_up.motion_ended()
+            if problem is None:
+                return name
+            self._watch.expect([interval.trajectory.duration])
+            self._reporter.say(
+                f"{interval} ({name}) is rejected: {problem.sentence}; the motion is run again"
+            )
+            reasons.append(problem.sentence)
+        raise RepetitionsRejectedError(str(interval), reasons)
+
+    def go_back(self, most: float = 1.0) -> None:
+        """Go home, and from there to the first position; `most` is the largest override."""
+        self._go(self.campaign.cell.home, most)
+        self._go(self._start, most)
+
+    def _go(self, target: Array, most: float) -> None:
+        """Move on a straight way; one not seen in the dry run is no faster than a dry run."""
+        way = self._straight.between(self._position, target, self._moves)
+        if way is not None:
+            self._moves += 1
+            slow = self._approach(min(most, OVERRIDE) if self._unseen(way) else most)
+            name = self._execute(way, way.index + 1, way.index + 1, slow)
+            self.campaign.folder.add(name, "completed")
+            if self._seen is not None and most <= OVERRIDE:
+                self._seen.append(way.ends)
+        self._position = target
+
+    def _approach(self, share: float) -> float:
+        """Return the override of a way, planned at `approach_speed`, for a share of full speed."""
+        return min(1.0, share / self.campaign.cell.campaign.approach_speed)
+
+    def _unseen(self, way: Interval) -> bool:
+        """Return whether the operator should have seen this move in the dry run, and has not.
+
+        A move from or to the first position of the arm counts as unseen: the arm was jogged there.
+        """
+        if self._seen is None:
+            return False
+        return way.from_arm or not any(way.leads(*ends) for ends in self._seen)
+
+    def _execute(self, interval: Interval, number: int, total: int, most: float) -> str:
+        if self._watch.stop.requested:
+            raise MotionFailedError(str(interval), "stopped", NOT_STARTED)
+        spec, duration = self._archives.spec(interval), interval.trajectory.duration
+        self._watch.begin(interval.kind, number, total, duration, most)
+        player = player_of(self.campaign.cell, interval.trajectory)
+        ended = self._link.run(player, spec, self._watch.stop, override=most, watch=self._watch)
+        archived = spec.path.name if ended.outcome == "completed" or spec.path.exists() else None
+        if archived is not None:  # else it was stopped before
+            self._archives.names.append(archived)
+        if ended.outcome != "completed":
+            if archived is not None:
+                self.campaign.folder.add(archived, ended.outcome, ended.reason)
+            refused = self._link.connection.refused if ended.outcome == "refused" else None
+            raise MotionFailedError(str(interval), ended.outcome, ended.reason, archived, refused)
+        self.task.advance(duration / most, str(interval))
+        return spec.path.name
+
+
+def seen_in_dry_run(folder: CampaignFolder) -> list[tuple[Array, Array]]:
+    """Return start and end (n,) [rad] of the moves of a dry run, by its archives."""
+    entries = [one for one in folder.manifest() if one.outcome == "completed"]
+    last = max((k for k, one in enumerate(entries) if one.kind == "dryrun"), default=0)
+    found = []
+    for entry in entries[:last]:
+        if entry.kind == "move":
+            with suppress(ArchiveError, ValueError, KeyError, TypeError):  # then it is not seen
+                archive = open_archive(folder.archives / entry.name, fields=())
+                motion = trajectory_from_dict(parse_json(archive.text("plan.json"))["trajectory"])
+                found.append(Interval("move", 0, motion).ends)
+    return found
