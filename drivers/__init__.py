@@ -34,7 +34,7 @@ from drivers.events import (
 )
 from drivers.exchange.loop import exchange
 from drivers.guard import Guard, GuardLimits
-from drivers.motion_source import BoundsName, CorrectionSource, MotionSource
+from drivers.motion_source import BoundsName, MotionSource
 from drivers.packets import MODE_FIELDS, CyclicPacket, InitPacket, Mode
 from drivers.record import CycleRing, cycle_dtype
 from drivers.session import Session
@@ -56,7 +56,6 @@ from drivers.transports.udp import UdpSpec, UdpTransport
 __all__ = [
     "RepliesLost",
     "BoundsName",
-    "CorrectionSource",
     "Corrupt",
     "Counters",
     "CycleRing",

@@ -12,10 +12,9 @@ from drivers.errors import PacketError
 from drivers.events import InitReceived
 from drivers.guard import Guard
 from drivers.init_check import verify_controller
-from drivers.open_mode import CorrectionMode, OpenMode, SetPointGenerator
+from drivers.open_mode import SetPointGenerator
 from drivers.packets import InitPacket, OpenAxis
 from drivers.safe_reply import PacketClassifier, ReplyBuilder
-from drivers.states import CORRECTION_MODES
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +35,7 @@ class Controller:
     classifier: PacketClassifier
     builder: ReplyBuilder
     wire: ArmWire | None
-    open_mode: OpenMode | None
+    open_mode: SetPointGenerator | None
 
 
 def connect(
@@ -69,11 +68,7 @@ def connect(
         return Controller(init, received, classifier, builder, None, None)
     wire = ArmWire(drive_train, init, arm, only_axis)
     classifier = PacketClassifier(wire.joint_slots, arms, arm, mode, wire.opened)
-    open_mode = (
-        CorrectionMode(guard, wire, builder, mode)
-        if mode in CORRECTION_MODES
-        else SetPointGenerator(guard, wire, builder, mode, max_gap)
-    )
+    open_mode = SetPointGenerator(guard, wire, builder, mode, max_gap)
     joints = slice(0, drive_train.n_joints)
     guard.narrow(
         init.following_error[arm - 1, joints].astype(np.float64),

@@ -236,11 +236,6 @@ class ArmWire:
         difference: Array = np.dot(motor, self._to_joint)
         return difference
 
-    def joint_rounding(self, motor: Array) -> Array:
-        """Return the float32 rounding of a step between targets (n,) of this size, rad."""
-        rounding: Array = np.spacing(np.abs(motor).astype(np.float32)) @ np.abs(self._to_joint)
-        return rounding
-
     def put(self, frame: Floats, column: int, values: Array) -> None:
         """Write values (n,) into one column of a frame."""
         frame[self._slots, column] = values[self._written]

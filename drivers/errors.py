@@ -149,9 +149,6 @@ class Check(Enum):
     STATED_VELOCITY = "difference between stated velocity and step", "rad/s"
     FOLLOWING_ERROR = "following error", _REVOLUTIONS, _CHECK_AXIS
     CURRENT = "target current", "A", _CHECK_ARM
-    COMMANDED_CURRENT = "commanded current", "A", _CHECK_ARM
-    CURRENT_STEP = "change of commanded current in one cycle", "A", _CHECK_ARM
-    CORRECTION_END = "correction at the end", ""
     FIRST_SET_POINT = (
         "distance between received target and actual position",
         _REVOLUTIONS,
@@ -179,7 +176,6 @@ class Check(Enum):
         _LOOK_FOR_LOSSES,
     )
     GAP_AGE = "age, after a gap, of received target or velocity", "cycles", _LOOK_FOR_LOSSES
-    GAP_CORRECTION = "correction sent last before a gap", "", _LOOK_FOR_LOSSES
 
     def __init__(self, quantity: str, unit: str, remedy: str = RefusalError.remedy) -> None:
         self.quantity = quantity
@@ -192,7 +188,7 @@ class GuardError(RefusalError):
 
     Attributes:
         check: the one that failed.
-        unit: of value and bound; that of the check if it is None.
+        unit: of value and bound.
         joint: index from 0.
         value: what was found.
         bound: largest magnitude allowed (or the nearer position limit).
@@ -205,9 +201,8 @@ class GuardError(RefusalError):
         value: float,
         bound: float,
         cycle: int,
-        unit: str | None = None,
     ) -> None:
-        self.unit = unit = check.unit if unit is None else unit
+        self.unit = unit = check.unit
         message = (
             f"{check.quantity} of joint {joint + 1} is {value:.9g} {unit}; "
             f"allowed is {bound:.9g} {unit}"

@@ -65,7 +65,7 @@ class GapSeen:
 class RepliesLost:
     """The target received in `cycle` is that of an earlier set-point; `count` were not accepted.
 
-    Detected only in modes 1, 4 and 5, while a joint moves by more than the standstill threshold per
+    Detected only while a joint moves by more than the standstill threshold per
     cycle and the controller holds its target.
     """
 

@@ -1,9 +1,9 @@
-"""Execution of one requested motion or correction, from request to rest.
+"""Execution of one requested motion, from request to rest.
 
 A source is foreign code inside the cycle: anything it raises (SystemExit included), any array that
 is not (n,) numbers, and bounds wider than allowed become `SourceFailed`. Allowed are the bounds of
 a plan; those of an override from the first change of override on; those of a stop from `stop` or
-the first `hold` on; for a correction, until it is at rest. A stop that takes too long is a failure;
+the first `hold` on. A stop that takes too long is a failure;
 a hold that does not come to rest becomes a stop.
 """
 
@@ -17,26 +17,22 @@ import numpy as np
 
 from drivers.errors import SourceFailed, error_text
 from drivers.guard import RANK, Array
-from drivers.motion_source import BoundsName, CorrectionSource, MotionSource, has_members
-from drivers.states import CORRECTION_MODES, POSITION_MODES, Outcome
+from drivers.motion_source import BoundsName, MotionSource, has_members
+from drivers.states import Outcome
 
 _AT_REST: Final = 1e-9
 """Rounding of standstill, rad per cycle and rad/s."""
-_MEMBERS: Final = ("begin", "advance", "finished", "stop")
+_MEMBERS: Final = ("begin", "advance", "finished", "stop", "bounds")
 _HOLD: Final = ("hold", "resume")
 _SET_POINT: Final = ("position", "velocity")
-_CORRECTION: Final = ("correction", "current")
 
 
 class Execution:
-    """Set-points of a `MotionSource`, or corrections of a `CorrectionSource`.
+    """Set-points of a `MotionSource`.
 
-    The end is held for `settle_cycles`; a stop or hold may take `stop_cycles`. A correction is zero
-    after its end.
+    The end is held for `settle_cycles`; a stop or hold may take `stop_cycles`.
 
     Attributes:
-        corrects: the source is a `CorrectionSource`.
-        feeds_forward: the source has `feed_forward`.
         started: the first set-point was sent.
         position: (n,) rad, the last set-point.
         fraction: of the planned speed, last requested; None before.
@@ -48,8 +44,7 @@ class Execution:
 
     def __init__(
         self,
-        source: MotionSource | CorrectionSource,
-        mode: int,
+        source: MotionSource,
         n_joints: int,
         settle_cycles: int,
         stop_cycles: int,
@@ -62,9 +57,6 @@ class Execution:
         self._allowed: tuple[BoundsName, ...] = ("plan",)
         self._rest_by: int | None = None  # first cycle in which it takes too long
         self._resting = 0
-        self.corrects = mode in CORRECTION_MODES
-        self._names = _CORRECTION if self.corrects else _SET_POINT
-        self.feeds_forward = callable(getattr(source, "feed_forward", None))
         self.position = self._still
         self.finished = False
         self.started = False
@@ -80,11 +72,6 @@ class Execution:
         return self.finished and self._resting >= self._settle_cycles
 
     @property
-    def widest(self) -> BoundsName:
-        """The widest bounds allowed now."""
-        return self._allowed[-1]
-
-    @property
     def is_resumable(self) -> bool:
         """Whether the source runs and can continue from the controller's target."""
         running = self.started and not self.finished
@@ -97,11 +84,8 @@ class Execution:
             SourceFailed: the source does not begin there, or does not hold.
         """
         with _failing("cannot begin", cycle):
-            if self.corrects:
-                self._source.begin()
-            else:
-                self.position = position
-                self._source.begin(position.copy())
+            self.position = position
+            self._source.begin(position.copy())
             self.finished = bool(self._source.finished)
         self.started = True
         if self.held and (reason := self.hold(cycle)) is not None:
@@ -173,44 +157,27 @@ class Execution:
     def advance(self, cycle: int) -> tuple[Array, Array, BoundsName]:
         """Return the next set-point (n,) rad, rad/s, and its bounds; the end is held.
 
-        Of a correction: motion (n,) as of `CorrectionSource`, motor current (n,) A, and the widest
-        bounds, because it names none. Raises SourceFailed.
+        Raises SourceFailed.
         """
         try:
             if self.finished:
                 self._resting += 1
                 return self.position, self._still, self._bounds()
             first, second = self._source.advance()
-            first = self._checked(first, self._names[0])
-            second = self._checked(second, self._names[1])
+            first = self._checked(first, _SET_POINT[0])
+            second = self._checked(second, _SET_POINT[1])
             bounds = self._bounds()
             self.finished = bool(self._source.finished)
         except BaseException as error:
             raise _failed("failed", error, cycle) from error
         if self._rest_by is not None:
             moved = np.abs(first - self.position).max()
-            if not self.corrects and max(moved, np.abs(second).max()) <= _AT_REST:
+            if max(moved, np.abs(second).max()) <= _AT_REST:
                 self.mark_at_rest()
             self._require_rest(cycle)
         # The source may reuse its arrays.
-        if self.corrects:
-            return first.copy(), second.copy(), bounds
         self.position = first.copy()
         return self.position, second, bounds
-
-    def feed_forward(self, cycle: int) -> tuple[Array, Array]:
-        """Return velocity (n,) rad/s and motor current (n,) A of the set-point given last.
-
-        Zero at the end. Raises SourceFailed.
-        """
-        if self._resting:
-            return self._still, self._still
-        with _failing("failed to feed forward", cycle):
-            velocity, current = self._source.feed_forward()
-            return (
-                self._checked(velocity, "feed-forward velocity").copy(),
-                self._checked(current, "feed-forward current").copy(),
-            )
 
     def resume_from(self, position: Array, velocity: Array, cycles: int, cycle: int) -> None:
         """Continue from the controller's target, see `MotionSource`; raises SourceFailed."""
@@ -223,8 +190,6 @@ class Execution:
         if self.outcome == "stopped":
             return
         self._rest_by = None
-        if self.corrects:
-            self._allowed = tuple(name for name in self._allowed if name != "stop")
 
     def _allow(self, bounds: BoundsName) -> None:
         if bounds not in self._allowed:
@@ -237,7 +202,7 @@ class Execution:
         return array
 
     def _bounds(self) -> BoundsName:
-        bounds: BoundsName = self._allowed[-1] if self.corrects else self._source.bounds
+        bounds: BoundsName = self._source.bounds
         if not isinstance(bounds, str) or bounds not in self._allowed:
             raise ValueError(f"bounds {bounds!r}, not {' or '.join(self._allowed)}")
         return bounds
@@ -270,18 +235,12 @@ def _failed(what: str, error: BaseException, cycle: int) -> SourceFailed:
 
 
 def execution_of(
-    source: MotionSource | CorrectionSource,
-    mode: int,
-    n_joints: int,
-    settle_cycles: int,
-    stop_cycles: int,
+    source: MotionSource, n_joints: int, settle_cycles: int, stop_cycles: int
 ) -> Execution | str:
-    """Return the execution of a source, or why it cannot run in this open mode."""
+    """Return the execution of a source, or why it cannot run."""
     try:
-        named = has_members(source, ("bounds",))
-        fits = (mode in POSITION_MODES) if named else (mode in CORRECTION_MODES)
-        if fits and has_members(source, _MEMBERS):
-            return Execution(source, mode, n_joints, settle_cycles, stop_cycles)
+        if has_members(source, _MEMBERS):
+            return Execution(source, n_joints, settle_cycles, stop_cycles)
     except BaseException as error:
         return f"the motion source cannot be inspected: {error_text(error)}"
-    return f"a {type(source).__name__} is not the kind of source mode {mode} needs"
+    return f"a {type(source).__name__} is no source of a motion"

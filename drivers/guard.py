@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal, NoReturn
+from typing import Final, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,14 +27,12 @@ Array = NDArray[np.float64]
 Joints = NDArray[np.bool_]
 
 
-def require(
-    where: Joints, values: Array, bounds: Array, check: Check, cycle: int, unit: str | None = None
-) -> None:
+def require(where: Joints, values: Array, bounds: Array, check: Check, cycle: int) -> None:
     """Raise for the first joint of `where` (n,) whose value (n,) is above its bound (n,)."""
     bad = where & ~(values <= bounds)
     if bad.any():
         joint = int(np.argmax(bad))
-        raise GuardError(check, joint, float(values[joint]), float(bounds[joint]), cycle, unit)
+        raise GuardError(check, joint, float(values[joint]), float(bounds[joint]), cycle)
 
 
 def require_finite(values: Array, where: Joints, cycle: int) -> None:
@@ -90,7 +88,6 @@ class GuardLimits:
         override_acceleration, override_jerk: factors while an override changes.
         stop_acceleration, stop_jerk: factors during hold and stop.
         standstill: motor revolutions per cycle, see `DEFAULT_STANDSTILL`.
-        current_rise: shortest rise time of a commanded current from zero to its limit, s.
 
     Raises:
         ValueError: a shape, sign or order is wrong; names the field.
@@ -108,7 +105,6 @@ class GuardLimits:
     stop_acceleration: float = 2.0
     stop_jerk: float = 3.0
     standstill: float = DEFAULT_STANDSTILL
-    current_rise: float = 0.01
 
     def __post_init__(self) -> None:
         n = np.size(self.lower)
@@ -129,7 +125,7 @@ class GuardLimits:
         ):
             if not 1.0 <= override <= stop:
                 raise ValueError(f"guard limits: factors 1 <= {override} <= {stop} do not hold")
-        for name in ("standstill", "current_rise"):
+        for name in ("standstill",):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"guard limits: {name} {getattr(self, name)} is not positive")
 
@@ -374,12 +370,6 @@ class Guard:
         bound = LAG * factor * self.limits.acceleration
         require(where, np.abs(velocity - sent), bound, Check.PAUSE_VELOCITY, cycle)
 
-    def check_position(self, q: Array, cycle: int) -> None:
-        """Check the position (n,) rad that a correction leads to."""
-        found, allowed = (q - self._middle)[None], self._sets[0][:1]
-        if not (np.abs(found) <= allowed).all():
-            raise_first(found, allowed, _SET_POINT_CHECKS[:1], cycle, self._middle)
-
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:
         """Check the next set-point q (n,) rad, qd (n,) rad/s, which then counts as sent.
 
@@ -396,117 +386,3 @@ class Guard:
         allowed = self._sets[self._active.update(bounds)]
         if not (np.abs(found) <= allowed).all():
             raise_first(found, allowed, _SET_POINT_CHECKS, cycle, self._middle)
-
-
-_RATE_CHECKS: Final = (Check.VELOCITY, Check.ACCELERATION, Check.JERK)
-_UNIT: Final = {"velocity": "rad/s", "offset": "rad"}
-
-
-class CorrectionGuard:
-    """Checks corrections of one arm, cycle by cycle, from zero to zero.
-
-    A velocity fed forward and an offset from the controller's target have the same three sets of
-    bounds as set-points, on their differences from one reply to the next: the differences of a
-    velocity are mean accelerations and jerks, those of an offset one order higher. An offset also
-    has the bounds of a velocity, as if the controller added it up cycle by cycle; so has its sum
-    with the target. A current has a limit and a largest step per cycle. Nothing is clamped; every
-    check raises `GuardError`.
-
-    The motion is a "velocity", rad/s, or an "offset" of positions, rad.
-    """
-
-    def __init__(self, guard: Guard, kind: Literal["velocity", "offset"]) -> None:
-        self._guard = guard
-        self._is_velocity = kind == "velocity"
-        self._unit = _UNIT[kind]
-        limits, T = guard.limits, guard.period
-        n = limits.n_joints
-        self._every = np.ones(n, dtype=np.bool_)
-        first = np.array([0.0, 0.0, -1.0, 1.0])
-        second = np.array([0.0, 1.0, -2.0, 1.0])
-        third = np.array([-1.0, 3.0, -3.0, 1.0])
-        itself = np.array([0.0, 0.0, 0.0, 1.0])
-        as_velocity = np.array([itself, first / T, second / T**2])
-        as_position = np.array([first / T, second / T**2, third / T**3])
-        self._differences = (
-            as_velocity if kind == "velocity" else np.vstack([as_position, as_velocity / T])
-        )
-        self._checks = _RATE_CHECKS * (len(self._differences) // 3)
-        self._sets = {rank: self._bounds(rank) for rank in RANK.values()}
-        self._active = ActiveBounds()
-        self._history = np.zeros((4, n))
-        self._quantities = np.zeros((len(self._differences), n))
-        self._current = np.zeros(n)
-        self._target = self._offset = self._sent_in = np.zeros(n)
-        self._rise = T / limits.current_rise
-        # Rounding of zero: a millionth of a limit, for an offset of one step.
-        step = T if kind == "offset" else 1.0
-        self._nothing = RELATIVE_TOLERANCE * limits.velocity * step
-
-    def _bounds(self, rank: int) -> Array:
-        limits = self._guard.limits
-        factor_a, factor_j = limits.factors(rank)
-        bounds = np.array([limits.velocity, factor_a * limits.acceleration, factor_j * limits.jerk])
-        allowed = np.tile(bounds, (len(self._differences) // 3, 1))
-        return allowed * (1.0 + RELATIVE_TOLERANCE)
-
-    def begin(self) -> None:
-        """Begin with a correction of zero."""
-        self._history[...] = 0.0
-        self._current[...] = 0.0
-        self._active.reset()
-
-    def check_motion(self, motion: Array, bounds: BoundsName, cycle: int) -> None:
-        """Check the next velocity or offset (n,), which then counts as sent."""
-        history = self._history
-        history[:3] = history[1:]
-        history[3] = motion
-        found = self._quantities
-        np.matmul(self._differences, history, out=found)
-        allowed = self._sets[self._active.update(bounds)]
-        if not (np.abs(found) <= allowed).all():
-            raise_first(found, allowed, self._checks, cycle)
-
-    @property
-    def resting(self) -> bool:
-        """Whether the velocities sent last are zero, or the offsets the same."""
-        history = self._history
-        rates = history if self._is_velocity else np.diff(history, axis=0)
-        return bool((np.abs(rates) <= self._nothing).all())
-
-    def set_target(self, target: Array, offset: Array, sent_in: Array) -> None:
-        """Store the controller's target (n,) rad, the offset from it, and its cycle, (n,)."""
-        self._target, self._offset, self._sent_in = target, offset, sent_in
-
-    def check_target(
-        self, target: Array, offset: Array, sent_in: Array, rounding: Array, cycle: int
-    ) -> None:
-        """Check the speed of target and offset (n,) rad together, which then count as sent.
-
-        `sent_in` (n,) is the cycle in which each target was sent, `rounding` (n,) rad of a step.
-        """
-        T = self._guard.period
-        elapsed = T * np.maximum(sent_in - self._sent_in, 1.0)
-        speed = (target - self._target) / elapsed
-        bound = self._guard.limits.velocity * (1.0 + RELATIVE_TOLERANCE) + rounding / elapsed
-        for step in (offset - self._offset, offset):
-            require(self._every, np.abs(speed + step / T), bound, Check.VELOCITY, cycle)
-        self.set_target(target, offset, sent_in)
-
-    def check_current(self, current: Array, servo: Array | None, cycle: int) -> None:
-        """Check the next current (n,) A, which then counts as sent.
-
-        It is fed forward, or added to the servo's own (n,) A.
-        """
-        total = current if servo is None else current + servo
-        bound = self._guard.current * (1.0 + RELATIVE_TOLERANCE)
-        require(self._every, np.abs(total), bound, Check.COMMANDED_CURRENT, cycle)
-        step, largest = np.abs(current - self._current), bound * self._rise
-        require(self._every, step, largest, Check.CURRENT_STEP, cycle)
-        self._current[...] = current
-
-    def require_zero(self, check: Check, cycle: int) -> None:
-        """Require the last correction to be zero; raises GuardError with this check."""
-        no_current = RELATIVE_TOLERANCE * self._guard.current
-        require(self._every, np.abs(self._history[3]), self._nothing, check, cycle, self._unit)
-        require(self._every, np.abs(self._current), no_current, check, cycle, "A")

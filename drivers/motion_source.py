@@ -1,13 +1,4 @@
-"""Sources of set-points and corrections for a session.
-
-===========  ==========================================================  ====================
-open mode    who generates the targets                                   source
-===========  ==========================================================  ====================
-4, 5         the PC                                                      `MotionSource`
-1            the PC, with feed-forward of velocity and current           `MotionSource`
-2, 7, 8, 9   the controller; the PC corrects them                        `CorrectionSource`
-===========  ==========================================================  ====================
-"""
+"""Sources of set-points for a session: the PC generates the targets, in open modes 4 and 5."""
 
 from __future__ import annotations
 
@@ -40,9 +31,6 @@ class MotionSource(Protocol):
     - ``resume_from(position, velocity, cycles)``: continue along the path from the target, (n,) rad
       and rad/s, to which a controller has extrapolated the motion. A velocity across the path
       decays within `cycles`. Raises if the target is off the path.
-    - ``feed_forward()``: in mode 1, return velocity (n,) rad/s and motor current (n,) A of the
-      set-point given last; called once after each `advance`. Both are zero at the first set-point
-      and at the end. Without it the velocity is that of the set-points, and the current zero.
 
     Attributes ``motion_time`` (s) and ``rate`` (1 as planned), if both exist, are displayed.
     """
@@ -74,39 +62,6 @@ class MotionSource(Protocol):
 
         Drive-off is requested if that takes longer than `session.STOP_TIMEOUT`.
         """
-
-
-class CorrectionSource(Protocol):
-    """Corrections of a motion that the controller itself generates. Joint arrays are (n,).
-
-    Like a `MotionSource`, it is called once per packet replied to. A correction starts at zero,
-    satisfies the bounds of a plan (those of a stop after `stop`, and from `hold` until it rests: a
-    velocity at zero, an offset unchanged), and is zero again when it is finished. The session
-    never clamps or fades it.
-    """
-
-    @property
-    def finished(self) -> bool:
-        """Whether the corrections given last were the end, zero."""
-
-    def begin(self) -> None:
-        """Begin: the reply to the first packet with every axis open is zero. Raise to refuse."""
-
-    def advance(self) -> tuple[Array, Array]:
-        """Return the next correction: motion and motor current, A.
-
-        ====  ===========================================  ======================================
-        mode  motion                                       current
-        ====  ===========================================  ======================================
-        2     velocity fed forward, rad/s                  fed forward
-        7     offset from the controller's target, rad     none: zeros
-        8     velocity fed forward, rad/s                  none: zeros
-        9     none: zeros                                  added to the servo's own
-        ====  ===========================================  ======================================
-        """
-
-    def stop(self) -> None:
-        """Bring the correction back to zero; then `finished` is true."""
 
 
 def has_members(source: object, names: Sequence[str]) -> bool:

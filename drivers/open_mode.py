@@ -18,22 +18,20 @@ than `max_gap`, open mode continues only if D1 is within 10 % of the threshold o
 last, or of some steps more, and its velocity (D2) is zero or within half the velocity sent last or
 the standstill threshold; for an arm at rest the same is required of its own velocity (D4). The
 motion comes to rest on its path from D1 and D2, which count as sent. Where packets arrive late
-although none is missing, D4 is compared with the velocity sent last. Corrections of targets that
-the controller generates (modes 2, 7, 8, 9) are refused after such a gap unless they were zero. A
-value needed for these decisions, for the first set-point, or to be returned to an open axis is
-refused if it was not sent in this packet.
+although none is missing, D4 is compared with the velocity sent last. A value needed for these
+decisions, for the first set-point, or to be returned to an open axis is refused if it was not sent
+in this packet.
 
 The end is held for `settle_cycles`; the next reply asks for the end of open mode (status byte 1),
 and again every `EXIT_RETRY_CYCLES`; after `EXIT_TIMEOUT` that is a fault. The end is requested as
 well where a motion waits that long for the last axis to open.
 
-Nothing here changes the session: `OpenMode.reply` returns `Reply`, `Exit` or `Refuse`, which the
-session applies.
+Nothing here changes the session: `SetPointGenerator.reply` returns `Reply`, `Exit` or `Refuse`,
+which the session applies.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -45,13 +43,12 @@ from drivers.errors import (
     Check,
     ExitTimeout,
     RefusalError,
-    SourceFailed,
     as_refusal,
 )
 from drivers.execution import Execution
-from drivers.guard import FIRST_FRACTION, Array, CorrectionGuard, Guard, Joints, require
-from drivers.packets import MODE_FIELDS, Mode
-from drivers.safe_reply import D1, D2, D4, D5, PacketStatus, ReplyBuilder
+from drivers.guard import FIRST_FRACTION, Array, Guard, Joints, require
+from drivers.packets import Mode
+from drivers.safe_reply import D1, D2, PacketStatus, ReplyBuilder
 from drivers.states import LossTracker, State
 
 LEAP_FRACTION: Final = 0.25
@@ -271,8 +268,10 @@ than half of it has so little curvature, less than 10 rad/s² within 1e-3 rad, t
 is needed; and the motion does not stay beside its path for as long as a gap may last."""
 
 
-class OpenMode(ABC):
+class SetPointGenerator:
     """Writes set-points into a reply, which holds the safe one, and into the cycle's record.
+
+    In the modes served, 4 and 5, the PC generates the targets.
 
     Methods that check or send something raise `GuardError` or `SourceFailed`; `reply` raises
     nothing.
@@ -282,7 +281,9 @@ class OpenMode(ABC):
         rejected: replies that were not used according to the last packet.
     """
 
-    def __init__(self, guard: Guard, wire: ArmWire, builder: ReplyBuilder, mode: int) -> None:
+    def __init__(
+        self, guard: Guard, wire: ArmWire, builder: ReplyBuilder, mode: int, max_gap: int
+    ) -> None:
         n = guard.limits.n_joints
         self._guard = guard
         self._wire = wire
@@ -294,6 +295,13 @@ class OpenMode(ABC):
         self._exit_cycles = round(EXIT_TIMEOUT / guard.period)
         self.set_point = self._still
         self.rejected = 0
+        self._history = SentSetPoints(guard, max_gap + 1)
+        self._sent = self._still
+        self._step = self._still
+        self._velocity = self._still
+        self._slots = wire.joint_slots[wire.opened]
+        self._last_reply = builder.floats[self._slots]
+        self._continuing = wire.opened.copy()
 
     def reply(self, now: OpenCycle) -> OpenReply:
         """Fill in the reply to the packet of a cycle in open mode."""
@@ -389,7 +397,7 @@ class OpenMode(ABC):
         self._require_fresh((TARGET,), Check.FIRST_AGE, held)
         self._guard.check_hold(self._raw[TARGET], self._raw[ACTUAL], where, self._cycle)
 
-    def require_start(self) -> None:
+    def _require_at_rest(self) -> None:
         """Require the conditions of the first set-point."""
         self._require_fresh(_NEEDED_FIRST, Check.FIRST_AGE, self._every)
         self._check_start(self._raw[TARGET])
@@ -409,53 +417,12 @@ class OpenMode(ABC):
         raw = self._raw
         self._guard.check_feedback(raw[TARGET], raw[ACTUAL], raw[CURRENT], sent, self._cycle, where)
 
-    @abstractmethod
-    def enter(self) -> None:
-        """Send the first set-point, at rest, or a correction of zero."""
-
-    @abstractmethod
-    def next(self, execution: Execution | None) -> None:
-        """Send the next set-point or correction of the motion; without one, rest."""
-
-    @abstractmethod
-    def check_after_gap(self, execution: Execution | None) -> None:
-        """Require after a long gap that to continue is no jump."""
-
-    @abstractmethod
-    def check_after_pause(self) -> None:
-        """Require after a late packet that the arm moves as commanded."""
-
-    @abstractmethod
-    def leaving(self) -> None:
-        """Rest, while the controller closes open mode."""
-
-
-class SetPointGenerator(OpenMode):
-    """Modes 1, 4 and 5: the PC generates the targets."""
-
-    def __init__(
-        self, guard: Guard, wire: ArmWire, builder: ReplyBuilder, mode: int, max_gap: int
-    ) -> None:
-        super().__init__(guard, wire, builder, mode)
-        self._history = SentSetPoints(guard, max_gap + 1)
-        self._sent = self._still
-        self._step = self._still
-        self._velocity = self._still
-        self._slots = wire.joint_slots[wire.opened]
-        self._last_reply = builder.floats[self._slots]
-        self._continuing = wire.opened.copy()
-        self._feed_forward = (
-            CorrectionGuard(guard, "velocity") if mode == Mode.POSITION_FEED_FORWARD else None
-        )
-
     def enter(self) -> None:
         """Send the target received as the first set-point, at rest."""
-        super().require_start()
+        self._require_at_rest()
         target, position = self._raw[TARGET].copy(), self._measured[0].copy()
         self._guard.begin(position, self._cycle)
         self._check_feedback(target)
-        if self._feed_forward is not None:
-            self._feed_forward.begin()
         self.set_point = position
         self._sent = target
         self._history.begin(target)
@@ -465,7 +432,7 @@ class SetPointGenerator(OpenMode):
 
     def require_start(self) -> None:
         """Require the arm at rest at the set-point sent last, too."""
-        super().require_start()
+        self._require_at_rest()
         self._check_start(self._sent)
 
     def next(self, execution: Execution | None) -> None:
@@ -493,8 +460,6 @@ class SetPointGenerator(OpenMode):
         self._velocity = (position - self.set_point) / self._guard.period
         commanded[0], commanded[1] = position, self._velocity
         self._wire.write(frame, motor, step)
-        if self._feed_forward is not None:
-            self._write_feed_forward(self._feed_forward, execution, step)
         self.set_point = position
         self._sent = motor
         self._history.add(motor)
@@ -520,21 +485,6 @@ class SetPointGenerator(OpenMode):
         if age is not None and age[TARGET].any():
             # An old target does not show whether the last reply was accepted.
             self.rejected, self._history.resend_needed = 0, False
-
-    def _write_feed_forward(
-        self, guard: CorrectionGuard, execution: Execution, step: Array
-    ) -> None:
-        frame, wire = self._builder.floats, self._wire
-        if not execution.feeds_forward:
-            wire.put(frame, D4, step)
-            return
-        velocity, current = execution.feed_forward(self._cycle)
-        guard.check_motion(velocity, execution.widest, self._cycle)
-        guard.check_current(current, None, self._cycle)
-        if execution.finished:
-            guard.require_zero(Check.CORRECTION_END, self._cycle)
-        wire.put(frame, D4, wire.motor_difference(velocity) * self._guard.period)
-        wire.put(frame, D5, current)
 
     def check_after_gap(self, execution: Execution | None) -> None:
         """Compare target and velocity with the set-point sent last, after a long gap.
@@ -597,115 +547,3 @@ class SetPointGenerator(OpenMode):
         self._wire.write(self._builder.floats, self._sent, self._still)
         self._commanded[0] = self.set_point
         self._commanded[1] = 0.0
-
-
-class CorrectionMode(OpenMode):
-    """Modes 2, 7, 8 and 9: corrections of targets that the controller generates, or zeros.
-
-    ====  ==============================  ===================================================
-    mode  reply                           effect in the controller
-    ====  ==============================  ===================================================
-    2     D4 velocity, D5 current         fed forward beside the controller's own loop
-    7     D1 offset                       added to the controller's own target of this cycle
-    8     D4 velocity                     fed forward
-    9     D5 current                      added to the current the servo asks for (D5 received)
-    ====  ==============================  ===================================================
-
-    Whether the controller applies an offset in mode 7 for one cycle or adds it up is not
-    documented. Hence it satisfies the bounds in both cases: as a position beside the target, and
-    as a step in every cycle, which limits it to the distance of one cycle at full speed. So does
-    its sum with the target.
-
-    Following error is |D1 - D3| as received, because the PC sends no target.
-    """
-
-    def __init__(self, guard: Guard, wire: ArmWire, builder: ReplyBuilder, mode: int) -> None:
-        super().__init__(guard, wire, builder, mode)
-        self._offset = mode == Mode.DELTA_POSITION
-        self._velocity = D4 in MODE_FIELDS[mode]
-        self._current = D5 in MODE_FIELDS[mode]
-        self._added_to_servo = mode == Mode.DELTA_CURRENT
-        self._corrections = CorrectionGuard(guard, "offset" if self._offset else "velocity")
-
-    def enter(self) -> None:
-        """Send zero; require the arm at rest at the controller's target."""
-        self.require_start()
-        self._corrections.begin()
-        self._send_zero()
-
-    def _send_zero(self) -> None:
-        self._check_feedback(self._raw[TARGET])
-        self.set_point = self._measured[0].copy()
-        self._guard.check_position(self.set_point, self._cycle)
-        self._corrections.set_target(self.set_point, self._still, self._sent_in())
-        self._record(self._still)
-
-    def next(self, execution: Execution | None) -> None:
-        """Send the next correction, or zero without a motion."""
-        if execution is None:
-            self._send_zero()
-            return
-        cycle, guard, target = self._cycle, self._corrections, self._raw[TARGET]
-        self._check_feedback(target)
-        self.set_point = self._measured[0].copy()
-        motion, current, bounds = execution.advance(cycle)
-        self._require_fields(motion, current)
-        guard.check_motion(motion, bounds, cycle)
-        if bounds == "stop" and guard.resting:
-            execution.mark_at_rest()
-        corrected = self.set_point + motion if self._offset else self.set_point
-        self._guard.check_position(corrected, cycle)
-        if self._offset:
-            rounding = self._wire.joint_rounding(target)
-            guard.check_target(self.set_point, motion, self._sent_in(), rounding, cycle)
-        servo = self._raw[CURRENT] if self._added_to_servo else None
-        guard.check_current(current, servo, cycle)
-        if execution.finished:
-            guard.require_zero(Check.CORRECTION_END, cycle)
-        self._write(motion, current)
-        self._record(motion)
-
-    def check_after_gap(self, execution: Execution | None) -> None:  # noqa: ARG002
-        """Require the last correction to be zero: it is unknown whether it was applied."""
-        self._corrections.require_zero(Check.GAP_CORRECTION, self._cycle)
-
-    def check_after_pause(self) -> None:
-        """Check nothing: the controller generates the motion."""
-
-    def leaving(self) -> None:
-        """Send zeros, by the safe reply; the target to an axis in a position mode."""
-        held = self._packet.held_joints
-        if held.any():
-            self.require_holdable(held, held)
-            self._record_held(held)
-        self._check_feedback(self._raw[TARGET], self._packet.ready)
-
-    def _sent_in(self) -> Array:
-        """Return the cycle in which each target received was sent."""
-        age = self._wire.age
-        return self._still + self._cycle if age is None else self._cycle - age[TARGET] * 1.0
-
-    def _require_fields(self, motion: Array, current: Array) -> None:
-        """Refuse a correction that this mode has no field for."""
-        for name, values, has_field in (
-            ("motion", motion, self._offset or self._velocity),
-            ("current", current, self._current),
-        ):
-            if not has_field and np.any(values):
-                message = f"mode {self._mode} has no field for a {name}: {values}"
-                raise SourceFailed(message, self._cycle)
-
-    def _write(self, motion: Array, current: Array) -> None:
-        frame, wire = self._builder.floats, self._wire
-        if self._offset:
-            wire.put(frame, D1, wire.motor_difference(motion))
-        elif self._velocity:
-            wire.put(frame, D4, wire.motor_difference(motion) * self._guard.period)
-        if self._current:
-            wire.put(frame, D5, current)
-
-    def _record(self, motion: Array) -> None:
-        if self._offset:
-            np.add(self._measured[0], motion, out=self._commanded[0])
-        elif self._velocity:
-            self._commanded[1] = motion

@@ -41,9 +41,7 @@ def cycle_dtype(n_joints: int) -> np.dtype[np.void]:
     packet; ``status`` status byte of the arm; ``mode`` of each joint; ``age`` cycles since the
     oldest joint value of each of `MEASURED` was sent (0: in this packet). Joint arrays are joint
     side in SI (rad, rad/s), currents motor side in A, ``diagonal_inertia`` kg·m²; ``commanded_*``
-    are those of the reply, NaN where no set-point was sent. Where the controller generates the
-    targets, ``commanded_position`` is its target with the offset added (mode 7, else NaN) and
-    ``commanded_velocity`` the velocity fed forward (modes 2 and 8, else NaN).
+    are those of the reply, NaN where no set-point was sent.
     """
     joint = (n_joints,)
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [

@@ -77,7 +77,7 @@ from drivers.events import (
 )
 from drivers.execution import Execution, execution_of
 from drivers.guard import Guard
-from drivers.motion_source import CorrectionSource, MotionSource
+from drivers.motion_source import MotionSource
 from drivers.open_mode import Exit, OpenCycle, OpenReply, Refuse, Reply
 from drivers.packets import (
     DRIVE_ON,
@@ -95,7 +95,6 @@ from drivers.packets import (
 from drivers.record import CycleRing
 from drivers.safe_reply import MODE, PacketStatus, ReplyBuilder, Words, words_of
 from drivers.states import (
-    CORRECTION_MODES,
     HAS_SET_POINTS,
     POSITION_MODES,
     Axes,
@@ -113,7 +112,7 @@ STOP_TIMEOUT: Final = 10.0
 """Largest time from the request of a stop to rest, s; then drive-off is requested."""
 MAX_GAP: Final = 100
 """Largest `max_gap`."""
-SERVED_MODES: Final = tuple(sorted(POSITION_MODES | CORRECTION_MODES))
+SERVED_MODES: Final = tuple(sorted(POSITION_MODES))
 """Open modes in which a motion can run."""
 _SYNC_AFTER_INIT: Final = (INIT_NUMBER + 1, INIT_NUMBER + 2)
 _NO_MOTION: Final = "no motion was requested"
@@ -139,8 +138,8 @@ def _check_arguments(
         raise ValueError(f"a gap of {max_gap} packets is not one of 0..{MAX_GAP}")
     if not 1 <= arm <= N_ARMS:
         raise ValueError(f"arm {arm} is not one of 1..{N_ARMS}")
-    if only_axis is not None and not (mode in POSITION_MODES and 1 <= only_axis <= n):
-        raise ValueError(f"only axis {only_axis} of {n} is not served in mode {mode}")
+    if only_axis is not None and not (1 <= only_axis <= n):
+        raise ValueError(f"only axis {only_axis} is not one of 1..{n}")
 
 
 class Session:
@@ -264,15 +263,14 @@ class Session:
         self._unreported.clear()
         return events
 
-    def request(self, source: MotionSource | CorrectionSource) -> None:
+    def request(self, source: MotionSource) -> None:
         """Run a motion as soon as every wanted axis is open, then leave open mode.
 
         Raises:
-            RequestError: the state does not allow one, or the source is not of the kind that the
-                open mode needs (see `drivers.motion_source`).
+            RequestError: the state does not allow one, or it is no source of a motion.
         """
         n, stop_cycles = self._drive_train.n_joints, round(STOP_TIMEOUT / self._guard.period)
-        execution = execution_of(source, self._mode, n, self._settle_cycles, stop_cycles)
+        execution = execution_of(source, n, self._settle_cycles, stop_cycles)
         if isinstance(execution, str):
             raise self._request_error(execution)
         reason = None

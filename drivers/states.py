@@ -72,14 +72,8 @@ HOLDABLE: Final = frozenset(mode for mode, d in MODE_FIELDS.items() if d[:2] == 
 """Open modes in which D1 is an absolute position: the target received is the safe reply."""
 INCREMENTAL: Final = OPEN_MODES - HOLDABLE
 """Open modes in which zero is the safe reply."""
-POSITION_MODES: Final = frozenset(
-    {Mode.POSITION_FEED_FORWARD, Mode.POSITION, Mode.POSITION_RELATIVE}
-)
-"""Open modes in which the PC generates the targets."""
-CORRECTION_MODES: Final = frozenset(
-    {Mode.FEED_FORWARD, Mode.DELTA_POSITION, Mode.VELOCITY, Mode.DELTA_CURRENT}
-)
-"""Open modes in which the PC corrects targets that the controller generates."""
+POSITION_MODES: Final = frozenset({Mode.POSITION, Mode.POSITION_RELATIVE})
+"""Open modes in which the PC generates the targets: those in which a motion can run."""
 CLOSED_MODES: Final = frozenset({Mode.CLOSED, Mode.CLOSED_MIRRORED})
 PAUSE_MODES: Final = frozenset({Mode.PAUSE_BY_PC, Mode.PAUSE_BY_CONTROLLER})
 KNOWN_MODES: Final = OPEN_MODES | CLOSED_MODES | PAUSE_MODES | {Mode.DRIVING_ON}

@@ -61,7 +61,6 @@ _SET_BY: Final[Mapping[Check, str]] = {
     Check.STATED_VELOCITY: "[limits] acceleration_deg and its factor in [bounds], times a cycle",
     Check.FOLLOWING_ERROR: "[drive_train] following_error, or the controller where it is narrower",
     Check.CURRENT: "[drive_train] current_limit, or the controller where it is narrower",
-    Check.COMMANDED_CURRENT: "[drive_train] current_limit, or the controller where it is narrower",
 }
 """What in the cell file sets the bound of a check."""
 

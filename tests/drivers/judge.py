@@ -220,8 +220,6 @@ class Conduct:
         # Coming to rest must not be a jump.
         if self.mode in POSITION_MODES:
             self._advance(self.sent[-1], 1, 0.0)
-        elif self.mode != 9:
-            self._advance(np.zeros(len(ready)), int(self.mode == 7), 0.0)
         self._count("leaving")
 
     def _open(self, received: oracle.Packet, answer: oracle.Packet, record: np.void) -> None:
@@ -238,10 +236,7 @@ class Conduct:
         first = self.motor is None
         if first:
             self._first(r)
-        if self.mode in POSITION_MODES:
-            self._position(received, answer, a, r, record)
-        else:
-            self._correction(a, r, record)
+        self._position(received, answer, a, r, record)
         self._count("first" if first else "set-point")
 
     def _first(self, r: np.ndarray) -> None:
@@ -291,8 +286,6 @@ class Conduct:
         span = 0.5 * (self.limits.upper - self.limits.lower)
         assert (q >= self.limits.lower - 2e-6 * span).all(), "position"
         assert (q <= self.limits.upper + 2e-6 * span).all(), "position"
-        if self.mode == 1:
-            self._beside(a)
         if self.motor is not None:
             self._count_lost(r[0])
         self.repeats, self.answered = 0, a
@@ -397,41 +390,6 @@ class Conduct:
             found = np.abs(np.diff(rows, order, axis=0)[-1]) / self.period**order
             rounding = 2**order * (8 * EPS * np.abs(rows).max() + noise) / self.period**order
             assert (found <= bound * (1 + 2e-6) + rounding).all(), (name, found / bound)
-
-    def _beside(self, a: np.ndarray) -> None:
-        assert (np.abs(a[4]) <= self.current * (1 + 2e-6)).all(), "current fed forward"
-        velocity = self.train.joint_velocity(a[3], self.period)
-        assert (np.abs(velocity) <= self.limits.velocity * (1 + 1e-5)).all(), "velocity fed forward"
-        assert self.entitled or not a[3:5].any()
-
-    def _correction(self, a: np.ndarray, r: np.ndarray, record: np.void) -> None:
-        n = len(self.slots)
-        zero = np.zeros(n)
-        if self.motor is None:
-            assert not a.any(), "the first correction is not zero"
-            self.sent = [zero, zero, zero, zero]
-        if a.any():
-            assert self.entitled, "corrected without a request"
-            self._count("moving")
-        if self.mode == 7:
-            dq = 2 * np.pi * self.train.joint_from_motor @ a[0]
-            float32 = np.spacing(np.float32(np.abs(a[0]).max()))
-            noise = 2 * np.pi * np.abs(self.train.joint_from_motor).sum(axis=1).max() * float32
-            target = self.train.joint_position(r[0]) + dq
-            span = self.limits.upper - self.limits.lower
-            slack = 2e-6 * span + noise
-            assert (target <= self.limits.upper + slack).all(), "target with offset"
-            assert (target >= self.limits.lower - slack).all(), "target with offset"
-            self._advance(dq, 1, float(noise))
-        elif self.mode in (2, 8):
-            # While open mode is being left the answer is zero, and no correction is recorded.
-            qd = np.nan_to_num(record["commanded_velocity"])
-            per_cycle = self.train.motor_revolutions_per_cycle(qd, self.period)
-            np.testing.assert_allclose(a[3], per_cycle, rtol=1e-6, atol=1e-12)
-            self._advance(qd, 0, 0.0)
-        servo = r[4] if self.mode == 9 else zero
-        assert (np.abs(servo + a[4]) <= self.current * (1 + 2e-6)).all(), "current"
-        self.motor = zero
 
     def _advance(self, row: np.ndarray, first_order: int, noise: float) -> None:
         self.sent.append(row)

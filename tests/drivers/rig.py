@@ -166,30 +166,6 @@ class Table:
         self.positions = self.positions[: self.index + 1]
 
 
-class Correction:
-    """Rows of corrections (m, n), motion and current, executed to their end even if stopped."""
-
-    def __init__(self, motion=None, current=None, rows=0):
-        rows = next((len(part) for part in (motion, current) if part is not None), rows)
-        self.motion = np.zeros((rows, N)) if motion is None else np.asarray(motion, dtype=float)
-        self.current = np.zeros((rows, N)) if current is None else np.asarray(current, dtype=float)
-        self.index = self.begun = self.stops = 0
-
-    @property
-    def finished(self):
-        return self.index >= len(self.motion)
-
-    def begin(self):
-        self.begun += 1
-
-    def advance(self):
-        self.index += 1
-        return self.motion[self.index - 1], self.current[self.index - 1]
-
-    def stop(self):
-        self.stops += 1
-
-
 class Unstopped(Table):
     """A table executed to its end, with the bounds of a stop from `stop` on."""
 

@@ -1,4 +1,4 @@
-"""Motions and corrections of every kind, good, at the edge of the bounds, and broken."""
+"""Motions of every kind, good, at the edge of the bounds, and broken."""
 
 from __future__ import annotations
 
@@ -114,36 +114,6 @@ class ScriptedMotion(Scripted):
     def override(self, fraction):
         if self.breaks.what == "override raises":
             raise ValueError(fraction)
-
-
-class FedMotion(ScriptedMotion):
-    """Feeds forward its own velocity and a current."""
-
-    def feed_forward(self):
-        current = np.zeros(len(self._buffers[0]))
-        current[self.breaks.joint] = 0.1 * (self.index % 7)
-        if self._breaks("current"):
-            current[self.breaks.joint] = self.breaks.value
-        if self.index + 1 >= len(self.motion):
-            current[:] = 0.0
-        return self._buffers[1], current
-
-
-class ScriptedCorrection(Scripted):
-    """A `CorrectionSource`."""
-
-    def _ramp_down(self):
-        share = 0.5 + 0.5 * np.cos(np.linspace(0.0, np.pi, 401))[1:, None]
-        self.motion, self.beside = (
-            np.vstack([table[: self.index + 1], share * table[self.index]])
-            for table in (self.motion, self.beside)
-        )
-        self.motion[-1] = self.beside[-1] = 0.0
-
-    def begin(self):
-        if self.breaks.what == "begin raises":
-            raise ValueError("begin")
-        self.begun = True
 
 
 def smooth(cycles: int, distance: np.ndarray) -> np.ndarray:

@@ -1,11 +1,11 @@
-"""Duration of stops and holds, allowed bounds, and results of motions and corrections."""
+"""Duration of stops and holds, allowed bounds, and results of motions."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from drivers import Mode, SourceFailed
+from drivers import SourceFailed
 from drivers.execution import Execution, execution_of
 
 N = 2
@@ -13,28 +13,14 @@ SETTLE, STOP = 3, 5
 HERE = np.array([0.5, -0.25])
 
 
-class Correction:
-    """Always the same; records the calls of its other methods."""
-
-    def __init__(self):
-        self.finished = False
-        self.calls = []
-        self.rows = (np.array([0.1, 0.0]), np.array([0.0, 2.0]))
-        for name in ("stop", "hold", "resume"):
-            setattr(self, name, lambda name=name: self.calls.append(name))
-
-    def begin(self):
-        pass
-
-    def advance(self):
-        return self.rows
-
-
-class Motion(Correction):
-    """Steps of `step` rad in joint 1, at a velocity of its own."""
+class Motion:
+    """Steps of `step` rad in joint 1, at a velocity of its own; records the calls of the rest."""
 
     def __init__(self, step=0.01, speed=5.0):
-        super().__init__()
+        self.finished = False
+        self.calls = []
+        for name in ("stop", "hold", "resume"):
+            setattr(self, name, lambda name=name: self.calls.append(name))
         self.step, self.speed = step, speed
         self.bounds = "plan"
 
@@ -48,13 +34,9 @@ class Motion(Correction):
     def override(self, fraction):
         self.calls.append(fraction)
 
-    def feed_forward(self):
-        return np.full(N, 0.25), np.full(N, 0.5)
-
 
 def requested(source) -> Execution:
-    mode = Mode.POSITION if isinstance(source, Motion) else Mode.VELOCITY
-    execution = execution_of(source, mode, N, SETTLE, STOP)
+    execution = execution_of(source, N, SETTLE, STOP)
     assert isinstance(execution, Execution)
     return execution
 
@@ -76,26 +58,18 @@ def fails(execution: Execution, words: str, cycle: int = 7) -> None:
     assert caught.value.cycle == cycle
 
 
-@pytest.mark.parametrize("kind", [Motion, Correction])
 class TestEnd:
-    def test_end_is_held_for_the_settling_time(self, kind):
-        """A correction and what is fed forward are zero then."""
-        source = kind()
+    def test_end_is_held_for_the_settling_time(self):
+        source = Motion()
         execution = begun(source)
         execution.advance(1)
         source.finished = True
         last = execution.advance(2)
-        if kind is Correction:
-            np.testing.assert_array_equal(last[:2], source.rows)
-            at_rest = np.zeros(N)
-        else:
-            np.testing.assert_array_equal(execution.feed_forward(2), [[0.25] * N, [0.5] * N])
-            at_rest = last[0]
         for cycle in range(SETTLE):
             assert not execution.settled
             position, velocity, bounds = execution.advance(3 + cycle)
-            np.testing.assert_array_equal(position, at_rest)
-            np.testing.assert_array_equal([velocity, *execution.feed_forward(3)], np.zeros((3, N)))
+            np.testing.assert_array_equal(position, last[0])
+            np.testing.assert_array_equal(velocity, np.zeros(N))
             assert bounds == "plan"
         assert execution.settled
         assert not execution.leaving
@@ -105,9 +79,9 @@ class TestEnd:
         assert not execution.held
 
     @pytest.mark.parametrize(("cycles", "late"), [(STOP, STOP + 1), (1, STOP + 7)])
-    def test_longest_duration_of_a_stop(self, kind, cycles, late):
+    def test_longest_duration_of_a_stop(self, cycles, late):
         """Missed packets included; the first reason stays, and the source is called once."""
-        execution = begun(source := kind())
+        execution = begun(source := Motion())
         execution.stop("first", 1)
         execution.stop("second", 2)
         run(execution, cycles)
@@ -118,16 +92,16 @@ class TestEnd:
         assert not execution.held
         assert execution.resume() == "the motion is being stopped"
 
-    def test_values_of_another_shape_are_named(self, kind):
-        names = ("correction", "current") if kind is Correction else ("position", "velocity")
+    def test_values_of_another_shape_are_named(self):
+        names = ("position", "velocity")
         for place, name in enumerate(names):
             rows = [np.zeros(1 if k == place else N) for k in range(2)]
-            source = kind()
+            source = Motion()
             source.advance = lambda rows=rows: rows
             fails(begun(source), rf"source failed: ValueError: a {name} of shape \(1,\), not \(2,")
 
-    def test_end_of_a_stop_is_held_without_limit(self, kind):
-        execution = begun(source := kind())
+    def test_end_of_a_stop_is_held_without_limit(self):
+        execution = begun(source := Motion())
         execution.hold(0)
         execution.stop("enough", 1)
         assert not execution.held
@@ -135,8 +109,8 @@ class TestEnd:
         run(execution, 3 * STOP)
         assert execution.outcome == "stopped"
 
-    def test_motion_that_does_not_come_to_rest_in_a_hold_is_stopped(self, kind):
-        execution = begun(kind())
+    def test_motion_that_does_not_come_to_rest_in_a_hold_is_stopped(self):
+        execution = begun(Motion())
         execution.hold(0)
         for cycle in range(STOP):
             execution.advance(1 + cycle)
@@ -201,12 +175,12 @@ class TestHold:
     def test_hold_before_the_begin(self):
         execution = requested(source := Motion())
         assert execution.hold(0) is None
-        assert (execution.held, source.calls, execution.widest) == (True, [], "plan")
+        assert (execution.held, source.calls, execution._allowed[-1]) == (True, [], "plan")
         assert execution.resume() is None
         assert (execution.held, source.calls) == (False, [])
         execution.hold(0)
         execution.begin(HERE, 0)
-        assert (source.calls, execution.widest) == (["hold"], "stop")
+        assert (source.calls, execution._allowed[-1]) == (["hold"], "stop")
         run(execution, STOP + 1)
         assert execution.outcome == "stopped"
 
@@ -231,29 +205,19 @@ class TestBounds:
             source.bounds = needs
             fails(execution, f"bounds '{needs}', not")
             assert call() is None
-            assert execution.widest == needs
+            assert execution._allowed[-1] == needs
             assert execution.advance(2)[2] == needs
         source.bounds = "override"
-        assert (execution.advance(3)[2], execution.widest) == ("override", "stop")
+        assert (execution.advance(3)[2], execution._allowed[-1]) == ("override", "stop")
         execution = begun(source)
         execution.stop("enough", 1)
         fails(execution, "not plan or stop")
-
-    def test_bounds_of_a_correction_at_rest(self):
-        execution = begun(Correction())
-        execution.hold(0)
-        assert execution.advance(1)[2] == execution.widest == "stop"
-        execution.mark_at_rest()
-        assert execution.widest == "plan"
-        execution.stop("enough", 3)
-        execution.mark_at_rest()
-        assert execution.widest == "stop"
 
     @pytest.mark.parametrize("fraction", [-0.01, 1.01, float("nan")])
     def test_override_is_between_0_and_1(self, fraction):
         execution = begun(Motion())
         assert "is not one of 0..1" in execution.override(fraction)
-        assert execution.widest == "plan"
+        assert execution._allowed[-1] == "plan"
         for share in (0.0, 1.0, 1):
             assert execution.override(share) is None
             assert execution.fraction == share

@@ -1,4 +1,4 @@
-"""The guard's checks of set-points and corrections: laws, and each bound at its limit."""
+"""The guard's checks of set-points: laws, and each bound at its limit."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import Guard, GuardError, GuardLimits
+from drivers import Guard, GuardLimits
 from drivers.errors import Check
-from drivers.guard import CorrectionGuard
 from tests.drivers import rig
 from tests.drivers.rig import (
     FACTORS,
@@ -47,17 +46,6 @@ def only(**bounds: float) -> Guard:
     return begun(rig.only(**bounds))
 
 
-def correcting(kind: str, bounds: GuardLimits | None = None) -> CorrectionGuard:
-    checks = CorrectionGuard(Guard(bounds or limits(), PERIOD), kind)
-    checks.begin()
-    return checks
-
-
-def correcting_only(kind: str, **bounds: float) -> CorrectionGuard:
-    """Every rate but those given is out of reach."""
-    return correcting(kind, rig.only(**bounds))
-
-
 class TestLimits:
     @pytest.mark.parametrize(
         "name",
@@ -79,7 +67,7 @@ class TestLimits:
         [
             *(
                 ({name: value}, f"{name} {value} is not positive")
-                for name in ("standstill", "current_rise")
+                for name in ("standstill",)
                 for value in (0.0, -1.0, np.nan)
             ),
             ({"upper": np.where(np.arange(N) == 4, -2.0, 2.0)}, "is not below"),
@@ -113,7 +101,7 @@ def test_values_that_are_not_finite_are_refused(joint, value):
     """Of any joint, before any other violation."""
     row, far = at(joint, 1.0), at(1, 100.0)
     row[joint] = value
-    guard, set_points, checks = Guard(limits(), PERIOD), begun(limits()), correcting("velocity")
+    guard, set_points = Guard(limits(), PERIOD), begun(limits())
     for check, *arguments in (
         (set_points.check_set_point, row, REST, "plan"),
         (begun(limits()).check_set_point, START, row, "plan"),
@@ -122,11 +110,7 @@ def test_values_that_are_not_finite_are_refused(joint, value):
         (guard.check_hold, row, row, EVERY),
         (guard.check_start, REST, row, np.zeros((2, N))),
         (guard.check_start, row, row, np.zeros((2, N))),
-        (guard.check_position, row),
-        (checks.check_motion, row, "plan"),
-        (checks.check_current, row, None),
-        (checks.check_current, row, REST),
-        (checks.check_current, REST, row),
+        (guard.begin, row),
     ):
         with np.errstate(invalid="ignore"):
             error = refused(Check.FINITE, check, *arguments, 5)
@@ -154,8 +138,7 @@ class TestPositions:
 
     @joints
     @pytest.mark.parametrize("limit", [LOWER, UPPER])
-    @pytest.mark.parametrize("check", [Guard.begin, Guard.check_position])
-    def test_the_range_need_not_lie_about_zero(self, check, joint, limit):
+    def test_the_range_need_not_lie_about_zero(self, joint, limit):
         outwards = np.sign(limit)
 
         def at_limit(off: float) -> tuple[Guard, np.ndarray]:
@@ -163,9 +146,9 @@ class TestPositions:
             return Guard(ranges, PERIOD), at(joint, limit + off * outwards)
 
         for off in (0.0, 5e-7):
-            check(*at_limit(off), 0)
+            Guard.begin(*at_limit(off), 0)
         guard, q = at_limit(7e-7)
-        error = refused(Check.POSITION, check, guard, q, 3)
+        error = refused(Check.POSITION, guard.begin, q, 3)
         assert (error.joint, error.bound, error.cycle) == (joint, pytest.approx(limit), 3)
         assert error.value == pytest.approx(q[joint], abs=1e-12)
 
@@ -182,7 +165,7 @@ class TestPositions:
     @joints
     def test_a_position_at_its_bound_passes_at_any_speed_limit(self, joint):
         guard = Guard(limits(velocity=np.full(N, 0.01)), PERIOD)
-        guard.check_position(at(joint, 2.0 * (1.0 + 1e-6)), 0)
+        guard.begin(at(joint, 2.0 * (1.0 + 1e-6)), 0)
 
 
 RATE_EDGES = {
@@ -269,7 +252,7 @@ class TestRates:
         guard, both = only(velocity=0.5), START + at(1, T) + at(4, T)
         assert refused(Check.VELOCITY, guard.check_set_point, both, REST, "plan", 1).joint == 1
         q = at(1, -3.0) + at(4, 3.0)
-        error = refused(Check.POSITION, Guard(limits(), PERIOD).check_position, q, 2)
+        error = refused(Check.POSITION, Guard(limits(), PERIOD).begin, q, 2)
         assert (error.joint, error.bound) == (1, pytest.approx(-2.0))
 
 
@@ -418,189 +401,3 @@ class TestAfterGap:
         guard.resume_from(q, step / PERIOD, 2)
         far = q + step + at(joint, 1.1 * bound)
         refused(Check.ACCELERATION, guard.check_set_point, far, (far - q) / PERIOD, "stop", 3)
-
-
-V, A, J = 0.5, 8.0, 100.0
-EDGES = {
-    # What is at its bound in the last row alone; before it, and by any other reading, it is less.
-    "velocity: it is too fast": ("velocity", "velocity", [0.3, 0.6, 1.0], V),
-    "velocity: it changes too fast": ("velocity", "acceleration", [0.5, 1.5], A * T),
-    "velocity: its change does": ("velocity", "jerk", [0.5, 2.0], J * T**2),
-    "offset: the step to it": ("offset", "velocity", [0.4, -0.6], V * T),
-    "offset: a step in each cycle": ("offset", "velocity", [0.3, 0.6, 1.0], V * T),
-    "offset: how its step changes": ("offset", "acceleration", [0.5, 0.0], A * T**2),
-    "offset: how it changes, in each cycle": ("offset", "acceleration", [0.5, 1.5], A * T**2),
-    "offset: how that changes": ("offset", "jerk", [0.5, 0.5], J * T**3),
-    "offset: how that changes, in each cycle": ("offset", "jerk", [0.5, 2.0], J * T**3),
-}
-
-
-class TestCorrectionRates:
-    @joints
-    @signs
-    @names
-    @pytest.mark.parametrize("edge", EDGES)
-    def test_bounds_of_corrections(self, edge, bounds, joint, sign):
-        kind, field, shape, unit = EDGES[edge]
-        factor = dict(zip(RATES, (1.0, *FACTORS[bounds]), strict=True))[field]
-        value = {"velocity": V, "acceleration": A, "jerk": J}[field]
-        rows = [at(joint, sign * factor * unit * share) for share in shape]
-        passes, fails = (correcting_only(kind, **{field: value}) for _ in range(2))
-        for cycle, row in enumerate(rows):
-            passes.check_motion(row * JUST_BELOW, bounds, cycle)
-        for cycle, row in enumerate(rows[:-1]):
-            fails.check_motion(row * JUST_ABOVE, bounds, cycle)
-        error = refused(RATES[field], fails.check_motion, rows[-1] * JUST_ABOVE, bounds, 9)
-        assert (error.joint, error.cycle) == (joint, 9)
-        assert abs(error.value) == pytest.approx(factor * value, rel=1e-5)
-        assert error.bound == pytest.approx(factor * value, rel=1e-5)
-
-    @signs
-    def test_a_velocity_at_its_bound_may_last(self, sign):
-        checks = correcting_only("velocity", velocity=V)
-        for cycle in range(8):
-            checks.check_motion(np.full(N, sign * V * (1.0 + 1e-6)), "plan", cycle)
-
-    def test_duration_of_wider_bounds(self):
-        checks = correcting("velocity")
-        rows = [at(2, 145.0 * k * (k + 1) * T**2) for k in range(1, 9)]
-        for cycle, row in enumerate(rows[:7]):
-            checks.check_motion(row, "stop" if cycle < 5 else "plan", cycle)
-        refused(Check.JERK, checks.check_motion, rows[7], "plan", 7)
-
-    @pytest.mark.parametrize(("kind", "unit"), [("velocity", T**2), ("offset", T**3)])
-    def test_begin_resets_the_history(self, kind, unit):
-        """Neither a correction sent before nor the bounds it was granted."""
-        checks = correcting_only(kind, jerk=J)
-        checks.check_motion(at(1, 2.9 * J * unit), "stop", 1)
-        checks.begin()
-        assert checks.resting
-        checks.check_motion(REST, "plan", 2)
-        checks.begin()
-        refused(Check.JERK, checks.check_motion, at(1, 1.6 * J * unit), "plan", 3)
-
-    @pytest.mark.parametrize(
-        ("kind", "given", "rests"),
-        [
-            ("velocity", [0.1, 0, 0, 0, 0], [False] * 4 + [True]),
-            ("velocity", [-0.1] * 8, [False] * 8),
-            *(
-                ("offset", [value] * 4 + [0], [False] * 3 + [True, False])
-                for value in (-1e-4, 1e-4)
-            ),
-        ],
-    )
-    def test_velocity_rests_at_zero_and_an_offset_where_it_stays(self, kind, given, rests):
-        """Over four cycles."""
-        checks = correcting_only(kind, velocity=2.0)
-        assert checks.resting
-        for value, resting in zip(given, rests, strict=True):
-            checks.check_motion(at(2, value), "plan", 1)
-            assert checks.resting == resting
-
-
-@signs
-@pytest.mark.parametrize("check", [Check.CORRECTION_END, Check.GAP_CORRECTION])
-@pytest.mark.parametrize(
-    ("kind", "nothing", "unit"),
-    [("velocity", 2e-6, "rad/s"), ("offset", 2e-6 * T, "rad"), ("current", 2e-5, "A")],
-)
-def test_the_correction_sent_last_is_zero(check, kind, nothing, unit, sign):
-    """A millionth of the limit is what rounding leaves. The limits are 2 rad/s and 20 A."""
-    if kind == "current":
-        checks = correcting("velocity")
-        send = lambda value, cycle: checks.check_current(at(3, value), None, cycle)  # noqa: E731
-    else:
-        checks = correcting_only(kind, velocity=2.0)
-        send = lambda value, cycle: checks.check_motion(at(3, value), "plan", cycle)  # noqa: E731
-    send(sign * 0.9 * nothing, 1)
-    checks.require_zero(check, 1)
-    send(sign * 1.1 * nothing, 2)
-    found = refused(check, checks.require_zero, check, 4)
-    assert (found.joint, found.unit, found.cycle) == (3, unit, 4)
-    assert (found.value, found.bound) == (pytest.approx(1.1 * nothing), pytest.approx(nothing))
-    checks.begin()
-    checks.require_zero(check, 4)
-
-
-class TestTarget:
-    """Target and offset together move no faster than 0.5 rad/s, the offset read either way."""
-
-    def allows(self, target, offset=REST, *, before=REST, sent_in=8.0, rounding=0.0) -> bool:
-        """Whether a target may follow START, which was sent in cycle 7 with an offset before."""
-        checks = correcting_only("offset", velocity=V)
-        checks.set_target(START, before, np.full(N, 7.0))
-        sent, rounded = np.full(N, sent_in), np.full(N, rounding)
-        try:
-            checks.check_target(START + target, offset, sent, rounded, 5)
-        except GuardError as error:
-            assert (error.check, error.cycle) == (Check.VELOCITY, 5)
-            assert error.joint == np.argmax(np.abs(target))
-            return False
-        return True
-
-    @joints
-    @signs
-    @pytest.mark.parametrize(("sent_in", "cycles"), [(7.0, 1.0), (8.0, 1.0), (10.0, 3.0)])
-    @pytest.mark.parametrize("rounding", [0.0, 1e-5])
-    def test_target_moves_for_the_time_between(self, joint, sign, sent_in, cycles, rounding):
-        """The rounding of the wire is no motion."""
-        for share, allowed in ((JUST_BELOW, True), (1.01 if rounding else JUST_ABOVE, False)):
-            step = V * cycles * T + share * rounding if rounding else V * cycles * T * share
-            target = at(joint, sign * step)
-            assert self.allows(target, sent_in=sent_in, rounding=rounding) == allowed
-
-    @joints
-    @signs
-    @pytest.mark.parametrize(("before", "after"), [(0.6, 0.6), (-0.3, 0.3)])
-    def test_an_offset_counts_as_a_step_and_as_its_change(self, joint, sign, before, after):
-        """Four tenths of the way of a cycle at full speed are left; the other way is free."""
-        unit = at(joint, sign * V * T)
-        for share, allowed in ((0.399, True), (0.401, False), (-1.0, True)):
-            assert self.allows(share * unit, after * unit, before=before * unit) == allowed
-
-    def test_each_cycle_is_compared_with_the_one_before(self):
-        checks = correcting_only("offset", velocity=V)
-        checks.set_target(START, REST, np.full(N, 7.0))
-        for cycle in range(1, 5):
-            target = START + cycle * V * T
-            checks.check_target(target, REST, np.full(N, 7.0 + cycle), REST, cycle)
-        offset = np.full(N, 0.9 * V * T)
-        checks.check_target(target, offset, np.full(N, 12.0), REST, 6)
-        refused(Check.VELOCITY, checks.check_target, target, -offset, np.full(N, 13.0), REST, 7)
-
-
-@joints
-@signs
-class TestCurrent:
-    """20 A, and from zero to there in no less than 0.01 s: 4 A per cycle of 2 ms."""
-
-    @pytest.mark.parametrize("own", [None, 9.0])
-    def test_step_of_the_current_sent(self, joint, sign, own):
-        check = correcting("velocity").check_current
-        servo = None if own is None else at(joint, sign * own)
-        check(at(joint, sign * 4.0), servo, 1)
-        check(at(joint, sign * 7.9999), servo, 2)
-        check(at(joint, sign * 4.0), None, 3)
-        error = refused(Check.CURRENT_STEP, check, at(joint, sign * 8.001), servo, 4)
-        assert (error.joint, error.cycle) == (joint, 4)
-        assert error.bound == pytest.approx(4.0, rel=1e-5)
-
-    def test_the_servo_s_own_counts_in_the_limit(self, joint, sign):
-        check, one = correcting("velocity").check_current, at(joint, sign)
-        check(one, at(joint, sign * (20.0 * JUST_BELOW - 1.0)), 1)
-        servo = at(joint, sign * (20.0 * JUST_ABOVE - 1.0))
-        error = refused(Check.COMMANDED_CURRENT, check, one, servo, 5)
-        assert (error.joint, error.cycle) == (joint, 5)
-        assert error.value == pytest.approx(20.0, rel=1e-5)
-        check(one, at(joint, -sign * 20.0), 6)
-
-    def test_the_controller_s_narrower_limit_narrows_both(self, joint, sign):
-        guard = Guard(limits(), PERIOD)
-        checks = CorrectionGuard(guard, "velocity")
-        guard.narrow(np.full(N, np.nan), np.full(N, 5.0))
-        checks.begin()
-        check, one = checks.check_current, at(joint, sign)
-        refused(Check.CURRENT_STEP, check, 1.001 * one, None, 1)
-        check(one, 4.0 * one, 1)
-        refused(Check.COMMANDED_CURRENT, check, one, 4.001 * one, 1)

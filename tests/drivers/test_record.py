@@ -137,7 +137,7 @@ EXAMPLES = {
     AxisNotInMode: AxisNotInMode("joint 3 is in mode 0", 99),
     ModeRefused: ModeRefused("joint 3 is in mode 3", 99),
     ExitTimeout: ExitTimeout("open", 6000),
-    GuardError: GuardError(Check.CORRECTION_END, 1, 2.0, 0.0, 3, "rad/s"),
+    GuardError: GuardError(Check.JERK, 1, 2.0, 0.0, 3),
     errors.SessionFailed: errors.SessionFailed("why", 7),
 }
 

@@ -21,11 +21,10 @@ from drivers.events import RepliesLost
 from drivers.open_mode import EXIT_RETRY_CYCLES, EXIT_TIMEOUT
 from drivers.packets import DRIVE_ON, LAST_NUMBER
 from drivers.session import FLIGHT_RECORDER, STOP_TIMEOUT
-from drivers.states import CORRECTION_MODES
+from drivers.states import POSITION_MODES
 from tests.drivers.rig import (
     PERIOD,
     START,
-    Correction,
     Cruise,
     N,
     Rig,
@@ -35,7 +34,6 @@ from tests.drivers.rig import (
     accelerating,
     all_drive_off,
     assert_refused,
-    bump,
     closed,
     exiting,
     init_packet,
@@ -105,15 +103,15 @@ MEMBERS = ("begin", "advance", "stop", "finished")
 
 
 class TestSources:
-    """A motion or correction is refused whatever its source does wrong."""
+    """A motion is refused whatever its source does wrong."""
 
     def refused(self, base: type, *, stopped: bool = False, **parts) -> SourceFailed:
         """Return the refusal of a source with these methods and properties."""
         faulty = type("Faulty", (base,), {"__init__": lambda self: None, **parts})()
-        usual = Correction(rows=90) if base is Correction else base()
+        usual = base()
         for name in vars(usual).keys() - parts.keys():
             setattr(faulty, name, getattr(usual, name))
-        rig = Rig(mode=Mode.VELOCITY if base is Correction else Mode.POSITION)
+        rig = Rig()
         rig.session.request(faulty)
         answer = rig.open()
         if stopped:
@@ -123,29 +121,22 @@ class TestSources:
             answer = rig.cycle()
         return assert_refused(rig, answer, SourceFailed)
 
-    @pytest.mark.parametrize(
-        ("base", "where"),
-        [
-            *((base, part) for base in (Cruise, Correction) for part in MEMBERS),
-            (Cruise, "bounds"),
-        ],
-    )
+    @pytest.mark.parametrize("where", [*MEMBERS, "bounds"])
     @pytest.mark.parametrize(
         "kind", [ZeroDivisionError, SystemExit, KeyboardInterrupt, GeneratorExit, Unspeakable]
     )
-    def test_exception_in_any_member(self, base, where, kind):
+    def test_exception_in_any_member(self, where, kind):
         def fails(self, *_):
             raise kind
 
         part = property(fails) if where in ("finished", "bounds") else fails
-        error = self.refused(base, stopped=where == "stop", **{where: part})
+        error = self.refused(Cruise, stopped=where == "stop", **{where: part})
         assert kind.__name__ in str(error)
         assert isinstance(error.__cause__, kind)
 
-    @pytest.mark.parametrize("base", [Cruise, Correction])
     @pytest.mark.parametrize("given", [*INVALID_STEPS, (START, 0.0)])
-    def test_invalid_step(self, base, given):
-        self.refused(base, advance=lambda self: given)
+    def test_invalid_step(self, given):
+        self.refused(Cruise, advance=lambda self: given)
 
     @pytest.mark.parametrize(
         "bounds", ["whatever", None, 1, np.array(["plan"]), np.full(2, "plan"), ["plan"]]
@@ -220,7 +211,7 @@ class TestFeedback:
             assert rig.refusal.bound == pytest.approx(bound, rel=1e-5)
 
     @pytest.mark.parametrize("held", [False, True])
-    @pytest.mark.parametrize("mode", [1, 4, 5])
+    @pytest.mark.parametrize("mode", [4, 5])
     @pytest.mark.parametrize(
         ("columns", "near", "far", "kind"),
         [
@@ -607,7 +598,7 @@ class TestWhileLeaving:
         assert kind_of(rig.refusal) is Check.FOLLOWING_ERROR
 
     @pytest.mark.parametrize("value", [99.0, np.nan])
-    @pytest.mark.parametrize("mode", [Mode.POSITION, *sorted(CORRECTION_MODES)])
+    @pytest.mark.parametrize("mode", sorted(POSITION_MODES))
     def test_closed_axis_is_not_checked(self, mode, value):
         rig = leaving(axis=2, mode=mode)
         for column in (0, 2, 4):
@@ -617,43 +608,6 @@ class TestWhileLeaving:
         rig.axes["d"][3, 2] += 5.0
         rig.cycle()
         assert (kind_of(rig.refusal), rig.refusal.joint) == (Check.FOLLOWING_ERROR, 3)
-
-    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
-    @pytest.mark.parametrize(
-        ("target", "age", "opening", "kind"),
-        [
-            (np.nan, 0, False, Check.FINITE),
-            (np.nan, 0, True, Check.FINITE),
-            (50.0, 0, False, Check.FOLLOWING_ERROR),
-            (None, 1, False, Check.FIRST_AGE),
-            (None, 0, False, None),
-        ],
-    )
-    def test_axis_in_a_position_mode_gets_its_target_if_holdable(
-        self, mode, target, age, opening, kind
-    ):
-        """While corrections end, or begin."""
-        rig = opened(5, mode=mode)
-        if opening:
-            rig.close()
-        rig.modes = [mode if opening else 0, 0, 4, 0, 0, 0]
-        if target is not None:
-            rig.axes["d"][2, 0] = target
-        rig.ages = np.full((N, 8), age, np.uint16)
-        answer = rig.cycle()
-        assert np.isfinite(answer.axes["d"]).all()
-        if kind is None:
-            assert rig.state is State.EXITING
-            assert answer.axes["mode"].tolist() == [0, 0, 4, 0, 0, 0]
-            assert answer.axes["d"][2, 0] == rig.axes["d"][2, 0]
-            record = rig.records[-1]
-            expected = np.where(np.arange(N) == 2, START, np.nan)
-            np.testing.assert_allclose(record["commanded_position"], expected, atol=1e-6)
-            np.testing.assert_array_equal(record["commanded_velocity"], 0.0 * expected)
-        else:
-            assert kind_of(rig.refusal) is kind
-            reported = [0, 0, 508, 0, 0, 0] if kind is Check.FOLLOWING_ERROR else [505] * N
-            assert answer.axes["mode"].tolist() == reported
 
 
 EVERY = np.ones(N, dtype=bool)
@@ -684,29 +638,6 @@ class TestAges:
         rig.ages[axis, column] = 1
         rig.cycle()
         assert [kind_of(event.error) for event in rig.seen(Refused)] == [Check.GAP_AGE] * is_refused
-
-    @pytest.mark.parametrize(("ages", "is_refused"), [((1, 2, 0), False), ((0, 0, 0), True)])
-    def test_speed_of_an_old_target(self, ages, is_refused):
-        """Mode 7 holds target and offset together to the velocity of the joint, here 2 rad/s."""
-        rig = running(Correction(rows=50), mode=Mode.DELTA_POSITION)
-        rig.ages = np.zeros((N, 8), np.uint16)
-        for age in ages[:-1]:
-            rig.ages[:, self.TARGET] = age
-            rig.cycle()
-        rig.ages[:, self.TARGET] = ages[-1]
-        step = 2.9 * rig.train.motor_from_joint[:, 0] * (2.0 * PERIOD) / (2.0 * np.pi)
-        rig.axes["d"][:, [0, 2]] += step[:, None]
-        rig.cycle()
-        assert bool(rig.seen(Refused)) == is_refused
-
-
-def test_velocity_near_the_end_of_the_range():
-    """0.1 rad/s is allowed 0.05 rad before the end of the range."""
-    rig = Rig(mode=Mode.VELOCITY)
-    rig.put_arm_at(np.array([1.95, *START[1:]]))
-    rig.session.request(Correction(bump([0.1, 0, 0, 0, 0, 0], 300)))
-    rig.open()
-    rig.run_to("completed")
 
 
 class TestIncompleteOpening:
