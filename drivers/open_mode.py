@@ -51,7 +51,7 @@ from drivers.packets import Mode
 from drivers.safe_reply import D1, D2, PacketStatus, ReplyBuilder
 from drivers.states import LossTracker, State
 
-LEAP_FRACTION: Final = 0.25
+MAX_TARGET_JUMP: Final = 0.25
 """Share of the following-error threshold allowed between target and set-point sent last."""
 SLOW: Final = 4.0
 """Multiple of the standstill threshold, some 2 % of full speed. Several such steps in one cycle are
@@ -219,7 +219,7 @@ class SentSetPoints:
 
         Raises:
             GuardError: a target further than `FIRST_FRACTION` of the following-error threshold
-                from all of them, or than `LEAP_FRACTION` from the last, or not the last one after
+                from all of them, or than `MAX_TARGET_JUMP` from the last, or not the last one after
                 `REPETITIONS` of it.
         """
         sent, standstill = self._sent, self._guard.limits.standstill
@@ -239,7 +239,7 @@ class SentSetPoints:
         nearest = np.minimum(late[: self._depth].min(axis=0), ahead.min(axis=0, initial=np.inf))
         threshold = self._guard.following_error
         require(where, nearest, FIRST_FRACTION * threshold, Check.ACCEPTED, cycle)
-        require(where, late[0], LEAP_FRACTION * threshold, Check.ACCEPTED, cycle)
+        require(where, late[0], MAX_TARGET_JUMP * threshold, Check.ACCEPTED, cycle)
         behind = where & (late[0] > standstill)
         behind &= late.min(axis=0) <= ahead.min(axis=0, initial=np.inf)
         lag = int(late.argmin(axis=0)[behind].max(initial=0))

@@ -22,7 +22,7 @@ from sim_fixtures import (
     SimulatedDrive,
     UnmodelledEffects,
 )
-from sim_fixtures.faults import ControllerFault
+from sim_fixtures.faults import InjectedFault
 from sim_fixtures.servo import loops_per_cycle
 
 Array = NDArray[np.float64]
@@ -81,7 +81,7 @@ def simulated_controller(
     truth: PlantTruth | None = None,
     settings: ControllerSettings | None = None,
     seed: int | None = None,
-    faults: Sequence[ControllerFault] = (),
+    faults: Sequence[InjectedFault] = (),
 ) -> SimulatedController:
     """Return controller and arm of a cell with any link; arguments as for `simulated_link`.
 

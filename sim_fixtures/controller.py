@@ -48,7 +48,7 @@ from drivers.packets import (
 )
 from sim_fixtures.arm import DisturbanceKind, SimulatedArm, UnmodelledEffects
 from sim_fixtures.drive import SimulatedDrive
-from sim_fixtures.faults import ControllerFault
+from sim_fixtures.faults import InjectedFault
 from sim_fixtures.plant import PlantTruth
 from sim_fixtures.servo import CycleDemand, CycleServo, NominalModel
 from sim_fixtures.settings import AXES_PER_ARM, ControllerSettings, SettingError
@@ -720,7 +720,7 @@ class SimulatedController:
         initial_position: ArrayLike | None = None,
         gravity: ArrayLike = EARTH,
         stated: SimulatedDrive | None = None,
-        faults: Sequence[ControllerFault] = (),
+        faults: Sequence[InjectedFault] = (),
     ) -> None:
         n = drive.n_axes
         if truth.n_joints != n or n > AXES_PER_ARM:
@@ -768,8 +768,8 @@ class SimulatedController:
             repeats=settings.own_motion_repeats,
         )
 
-    def _schedule(self, faults: Sequence[ControllerFault]) -> dict[int, list[ControllerFault]]:
-        schedule: dict[int, list[ControllerFault]] = {}
+    def _schedule(self, faults: Sequence[InjectedFault]) -> dict[int, list[InjectedFault]]:
+        schedule: dict[int, list[InjectedFault]] = {}
         for fault in faults:
             if not 1 <= getattr(fault, "axis", 1) <= self._drive.n_axes:
                 raise SettingError("faults", fault, f"axes 1..{self._drive.n_axes}")

@@ -66,7 +66,7 @@ class FaultyController(Protocol):
 
 
 @dataclass(frozen=True)
-class ControllerFault:
+class InjectedFault:
     """One fault of the controller or its robot; see `GRAMMAR` for the kinds.
 
     `cycle` is that of its beginning, `axis` counts from 1, `count` is its duration in cycles,
@@ -101,7 +101,7 @@ class ControllerFault:
                 controller.disturb("load", self.axis, size, self.count)
 
 
-Fault = link.Fault | ControllerFault
+Fault = link.Fault | InjectedFault
 
 
 class _Kind(NamedTuple):
@@ -197,7 +197,7 @@ def _parsed(text: str) -> Fault:
             return link.Corrupt(cycle, to, count, offset=offset, mask=mask)
     axis = int(found["axis"][1]) if "axis" in found else 1
     words = (found[option][0] for option in ("start", "how", "mode") if option in found)
-    return ControllerFault(name, cycle, axis, count, next(words, kind.word))
+    return InjectedFault(name, cycle, axis, count, next(words, kind.word))
 
 
 def _matched(name: str, kind: _Kind, options: Iterable[str]) -> dict[str, re.Match[str]]:
@@ -218,8 +218,8 @@ def _matched(name: str, kind: _Kind, options: Iterable[str]) -> dict[str, re.Mat
 
 def split_faults(
     faults: Iterable[Fault],
-) -> tuple[tuple[link.Fault, ...], tuple[ControllerFault, ...]]:
+) -> tuple[tuple[link.Fault, ...], tuple[InjectedFault, ...]]:
     """Return the faults of the link and those of the controller."""
     every = tuple(faults)
-    of_link = tuple(fault for fault in every if not isinstance(fault, ControllerFault))
-    return of_link, tuple(fault for fault in every if isinstance(fault, ControllerFault))
+    of_link = tuple(fault for fault in every if not isinstance(fault, InjectedFault))
+    return of_link, tuple(fault for fault in every if isinstance(fault, InjectedFault))

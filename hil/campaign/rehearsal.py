@@ -17,7 +17,7 @@ import pinocchio
 from numpy.typing import NDArray
 from pydantic import StrictBool, model_validator
 
-from drivers.open_mode import LEAP_FRACTION
+from drivers.open_mode import MAX_TARGET_JUMP
 from drivers.transports.simulated import Delay, Duplicate, Fault, Lose, SimulatedTransport
 from hil.archive import open_archive
 from hil.cell import Cell
@@ -237,7 +237,7 @@ def too_far_without_a_packet(cell: Cell) -> str | None:
     """
     if not cell.controller.max_gap:
         return None
-    share = LEAP_FRACTION * np.array(cell.drive_table.following_error)
+    share = MAX_TARGET_JUMP * np.array(cell.drive_table.following_error)
     speeds = np.diag(cell.joint_limits.velocity)
     turns = cell.drive_train.motor_revolutions_per_cycle(speeds, cell.period)
     steps = np.abs(turns).sum(axis=0)
@@ -247,7 +247,7 @@ def too_far_without_a_packet(cell: Cell) -> str | None:
     return (
         f"no packet is lost: at full speed the motor of {cell.joint_names[motor]} turns by "
         f"{steps[motor]:.2g} revolutions in a cycle of {cell.controller.cycle_ms} ms; the guard "
-        f"allows {share[motor]:.2g} ({percentage(LEAP_FRACTION)} of following_error in "
+        f"allows {share[motor]:.2g} ({percentage(MAX_TARGET_JUMP)} of following_error in "
         "[drive_train]), so "
         "that a packet lost at that speed ends the motion on the real arm; a shorter cycle or a "
         "lower velocity_deg in [limits] avoids this"

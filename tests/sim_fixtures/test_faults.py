@@ -13,8 +13,8 @@ from drivers.transports.simulated import Corrupt, Delay, Duplicate, Lose, Reorde
 from sim_fixtures import Phase, SettingError, SimulatedController
 from sim_fixtures.faults import (
     GRAMMAR,
-    ControllerFault,
     FaultScriptError,
+    InjectedFault,
     parse_fault,
     split_faults,
 )
@@ -31,17 +31,17 @@ LINES = {
     "corrupt@1200:offset=8:mask=0x80:to_controller": Corrupt(
         1200, "to_controller", offset=8, mask=0x80
     ),
-    "restart@5000": ControllerFault("restart", 5000, word="cold"),
-    "restart@5000:warm": ControllerFault("restart", 5000, word="warm"),
-    "drive-drop@7": ControllerFault("drive-drop", 7),
-    "e-stop@7": ControllerFault("e-stop", 7),
-    "axis-leaves@7:axis=3": ControllerFault("axis-leaves", 7, 3),
-    "following-error@7:axis=2": ControllerFault("following-error", 7, 2, 500, "jam"),
-    "following-error@7x20:axis=2:slip": ControllerFault("following-error", 7, 2, 20, "slip"),
-    "saturate@7x30:axis=1": ControllerFault("saturate", 7, 1, 30),
-    "push@7:axis=2": ControllerFault("push", 7, 2, 50),
-    "pause@7x50:502": ControllerFault("pause", 7, count=50, word="502"),
-    "pause@7:500": ControllerFault("pause", 7, count=50, word="500"),
+    "restart@5000": InjectedFault("restart", 5000, word="cold"),
+    "restart@5000:warm": InjectedFault("restart", 5000, word="warm"),
+    "drive-drop@7": InjectedFault("drive-drop", 7),
+    "e-stop@7": InjectedFault("e-stop", 7),
+    "axis-leaves@7:axis=3": InjectedFault("axis-leaves", 7, 3),
+    "following-error@7:axis=2": InjectedFault("following-error", 7, 2, 500, "jam"),
+    "following-error@7x20:axis=2:slip": InjectedFault("following-error", 7, 2, 20, "slip"),
+    "saturate@7x30:axis=1": InjectedFault("saturate", 7, 1, 30),
+    "push@7:axis=2": InjectedFault("push", 7, 2, 50),
+    "pause@7x50:502": InjectedFault("pause", 7, count=50, word="502"),
+    "pause@7:500": InjectedFault("pause", 7, count=50, word="500"),
 }
 
 

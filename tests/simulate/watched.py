@@ -18,7 +18,7 @@ from drivers.transports.simulated import Fault as LinkFault
 from drivers.transports.simulated import SimulatedTransport
 from hil.campaign import VirtualLink
 from sim_fixtures import Phase, SimulatedController
-from sim_fixtures.faults import ControllerFault
+from sim_fixtures.faults import InjectedFault
 from tests.simulate.observed import Act, ArmHistory, Exchanged
 from tests.simulate.script import Script
 
@@ -34,7 +34,7 @@ class WatchedController:
         self.period = controller.period
         self.cycle = 0
         self.struck: list[str] = []
-        self._faults: dict[int, list[tuple[str, ControllerFault]]] = {}
+        self._faults: dict[int, list[tuple[str, InjectedFault]]] = {}
         for line, fault in script.faults:
             if not isinstance(fault, LinkFault):
                 self._faults.setdefault(fault.cycle, []).append((line, fault))
