@@ -87,6 +87,9 @@ class Cluster:
             and none for few archives.
         scheduler: address of a running scheduler, whose workers are used.
         reporter: reports which workers there are, and the address of the dashboard.
+
+    Raises:
+        InputError: both a number of workers and a scheduler are given.
     """
 
     def __init__(
@@ -96,6 +99,10 @@ class Cluster:
         scheduler: str | None = None,
         reporter: Reporter | None = None,
     ) -> None:
+        if workers is not None and scheduler is not None:
+            problem = "a running cluster has its own workers"
+            remedy = "omit --workers, or --scheduler"
+            raise InputError(None, problem, field="--workers", remedy=remedy)
         self._workers = workers
         self._scheduler = scheduler
         self._reporter = Silent() if reporter is None else reporter

@@ -102,11 +102,11 @@ def archives_at(url: str) -> list[str]:
     return [
         place
         for place in places
-        if name_of(place).endswith(SUFFIX) and place.startswith(root) and _is_plain(place)
+        if name_of(place).endswith(SUFFIX) and place.startswith(root) and _stays_below(place)
     ]
 
 
-def _is_plain(place: str) -> bool:
+def _stays_below(place: str) -> bool:
     """Return whether a URL of a listing leads nowhere else: `::` would chain another protocol."""
     return "::" not in place and ".." not in place.split("/")
 

@@ -19,7 +19,6 @@ from hil.batch.run import BatchResult
 from hil.batch.table import write_tables
 from hil.cli.arguments import JsonOption, QuietOption, print_json, with_options
 from hil.cli.identify_options import Identifying
-from hil.errors import InputError
 from hil.files import convert_write_errors, make_folder
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import plural, printable
@@ -63,10 +62,6 @@ def batch(
         cache: Folder of cached factors, or none. Default: .hil-cache next to the archives, or in
             the user's cache folder if those are read-only.
     """
-    if workers is not None and scheduler is not None:
-        problem = "a running cluster has its own workers"
-        remedy = "omit --workers, or --scheduler"
-        raise InputError(None, problem, field="--workers", remedy=remedy)
     reporter = make_reporter(quiet=quiet or json)
     if output is not None:
         make_folder(output)
@@ -74,10 +69,7 @@ def batch(
     location = CacheLocation(str(Path(cache).resolve()) if keep and cache else None, keep)
     with Cluster(workers, scheduler=scheduler, reporter=reporter) as cluster:
         result = run.reidentify(places, options, cluster, reporter, cache=location)
-    written: list[Path] = []
-    if output is not None:
-        with convert_write_errors(output):
-            written = write_tables(output, result)
+    written = _tables(output, result)
     if json:
         print_json(as_dict(result, written))
     else:
@@ -98,6 +90,13 @@ def batch(
         )
     if result.broken:
         raise typer.Exit(SOME_BROKEN)
+
+
+def _tables(folder: Path | None, result: BatchResult) -> list[Path]:
+    if folder is None:
+        return []
+    with convert_write_errors(folder):
+        return write_tables(folder, result)
 
 
 def result_lines(result: BatchResult) -> Iterator[str]:

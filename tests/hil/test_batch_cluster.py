@@ -61,7 +61,7 @@ def expected(folder):
 
 
 @pytest.mark.slow
-def test_tasks_that_fail_or_end_their_process_do_not_affect_others():
+def test_tasks_that_fail_or_end_their_process_affect_no_other():
     tasks = [work.task(work.number, k) for k in range(8)]
     tasks[2], tasks[4] = work.task(work.crash, 2), work.task(work.absent, 4)
     tasks[7] = work.task(work.faulty, 7)
