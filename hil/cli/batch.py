@@ -57,8 +57,8 @@ def batch(
         output: Folder for the tables (CSV and Parquet). Default: none.
         estimator: Estimator that needs no samples: see `hil identify --estimator`.
         workers: Number of processes. Default: one per core, and none if few archives are read.
-        scheduler: Address of a running Dask scheduler, such as tcp://host:8786, whose workers do
-            the work. They need the same version of hil, and archives and cache under these paths.
+        scheduler: Address of a running Dask scheduler, such as tcp://host:8786. Its workers need
+            this version of hil and these paths.
         cache: Folder of cached factors, or none. Default: .hil-cache next to the archives, or in
             the user's cache folder if those are read-only.
     """
