@@ -193,9 +193,9 @@ def _shorten(option: TyperOption) -> None:
 
 
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
-    "Start": ("demo", "new"),
+    "Start": ("demo", "new", "look"),
     "Identify": (
-        "look", "identify", "payload", "torque-constants", "batch", "compare", "export", "rollout",
+        "identify", "payload", "torque-constants", "batch", "compare", "export", "rollout",
         "report",
     ),
     "On the controller": (

@@ -88,14 +88,14 @@ def _ask(choices: Sequence[Choice]) -> Choice | None:
 
 
 def table(rows: Sequence[Row]) -> list[str]:
-    """Return the rows as lines, and below each what would settle a doubt."""
+    """Return the rows as lines, and below each what would decide it."""
     width = max((len(row.aspect) for row in rows), default=0)
     lines = []
     for row in rows:
         lines.append(f"{row.aspect.ljust(width)}  {row.certainty.ljust(6)}  {row.reading}")
         lines.append(f"{' ' * width}          {row.reason}")
-        if row.settle and row.certainty != "sure":
-            lines.append(f"{' ' * width}          to settle: {row.settle}")
+        if row.decide and row.certainty != "sure":
+            lines.append(f"{' ' * width}          to decide: {row.decide}")
     return lines
 
 

@@ -299,7 +299,7 @@ def _parquet(path: Path) -> dict[str, Stored]:
         arrays[name] = values
     episodes = np.unique(arrays.get("episode_index", np.zeros(1)))
     if len(episodes) > 1:
-        problem = f"has {len(episodes)} episodes, each with a clock that begins anew"
+        problem = f"has {len(episodes)} episodes, each with a clock that starts at zero"
         remedy = "save one of them as a file of its own"
         raise SourceError(path, problem, field="episode_index", remedy=remedy)
     return _in_memory(arrays)

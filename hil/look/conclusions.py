@@ -50,7 +50,7 @@ def concluded(
     if found.error is not None and found.error > _OTHER_ARM:
         raise _other_arm(source, found.error)
     if found.questions:
-        raise _doubt(source, found.questions[0])
+        raise _undecided(source, found.questions[0])
     if found.map_text != imported.map_text or found.options:
         return _again(imported, source, robot_of, found, use)
     return imported
@@ -102,7 +102,7 @@ def _gravity(found: Look) -> tuple[float, ...] | None:
     return tuple(float(word) for word in words[1:4]) if words else None
 
 
-def _doubt(source: Path, choices: tuple[Choice, ...]) -> SourceError:
+def _undecided(source: Path, choices: tuple[Choice, ...]) -> SourceError:
     readings = " or ".join(
         f"{choice.reading} (error {choice.error:.1%})" if choice.error else choice.reading
         for choice in choices

@@ -107,7 +107,7 @@ class Finding:
             return "all joints"
         return ", ".join(self.cell.joint_names[joint] for joint in change.joints)
 
-    def _found(self, aspect: str, steps: list[Step], text: str, settle: str) -> Row:
+    def _found(self, aspect: str, steps: list[Step], text: str, decide: str) -> Row:
         ratio = float(np.prod([step.ratio for step in steps]))
         sigmas = min(step.sigmas for step in steps)
         certainty: Certainty = "sure" if all(step.sure for step in steps) else "open"
@@ -118,22 +118,22 @@ class Finding:
         reason = f"error {ratio:.2f} times that as recorded ({-sigmas:.0f} standard errors)"
         if ratio > 1.0 - 0.05:
             reason = "friction would drive the joint otherwise"
-        return Row(aspect, text, certainty, reason, settle)
+        return Row(aspect, text, certainty, reason, decide)
 
-    def _unchanged(self, aspect: str, reading: str, *meanings: Meaning, settle: str = "") -> Row:
+    def _unchanged(self, aspect: str, reading: str, *meanings: Meaning, decide: str = "") -> Row:
         """Return the row of an aspect that is as recorded, and how sure that is."""
         nearest = self.readings.nearest
         rivals = [nearest[meaning] for meaning in meanings if meaning in nearest]
         if not rivals:
-            return Row(aspect, reading, "likely", "not examined", settle)
+            return Row(aspect, reading, "likely", "not examined", decide)
         change, against = min(rivals, key=lambda rival: rival[1].sigmas)
         reason = f"next best: {self.described(change)}, error {against.ratio:.2f} times"
         if against.sigmas > _SEPARATE:
             return Row(aspect, reading, "sure", reason)
         if against.sigmas < _HALF * _SEPARATE or against.ratio < _ALIKE:
             both = f"{reading}, or {self.described(change)}"
-            return Row(aspect, both, "open", reason, settle)
-        return Row(aspect, reading, "likely", reason, settle)
+            return Row(aspect, both, "open", reason, decide)
+        return Row(aspect, reading, "likely", reason, decide)
 
     def described(self, change: Change) -> str:
         """Return a change in words."""
@@ -158,7 +158,7 @@ class Finding:
         if not steps:
             return self._unchanged("order", "joints in the order of the URDF", "torque order",
                               "position order", "joint order",
-                              settle="move the joints one by one")  # fmt: skip
+                              decide="move the joints one by one")  # fmt: skip
         kinds = sorted({step.change.meaning for step in steps})
         names = np.array(self.cell.joint_names)
         texts = []
@@ -182,12 +182,12 @@ class Finding:
                 "signs", "as the URDF's axes", "sure", "friction takes energy in every joint"
             )
         row = self._unchanged("signs", "as the URDF's axes", "torque sign", "position sign",
-                         settle="push one joint by hand and see its torque")  # fmt: skip
+                         decide="push one joint by hand and see its torque")  # fmt: skip
         unsure = ", ".join(
             name for name, sure in zip(self.cell.joint_names, dissipates, strict=True) if not sure
         )
         return Row(row.aspect, row.reading, row.certainty,
-                   f"{row.reason}; friction is not seen in {unsure}", row.settle)  # fmt: skip
+                   f"{row.reason}; friction is not seen in {unsure}", row.decide)  # fmt: skip
 
     def _unit(self) -> Row:
         steps = self.steps("degrees", "radians")
@@ -202,11 +202,11 @@ class Finding:
             change, against = self.readings.nearest["zero"]
             if abs(against.ratio - 1.0) < _UNSEEN:
                 text = f"as the URDF; the torque does not show that of {self.names(change)}"
-                settle = "compare a posture with the URDF's (viewer)"
-                return Row("zero", text, "likely", "its error is the same for other zeros", settle)
+                decide = "compare a posture with the URDF's (viewer)"
+                return Row("zero", text, "likely", "its error is the same for other zeros", decide)
         if not steps:
             return self._unchanged("zero", "as the URDF", "zero",
-                              settle="compare a posture with the URDF's (viewer)")  # fmt: skip
+                              decide="compare a posture with the URDF's (viewer)")  # fmt: skip
         text = "; ".join(self.described(step.change) for step in steps)
         return self._found("zero", steps, text, "compare a posture with the URDF's (viewer)")
 
@@ -214,21 +214,21 @@ class Finding:
         steps = self.steps("no gravity")
         if steps:
             return self._found("gravity", steps, "torque without gravity", "--gravity 0 0 0")
-        settle = "hold the arm still, stretched out, and see the torque"
-        return self._unchanged("gravity", "torque with gravity", "no gravity", settle=settle)
+        decide = "hold the arm still, stretched out, and see the torque"
+        return self._unchanged("gravity", "torque with gravity", "no gravity", decide=decide)
 
     def _mounting(self) -> Row:
         steps = self.steps("mounting")
         if steps:
             return self._found("mounting", steps, steps[-1].change.name, "state --gravity X Y Z")
         return self._unchanged("mounting", "as stated, else upright", "mounting",
-                          settle="state --gravity X Y Z")  # fmt: skip
+                          decide="state --gravity X Y Z")  # fmt: skip
 
     def _size(self) -> Row:
         if self.common is None:
             reason = "no masses in the URDF and little weight: size not tested"
-            settle = "state gear ratios or torque constants ([drive] of a map) if not"
-            return Row("side", "joint side", "likely", reason, settle)
+            decide = "state gear ratios or torque constants ([drive] of a map) if not"
+            return Row("side", "joint side", "likely", reason, decide)
         basis = "the URDF's masses" if self.scale is not None else "the masses of arms of its reach"
         reason = f"measured over expected by {basis}: {self.common:.2g}"
         if not self.size_is_off:

@@ -18,14 +18,14 @@ class Row:
         certainty: ``sure``: nothing else fits; ``likely``: by names or custom; ``open``: the
             recording does not say.
         reason: why.
-        settle: what would settle a doubt; empty if there is none.
+        decide: what would decide it; empty if there is none.
     """
 
     aspect: str
     reading: str
     certainty: Certainty
     reason: str
-    settle: str = ""
+    decide: str = ""
 
 
 @dataclass(frozen=True)

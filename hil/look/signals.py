@@ -75,14 +75,14 @@ def _quantity(line: str, notes: Sequence[str]) -> Row:
         return Row("channels", channels, "likely", rest)
     concluded = next((note for note in notes if note.startswith(f"{kind}: ")), "")
     certainty: Certainty = "sure" if "as the log states" in reason else "likely"
-    settle = ""
+    decide = ""
     if kind in ("position", "velocity") and "no unit stated" in reason:
         unit = "deg" if "degrees" in concluded else "rad"
         unit += "/s" if kind == "velocity" else ""
         reason = concluded.partition(": ")[2] or reason.partition(";")[0]
         certainty = "sure" if concluded else "likely"
-        return Row(kind, f"{channels}: {unit}", certainty, reason, settle)
-    return Row(kind.replace("_", " "), channels, certainty, reason, settle)
+        return Row(kind, f"{channels}: {unit}", certainty, reason, decide)
+    return Row(kind.replace("_", " "), channels, certainty, reason, decide)
 
 
 def _velocity(recording: Recording) -> Row:
@@ -98,9 +98,9 @@ def _velocity(recording: Recording) -> Row:
     names = [recording.joint_names[joint] for joint in moving]
     if itself.min() < _FOLLOWS:
         bad = ", ".join(name for name, r in zip(names, itself, strict=True) if r < _FOLLOWS)
-        settle = "check the order of the columns of both"
+        decide = "check the order of the columns of both"
         return Row("velocity", f"not the slope of the position: {bad}", "sure",
-                   f"correlation {itself.min():.2f}", settle)  # fmt: skip
+                   f"correlation {itself.min():.2f}", decide)  # fmt: skip
     if np.all(np.abs(factor - 1.0) < _CLOSE):
         return Row("velocity", "slope of the position, same unit, sign and order", "sure",
                    f"slope over velocity {1.0 / np.mean(factor):.3f}")  # fmt: skip

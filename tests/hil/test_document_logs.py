@@ -55,7 +55,7 @@ def test_lists_in_parquet_are_joints(tmp_path: Path, robot: Robot) -> None:
 
 def test_several_episodes_in_one_file_are_refused(tmp_path: Path, robot: Robot) -> None:
     path = lerobot(tmp_path / "all.parquet", episode_index=np.arange(len(TIME)) // 300)
-    with pytest.raises(SourceError, match="episodes, each with a clock that begins anew"):
+    with pytest.raises(SourceError, match="episodes, each with a clock that starts at zero"):
         read(path, robot)
 
 
