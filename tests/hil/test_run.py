@@ -863,7 +863,7 @@ def test_an_arm_that_rests_for_hours_is_warmed_up_again(
     """Between two repetitions, or while the operator holds the next one before it begins."""
     campaign, clock = make(warmup_drift=0.9, warmup_least=4, repetitions=2), time.time
     passed = [0.0]
-    monkeypatch.setattr("hil.campaign.warmup.time.time", lambda: clock() + passed[0])
+    monkeypatch.setattr("hil.campaign.stages.time.time", lambda: clock() + passed[0])
 
     class Leaves(Operator):
         def show(self, status: RunStatus) -> None:
