@@ -26,6 +26,8 @@ from sim_fixtures.ns16 import CELL_PATH
 
 CASES: Final[dict[str, DesignSettings]] = {
     "B (eq. 7)": preset("b").kinematic(),
+    "gradient": preset("gradient").kinematic(),
+    "gradient, all constraints": preset("gradient"),
     "front": preset("front").kinematic(),
     "+ motor currents": preset("front").replaced(
         constraints={"closed": True, "collision": True, "current": True}
@@ -38,7 +40,9 @@ def run(cell: Cell, name: str, seed: int, *, workers: int, quick: bool) -> dict[
     settings = CASES[name].replaced(seed=seed)
     if quick:
         polish = min(settings.search.polish, 50)
-        settings = settings.replaced(search={"population": 24, "generations": 6, "polish": polish})
+        effort = {"population": 24, "generations": 6, "polish": polish}
+        effort["gradient"] = min(settings.search.gradient, 5)
+        settings = settings.replaced(search=effort)
     row: dict[str, Any] = {"case": name, "seed": seed}
     begin = time.perf_counter()
     with Population(problem_of(cell, settings), workers=workers) as population:

@@ -19,6 +19,7 @@ from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
 from hil.design import METHODS, Method, load_settings, preset
 from hil.design.advice import criteria_text
+from hil.design.given import given_of
 from hil.design.run import Designed, DesignFolder, run_design
 from hil.design.settings import preset_text
 from hil.errors import HilError, InputError, OperatorStopError
@@ -63,11 +64,14 @@ def design(
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/design"),
     method: Annotated[
         Method | None,
-        typer.Option(help=f"Search method: {', '.join(METHODS)}. Default: front.", metavar="NAME"),
+        typer.Option(
+            help=f"Search method: {', '.join(METHODS)}. Default: gradient.", metavar="NAME"
+        ),
     ] = None,
     settings: Path | None = None,
     show_settings: Annotated[Method | None, typer.Option(metavar="NAME")] = None,
     quick: bool = False,
+    given: Annotated[list[Path] | None, typer.Option(metavar="ARCHIVE|FOLDER")] = None,
     repetitions: Annotated[int | None, typer.Option(min=1, max=1000)] = None,
     seed: Annotated[int | None, typer.Option(min=0)] = None,
     workers: Annotated[int | None, typer.Option(min=1, max=256)] = None,
@@ -96,7 +100,8 @@ def design(
     **Examples:**
 
     - `hil design cell.toml -o runs/mine`
-    - `hil design --show-settings front > my.toml`, then `hil design cell.toml --settings my.toml`
+    - `hil design --show-settings gradient > my.toml`, then `hil design cell.toml --settings
+      my.toml`
 
     Options:
         cell: The cell file.
@@ -106,6 +111,8 @@ def design(
         show_settings: Print the commented settings of a method and exit.
         quick: Run a short search: method b with the number of motions in `candidates` of
             [campaign].
+        given: Archive or campaign folder of earlier recordings of this arm (repeatable): the motion
+            adds what they do not determine, and the criteria are those of all together.
         repetitions: Number of repetitions of the motion. Default: that of [campaign].
         seed: Seed of the search; the result depends on nothing else. Default: that of the settings.
         workers: Number of processes; the result does not depend on it. Default: one per processor.
@@ -130,11 +137,16 @@ def design(
     elif settings is not None:
         asked = load_settings(settings)
     else:
-        asked = preset(method or "front") if method or there is None else there
+        asked = preset(method or "gradient") if method or there is None else there
+    if given:
+        asked = asked.replaced(objective={"given": [str(path.resolve()) for path in given]})
     if seed is not None:
         asked = asked.replaced(seed=seed)
     if limits_only:
         asked = asked.kinematic()
+
+    recordings = [Path(name) for name in asked.objective.given]
+    known = given_of(loaded, recordings) if recordings else None
 
     def finish(done: Designed) -> None:
         """Report and draw the result, while the folder is locked."""
@@ -177,6 +189,7 @@ def design(
             reporter,
             workers=workers or len(os.sched_getaffinity(0)),
             stop=lambda: stop.requested,
+            given=known,
             resume=resume,
             force=force,
             then=finish,

@@ -13,6 +13,7 @@ from identification.excitation import (
     CollisionChecker,
     Constraints,
     CurrentModel,
+    Given,
     Objective,
     Problem,
     SearchSettings,
@@ -28,8 +29,8 @@ from .settings import DesignSettings, SettingsError
 Array = NDArray[np.float64]
 
 
-def problem_of(cell: Cell, settings: DesignSettings) -> Problem:
-    """Return genome, objective and constraints of a search.
+def problem_of(cell: Cell, settings: DesignSettings, given: Given | None = None) -> Problem:
+    """Return genome, objective and constraints of a search; `given` is of earlier recordings.
 
     Raises:
         SettingsError: settings that do not fit the cell.
@@ -37,13 +38,24 @@ def problem_of(cell: Cell, settings: DesignSettings) -> Problem:
         NoExcitationError: the initial posture collides, or exceeds the current limits at rest.
     """
     constraints = settings.constraints
+    if settings.objective.given and given is None:
+        raise SettingsError(
+            None,
+            "names recordings, and their information was not read",
+            field="objective.given",
+            remedy="pass given = hil.design.given.given_of(cell, paths)",
+        )
     checker = collision_checker(cell) if constraints.collision else None
     currents = planned(current_model(cell)) if constraints.current else None
     genome = _genome(cell, settings, checker)
     _require_start(cell, genome, checker, currents)
     return Problem(
         genome=genome,
-        objective=Objective(cell.model, parameters=_judged(cell, settings)),
+        objective=Objective(
+            cell.model,
+            parameters=_judged(cell, settings),
+            given=given,
+        ),
         constraints=Constraints(
             limits=cell.joint_limits,
             min_duration=constraints.min_duration,

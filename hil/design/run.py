@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, cast
 
 from hil.cell import AngleFrame, Cell
 from hil.errors import InputError, OperatorStopError, UnsafeError
-from hil.files import convert_write_errors, lock_folder, write_atomically
+from hil.files import convert_write_errors, json_digest, lock_folder, write_atomically
 from hil.motion_checks import violation_text
 from hil.progress import Reporter
 from hil.reading import open_file
@@ -122,6 +122,7 @@ def run_design(
     *,
     workers: int = 2,
     stop: Callable[[], bool] = lambda: False,
+    given: excitation.Given | None = None,
     resume: bool = False,
     force: bool = False,
     then: Callable[[Designed], None] = lambda _: None,
@@ -132,12 +133,17 @@ def run_design(
     `resume` continues it; `force` replaces an existing design. The folder is locked until `then`,
     called with the result, has returned.
 
+    `given` is the information of the earlier recordings in the settings.
+
     Raises:
         InputError: the folder has a design already, is locked, or cannot be written to.
         UnsafeError: the motion does not pass the final check.
         HilError: see :func:`run_search`.
     """
-    problem = problem_of(cell, settings)  # before anything is replaced
+    problem = problem_of(cell, settings, given)  # before anything is replaced
+    if problem.objective.given is not None:
+        seconds = problem.objective.given.duration
+        reporter.say(f"the criteria count {seconds:.3g} s of motion in the given recordings")
     with lock_folder(folder.root, "search", "-o"):
         if resume:
             if settings != folder.resumed_settings():
@@ -148,27 +154,7 @@ def run_design(
                 )
         else:
             folder.create(settings, force=force)
-        identity = {
-            "settings": _flat(settings),
-            "cell": fingerprint(cell),
-            "criteria": {"names": list(excitation.CRITERIA)},
-        }
-        with folder.opened_journal() as file:
-            journal = _journal(file, identity, reporter)
-            design = run_search(
-                cell,
-                settings,
-                reporter,
-                workers=workers,
-                stop=stop,
-                problem=problem,
-                journal=journal,
-            )
-        if journal.error is not None:
-            reporter.say(
-                f"the last scores are not in the journal ({journal.error.strerror}); a resumed "
-                "search computes them again"
-            )
+        design = _searched(folder, cell, settings, reporter, problem, workers=workers, stop=stop)
         trajectory = design.excitation.trajectory
         broken = problem.constraints.violations(trajectory, excitation.sampled(trajectory))
         if broken:
@@ -179,6 +165,46 @@ def run_design(
         done = Designed(problem, design, result)
         then(done)
     return done
+
+
+def _searched(
+    folder: DesignFolder,
+    cell: Cell,
+    settings: DesignSettings,
+    reporter: Reporter,
+    problem: excitation.Problem,
+    *,
+    workers: int,
+    stop: Callable[[], bool],
+) -> excitation.Design:
+    """Search with the journal of the folder."""
+    identity: dict[str, dict[str, Any]] = {
+        "settings": _flat(settings),
+        "cell": fingerprint(cell),
+        "criteria": {"names": list(excitation.CRITERIA)},
+    }
+    if (given := problem.objective.given) is not None:
+        identity["given"] = {
+            "duration": given.duration,
+            "information": json_digest(given.mean.tolist()),
+        }
+    with folder.opened_journal() as file:
+        journal = _journal(file, identity, reporter)
+        design = run_search(
+            cell,
+            settings,
+            reporter,
+            workers=workers,
+            stop=stop,
+            problem=problem,
+            journal=journal,
+        )
+    if journal.error is not None:
+        reporter.say(
+            f"the last scores are not in the journal ({journal.error.strerror}); a resumed "
+            "search computes them again"
+        )
+    return design
 
 
 def run_search(
@@ -245,6 +271,7 @@ def _note(progress: excitation.Progress) -> str:
     where = {
         "sample": "scoring random motions",
         "search": f"generation {progress.generation} of {progress.generations}",
+        "gradient": "improving by the gradient",
         "polish": "polishing",
     }[progress.phase]
     if math.isnan(progress.best[0]):

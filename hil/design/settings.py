@@ -54,6 +54,15 @@ class SearchTable(Table):
         "up to 1; methods b and balanced",
         (0.7, 0.3),
     )
+    gradient: Whole = field(
+        "a number of steps along the gradient from the best motion, 0 for none; with [via_points]",
+        0,
+        ge=0,
+        le=100_000,
+    )
+    starts: Whole = field(
+        "a number of motions that share the first half of these steps, 1 to 100", 1, ge=1, le=100
+    )
     polish: Whole = field(
         "a number of motions for the local search from the best one, 0 for none",
         0,
@@ -150,6 +159,11 @@ class ObjectiveTable(Table):
         '"all", or a list of at least two names of parameters as `hil identify` reports them', "all"
     )
 
+    given: list[str] = field(
+        "a list of archives or folders of earlier recordings, whose information the motion adds to",
+        [],
+    )
+
     @property
     def named(self) -> list[str] | None:
         """Names of the parameters, None if they are not listed."""
@@ -172,6 +186,11 @@ class DesignSettings(Table):
         if (self.via_points is None) == (self.sines is None):
             given = "neither" if self.via_points is None else "both"
             raise ValueError(f"has {given} of [via_points] and [sines]; give one of the two")
+        if self.sines is not None and self.search.gradient > 0:
+            raise ValueError(
+                f"[search] gradient = {self.search.gradient} improves [via_points], not [sines]; "
+                "make it 0"
+            )
         asked, length = self.constraints, None if self.sines is None else self.sines.length
         if length is not None and not asked.min_duration <= length <= asked.max_duration:
             raise ValueError(
@@ -232,7 +251,7 @@ def load_settings(path: Path) -> DesignSettings:
         problem = f"cannot be read ({error.strerror})"
         raise SettingsError(path, problem, remedy="name a TOML file") from error
     except ValueError as error:
-        remedy = "see `hil design --show-settings front`"
+        remedy = "see `hil design --show-settings gradient`"
         raise SettingsError(path, f"is not TOML ({error})", remedy=remedy) from error
     if raw.get("format") == RESULT_FORMAT and isinstance(raw.get("settings"), dict):
         raw = raw["settings"]
@@ -241,7 +260,7 @@ def load_settings(path: Path) -> DesignSettings:
 
 def settings_of(raw: Mapping[str, Any], path: Path | None = None) -> DesignSettings:
     """Return settings from the data of a file; see :func:`load_settings`."""
-    method = raw.get("method", "front")
+    method = raw.get("method", "front" if "sines" in raw else "gradient")
     if method not in METHODS:
         raise SettingsError(
             path,

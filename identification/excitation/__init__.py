@@ -15,6 +15,7 @@ from identification.excitation.constraints import (
 from identification.excitation.criteria import (
     CRITERIA,
     Criteria,
+    Given,
     Objective,
     condition_number,
     correlation,

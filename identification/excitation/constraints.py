@@ -152,6 +152,14 @@ class CurrentModel:
         motor_torque = np.linalg.solve(self.motor_from_joint.T, torque.T).T
         return np.asarray(motor_torque / self.torque_constant, dtype=np.float64)
 
+    def loads(self, motion: Motion) -> Array:
+        """Return |current|, then |torque|, as fractions of what a motion may use (m, n or 2 n)."""
+        torque = self.torque(motion)
+        loads = np.abs(self.current(torque)) / (self.usable * self.current_limit)
+        if self.torque_limit is None:
+            return np.asarray(loads)
+        return np.column_stack((loads, np.abs(torque) / self.torque_limit))
+
     def check(self, motion: Motion) -> list[Violation]:
         """Return the largest violation of each joint and motor in the samples."""
         torque = self.torque(motion)

@@ -39,6 +39,13 @@ class _Cholesky(NamedTuple):
     lower: Array
 
     @property
+    def inverse(self) -> Array:
+        """The inverse of the Gram matrix (p, p)."""
+        half, _ = scipy.linalg.lapack.dpotri(self.lower, lower=1)
+        scaled = np.tril(half) + np.tril(half, -1).T
+        return np.asarray(scaled / self.scale[:, None] / self.scale)
+
+    @property
     def correlation(self) -> Array:
         """Lower triangle of the correlation matrix (p, p)."""
         half, _ = scipy.linalg.lapack.dpotri(self.lower, lower=1)
@@ -46,13 +53,29 @@ class _Cholesky(NamedTuple):
         return np.asarray(np.tril(half) / deviation[:, None] / deviation)
 
 
-def _log10_det(gram: _Cholesky, n_samples: int) -> float:
+def _log10_det(gram: _Cholesky, n_samples: float) -> float:
     logs = np.log10(np.diag(gram.lower)) + np.log10(gram.scale) - 0.5 * np.log10(n_samples)
     return float(2.0 * logs.sum())
 
 
-def _coupling_index(gram: _Cholesky, _: int) -> float:
+def _coupling_index(gram: _Cholesky, _: float) -> float:
     return float(np.abs(np.tril(gram.correlation, -1)).sum())
+
+
+def _log10_det_slope(gram: _Cholesky) -> Array:
+    """Return the derivative (p, p) of log10 det by the Gram matrix: its inverse / ln 10."""
+    return np.asarray(gram.inverse / np.log(10.0))
+
+
+def _coupling_index_slope(gram: _Cholesky) -> Array:
+    r"""Return :math:`-C A C` with C the inverse Gram and :math:`A = \partial I_c / \partial C`."""
+    inverse = gram.inverse
+    deviation = np.sqrt(np.diag(inverse))
+    coupled = inverse / deviation[:, None] / deviation
+    np.fill_diagonal(coupled, 0.0)
+    inner = 0.5 * np.sign(coupled) / deviation[:, None] / deviation
+    np.fill_diagonal(inner, -0.5 * np.abs(coupled).sum(axis=1) / deviation**2)
+    return -(inverse @ inner @ inverse)
 
 
 def coupling_index_max(p: int) -> float:
@@ -63,7 +86,7 @@ def coupling_index_max(p: int) -> float:
 class Criterion(NamedTuple):
     """A criterion that searches can optimise."""
 
-    score: Callable[[_Cholesky, int], float]  # of a factorised Gram matrix and N time samples
+    score: Callable[[_Cholesky, float], float]  # of a factorised Gram matrix and N time samples
     label: str  # name in messages
     sense: float  # 1 to maximise, -1 to minimise
     title: str  # name in tables and at axes
@@ -71,6 +94,8 @@ class Criterion(NamedTuple):
     decimals: int  # in the report
     relative: bool  # whether the report states its change in percent
     largest: Callable[[int], float] | None = None  # largest value for p parameters
+    # derivative (p, p) of the score by the Gram matrix; None: steps along the gradient ignore it
+    slope: Callable[[_Cholesky], Array] | None = None
 
     @property
     def better(self) -> str:
@@ -87,6 +112,7 @@ CRITERIA: Final[Mapping[str, Criterion]] = {
         "eq. 9: information, in SI units",
         2,
         relative=False,
+        slope=_log10_det_slope,
     ),
     "coupling_index": Criterion(
         _coupling_index,
@@ -97,6 +123,7 @@ CRITERIA: Final[Mapping[str, Criterion]] = {
         1,
         relative=True,
         largest=coupling_index_max,
+        slope=_coupling_index_slope,
     ),
 }
 """Criteria by the name of their field in :class:`Criteria`; of each motion all are computed."""
@@ -112,7 +139,7 @@ def columns(values: Array, criteria: Sequence[str]) -> Array:
     return np.take(values, [names.index(name) for name in criteria], axis=-1)
 
 
-def measures(gram: Array, n_samples: int) -> dict[str, float]:
+def measures(gram: Array, n_samples: float) -> dict[str, float]:
     """Return the values of all `CRITERIA` for a Gram matrix (p, p)."""
     root = _factorised(gram)
     return {
@@ -207,9 +234,9 @@ class Criteria:
         return cls(**strict(dict[str, float], given), n_samples=n_samples)
 
     @classmethod
-    def of_gram(cls, gram: Array, n_samples: int) -> Self:
-        """Evaluate the criteria for the Gram matrix (p, p) of N time samples."""
-        found = measures(gram, n_samples)
+    def of_gram(cls, gram: Array, n_samples: int, given: float = 0.0) -> Self:
+        """Evaluate the criteria for the Gram matrix (p, p) of N time samples and `given` others."""
+        found = measures(gram, n_samples + given)
         return cls(
             **found,
             fitness=fitness_eq7(found["log10_det"], found["coupling_index"], len(gram)),
@@ -237,6 +264,18 @@ def _smallest_pivot(p: int) -> float:
 
 
 @dataclass(frozen=True, eq=False)
+class Given:
+    """Information of earlier recordings, to which a motion adds its own."""
+
+    mean: Array  #: Gram matrix of the regressor (p, p), of one time sample on average
+    duration: float  #: of their motions together [s]
+
+    def count(self, step: float) -> float:
+        """Return to how many samples of a step [s] the recordings amount."""
+        return self.duration / step
+
+
+@dataclass(frozen=True, eq=False)
 class Objective:
     """Evaluates motions by the information on a model's parameters.
 
@@ -246,6 +285,8 @@ class Objective:
 
     model: RobotModel  #: the robot, with p parameters
     parameters: NDArray[np.intp] | None = None  #: indices (e,) of those in the criteria; None: all
+    #: of earlier recordings: the criteria are those of all recordings and the motion together
+    given: Given | None = None
 
     @property
     def n_parameters(self) -> int:
@@ -253,34 +294,72 @@ class Objective:
         return self.model.n_parameters if self.parameters is None else len(self.parameters)
 
     def information(self, motion: Motion) -> Array:
-        """Return the information (e, e) of a uniformly sampled motion.
+        """Return the information (e, e) of a uniformly sampled motion, and of what is given.
 
         Raises:
             ShapeError: an array of the motion has the wrong shape.
         """
         total = self._gram(motion)
+        if self.given is not None:
+            total += self.n_given(motion) * self.given.mean
         return total if self.parameters is None else total[np.ix_(self.parameters, self.parameters)]
 
     def measures(self, motion: Motion) -> dict[str, float]:
         """Return the `CRITERIA` of a sampled motion by name (see :meth:`information`)."""
-        return measures(self.information(motion), motion.n_samples)
+        return measures(self.information(motion), motion.n_samples + self.n_given(motion))
+
+    def n_given(self, motion: Motion) -> float:
+        """Return the samples that the given recordings have at the period of a motion."""
+        if self.given is None:
+            return 0.0
+        return self.given.count(float(motion.time[1] - motion.time[0]))
 
     def criteria(self, trajectory: Trajectory, period: float) -> Criteria:
         """Return all criteria of a planned motion, sampled every `period` [s]."""
         motion = midpoints(trajectory, period)
-        return Criteria.of_gram(self.information(motion), motion.n_samples)
+        return Criteria.of_gram(self.information(motion), motion.n_samples, self.n_given(motion))
 
-    def _gram(self, motion: Motion) -> Array:
-        """Return the Gram matrix (p, p) of the motion."""
+    def slope(self, gram: Array, weights: Array) -> Array:
+        """Return the derivative (e, e) of `weights` (d,) times the `CRITERIA` by an information.
+
+        It is zero where the information is singular.
+        """
+        root = _factorised(gram)
+        total = np.zeros_like(gram)
+        if root is not None:
+            for weight, one in zip(weights.tolist(), CRITERIA.values(), strict=True):
+                if weight != 0.0 and one.slope is not None:
+                    total += weight * one.slope(root)
+        return total
+
+    def along(self, motion: Motion, matrix: Array) -> Array:
+        r"""Return :math:`\mathrm{tr}(\Phi_t M \Phi_t^T)` of each sample (m,), M (e, e)."""
         model = self.model
-        states = joint_arrays(
-            model.n_joints,
+        if self.parameters is not None:
+            whole = np.zeros((model.n_parameters, model.n_parameters))
+            whole[np.ix_(self.parameters, self.parameters)] = matrix
+            matrix = whole
+        blocks = [matrix[index] for index in self._block_indices]
+        total = np.zeros(motion.n_samples)
+        for part, rows in model.chunks(*self._states(motion)):
+            for block, weights in zip(rows, blocks, strict=True):
+                total[part] += np.einsum("pm,pm->m", block, weights @ block)
+        return total
+
+    def _states(self, motion: Motion) -> tuple[Array, ...]:
+        """Return position, velocity and acceleration, checked."""
+        return joint_arrays(
+            self.model.n_joints,
             position=motion.position,
             velocity=motion.velocity,
             acceleration=motion.acceleration,
         )
+
+    def _gram(self, motion: Motion) -> Array:
+        """Return the Gram matrix (p, p) of the motion."""
+        model = self.model
         sums = [np.zeros((len(used), len(used))) for used in model.plan.columns]
-        for _, rows in model.chunks(*states):
+        for _, rows in model.chunks(*self._states(motion)):
             for joint, block in enumerate(rows):
                 sums[joint] += block @ block.T
         total = np.zeros((model.n_parameters, model.n_parameters))

@@ -96,6 +96,21 @@ class ViaPointGenome:
             before = self._redraw(random, self.checker, coordinates[:, k], before, after)
         return genes
 
+    def contracted(self, genes: Array, reach: Sequence[float]) -> Array:
+        """Return genes (m, n_genes) with via points nearer to home, or the middle without one.
+
+        The rows have the fractions `reach` of their distance from there in turn.
+        """
+        n = self.limits.n_joints
+        share = np.resize(np.asarray(reach, dtype=np.float64), len(genes))[:, None, None]
+        centre = np.full(n, 0.5)
+        if self.home is not None:
+            lower, upper = self._points(np.array([np.zeros(n), np.ones(n)]))
+            centre = np.clip((self.home - lower) / (upper - lower), 0.0, 1.0)
+        coordinates = genes[:, : self.n_via * n].reshape(len(genes), self.n_via, n)
+        nearer = share * coordinates + (1.0 - share) * centre
+        return np.column_stack((nearer.reshape(len(genes), -1), genes[:, self.n_via * n :]))
+
     def source(self, genes: Array) -> dict[str, Any]:
         """Return the fields of `Excitation` that genes (n_genes,) determine."""
         points, speed = (each[0] for each in self.decode(genes))

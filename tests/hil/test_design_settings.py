@@ -51,9 +51,9 @@ def test_presets_are_files_with_all_constraints_on(method, tmp_path):
 
 
 def test_missing_settings_are_those_of_the_preset():
-    """All methods can search both kinds of motion."""
+    """All methods but the gradient can search both kinds of motion."""
     assert settings_of({"method": "b"}) == preset("b")
-    assert settings_of({}) == preset("front")
+    assert settings_of({}) == preset("gradient")
     mine = settings_of({"method": "b", "via_points": {"n_via": 9}})
     assert mine.via_points.n_via == 9
     assert mine.via_points.fly == 0.5 and mine.search == preset("b").search
@@ -67,6 +67,7 @@ def test_missing_settings_are_those_of_the_preset():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        ('method = "gradient"\n[sines]', ["gradient = 180", "not [sines]", "make it 0"]),
         ('metod = "b"', ["metod", "is not a field", "valid fields", "method"]),
         ('method = "c"', ["method = 'c'", "a, b, balanced, front"]),
         ("[search]\npopulation = 2", ["search.population = 2", "4 to 10000"]),

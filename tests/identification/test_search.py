@@ -102,11 +102,13 @@ def asked(method, **others):
 
 
 def fitness_of(settings, scores, scale=None):
-    """Return the fitness of the three methods with a single objective."""
+    """Return the fitness of the methods with a single objective."""
     size, coupled = columns(scores.measures, ("log10_det", "coupling_index")).T
     if settings.method == "a":
         return size
     first, second = settings.weights
+    if settings.method == "gradient":
+        return first * size - second * coupled
     if settings.method == "b":
         return first * size + second * coupling_index_max(13) / coupled
     spreads = [np.subtract(*np.quantile(each, (0.75, 0.25))) for each in scale.measures.T]
@@ -114,7 +116,7 @@ def fitness_of(settings, scores, scale=None):
 
 
 class TestChoice:
-    @pytest.mark.parametrize("method", ["a", "b", "balanced"])
+    @pytest.mark.parametrize("method", ["a", "b", "balanced", "gradient"])
     @pytest.mark.parametrize("weights", [(0.7, 0.3), (0.0, 1.0)])
     def test_the_largest_fitness_is_chosen(self, population, method, weights):
         """Determinant, eq. 7, or both measures in units of their spread over 200 random motions."""
@@ -185,7 +187,7 @@ class TestRun:
     @pytest.mark.parametrize("method", METHODS)
     def test_a_seed_determines_every_bit(self, population, method, capsys):
         """With any number of processes, whatever the generator that everybody shares."""
-        chosen = asked(method, polish=40)
+        chosen = asked(method, polish=40, gradient=2 if method == "gradient" else 0)
         np.random.seed(1)  # noqa: NPY002
         first = search(population, chosen)
         between = np.random.get_state()  # noqa: NPY002
@@ -201,12 +203,12 @@ class TestRun:
 
     @pytest.mark.parametrize(
         ("method", "stop", "interrupt"),
-        [("b", 1, None), ("front", 3, None), ("front", 6, None)]
+        [("b", 1, None), ("front", 3, None), ("front", 6, None), ("gradient", 6, None)]
         + [("front", 99, after) for after in (0, 2, 6)],
     )
     def test_resumed_it_equals_an_uninterrupted_one(self, population, method, stop, interrupt):
         """After a request to stop, or an interrupt that loses one generation."""
-        chosen = asked(method, polish=60)
+        chosen = asked(method, polish=60, gradient=4 if method == "gradient" else 0)
         whole = bits(search(population, chosen))
         sizes = [len(genes) for genes in population.genes]
         file, first = io.BytesIO(), population.begin(interrupt)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from identification.excitation.criteria import OF_PAPER, fitness_eq7
 
 Array = NDArray[np.float64]
-Method = Literal["a", "b", "balanced", "front"]
+Method = Literal["a", "b", "balanced", "front", "gradient"]
 
 
 class SearchMethod(NamedTuple):
@@ -28,6 +28,9 @@ class SearchMethod(NamedTuple):
     #: whether values count from their median over random motions, in interquartile ranges, and
     #: larger ones are better
     scaled: bool = False
+    #: fractions of their distance from home (or the middle) at which motions of the first
+    #: generation have their via points, in turn: closer motions are shorter and clear of obstacles
+    reach: tuple[float, ...] = (1.0,)
 
 
 def _eq7(values: Mapping[str, Array], weights: tuple[float, float], p: int) -> Array:
@@ -37,6 +40,10 @@ def _eq7(values: Mapping[str, Array], weights: tuple[float, float], p: int) -> A
 
 def _balanced(values: Mapping[str, Array], weights: tuple[float, float], _: int) -> Array:
     return weights[0] * values["log10_det"] + weights[1] * values["coupling_index"]
+
+
+def _weighted(values: Mapping[str, Array], weights: tuple[float, float], _: int) -> Array:
+    return weights[0] * values["log10_det"] - weights[1] * values["coupling_index"]
 
 
 METHODS: Final[Mapping[Method, SearchMethod]] = {
@@ -61,5 +68,11 @@ METHODS: Final[Mapping[Method, SearchMethod]] = {
         "designed as the knee of log det and I_c",
         None,
         scaled=True,
+    ),
+    "gradient": SearchMethod(
+        "log det less I_c by weights, a short search improved by the gradient",
+        "designed by the gradient of log det and I_c",
+        _weighted,
+        reach=(1.0, 0.85, 0.7, 0.55, 0.4, 0.25),
     ),
 }

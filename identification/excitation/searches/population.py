@@ -22,6 +22,12 @@ from identification.excitation.criteria import (
 from identification.excitation.errors import DesignError
 from identification.excitation.genomes import Genome, Motion
 from identification.excitation.searches.methods import Method
+from identification.excitation.searches.tangent import (
+    Linearisation,
+    Tangent,
+    gene_slopes,
+    tangent_of,
+)
 from identification.excitation.violation import KINDS, Violation, excess_by_kind
 from planner import PlannerCrashed, PlannerError, PlanningTimedOut
 from planner.worker import WorkerProcess, chunks_of, load, map_in_children, pack
@@ -223,12 +229,14 @@ class SearchSettings:
     generations: int = 120  #: number of generations, the random first one included
     crossover: float = 0.9  #: probability that two parents are crossed (Table 1)
     mutation: float = 0.01  #: probability that a gene of a child is mutated (Table 1)
-    #: lambda_1 of log10 det and lambda_2 of the coupling index ("b" and "balanced")
+    #: lambda_1 of log10 det and lambda_2 of the coupling index ("gradient", "b" and "balanced")
     weights: tuple[float, float] = (0.7, 0.3)
     seed: int = 0  #: the same seed gives the same design bit for bit
     polish: int = 0  #: evaluations of a local search from the best motion; 0: none
     crossover_eta: float = 15.0  #: distribution index of SBX; larger: children closer to parents
     mutation_eta: float = 20.0  #: distribution index of the mutation; larger: smaller changes
+    gradient: int = 0  #: steps along the gradient from the best motion, before the polish; 0: none
+    starts: int = 1  #: motions that share the first half of these steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,6 +282,14 @@ class Problem:
             raise motion
         return motion, self.objective.criteria(motion, period)
 
+    def tangent(self, genes: Array, weights: Array) -> Tangent:
+        """Return the slopes of `weights` (d,) times the criteria along the motion of genes.
+
+        Raises:
+            PlannerError: the motion cannot be planned.
+        """
+        return tangent_of(self, genes, weights)
+
     def _violations(self, motion: Motion) -> tuple[Violation, ...]:
         return self.constraints.violations(motion, sampled(motion, self.period))
 
@@ -284,6 +300,10 @@ def _unplannable(error: PlannerError) -> Violation:
 
 CHUNK: Final = 8
 """Motions per call to a child process; few, so that all children finish a generation together."""
+
+
+_GENES: Final = 16
+"""Genes per call to a child process for a gradient."""
 
 
 class Population:
@@ -342,6 +362,27 @@ class Population:
         found: tuple[Motion, Criteria] = self._call("evaluate", genes, period)
         return found
 
+    def linearise(self, genes: Array, weights: Array) -> Linearisation | None:
+        """Return `weights` (d,) times the criteria, and the margins, to first order in the genes.
+
+        None if the motion cannot be planned.
+        """
+        try:
+            tangent: Tangent = self._call("tangent", genes, weights)
+        except PlannerError:
+            return None
+        chunks = chunks_of(len(genes), _GENES)
+        packed = pack(tangent)
+        rows = map_in_children(
+            self._children,
+            _slopes,
+            chunks,
+            lambda chunk: (self._packed, packed, genes, np.array(chunk)),
+        )
+        none = np.zeros(1 + len(tangent.left))
+        slopes = np.array([none if isinstance(row, Exception) else row for row in rows])
+        return Linearisation(slopes[:, 0], slopes[:, 1:].T.copy(), tangent.left)
+
     def _call(self, method: str, *arguments: object) -> Any:
         """Call a method of the problem in a child, again if another process killed the child."""
         (result,) = map_in_children(
@@ -354,6 +395,16 @@ class Population:
 
 def _score(packed: bytes, genes: Array) -> Array:
     return _problem(packed).score(genes).rows
+
+
+def _slopes(packed: bytes, tangent: bytes, genes: Array, which: Array) -> Array:
+    return gene_slopes(_problem(packed), _tangent(tangent), genes, which)
+
+
+@lru_cache(maxsize=1)
+def _tangent(packed: bytes) -> Tangent:
+    tangent: Tangent = load(packed)
+    return tangent
 
 
 def _apply(packed: bytes, method: str, *arguments: Any) -> list[Any]:

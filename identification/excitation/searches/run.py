@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from identification.excitation.criteria import OF_PAPER, SENSE, Criteria, columns
 from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation
+from identification.excitation.genomes import ViaPointGenome
+from identification.excitation.searches.gradient import TRIED, Ascent, improve
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.methods import METHODS, SearchMethod
 from identification.excitation.searches.population import (
@@ -29,14 +31,14 @@ from identification.excitation.searches.population import (
 from identification.excitation.violation import KINDS, NoFeasibleMotionError
 
 Array = NDArray[np.float64]
-Phase = Literal["sample", "search", "polish"]
+Phase = Literal["sample", "search", "gradient", "polish"]
 Fitness = Callable[[Scores], Array]
 
 
 class Progress(NamedTuple):
     """Progress of a search."""
 
-    phase: Phase  #: "sample" (random motions for the scale), "search" or "polish"
+    phase: Phase  #: "sample" (random motions for the scale), "search", "gradient", "polish"
     generation: int  #: scored generations
     generations: int  #: all generations
     evaluated: int  #: scored motions of all phases
@@ -81,6 +83,7 @@ _UNEXCITING: Final = 1e6
 _STEP: Final = 0.03  # first step, fraction of each gene's range
 _SMALLEST_STEP: Final = 1e-7
 _POLISH_STREAM: Final = 3
+_MEASURE_STEP: Final = 1e-3  # of criteria, for the derivatives of a fitness
 _SECOND: Final = 1e-3  # weight of the largest gain if none is negative
 
 
@@ -137,6 +140,16 @@ def dominating(
         return merit
 
     return fitness
+
+
+def partials(fitness: Fitness, scores: Scores) -> Array:
+    """Return the derivatives (d,) of a fitness by the `CRITERIA` of a motion (m = 1)."""
+    steps = _MEASURE_STEP * np.eye(len(SENSE))
+    measures = scores.measures + np.concatenate((steps, -steps))
+    rows = np.repeat(scores.rows, len(measures), axis=0)
+    values = fitness(Scores.of_rows(rows)._replace(measures=measures))
+    above, below = np.split(values, 2)
+    return np.asarray((above - below) / (2.0 * _MEASURE_STEP))
 
 
 def generation_size(n_genes: int) -> int:
@@ -315,7 +328,8 @@ def search(
 def most_evaluations(settings: SearchSettings) -> int:
     """Return the largest number of motions that a search scores in all its phases."""
     sampled = SAMPLE_COUNT if METHODS[settings.method].scaled else 0
-    return sampled + settings.population * settings.generations + settings.polish
+    improved = TRIED * settings.gradient + settings.polish
+    return sampled + settings.population * settings.generations + improved
 
 
 class _Search:
@@ -337,6 +351,7 @@ class _Search:
         self._phase: Phase = "sample"
         self._goal: Goal | None = None
         self._generations = 0
+        self._first: tuple[Array, Scores] | None = None
         self._method = METHODS[settings.method]
         self._front = Front.empty(self._genome.n_genes, self._method.criteria)
         self._tried = self._feasible = 0
@@ -350,6 +365,8 @@ class _Search:
         self._phase = "search"
         random = np.random.default_rng((_FIRST, settings.seed))
         first = self._genome.sample(random, settings.population)
+        if isinstance(self._genome, ViaPointGenome) and len(goal.method.reach) > 1:
+            first = self._genome.contracted(first, goal.method.reach)
         evolution = Evolution(settings, first, 2 if goal.method.fitness is None else 1)
         while self._generations < settings.generations and not self._should_stop():
             children = evolution.ask()
@@ -357,6 +374,8 @@ class _Search:
                 self._exhausted = True
                 break
             scores = self._score(children)
+            if self._first is None:
+                self._first = children, scores
             evolution.tell(scores, goal.objectives(scores.measures))
         front = self._front
         if len(front) == 0:
@@ -364,18 +383,7 @@ class _Search:
         winner = goal.choice(front)
         genes = start = front.genes[winner]
         origin = trajectory, criteria = self._population.evaluate(start, RESCORE_PERIOD)
-        if settings.polish > 0 and not self._should_stop():
-            self._phase = "polish"
-            start_scores = front.scores(winner)
-            genes, _ = polish(
-                self._score,
-                start,
-                start_scores,
-                goal.polish_fitness(start_scores),
-                evaluations=settings.polish,
-                seed=settings.seed,
-                stop=self._should_stop,
-            )
+        genes = self._improved(goal, start, front.scores(winner))
         if genes.tobytes() != start.tobytes():
             trajectory, criteria = self._population.evaluate(genes, RESCORE_PERIOD)
             # better only at the search's sample period, or other genes of the same motion
@@ -400,6 +408,58 @@ class _Search:
             complete=not self._stopped,
             exhausted=self._exhausted,
         )
+
+    def _improved(self, goal: Goal, genes: Array, scores: Scores) -> Array:
+        """Return the genes (n_genes,) of the best motion, improved by gradient and polish."""
+        settings = self._settings
+        if settings.gradient > 0 and not self._should_stop():
+            self._phase = "gradient"
+            genes, scores = self._climbed(goal.polish_fitness(scores), genes, scores)
+        if settings.polish > 0 and not self._should_stop():
+            self._phase = "polish"
+            genes, _ = polish(
+                self._score,
+                genes,
+                scores,
+                goal.polish_fitness(scores),
+                evaluations=settings.polish,
+                seed=settings.seed,
+                stop=self._should_stop,
+            )
+        return genes
+
+    def _climbed(self, fitness: Fitness, genes: Array, scores: Scores) -> tuple[Array, Scores]:
+        """Return genes and scores of the best motion, improved by the gradient.
+
+        With several starts half of the steps are shared by this motion and the best ones of the
+        first generation; the other half improve what is best then.
+        """
+        settings = self._settings
+        ascent = Ascent(
+            self._score,
+            lambda genes, scores: self._population.linearise(genes, partials(fitness, scores)),
+            fitness,
+            self._should_stop,
+        )
+        steps, best = settings.gradient, (genes, scores)
+        if settings.starts > 1:
+            each = steps // (2 * settings.starts)
+            others = self._first_best(fitness, settings.starts - 1, genes)
+            found = [improve(ascent, *start, each) for start in (best, *others)]
+            best = max(found, key=lambda motion: float(fitness(motion[1])[0]))
+            steps -= each * len(found)
+        return improve(ascent, *best, steps)
+
+    def _first_best(self, fitness: Fitness, count: int, but: Array) -> list[tuple[Array, Scores]]:
+        """Return genes and scores of the best usable motions of the first generation but one."""
+        if self._first is None:
+            return []
+        genes, scores = self._first
+        values = np.where(scores.usable, fitness(scores), -np.inf)
+        order = np.argsort(-values, kind="stable")
+        chosen = [k for k in order.tolist() if np.isfinite(values[k])]
+        chosen = [k for k in chosen if genes[k].tobytes() != but.tobytes()]
+        return [(genes[k].copy(), scores.take(k)) for k in chosen[:count]]
 
     def _make_goal(self) -> Goal:
         """Return the goal, with a scale from random motions if the method needs one."""

@@ -1,0 +1,161 @@
+r"""Improvement of a feasible motion by the gradient of its criterion, from feasible to feasible.
+
+A proximal bundle method (Kiwiel 1985, "Methods of Descent for Nondifferentiable Optimization"),
+since criterion and duration have kinks: the slowest joint sets the time of a move. Each step solves
+
+.. math:: \max_d \; \min_i (\alpha_i + g_i^T d) - \tfrac{\rho}{2} d^T d
+
+over changes d of the genes in a box, with the linearised constraints of all motions i of the
+bundle. A step that fails adds the linearisation there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from identification.excitation.searches.population import Scores
+from identification.excitation.searches.tangent import Linearisation
+
+Array = NDArray[np.float64]
+Fitness = Callable[[Scores], Array]
+
+_BOX: Final = 0.1  # first half width of the box, as a fraction of each gene's range
+_WIDEST: Final = 0.2
+_SMALLEST: Final = 1e-4
+_CURVATURE: Final = 5.0  # rho
+_NONCONVEX: Final = 5.0  # least offset of the linearisation at a distance of 1
+_BUNDLE_SIZE: Final = 20  # linearisations in the bundle
+_SHARE: Final = 0.05  # of the predicted gain that makes a step
+_PATIENCE: Final = 4  # failures before the box is made smaller
+_FRACTIONS: Final = np.array((1.0, 0.4))  # of a step that are scored
+
+TRIED: Final = len(_FRACTIONS)
+"""Motions that a step scores."""
+
+
+class _Cut(NamedTuple):
+    """Linearisation at some genes (n_genes,), with the fitness there."""
+
+    genes: Array
+    fitness: float
+    slopes: Linearisation
+
+    def offset(self, genes: Array, fitness: float) -> float:
+        """Return by how much the linearisation may exceed the fitness at other genes, >= 0."""
+        change = genes - self.genes
+        error = self.fitness + float(np.sum(self.slopes.gradient * change)) - fitness
+        return max(abs(error), _NONCONVEX * float(np.sum(change**2)))
+
+    def left(self, genes: Array) -> Array:
+        """Return the linearised margins (1 + c,) at other genes."""
+        change = genes - self.genes
+        return np.asarray(self.slopes.left + np.sum(self.slopes.rows * change, axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Ascent:
+    """Functions of a search that an improvement by gradient calls."""
+
+    score: Callable[[Array], Scores]  #: of genes (m, n_genes)
+    #: of genes (n_genes,) with their scores (m = 1); None if the motion cannot be planned
+    linearise: Callable[[Array, Scores], Linearisation | None]
+    fitness: Fitness  #: to maximise; -inf is the worst
+    stop: Callable[[], bool]  #: asked before each step; true ends with the best motion so far
+
+
+def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[Array, Scores]:
+    """Return genes (n_genes,) and scores (m = 1) of a motion that is not worse than a feasible one.
+
+    Every motion that replaces another satisfies all constraints and has a larger fitness.
+    """
+    best, value = (genes.copy(), scores), float(ascent.fitness(scores)[0])
+    slopes = ascent.linearise(genes, scores)
+    if slopes is None:
+        return best
+    bundle, failures, box = [_Cut(best[0], value, slopes)], 0, _BOX
+    for _ in range(steps):
+        if box < _SMALLEST or ascent.stop():
+            break
+        centre = best[0]
+        here = next(cut for cut in bundle if cut.genes is centre)
+        near = [c for c in bundle if c is not here and np.abs(c.genes - centre).max() <= 2 * box]
+        bundle = [here, *near[-_BUNDLE_SIZE:]]
+        change, gain = _step(bundle, centre, value, box)
+        tried = np.clip(centre + _FRACTIONS[:, None] * change, 0.0, 1.0)
+        found = ascent.score(tried.copy())
+        values = np.where(found.usable, ascent.fitness(found), -np.inf)
+        index = int(np.argmax(values))
+        least = 0.0 if failures >= _PATIENCE else _SHARE * max(gain, 0.0)
+        if values[index] > value + least:
+            if values[index] - value > 0.5 * gain:
+                box = min(1.5 * box, _WIDEST)
+            best, value, failures = (tried[index].copy(), found.take(index)), values[index], 0
+            slopes = ascent.linearise(best[0], best[1])
+            if slopes is None:
+                break
+            bundle.append(_Cut(best[0], float(value), slopes))
+            continue
+        failures += 1
+        refused = _refused(ascent, tried[0].copy(), found.take(0))
+        if refused is not None:
+            bundle.append(refused)
+        if refused is None or failures >= _PATIENCE:
+            box *= 0.6
+            failures = min(failures, 1)
+    return best
+
+
+def _refused(ascent: Ascent, genes: Array, scores: Scores) -> _Cut | None:
+    """Return the linearisation at a motion that was no step, None if it has none."""
+    value = float(ascent.fitness(scores)[0])
+    if not (np.isfinite(value) and scores.exciting[0]):
+        return None
+    slopes = ascent.linearise(genes, scores)
+    return None if slopes is None else _Cut(genes, value, slopes)
+
+
+def _step(bundle: list[_Cut], genes: Array, fitness: float, box: float) -> tuple[Array, float]:
+    """Return the change of genes (n_genes,) with the best of the model, and its predicted gain."""
+    import clarabel  # slow to import
+
+    n = len(genes)
+    offsets = [0.0] + [cut.offset(genes, fitness) for cut in bundle[1:]]
+    rows = np.concatenate([-cut.slopes.rows for cut in bundle])
+    left = np.concatenate([np.maximum(cut.left(genes), 0.0) for cut in bundle])
+    within = left < box * np.abs(rows).sum(axis=1)  # the others hold in all of the box
+    rows, left = rows[within], left[within]
+    gradients = np.array([-cut.slopes.gradient for cut in bundle])
+    scale = np.abs(rows).max(axis=1, initial=0.0)
+    unit, zero = np.eye(n), np.zeros((n, 1))
+    matrix = np.block(
+        [
+            [rows / scale[:, None], np.zeros((len(rows), 1))],
+            [unit, zero],
+            [-unit, zero],
+            [gradients, np.ones((len(gradients), 1))],
+        ]
+    )
+    upper, lower = np.minimum(box, 1.0 - genes), np.minimum(box, genes)
+    bound = np.concatenate((left / scale, upper, lower, offsets))
+    quadratic = scipy.sparse.diags_array(np.append(np.full(n, _CURVATURE), 0.0)).tocsc()
+    settings: Any = clarabel.DefaultSettings()
+    settings.verbose = False
+    cones = [clarabel.NonnegativeConeT(len(bound))]
+    solution = clarabel.DefaultSolver(
+        quadratic,
+        np.append(np.zeros(n), -1.0),
+        scipy.sparse.csc_matrix(matrix),
+        bound,
+        cones,
+        settings,
+    ).solve()
+    found = np.array(solution.x)
+    if not np.all(np.isfinite(found)):
+        return np.zeros(n), 0.0
+    return found[:n], float(found[n])

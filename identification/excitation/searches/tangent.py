@@ -1,0 +1,223 @@
+r"""First-order change of criteria and constraints of a motion with its genes.
+
+The slope of a function :math:`F(\Phi^T\Phi)` along a motion is that of
+:math:`\sum_t \mathrm{tr}(\Phi_t M \Phi_t^T)` with :math:`M = \partial F / \partial(\Phi^T\Phi)`. It
+needs the regressor only near the sampled states, whatever the number of genes; how the states
+change with a gene follows from the interpolator, which plans each gene with a small step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.excitation.collision import CollisionChecker
+from identification.excitation.constraints import CurrentModel
+from identification.excitation.criteria import Objective
+from identification.model.motion import Motion
+from planner import FourierSeries, PiecewiseCubic, PlannerError
+
+if TYPE_CHECKING:
+    from identification.excitation.searches.population import Problem
+
+Array = NDArray[np.float64]
+
+N_SAMPLES: Final = 900
+"""Samples of a motion, the middles of equal steps: 22 ms of a motion of 20 s."""
+
+_GENE_STEP: Final = 1e-4
+_POSITION_STEP: Final = 1e-3  # rad or m
+_ACCELERATION_STEP: Final = 1.0  # exact: the regressor is linear in accelerations
+_DURATION_STEP: Final = 1e-3  # relative
+_LOADED: Final = 0.75  # loads above this fraction of the limit are followed
+_NEAR: Final = 0.08  # pairs of bodies closer than this to their least distance are followed [m]
+_RESERVE: Final = 1e-3  # kept of each bound, relative, against the rounding of a check
+
+
+class Pull(NamedTuple):
+    """Slopes (3, k, n) of one quantity by position, velocity and acceleration at k samples."""
+
+    samples: NDArray[np.intp]
+    slope: Array
+
+    def along(self, change: Array) -> float:
+        """Return the change of the quantity for a change of all states (3, N, n)."""
+        return float(np.einsum("ikn,ikn->", self.slope, change[:, self.samples]))
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """Slopes of a motion's criterion and constraints by its states."""
+
+    states: Array  #: position, velocity and acceleration (3, N, n)
+    duration: float  #: of the motion [s]
+    criterion: Pull  #: of the criterion
+    #: of the criterion by the duration [1/s]: a longer motion counts for more beside what is given
+    by_duration: float
+    margins: tuple[Pull, ...]  #: of what is left to the bounds of loads and distances, (c,)
+    left: Array  #: (1 + c,) to the longest duration [s], then of `margins`; negative if violated
+
+    def slopes(self, motion: PiecewiseCubic | FourierSeries, step: float) -> Array:
+        """Return the slopes (2 + c,) of criterion, duration's and other margins for one gene.
+
+        `motion` is planned with a gene changed by `step`.
+        """
+        change = (states_of(motion) - self.states) / step
+        longer = (motion.duration - self.duration) / step
+        margins = (margin.along(change) for margin in self.margins)
+        criterion = self.criterion.along(change) + self.by_duration * longer
+        return np.array((criterion, -longer, *margins))
+
+
+class Linearisation(NamedTuple):
+    """Criterion and margins of a motion to first order in its genes."""
+
+    gradient: Array  #: of the criterion (n_genes,)
+    rows: Array  #: gradients of the margins (1 + c, n_genes)
+    left: Array  #: the margins (1 + c,); negative if violated
+
+
+def states_of(motion: PiecewiseCubic | FourierSeries) -> Array:
+    """Return position, velocity and acceleration (3, N, n) in the middles of equal steps."""
+    time = (np.arange(N_SAMPLES, dtype=np.float64) + 0.5) * (motion.duration / N_SAMPLES)
+    return np.array(motion.sample(time))
+
+
+def tangent_of(problem: Problem, genes: Array, weights: Array) -> Tangent:
+    """Return the slopes of `weights` (d,) times the criteria, and of the margins, by the states.
+
+    Raises:
+        PlannerError: the motion cannot be planned.
+    """
+    (motion,) = problem.genome.motions(genes[None])
+    if isinstance(motion, PlannerError):
+        raise motion
+    states, constraints = states_of(motion), problem.constraints
+    # Steps of velocity as wide as its change between two samples: sgn(qd) jumps between them.
+    swing = np.abs(np.diff(states[1], axis=0)).max(axis=0)
+    n = states.shape[2]
+    steps = np.array(
+        (np.full(n, _POSITION_STEP), np.maximum(swing, 1e-3), np.full(n, _ACCELERATION_STEP))
+    )
+    left = [(1.0 - _RESERVE) * constraints.max_duration - motion.duration]
+    margins: list[tuple[Pull, float]] = []
+    if constraints.currents is not None:
+        margins += _loads(constraints.currents, states, steps)
+    if constraints.checker is not None:
+        margins += _distances(constraints.checker, states[0])
+    pulls = [pull for pull, _ in margins]
+    left += [margin for _, margin in margins]
+    slope, by_duration = _excitation(
+        problem.objective, states, steps, weights, motion.duration / N_SAMPLES
+    )
+    criterion = Pull(np.arange(N_SAMPLES), slope)
+    return Tangent(states, motion.duration, criterion, by_duration, tuple(pulls), np.array(left))
+
+
+def gene_steps(genes: Array) -> Array:
+    """Return the steps (n_genes,) by which genes are changed, towards the middle of their range."""
+    return np.where(genes > 0.5, -_GENE_STEP, _GENE_STEP)
+
+
+def gene_slopes(problem: Problem, tangent: Tangent, genes: Array, which: Array) -> Array:
+    """Return the slopes (k, 2 + c) for some genes (k,); 0 for one whose step cannot be planned."""
+    steps = gene_steps(genes)[which]
+    rows = np.repeat(genes[None], len(which), axis=0)
+    rows[np.arange(len(which)), which] += steps
+    slopes = np.zeros((len(which), 1 + len(tangent.left)))
+    for row, (motion, step) in enumerate(zip(problem.genome.motions(rows), steps, strict=True)):
+        if not isinstance(motion, PlannerError):
+            slopes[row] = tangent.slopes(motion, float(step))
+    return slopes
+
+
+def _neighbours(states: Array, steps: Array) -> Iterator[tuple[int, int, Array, Array, float]]:
+    """Yield for each state of each joint the states (3, N, n) above and below, and their gap."""
+    for kind, joint in np.ndindex(steps.shape):
+        step = float(steps[kind, joint])
+        above, below = states.copy(), states.copy()
+        above[kind, :, joint] += step
+        below[kind, :, joint] -= step
+        yield kind, joint, above, below, 2.0 * step
+
+
+def _excitation(
+    objective: Objective, states: Array, steps: Array, weights: Array, period: float
+) -> tuple[Array, float]:
+    """Return the slopes of the weighted criteria by the states (3, N, n), and by the duration."""
+    gram = objective.information(_motion(states, period))
+    by_duration = 0.0
+    if objective.given is not None:
+        longer, shorter = (
+            np.array([*objective.measures(_motion(states, factor * period)).values()]) @ weights
+            for factor in (1.0 + _DURATION_STEP, 1.0 - _DURATION_STEP)
+        )
+        change = 2.0 * _DURATION_STEP * N_SAMPLES * period
+        by_duration = float((longer - shorter) / change)
+    matrix = objective.slope(gram, weights)
+    slope = np.zeros_like(states)
+    for kind, joint, above, below, gap in _neighbours(states, steps):
+        difference = objective.along(_motion(above), matrix)
+        difference -= objective.along(_motion(below), matrix)
+        slope[kind, :, joint] = difference / gap
+    return slope, by_duration
+
+
+def _loads(currents: CurrentModel, states: Array, steps: Array) -> Iterator[tuple[Pull, float]]:
+    """Yield slope and margin, as a fraction, of each peak of the load of a motor or joint."""
+    loads = currents.loads(_motion(states))
+    peaks = [
+        (int(run[np.argmax(loads[run, column])]), column)
+        for column in range(loads.shape[1])
+        for run in _runs(loads[:, column] > _LOADED)
+    ]
+    if not peaks:
+        return
+    sample, column = np.array(peaks).T
+    samples, row = np.unique(sample, return_inverse=True)
+    chosen = states[:, samples]
+    slope = np.zeros((len(peaks), 3, 1, states.shape[2]))
+    for kind, joint, above, below, gap in _neighbours(chosen, steps):
+        change = (currents.loads(_motion(above)) - currents.loads(_motion(below))) / gap
+        slope[:, kind, 0, joint] = -change[row, column]
+    for peak, at, which in zip(slope, sample, column, strict=True):
+        yield Pull(np.array([at]), peak), float(1.0 - _RESERVE - loads[at, which])
+
+
+def _runs(which: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """Return the indices of each stretch of true values."""
+    chosen = np.flatnonzero(which)
+    if len(chosen) == 0:
+        return []
+    return np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
+
+
+def _distances(checker: CollisionChecker, q: Array) -> Iterator[tuple[Pull, float]]:
+    """Yield slope and margin [m] of each approach of two bodies along postures (N, n)."""
+    path, n = checker.path(q), q.shape[1]
+    pairs, count = len(checker.required), len(q)
+    pair, sample = np.indices((pairs, count)).reshape(2, -1)
+    bound = checker.separation.bound(path.bodies, pair, sample).reshape(pairs, count)
+    near = bound < checker.required[:, None] + _NEAR
+    for index in range(pairs):
+        for run in _runs(near[index]):
+            nearest = run[np.argmin(bound[index, run])]
+            postures = np.repeat(q[nearest][None], 2 * n, axis=0)
+            postures[:n] += _POSITION_STEP * np.eye(n)
+            postures[n:] -= _POSITION_STEP * np.eye(n)
+            around = checker.path(postures)
+            distance = np.array([checker.distance(index, around, k) for k in range(2 * n)])
+            here = checker.distance(index, path, int(nearest))
+            if not (np.isfinite(here) and np.all(np.isfinite(distance))):
+                continue
+            slope = np.zeros((3, 1, n))
+            slope[0, 0] = (distance[:n] - distance[n:]) / (2.0 * _POSITION_STEP)
+            yield Pull(np.array([nearest]), slope), here - (1 + _RESERVE) * checker.required[index]
+
+
+def _motion(states: Array, period: float = 1.0) -> Motion:
+    return Motion(period * np.arange(states.shape[1], dtype=np.float64), *states)

@@ -1,0 +1,204 @@
+"""Gradient of a motion's criteria by its genes, and the improvement that uses it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from identification.excitation.constraints import CurrentModel, midpoints
+from identification.excitation.criteria import SENSE, Given, measures
+from identification.excitation.searches import run
+from identification.excitation.searches.gradient import Ascent, improve
+from identification.excitation.searches.population import Population, Scores, SearchSettings
+from identification.excitation.searches.run import search
+from identification.excitation.searches.tangent import gene_slopes, states_of
+from identification.model.motion import Motion
+from planner import PlannerError
+from tests.identification.searching import bits, problem
+
+WEIGHTS = np.array([0.75, -0.25])
+SETTINGS = SearchSettings(
+    method="gradient", population=12, generations=2, seed=3, weights=(0.75, 0.25), gradient=8
+)
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch):
+    """Make the genomes of these tests importable in child processes."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
+
+
+def fitness(scores: Scores) -> np.ndarray:
+    return scores.measures @ WEIGHTS
+
+
+def limited(problem_):
+    """The problem with currents limited to the median of random motions."""
+    model = problem_.objective.model
+    currents = CurrentModel(
+        model,
+        np.abs(np.random.default_rng(4).standard_normal(model.n_parameters)),
+        np.eye(2),
+        np.ones(2),
+        np.ones(2),
+    )
+    genes = problem_.genome.sample(np.random.default_rng(5), 40)
+    loads = [
+        currents.loads(midpoints(motion)).max(axis=0) for motion in problem_.genome.motions(genes)
+    ]
+    currents = replace(currents, current_limit=np.median(loads, axis=0))
+    return replace(problem_, constraints=replace(problem_.constraints, currents=currents))
+
+
+@pytest.fixture(scope="module")
+def population():
+    with Population(limited(problem())) as population:
+        yield population
+
+
+@pytest.fixture(scope="module")
+def start(population):
+    """Genes and scores of the best feasible one of 60 random motions."""
+    genes = population.problem.genome.sample(np.random.default_rng(5), 60)
+    scores = population.score(genes)
+    best = int(np.argmax(np.where(scores.usable, fitness(scores), -np.inf)))
+    assert scores.usable[best]
+    return genes[best], scores.take(best)
+
+
+def test_slopes_are_derivatives_by_the_information():
+    random = np.random.default_rng(1)
+    root = random.standard_normal((40, 13)) * np.geomspace(0.1, 30.0, 13)
+    gram, change = root.T @ root, random.standard_normal((13, 13))
+    change = 1e-6 * (change + change.T)
+    objective = problem().objective
+    for weights in np.eye(len(SENSE)):
+        above, below = (
+            weights @ [*measures(gram + sign * change, 40).values()] for sign in (1.0, -1.0)
+        )
+        expected = np.sum(objective.slope(gram, weights) * change)
+        np.testing.assert_allclose((above - below) / 2.0, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["alone", "beside-earlier-recordings"])
+def test_the_gradient_predicts_changes_of_the_criteria(population, start, known):
+    """In random directions, along which no kink of the interpolator lies."""
+    genes, _ = start
+    problem_, random = population.problem, np.random.default_rng(2)
+    if known:
+        root = random.standard_normal((13, 40))
+        given = Given(root @ root.T / 40.0, 2.0)
+        problem_ = replace(problem_, objective=replace(problem_.objective, given=given))
+    tangent = problem_.tangent(genes, WEIGHTS)
+    gradient = gene_slopes(problem_, tangent, genes, np.arange(len(genes)))[:, 0]
+
+    def value(row):
+        (motion,) = problem_.genome.motions(row[None])
+        assert not isinstance(motion, PlannerError)
+        return WEIGHTS @ problem_.objective.criteria(motion, 1e-3).measures
+
+    changes = 1e-3 * random.standard_normal((12, len(genes)))
+    expected = [(value(genes + d) - value(genes - d)) / 2.0 for d in changes]
+    assert np.corrcoef(changes @ gradient, expected)[0, 1] > 0.95
+
+
+def test_margins_are_those_of_duration_and_currents(population, start):
+    genes, _ = start
+    found = population.linearise(genes, WEIGHTS)
+    (motion,) = population.problem.genome.motions(genes[None])
+    constraints = population.problem.constraints
+    states = states_of(motion)
+    loads = constraints.currents.loads(Motion(np.arange(states.shape[1]), *states)).max(axis=0)
+    np.testing.assert_allclose(found.left[0], 0.999 * constraints.max_duration - motion.duration)
+    followed = 0.999 - loads[loads > 0.75]
+    assert len(followed) > 0
+    assert all(np.any(np.isclose(found.left[1:], margin)) for margin in followed)
+    assert np.all((found.left[1:] >= np.min(followed)) & (found.left[1:] < 0.25))
+    assert found.rows.shape == (len(found.left), len(genes))
+
+
+class Watched:
+    """The ascent of a population; records what it scores and where it takes the slopes."""
+
+    def __init__(self, population, stop_after=99):
+        self.population, self.left = population, stop_after
+        self.scored, self.centres = [], []
+
+    def ascent(self):
+        def score(genes):
+            self.scored.append(self.population.score(genes))
+            return self.scored[-1]
+
+        def linearise(genes, _):
+            self.centres.append(genes)
+            return self.population.linearise(genes, WEIGHTS)
+
+        def stop():
+            self.left -= 1
+            return self.left < 0
+
+        return Ascent(score, linearise, fitness, stop)
+
+
+def test_an_improvement_is_feasible_and_beats_random_motions(population, start):
+    genes, scores = start
+    better, found = improve(Watched(population).ascent(), genes, scores, 15)
+    assert found.usable[0]
+    np.testing.assert_array_equal(population.score(better[None]).rows, found.rows)
+    random = population.score(population.problem.genome.sample(np.random.default_rng(6), 300))
+    most = np.max(np.where(random.usable, fitness(random), -np.inf))
+    assert fitness(found)[0] > max(most, fitness(scores)[0])
+
+
+@pytest.mark.parametrize("steps", [0, 1, 3])
+def test_stopped_early_the_motion_is_valid_and_not_worse(population, start, steps):
+    genes, scores = start
+    watched = Watched(population, steps)
+    better, found = improve(watched.ascent(), genes, scores, 15)
+    assert len(watched.scored) == steps
+    assert found.usable[0] and fitness(found)[0] >= fitness(scores)[0]
+    if steps == 0:
+        assert better.tobytes() == genes.tobytes()
+
+
+def test_the_number_of_processes_changes_no_bit(population):
+    with Population(population.problem, workers=3) as three:
+        assert bits(search(three, SETTINGS)) == bits(search(population, SETTINGS))
+
+
+def test_the_gradient_improves_the_short_search(population):
+    short = search(population, replace(SETTINGS, gradient=0))
+    design = search(population, SETTINGS)
+    assert design.chosen is None and design.origin_criteria == short.excitation.criteria
+    before, after = (np.array(each.excitation.criteria.measures) for each in (short, design))
+    assert WEIGHTS @ after > WEIGHTS @ before
+
+
+def test_several_starts_share_half_of_the_steps(monkeypatch, population):
+    """Each has an eighth of 32; the best of the four has the other half."""
+    taken = []
+
+    def recorded(ascent, genes, scores, steps):
+        found = improve(ascent, genes, scores, min(steps, 1))
+        taken.append((genes.tobytes(), fitness(scores)[0], steps, found[0].tobytes()))
+        return found
+
+    monkeypatch.setattr(run, "improve", recorded)
+    design = search(population, replace(SETTINGS, gradient=32, starts=4))
+    assert [steps for _, _, steps, _ in taken] == [4, 4, 4, 4, 16]
+    starts = [start for start, *_ in taken[:4]]
+    assert len(set(starts)) == 4
+    assert taken[0][1] == max(value for _, value, _, _ in taken[:4])
+    assert taken[4][0] in {end for *_, end in taken[:4]}
+    assert design.genes.tobytes() == taken[4][3]
+
+
+def test_the_first_generation_has_motions_near_home():
+    genome = replace(problem().genome, home=np.array([1.0, -1.0]))
+    genes = genome.sample(np.random.default_rng(1), 4)
+    drawn = genome.contracted(genes, (1.0, 0.5))
+    np.testing.assert_array_equal(drawn[::2], genes[::2])
+    points, nearer = (genome.decode(rows)[0][1::2] for rows in (genes, drawn))
+    np.testing.assert_allclose(nearer - genome.home, 0.5 * (points - genome.home), atol=1e-12)
+    assert drawn[:, 6:].tobytes() == genes[:, 6:].tobytes(), "speeds stay"
