@@ -71,7 +71,7 @@ def test_a_design_counts_all_recordings_together(campaign, given, tmp_path):
     """And the settings of its file name them, so that a design from it counts them again."""
     (tmp_path / "my.toml").write_text(SETTINGS)
     out = tmp_path / "out"
-    words = ["design", str(CELL_PATH), "--settings", str(tmp_path / "my.toml"), "--kinematic"]
+    words = ["design", str(CELL_PATH), "--settings", str(tmp_path / "my.toml"), "--limits-only"]
     words += ["--given", str(campaign.folder.root), "-o", str(out), "--workers", "1"]
     result = CliRunner().invoke(app, words, catch_exceptions=False)
     assert result.exit_code == 0, result.output

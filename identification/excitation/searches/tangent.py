@@ -10,21 +10,36 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.collision import CollisionChecker
-from identification.excitation.constraints import CurrentModel
+from identification.excitation.constraints import Constraints, CurrentModel
 from identification.excitation.criteria import Objective
+from identification.excitation.genomes import Genome
 from identification.model.motion import Motion
 from planner import FourierSeries, PiecewiseCubic, PlannerError
 
-if TYPE_CHECKING:
-    from identification.excitation.searches.population import Problem
-
 Array = NDArray[np.float64]
+
+
+class Problem(Protocol):
+    """What a tangent needs of a search's problem."""
+
+    @property
+    def genome(self) -> Genome:
+        """Decodes genes."""
+
+    @property
+    def objective(self) -> Objective:
+        """Evaluates excitation."""
+
+    @property
+    def constraints(self) -> Constraints:
+        """Of every motion."""
+
 
 N_SAMPLES: Final = 900
 """Samples of a motion, the middles of equal steps: 22 ms of a motion of 20 s."""
