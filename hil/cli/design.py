@@ -64,9 +64,7 @@ def design(
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/design"),
     method: Annotated[
         Method | None,
-        typer.Option(
-            help=f"Search method: {', '.join(METHODS)}. Default: gradient.", metavar="NAME"
-        ),
+        typer.Option(help=f"Search method: {', '.join(METHODS)}. Default: front.", metavar="NAME"),
     ] = None,
     settings: Path | None = None,
     show_settings: Annotated[Method | None, typer.Option(metavar="NAME")] = None,
@@ -137,7 +135,7 @@ def design(
     elif settings is not None:
         asked = load_settings(settings)
     else:
-        asked = preset(method or "gradient") if method or there is None else there
+        asked = preset(method or "front") if method or there is None else there
     if given:
         asked = asked.replaced(objective={"given": [str(path.resolve()) for path in given]})
     if seed is not None:

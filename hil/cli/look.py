@@ -16,6 +16,7 @@ from hil.look import Choice, Group, Look, Row, look_at
 from hil.look.maps import with_entries
 from hil.progress import say
 from hil.terminal_text import printable
+from identification.text import percentage
 
 IN_DOUBT = 2
 """Exit status of a recording with two readings that fit alike."""
@@ -74,7 +75,7 @@ def _print(found: Look) -> None:
     for choices in found.questions:
         typer.echo(f"\n{choices[0].aspect}: two readings fit alike; choose one line for the map:")
         for number, choice in enumerate(choices, 1):
-            error = "" if choice.error is None else f" (error {choice.error:.2%})"
+            error = "" if choice.error is None else f" (error {percentage(choice.error, 2)})"
             typer.echo(printable(f"  {number}  {choice.line or choice.reading}"))
             typer.echo(printable(f"     {choice.reading}{error}"))
     for option in found.options:

@@ -17,6 +17,7 @@ from hil.look.result import Choice, Look
 from hil.look.run import SETTINGS, look_at
 from identification.errors import IdentificationError
 from identification.signals.samples import prepare
+from identification.text import percentage
 from identification.validation.readings import score_of
 
 _SUSPECT: Final = 0.15
@@ -103,9 +104,11 @@ def _gravity(found: Look) -> tuple[float, ...] | None:
 
 
 def _undecided(source: Path, choices: tuple[Choice, ...]) -> SourceError:
+    errors = [
+        f" (error {percentage(choice.error, 1)})" if choice.error else "" for choice in choices
+    ]
     readings = " or ".join(
-        f"{choice.reading} (error {choice.error:.1%})" if choice.error else choice.reading
-        for choice in choices
+        choice.reading + error for choice, error in zip(choices, errors, strict=True)
     )
     lines = " or ".join(choice.line for choice in choices)
     remedy = (
@@ -118,8 +121,9 @@ def _undecided(source: Path, choices: tuple[Choice, ...]) -> SourceError:
 
 def _other_arm(source: Path, error: float) -> SourceError:
     problem = (
-        f"its torque does not follow the arm of the URDF: whatever the masses, {error:.0%} of it "
-        "stays unexplained, and no other unit, sign or order of the joints helps"
+        "its torque does not follow the arm of the URDF: whatever the masses, "
+        f"{percentage(error)} of it stays unexplained, and no other unit, sign or order of the "
+        "joints helps"
     )
     remedy = (
         "give the URDF of this arm; to identify in spite of that, give the column map "

@@ -27,6 +27,7 @@ FAILING = {
     "rehearse": ("rehearse", NOWHERE),
     "run": ("run", NOWHERE),
     "status": ("status", NOWHERE),
+    "look": ("look", NOWHERE),
     "identify": ("identify", NOWHERE),
     "report": ("report", NOWHERE),
     "new": ("new", "--urdf", NOWHERE, "-o", "cell.toml"),

@@ -354,6 +354,7 @@ class Conversation(Judged):
     # What the user does -------------------------------------------------------------------
 
     def request(self) -> None:
+        self._draw.chance(8)  # a draw of stored inputs that decides nothing any more
         self.ask_for(self._motion())
 
     def ask_for(self, source: ScriptedMotion) -> None:
@@ -379,6 +380,7 @@ class Conversation(Judged):
         value = draw.choice(WILD) if draw.chance(128) else 0.01 * (draw.byte() / 128.0 - 1.0)
         breaks = Breaks(fault, draw.below(31), draw.below(n), value)
         velocity = np.diff(rows, axis=0, prepend=rows[:1]) / self.arm.period
+        draw.chance(96)  # likewise
         return ScriptedMotion(rows, velocity, breaks, draw.choice(("plan", "stop")))
 
     def request_and_open(self) -> None:
