@@ -61,8 +61,7 @@ _MODEL_ERROR: Final = 0.05  # difference of log variance up to which two minima 
 _REVERSAL_PERIODS: Final = 0.5  # periods of the smoothing's bandwidth beside a velocity reversal
 _FOLDS: Final = 5
 _BLOCKS: Final = 80  # blocks of time
-_ENOUGH_ROWS: Final = 6000  # that show how the torque depends on a delay
-_STRETCH: Final = 512  # rows
+_ROWS_AT_ONCE: Final = 8192
 _CHANCE: Final = 0.005  # one-sided probability of a false delay
 
 
@@ -93,14 +92,13 @@ def predicted_rate(samples: Samples, torque: Array) -> Array:
 def rate_products(model: RobotModel, samples: Samples) -> Array:
     """Return sums ``W' d[W | t]/dt`` per joint (n, p, p + 1); t is of the known payload.
 
-    Of a long recording they are those of stretches, for all rows.
+    Of all rows: those of a stretch do not cancel as those of a whole motion do.
     """
     products = np.zeros((model.n_joints, model.n_parameters, model.n_parameters + 1))
     m = len(samples.torque)
-    # A low-pass needs all rows at once.
-    length = m if samples.torque_bandwidth is not None else _STRETCH
-    count = max(1, m // _ENOUGH_ROWS) if length < m else 1
-    for start in range(0, m, max(1, count * length)):
+    # A low-pass needs all rows at once; otherwise the regressor of a long recording is never whole.
+    length = m if samples.torque_bandwidth is not None else _ROWS_AT_ONCE
+    for start in range(0, m, max(1, length)):
         stop = min(start + length, m)
         first = max(start - 1, 0)  # a rate needs the rows beside
         part = samples.between(first, min(stop + 1, m))
@@ -111,8 +109,7 @@ def rate_products(model: RobotModel, samples: Samples) -> Array:
             usable = part.usable[inside, joint]
             places = np.ix_(columns, np.append(columns, model.n_parameters))
             products[joint][places] += block[inside][usable].T @ rate[usable]
-    stretches = range(0, m, max(1, length))
-    return products * len(stretches) / max(1, len(stretches[::count]))
+    return products
 
 
 def with_uncertain_delay(
