@@ -45,6 +45,7 @@ OTHER_PROGRAMS = {
     "echo": "changes the computer",
     "candump": "needs a CAN bus",
     "ssh": "needs another machine",
+    "dask": "needs other machines; tests start a scheduler and workers themselves",
     "make": "is how tests are run: its targets are looked up",
     "pip": "network",
     ".": "is the shell's own",

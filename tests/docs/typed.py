@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 SHELL = ("", "sh", "bash", "shell", "console")
 PROGRAMS = {"hil", "make", "python", "pip", "sudo", "ip", "printf", "echo", "candump",
-            "ssh", ".", "cp", "cd"}  # fmt: skip
+            "ssh", ".", "cp", "cd", "dask"}  # fmt: skip
 _REDIRECTION = re.compile(r" > \S+$")
 _BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 

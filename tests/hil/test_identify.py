@@ -209,7 +209,7 @@ class TestSources:
             identify_campaign(tmp_path, Silent())
         with pytest.raises(InputError, match="is a copy of"):
             identified(first, copy)
-        with pytest.raises(InputError, match="in-sample"):
+        with pytest.raises(InputError, match="omit --fit-all"):
             gather_sources([first], 0.7, [first], in_sample=True)
         with pytest.raises(ArchiveError, match=r"other\.mcap.*has another"):
             identified(first, imported(tmp_path / "other.mcap"))
