@@ -16,6 +16,7 @@ SAFETY: Final = (
     "disk",
     "drivers",
     "endurance",
+    "fuzz/test_corpora.py",
     "hil/test_campaign.py",
     "hil/test_live_link.py",
     "hil/test_supervision.py",
@@ -60,12 +61,14 @@ LONG: Final = (
     "hil/test_simulate.py",
     "hil/test_study.py",
     "hil/test_testing_plugin.py",
+    "hil/test_trajectory_files.py",
     "hil/test_viewers.py",
     "identification/test_gradient.py",
     "identification/test_instrumental.py",
     "identification/test_selection.py",
     "identification/test_payload.py",
     "identification/test_search.py",
+    "identification/test_torque_scale.py",
     "identification/test_verdict.py",
     "independent",
     "planner/test_interpolator.py",
@@ -84,11 +87,10 @@ QUICK: Final = (
     "drivers/test_states.py",
     "drivers/test_session_start.py",
     "drivers/test_udp.py",
-    "fuzz/test_corpora.py",
     "simulate/test_seeds_quick.py",
 )
-"""Files of these folders that run at every change all the same: packets, guard, transports, corpora
-of fuzzing and eight seeds of the simulation."""
+"""Files of these folders that run at every change all the same: packets, guard, transports and
+eight seeds of the simulation."""
 
 
 def tier_of(path: Path) -> Tier | None:
