@@ -26,6 +26,7 @@ from pydantic import TypeAdapter, ValidationError
 from hil.errors import InputError
 from hil.files import digest, json_digest, replace_file, user_cache
 from hil.reading import open_file
+from planner.arrays import DAMAGED
 
 from .places import folder_of, is_url
 
@@ -37,11 +38,14 @@ HEADER: Final = "header"  # array with the JSON text, as bytes
 
 LIBRARIES: Final = ("numpy", "scipy", "pin")  # that determine the numbers
 
-_DAMAGED: Final = (
-    *(OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, OverflowError),
-    *(BadZipFile, NotImplementedError, RuntimeError, struct.error, zlib.error, SyntaxError),
+_UNREADABLE: Final = (
+    *DAMAGED,
+    *(OSError, EOFError, MemoryError),
+    # By the `.zip` around the arrays: its directory, an unknown compression or encryption, its data.
+    *(BadZipFile, NotImplementedError, RuntimeError, struct.error, zlib.error),
+    SyntaxError,  # by the Python literal in the header of an array
 )
-"""What reading a damaged `.npz` raises."""
+"""What reading a damaged `.npz` raises; the entry is then computed again."""
 
 
 class CacheError(InputError):
@@ -93,7 +97,7 @@ class CacheLocation:
                 if header["key"] != key:
                     return None
                 return header["content"], {name: entry[name] for name in header["arrays"]}
-        except _DAMAGED:
+        except _UNREADABLE:
             return None
 
     def write(self, location: str, key: str, content: Any, arrays: Mapping[str, Any]) -> None:

@@ -344,8 +344,8 @@ class _Batch:
         The archives that did are removed from these, and reported.
         """
         archives = sum(self._uncached(campaign) for arm in arms for campaign in arm.campaigns)
-        #: by key of the future: what becomes of its result; no future is kept, so that the
-        #: workers release results that nothing else needs
+        #: who receives a result, by the key of its future. No reference to a future is held, so
+        #: that the workers release results that nothing else needs
         receivers: dict[str, Callable[[Any], None]] = {}
         damaged: list[_ArmWork] = []
 

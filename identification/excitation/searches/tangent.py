@@ -50,7 +50,7 @@ _ACCELERATION_STEP: Final = 1.0  # exact: the regressor is linear in acceleratio
 _DURATION_STEP: Final = 1e-3  # relative
 _LOADED: Final = 0.75  # loads above this fraction of the limit are followed
 _NEAR: Final = 0.08  # pairs of bodies closer than this to their least distance are followed [m]
-_RESERVE: Final = 1e-3  # kept of each bound, relative, against the rounding of a check
+_RESERVE: Final = 1e-3  # margin to each bound, relative, above the rounding of a check
 
 
 class Pull(NamedTuple):
