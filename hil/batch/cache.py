@@ -41,7 +41,7 @@ LIBRARIES: Final = ("numpy", "scipy", "pin")  # that determine the numbers
 _UNREADABLE: Final = (
     *DAMAGED,
     *(OSError, EOFError, MemoryError),
-    # By the `.zip` around the arrays: its directory, an unknown compression or encryption, its data.
+    # By the `.zip` around the arrays: its directory, compression, encryption or data.
     *(BadZipFile, NotImplementedError, RuntimeError, struct.error, zlib.error),
     SyntaxError,  # by the Python literal in the header of an array
 )

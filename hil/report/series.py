@@ -131,7 +131,7 @@ def example_series(
     if nominal is not None:
         torques["example_nominal"] = _means(samples.predicted_torque(model, nominal), step)
     time = few.motion.time
-    rows = _rows_between(time, *samples.motion.time[shown][[0, -1]]) if _any(shown) else shown
+    rows = _rows_within(time, samples.motion.time[shown])
     columns = for_figure(time, np.hstack([*torques.values()]))[rows]
     low_passed = dict(zip(torques, np.split(columns, len(torques), axis=1), strict=True))
     return {
@@ -162,10 +162,6 @@ def _means(torque: Array, step: int) -> Array:
     sums = np.add.reduceat(torque, starts, axis=0)
     means = sums / np.diff(np.append(starts, len(torque)))[:, None]
     return np.asarray(means[: len(torque[step // 2 :: step])])
-
-
-def _any(rows: slice) -> bool:
-    return bool(rows.stop > rows.start)
 
 
 def torque_parts(model: RobotModel, values: Array, samples: Samples) -> dict[str, Array]:
@@ -205,12 +201,14 @@ def _with_motion(samples: Samples, *, velocity: bool, acceleration: bool) -> Sam
     return replace(samples, motion=moving, parent=(parent, part))
 
 
-def _rows_between(time: Array, first: float, last: float) -> slice:
-    """Return the rows of times (m,) from the first to the last, at most `_ROWS`, at `_RATE`."""
-    start = int(np.searchsorted(time, first - 1e-9))
-    stop = int(np.searchsorted(time, last + 1e-9, side="right"))
+def _rows_within(time: Array, shown: Array) -> slice:
+    """Return rows of times (m,) within the shown ones, some `_RATE` a second, at most `_ROWS`."""
+    if not shown.size:
+        return slice(0, 0)
+    start = int(np.searchsorted(time, shown[0] - 1e-9))
+    stop = int(np.searchsorted(time, shown[-1] + 1e-9, side="right"))
     rows = stop - start
-    duration = max(float(time[stop - 1] - time[start]), 1e-9) if rows else 1.0
+    duration = max(float(shown[-1] - shown[0]), 1e-9)
     return slice(start, stop, max(int(rows / duration / _RATE), -(-rows // _ROWS), 1))
 
 
