@@ -155,6 +155,7 @@ def _array(figures: tuple[float, ...] | None) -> Array | None:
 MAX_RECORDINGS: Final = 32
 """Recordings that settings are chosen from."""
 _DELAY_SAMPLES: Final = 8000  # A stated delay is checked on the first samples of a recording
+_DELAY_RATE: Final = 250.0  # Hz, to which it is averaged; both positions and torques, without bias
 RIPPLE: Final = ((1,), (2,), (1, 2))
 """Periods of a torque ripple per motor turn: rotor eccentricity, wave generator, both."""
 
@@ -382,16 +383,18 @@ def _delays(
     """Estimate the delays in the longest fitted recording, or in its beginning if not requested."""
     if options.delay == "stated":
         return None
-    recording = max((source.recording for source in sources.training), key=lambda r: r.n_samples)
+    source = max(sources.training, key=lambda source: source.recording.n_samples)
     wanted = options.delay == "auto"
     if not wanted:
-        recording = recording.between(0, min(recording.n_samples, _DELAY_SAMPLES))
+        some = min(source.recording.n_samples, _DELAY_SAMPLES)
+        source = replace(source, recording=source.recording.between(0, some))
+    mean = averaged_source(source, _DELAY_RATE)
     with reporter.task("estimating the delay", 1) as task:
         try:
             found = estimate_delay(
-                recording,
+                mean.recording,
                 sources.cell.model,
-                noise_variance=sources.noise_variance,
+                noise_variance=_array(averaged_noise(stated, source, mean).noise_variance),
                 options=replace(stated.preprocessing, smooth_torque=False),
             )
         except IdentificationError:
@@ -399,7 +402,7 @@ def _delays(
                 raise
             return None
         task.advance(1)
-    return found
+    return replace(found, cycle=float(np.median(np.diff(source.recording.time))))
 
 
 def _described(found: DelayEstimate) -> list[str]:
