@@ -22,7 +22,7 @@ from hil.importers import Robot
 
 RATES: Final = (1000.0, 250.0)  # Hz
 DURATION: Final = 30.0  # s
-MINUTES: Final = (1.0, 2.0, 4.0)
+MINUTES: Final = (1.0, 2.0, 4.0, 8.0)
 MEMORY_RATE: Final = 1000.0  # Hz
 URDF: Final = ARMS["ns16"]
 _ARM: Final = ARM_TYPES["ns16"]

@@ -24,6 +24,7 @@ FIGURE_SAMPLES: Final = 4000
 FRICTION_POINTS: Final = 600
 """Points per joint in a friction figure."""
 _RECORDINGS: Final = 4  # fitted recordings in a friction figure
+_FRICTION_ROWS: Final = 20 * FRICTION_POINTS  # of each; a joint rests in many of them
 _MARGIN: Final = 1.0  # time shown before and after the motion, s
 
 
@@ -72,11 +73,18 @@ def _shown(samples: Samples) -> slice:
     return slice(first, last, max(1, (last - first) // FIGURE_SAMPLES))
 
 
+def _fewer_rows(samples: Samples) -> Samples:
+    """Return some rows of a long recording; all of one whose low-pass needs them."""
+    if samples.torque_bandwidth is not None:
+        return samples
+    return samples.thinned(max(1, len(samples.torque) // _FRICTION_ROWS))
+
+
 def _friction_data(
     model: RobotModel, values: Array, fitted: tuple[Samples, ...]
 ) -> tuple[Array, Array]:
     """Speed and friction torque of fitted rows, each (FRICTION_POINTS, n), padded with NaN."""
-    some = fitted[:: -(-len(fitted) // _RECORDINGS)]
+    some = [_fewer_rows(samples) for samples in fitted[:: -(-len(fitted) // _RECORDINGS)]]
     parts = [(one.motion.velocity, friction_torque(model, values, one), one.usable) for one in some]
     speed, torque, usable = (np.concatenate(column) for column in zip(*parts, strict=True))
     found = np.full((2, FRICTION_POINTS, model.n_joints), np.nan)

@@ -378,16 +378,21 @@ def useful_part(archive: Archive, recording: Recording) -> range | None:
 
 
 def _split(whole: Source, share: float) -> tuple[tuple[Source, ...], list[Source]]:
-    """Split a recording in two parts, each with the complete motion as context."""
-    recording, count = whole.recording, whole.recording.n_samples
-    cut, rows = round(share * count), np.arange(count)[:, None]
+    """Split a recording in two parts, each with the complete motion as context.
 
-    def part(words: str, start: int, stop: int) -> Source:
-        torque, current = (
-            None if values is None else np.where((rows >= start) & (rows < stop), values, 0.0)
-            for values in (recording.torque, recording.motor_current)
-        )
-        context = replace(recording, torque=torque, motor_current=current)
+    The first has no torque of the last in it, so that no filter of torques can bring it there.
+    """
+    recording = whole.recording
+    count = recording.n_samples
+    cut = round(share * count)
+    known = (np.arange(count) < cut)[:, None]
+    torque, current = (
+        None if values is None else np.where(known, values, 0.0)
+        for values in (recording.torque, recording.motor_current)
+    )
+    context = replace(recording, torque=torque, motor_current=current)
+
+    def part(words: str, context: Recording, start: int, stop: int) -> Source:
         return replace(
             whole,
             name=f"{whole.name} ({words})",
@@ -396,7 +401,7 @@ def _split(whole: Source, share: float) -> tuple[tuple[Source, ...], list[Source
             context=(context, start),
         )
 
-    return (part("first part", 0, cut),), [part("last part", cut, count)]
+    return (part("first part", context, 0, cut),), [part("last part", recording, cut, count)]
 
 
 def position_noise(cell: Cell, rest: Recording) -> Array:

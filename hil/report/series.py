@@ -132,8 +132,7 @@ def example_series(
         torques["example_nominal"] = _means(samples.predicted_torque(model, nominal), step)
     time = few.motion.time
     rows = _rows_within(time, samples.motion.time[shown])
-    columns = for_figure(time, np.hstack([*torques.values()]))[rows]
-    low_passed = dict(zip(torques, np.split(columns, len(torques), axis=1), strict=True))
+    low_passed = {name: for_figure(time, torque)[rows] for name, torque in torques.items()}
     return {
         "example_time": time[rows] - samples.origin,
         "example_used": few.usable[rows].astype(np.float64),

@@ -96,6 +96,9 @@ class Samples:
     def between(self, start: int, stop: int) -> Samples:
         """Return samples start to stop (exclusive), filtered as part of these."""
         part = slice(start, stop)
+        motion = self.motion.rows(part)
+        if motion.direction is not None:  # the whole recording's is not kept
+            motion = motion._replace(direction=motion.direction.copy())
         segments = [
             slice(max(one.start, start) - start, min(one.stop, stop) - start)
             for one in self.segments
@@ -103,7 +106,7 @@ class Samples:
         ]
         return replace(
             self,
-            motion=self.motion.rows(part),
+            motion=motion,
             torque=self.torque[part],
             usable=self.usable[part],
             segments=tuple(segments),

@@ -156,8 +156,14 @@ class SmoothingSpline:
 
     def __call__(self, time: Array, derivative: int = 0) -> Array:
         """Return value or derivative at times (m,): (m, c), per second to its power."""
-        rows = _rows(self.start, self.spacing, len(self.coefficients) - DEGREE, time, derivative)
-        return np.asarray(rows @ self.coefficients)
+        intervals = len(self.coefficients) - DEGREE
+        values = np.empty((len(time), self.coefficients.shape[1]))
+        # The basis functions of a long recording take many times the memory of its values.
+        for start in range(0, len(time), _ROWS_AT_ONCE):
+            some = slice(start, start + _ROWS_AT_ONCE)
+            rows = _rows(self.start, self.spacing, intervals, time[some], derivative)
+            values[some] = rows @ self.coefficients
+        return values
 
 
 def fit_smoothing_spline(

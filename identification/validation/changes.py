@@ -70,12 +70,13 @@ class _Part(NamedTuple):
             usable, block = samples.usable, block_index(samples)
             predicted = samples.predicted_torque(model, values)
             left = np.where(usable, samples.torque - predicted, 0.0)
-            torque += (np.where(usable, samples.torque, 0.0) ** 2).sum(axis=0)
-            error += (left**2).sum(axis=0)
+            torque += np.einsum("mj,mj,mj->j", samples.torque, samples.torque, usable)
+            error += np.einsum("mj,mj->j", left, left)
             columns = predicted, samples.predicted_torque(model, values, model.friction_columns)
             for table, column in zip(sums, columns, strict=True):
                 column = np.where(usable, column, 0.0)
-                table.append(_by_block(block, np.stack([column * left, column**2])))
+                products = (_by_block(block, column, factor) for factor in (left, column))
+                table.append(np.array([*products]))
         products = np.array([sum(part.sum(axis=1) for part in table) for table in sums])
         power = np.where(products[:, 1] > 0.0, products[:, 1], np.inf)
         gain, friction = (block_mean(table) for table in sums)
@@ -115,12 +116,10 @@ def find_changes(
     return tuple(found)
 
 
-def _by_block(block: NDArray[np.intp], values: Array) -> Array:
-    """Sum values (2, m, n) by block (2, B, n)."""
-    sums = np.zeros((len(values), int(block[-1]) + 1, values.shape[2]))
-    for table, rows in zip(sums, values, strict=True):
-        np.add.at(table, block, rows)
-    return sums
+def _by_block(block: NDArray[np.intp], first: Array, second: Array) -> Array:
+    """Sum products of two tables (m, n) by block (B, n)."""
+    joints = zip(first.T, second.T, strict=True)
+    return np.column_stack([np.bincount(block, one * other) for one, other in joints])
 
 
 def _relative(squares: Array, torque: Array) -> Array:

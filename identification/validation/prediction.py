@@ -22,6 +22,7 @@ FRICTION_CHANGE: Final = 0.10
 # Hz. The torque of a rigid arm lies below, torque ripple and current noise above.
 SLOW: Final = 10.0
 _ROWS_AT_ONCE: Final = 30_000  # of a low-pass
+_ROWS_COMPARED: Final = 8192  # at once
 FIGURE_BANDWIDTH: Final = 30.0  # Hz, the paper's Fig. 4
 
 
@@ -41,10 +42,23 @@ class PredictionError:
         cls, measured: Array, predicted: Array, usable: NDArray[np.bool_] | None = None
     ) -> PredictionError:
         """Compare predicted with measured torque (m, n) over usable rows (m, n)."""
+        total = cls._of_rows(measured[:0], predicted[:0], None)
+        # A long recording is never copied whole.
+        for start in range(0, len(measured), _ROWS_COMPARED):
+            rows = slice(start, start + _ROWS_COMPARED)
+            part = None if usable is None else usable[rows]
+            total = total + cls._of_rows(measured[rows], predicted[rows], part)
+        return total
+
+    @classmethod
+    def _of_rows(
+        cls, measured: Array, predicted: Array, usable: NDArray[np.bool_] | None
+    ) -> PredictionError:
         counts = np.ones(measured.shape, dtype=np.bool_) if usable is None else usable
-        error, torque = (np.where(counts, one, 0.0) for one in (measured - predicted, measured))
+        error = np.where(counts, measured - predicted, 0.0)
+        torque = np.where(counts, measured, 0.0)
         sums = (np.abs(error), error, error**2, torque, torque**2)
-        return cls(np.count_nonzero(counts, axis=0), *(one.sum(axis=0) for one in sums))
+        return cls(np.count_nonzero(counts, axis=0), *(terms.sum(axis=0) for terms in sums))
 
     def __add__(self, other: PredictionError) -> PredictionError:
         """Return the error over both sets of rows."""

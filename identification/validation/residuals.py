@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,9 +116,13 @@ def _profile(
     runs: Sequence[Samples], left: Sequence[Array], over: Sequence[Array], repeated: int
 ) -> Profile:
     """Average residuals (m, n) of usable rows in equal bins of each joint's own quantity."""
-    values, rows = np.concatenate(over), np.concatenate([run.usable for run in runs])
-    lowest = np.where(rows, values, np.inf).min(axis=0)
-    highest = np.where(rows, values, -np.inf).max(axis=0)
+    lowest = np.full(over[0].shape[1], np.inf)
+    highest = -lowest
+    for run, values in zip(runs, over, strict=True):
+        for joint, usable in enumerate(run.usable.T):
+            moving = values[usable, joint]
+            lowest[joint] = moving.min(initial=lowest[joint])
+            highest[joint] = moving.max(initial=highest[joint])
     moved = np.isfinite(lowest) & (highest > lowest)
     lowest, highest = np.where(moved, lowest, 0.0), np.where(moved, highest, 1.0)
     edges, sums = np.linspace(lowest, highest, BINS + 1, axis=1), []
@@ -191,6 +195,17 @@ class FrictionDrift(NamedTuple):
         return np.asarray(np.abs(self.change) > limit * self.change_std)
 
 
+def _drift_sums(
+    model: RobotModel, values: Array, samples: Samples, residual: Array, pieces: int
+) -> Array:
+    """Sum friction times residual (m, n), and friction squared, over P parts (2, P, n)."""
+    friction = samples.predicted_torque(model, values, model.friction_columns)
+    friction = np.where(samples.usable, friction, 0.0)
+    edges = np.linspace(0, len(residual), pieces + 1).astype(np.intp)[:-1]
+    factors = (residual, friction)
+    return np.array([np.add.reduceat(friction * factor, edges, axis=0) for factor in factors])
+
+
 def _friction_drift(sums: Sequence[Array]) -> FrictionDrift | None:
     """Fit a trend over all parts in order; None with too few."""
     if sum(one.shape[1] for one in sums) < _FEWEST_PIECES:
@@ -235,16 +250,19 @@ class Outliers(NamedTuple):
 def find_outliers(torque: Array, residual: Array, usable: Rows) -> Outliers:
     """Find outliers of measured torque and residual (m, n) in usable rows (m, n)."""
     far = np.zeros_like(usable)
+    total = np.zeros(residual.shape[1])
+    outlying = np.zeros_like(total)
     for joint, rows in enumerate(usable.T):
         if rows.any():
-            distance = np.abs(residual[:, joint] - np.median(residual[rows, joint]))
+            error = residual[:, joint]
+            distance = np.abs(error - np.median(error[rows]))
             limit = _BEYOND * _NORMAL * float(np.median(distance[rows]))
             far[:, joint] = rows & (distance > max(limit, np.finfo(np.float64).tiny))
-    squares = np.where(usable, residual, 0.0) ** 2
-    total = squares.sum(axis=0)
+            total[joint] = (error[rows] ** 2).sum()
+            outlying[joint] = (error[far[:, joint]] ** 2).sum()
     return Outliers(
         share=np.count_nonzero(far, axis=0) / np.maximum(np.count_nonzero(usable, axis=0), 1),
-        power=np.where(far, squares, 0.0).sum(axis=0) / np.where(total > 0.0, total, 1.0),
+        power=outlying / np.where(total > 0.0, total, 1.0),
         without=PredictionError.between(torque, torque - residual, usable & ~far),
     )
 
@@ -274,8 +292,13 @@ def autocorrelation(
 ) -> Autocorrelation:
     """Return the autocorrelation of residuals and usable rows (m, n) up to the longest lag [s]."""
     lags = max(2, min(_MOST_LAGS, round(longest / step)))
-    products = sum(_products(np.where(usable, left, 0.0), lags) for left, usable in residuals)
-    pairs = np.rint(sum(_products(usable.astype(np.float64), lags) for _, usable in residuals))
+    shape = (lags + 1, residuals[0][0].shape[1])
+    products, pairs = np.zeros((2, *shape))
+    for left, usable in residuals:
+        for joint, (column, rows) in enumerate(zip(left.T, usable.T, strict=True)):
+            products[:, joint] += _products(np.where(rows, column, 0.0), lags)
+            pairs[:, joint] += _products(rows.astype(np.float64), lags)
+    pairs = np.rint(pairs)
     covariance = products / np.maximum(pairs, 1.0)
     power = covariance[0]
     return Autocorrelation(
@@ -286,15 +309,14 @@ def autocorrelation(
 
 
 def _products(values: Array, lags: int) -> Array:
-    """Return sums of x(t) x(t + l) for l = 0 .. lags, per column (lags + 1, n)."""
-    m, n = values.shape
-    found = np.zeros((lags + 1, n))
+    """Return sums of x(t) x(t + l) of values (m,) for l = 0 .. lags (lags + 1,)."""
+    m = len(values)
+    products = np.zeros(lags + 1)
     reach = min(lags, m - 1)
     length = 1 << (m + reach - 1).bit_length()  # zero-padded against wrap-around
-    for products, column in zip(found.T, values.T, strict=True):
-        power = np.abs(np.fft.rfft(column, length)) ** 2
-        products[: reach + 1] = np.fft.irfft(power, length)[: reach + 1]
-    return found
+    power = np.abs(np.fft.rfft(values, length)) ** 2
+    products[: reach + 1] = np.fft.irfft(power, length)[: reach + 1]
+    return products
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,16 +356,15 @@ def check_residuals(
     left = [
         np.where(run.usable, run.torque - run.predicted_torque(model, values), 0.0) for run in runs
     ]
-    torque = np.array([(np.where(run.usable, run.torque, 0.0) ** 2).sum(axis=0) for run in runs])
+    torque = np.array(
+        [np.einsum("mj,mj,mj->j", run.torque, run.torque, run.usable) for run in runs]
+    )
     rows = np.maximum(sum(np.count_nonzero(run.usable, axis=0) for run in runs), 1)
     repeated = fitted if same_motion else 1
-    drift = []
     pieces = -(-_PIECES // fitted)
-    for run, own in zip(training, left, strict=False):
-        friction = run.predicted_torque(model, values, model.friction_columns)
-        tables = np.where(run.usable, [friction * own, friction**2], 0.0)
-        edges = np.linspace(0, len(own), pieces + 1).astype(np.intp)[:-1]
-        drift.append(np.add.reduceat(tables, edges, axis=1))
+    drift = [
+        _drift_sums(model, values, *pair, pieces) for pair in zip(training, left, strict=False)
+    ]
     ripple = None
     if motor_from_joint is not None:
         waves = [_ripple_sums(*one, motor_from_joint) for one in zip(runs, left, strict=True)]
@@ -351,10 +372,15 @@ def check_residuals(
     friction_power, seen = sum(one[1].sum(axis=0) for one in drift), torque[:fitted].sum(axis=0)
     judged = slice(fitted if held_out else 0, None)
     usable = [run.usable for run in runs]
+    outliers = find_outliers(
+        _joined([run.torque for run in runs[judged]]),
+        _joined(left[judged]),
+        _joined(usable[judged]),
+    )
     steps = [np.median(np.diff(run.motion.time)) for run in training]
     return ResidualChecks(
         torque_rms=np.sqrt(torque.sum(axis=0) / rows),
-        rms=np.sqrt(sum((own**2).sum(axis=0) for own in left) / rows),
+        rms=np.sqrt(sum(np.einsum("mj,mj->j", own, own) for own in left) / rows),
         autocorrelation=autocorrelation(
             list(zip(left[:fitted], usable[:fitted], strict=True)), float(np.median(steps))
         ),
@@ -363,9 +389,10 @@ def check_residuals(
         ripple=ripple,
         drift=_friction_drift(drift),
         friction_share=np.sqrt(friction_power / np.where(seen > 0.0, seen, 1.0)),
-        outliers=find_outliers(
-            np.concatenate([run.torque for run in runs[judged]]),
-            np.concatenate(left[judged]),
-            np.concatenate(usable[judged]),
-        ),
+        outliers=outliers,
     )
+
+
+def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Concatenate arrays, or return the only one."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
