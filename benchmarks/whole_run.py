@@ -32,7 +32,7 @@ _DELAY: Final = 0.0  # s
 
 def simulated_archive(folder: Path, duration: float, rate: float) -> Path:
     """Simulate and import a log of six axes; its arrays are beside the archive, as .npz."""
-    log = logged(drawn_arm(_ARM, 1), 1, 0, duration, _DELAY, Conditions(rate=rate))
+    log = logged(drawn_arm(_ARM, 1), 1, 0, duration, _DELAY, Conditions(rate=rate, scale=0.0))
     robot = Robot.from_urdf(urdf(URDF))
     joint_log = JointLog(robot, log.time, log.position, None, log.torque, _ARM.rated_payload)
     return joint_log.imported(folder / "log.mcap")
