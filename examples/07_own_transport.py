@@ -81,11 +81,12 @@ def main() -> None:
     ring = CycleRing(len(cell.joint_names), capacity=1000)
     guard = Guard(cell.guard_limits, cell.period)
     session = Session(cell.drive_train, guard, ring, **cell.session_settings())
-    link = VirtualLink(PipeTransport(pc_end, cell.period), session, ring, guard, cell)
+    transport = PipeTransport(pc_end, cell.period)
+    link = VirtualLink(transport, session, ring, cell)
     with TemporaryDirectory() as folder, stop_on_interrupt() as stop:
         archive = Path(folder) / "move_000_a1.mcap"
         move = plan_move(cell, link.connect(stop), cell.home)
-        print(send(move, cell, link, archive, stop=stop).outcome, link.transport.packets, "packets")
+        print(send(move, cell, link, archive, stop=stop).outcome, transport.packets, "packets")
         PICTURE.parent.mkdir(parents=True, exist_ok=True)
         save(draw_archive(view_of(archive, joints=("1",))), PICTURE)
 

@@ -20,8 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from hil.annotate import annotate as write_annotated
 from hil.errors import InputError
 from hil.files import make_folder, write_output
+from hil.identified_campaign import identify_paths
 from hil.identify.options import Options
-from hil.identify.run import Identification, identify_paths
+from hil.identify.run import Identification
 from hil.importers.recording import ImportOptions, RobotOf, is_archive
 from hil.importers.robot import Robot
 from hil.importers.staging import Staging, staged

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.events import MotionEnded
+from hil.campaign.connection import active_checks
 from hil.campaign.errors import MotionRefusedError
 from hil.campaign.intervals import Interval, player_of, straight_move
-from hil.campaign.link import MotionLink, active_checks
+from hil.campaign.link import MotionLink
 from hil.campaign.operator import MotionWatch, Stop, unwatched_motion
 from hil.campaign.plan import moves_to_dict
 from hil.cell import AngleFrame, Cell

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.transports.simulated import SimulatedTransport
-from hil.campaign.link import VirtualLink
+from hil.campaign.virtual_link import VirtualLink
 from hil.cell import Cell, CellError
 from hil.motion_checks import collision_checker
 from identification.text import percentage

@@ -12,9 +12,10 @@ if TYPE_CHECKING:
         NotRehearsedError,
     )
     from .folder import CampaignFolder
-    from .link import MotionLink, Progress, VirtualLink
+    from .link import MotionLink, Progress
     from .operator import Stop, stop_on_interrupt
     from .plan import CampaignPlan, PlannedMotion, design, plan_around
+    from .virtual_link import VirtualLink
 
 __all__ = [
     "Campaign",
@@ -36,7 +37,8 @@ __all__ = [
 _HOME = {
     "Campaign": "campaign",
     "CampaignFolder": "folder",
-    **dict.fromkeys(("VirtualLink", "MotionLink", "Progress"), "link"),
+    **dict.fromkeys(("MotionLink", "Progress"), "link"),
+    "VirtualLink": "virtual_link",
     **dict.fromkeys(("Stop", "stop_on_interrupt"), "operator"),
     **dict.fromkeys(("CampaignPlan", "PlannedMotion", "design", "plan_around"), "plan"),
 }

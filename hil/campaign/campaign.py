@@ -75,7 +75,7 @@ class Campaign(CampaignState):
             InputError: there is no complete excitation yet, or the archives cannot be used.
             OutputError: the folder cannot be written to.
         """
-        from hil.identify.run import identify_campaign  # which loads matplotlib, as below
+        from hil.identified_campaign import identify_campaign  # which loads matplotlib, as below
         from hil.outcome import write_outcome
 
         reporter = reporter or Silent()

@@ -9,10 +9,11 @@ from hil.archive import open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError
 
+from .connection import Connection, narrower_limits
 from .dry_run import DryRunRecord, not_accepted, yes_or_no
 from .errors import CampaignFolderError, DryRunError, NotRehearsedError
 from .folder import CampaignFolder
-from .link import Connection, MotionLink, narrower_limits
+from .link import MotionLink
 from .rehearsal import Rehearsal
 from .runner import RunOptions
 from .state import CampaignState

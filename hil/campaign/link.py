@@ -1,200 +1,53 @@
-"""Connections to a controller: run motions on it, or record those of its own program.
+"""The link to a controller: runs motions on it, or records those of its own program.
 
-`VirtualLink` is a `MotionLink` in virtual time, where exchange and archive share one thread;
-`hil.campaign.live_link` is that in real time.
+A `MotionLink` steers over a `ControllerPort`: that of `hil.campaign.virtual_link` in virtual time,
+that of `hil.campaign.live_link` in real time.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import dataclass, field, replace
-from typing import ClassVar, Final, Literal
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from typing import Final, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.drive_train import TURN, DriveTrain
-from drivers.errors import RequestError
-from drivers.events import Event, InitReceived, MotionEnded, MotionStarted, Refused
-from drivers.exchange.event_log import ExchangeEvent
-from drivers.exchange.loop import exchange
-from drivers.exchange.process import ExchangeProcess, WithdrawnError
-from drivers.guard import Guard
-from drivers.init_check import float32_text, is_narrower
-from drivers.motion_source import MotionSource, progress_of
-from drivers.packets import DRIVE_ON, InitPacket
-from drivers.record import CycleRing
-from drivers.session import Session
-from drivers.states import HAS_SET_POINTS, State
-from drivers.transports.base import Transport
-from drivers.transports.simulated import SimulatedTransport
-from hil.archive import ArchiveSpec, ArchiveWriter, Recorder
-from hil.archive.recorder import Recorded
+from drivers.errors import DriverError, RequestError
+from drivers.events import MotionEnded, Refused
+from drivers.exchange.control import HEARTBEAT_TIMEOUT, HeartbeatMonitor
+from drivers.exchange.event_log import NO_ARCHIVE
+from drivers.exchange.process import WithdrawnError
+from drivers.exchange.serving import ARM_MOVED
+from drivers.motion_source import MotionSource
+from drivers.states import HAS_SET_POINTS, Outcome, State
+from hil.archive import ArchiveSpec
+from hil.archive.live import LiveView
+from hil.archive.recorder import Recorded, describe
 from hil.cell import Cell
 from hil.errors import ArchiveWriteError, ControllerFault, OperatorStopError
-from hil.motion_checks import MotionChecks
 
+from .connection import Connection, StartTimeout, active_guard, described, not_ready
 from .errors import refusal_text
-from .operator import REFUSED, MotionProgress, MotionWatch, Stop, unwatched_motion
+from .operator import MotionWatch, Stop, unwatched_motion
+from .port import ControllerPort
+from .steering import REQUEST_PERIOD, Steering
 
 Array = NDArray[np.float64]
 
-START_TIMEOUT: Final = 60.0  # s within which an accepted motion must have started
-OFF_TIMEOUT: Final = 2.0  # s with the drive off after which an accepted motion is dropped
-END_TIMEOUT: Final = 30.0  # s within which a session must end after that was requested
+REST_TIMEOUT: Final = 30.0
+"""s for an arm to come to rest, and for the archive of a motion that has ended."""
+CLOSE_TIMEOUT: Final = 1.0  # s for the axes to close after the motion of a failed archive
+SLOW_DISK: Final = 1.0  # Duration of one flush that is reported as a fault of the disk, s
 NOT_STARTED: Final = "it had not begun"
 """Reason of a motion that was stopped before it was requested."""
-_WITHOUT_DRIVE: Final = (State.SYNC, State.INIT, State.DRIVE_OFF, State.FAULTED, State.ENDED)
-
-
-class StartTimeout:
-    """Detects that a motion accepted at `now` [s of any monotonic clock] will not start."""
-
-    def __init__(self, now: float) -> None:
-        self._requested = self._drive_on = now
-
-    def no_start(self, state: State, now: float) -> str | None:
-        """Return why a motion that has not started will not start; None while it may."""
-        if state not in _WITHOUT_DRIVE:
-            self._drive_on = now
-        if now - self._drive_on > OFF_TIMEOUT:
-            event = "a refusal came" if state is State.FAULTED else "the drive went off"
-            return f"{event} before the motion began"
-        if now - self._requested > START_TIMEOUT:
-            return f"the motion did not begin within {START_TIMEOUT:g} s ({state.name})"
-        return None
-
-
-REQUEST_PERIOD: Final = 0.02  # Period of reading the operator's request during a hold, s
-SHOW_PERIOD: Final = 0.1  # Period of showing the motion, s
-
-Counts = tuple[int, int, int, int]
-"""Packets of a session that got a reply, were missed, got it late, and whose reply was not
-accepted; see `drivers.events.Counters`."""
-
-
-class Steering:
-    """Applies the requests of a motion's watch to the motion, and shows the motion to it.
-
-    Args:
-        most: largest fraction of the planned speed, whatever is requested.
-        counts: returns the present packet counts.
-
-    Attributes:
-        fraction: applied to the motion last.
-        held: whether a hold was applied last.
-
-    Raises:
-        ValueError: `most` is not in 0..1.
-    """
-
-    def __init__(
-        self, source: MotionSource, watch: MotionWatch, most: float, counts: Callable[[], Counts]
-    ) -> None:
-        if not 0.0 < most <= 1.0:
-            raise ValueError(f"an override of {most!r} is not above 0 and at most 1")
-        self.source, self._watch, self._most, self._counts = source, watch, most, counts
-        duration = getattr(source, "duration", None)
-        self._duration = float(duration) if isinstance(duration, int | float) else None
-        self.fraction, self.held = most, False
-        self._before = counts()
-        self._last: NDArray[np.void] | None = None
-        self._due = -math.inf
-
-    def begin(self, stop: Stop, meanwhile: Callable[[], object]) -> bool:
-        """Set the requested speed and wait while a hold is requested; return False after a stop.
-
-        Raises:
-            ControllerFault: it is to be slower than planned and supports no override.
-        """
-        request = self._watch.request()
-        while request.held and not stop.requested:
-            meanwhile()
-            time.sleep(REQUEST_PERIOD)
-            request = self._watch.request()
-        if stop.requested:
-            return False
-        self.fraction = min(self._most, request.override)
-        change = getattr(self.source, "override", None)
-        if callable(change):
-            change(self.fraction)
-        elif self.fraction < 1.0:
-            raise ControllerFault(
-                f"a {type(self.source).__name__} supports no override and cannot be run at "
-                f"{100.0 * self.fraction:.0f} %; nothing was sent"
-            )
-        self._before = self._counts()
-        return True
-
-    def unchanged(self, stop: Stop) -> bool:
-        """Return whether the motion may begin as `begin` left it: no stop, hold or lower speed."""
-        request = self._watch.request()
-        return not (stop.requested or request.held or request.override < self.fraction)
-
-    def follow(self, motion: Session | ExchangeProcess) -> None:
-        """Apply the present request. A motion held before it began begins at rest."""
-        request = self._watch.request()
-        fraction = min(self._most, request.override)
-        with suppress(RequestError):  # the motion has ended
-            if fraction != self.fraction:
-                self.fraction = fraction
-                motion.override(fraction)
-        with suppress(RequestError):
-            if request.held is not self.held:
-                self.held = request.held
-                (motion.hold if request.held else motion.resume)()
-
-    @property
-    def due(self) -> bool:
-        """Whether the motion is to be shown again."""
-        return time.monotonic() >= self._due
-
-    def add_records(self, records: NDArray[np.void]) -> None:
-        """Add cycle records; the last one is shown."""
-        if len(records):
-            self._last = records[-1:].copy()
-
-    def show(
-        self, drives: DriveTrain, guard: Guard, state: State, motion_time: float, rate: float
-    ) -> None:
-        """Show the motion at `motion_time` s, at `rate` of the planned speed (NaN if unknown).
-
-        Shares are of the active limits of `drives` and `guard`.
-        """
-        self._due = time.monotonic() + SHOW_PERIOD
-        replied, missed, late, not_accepted = np.subtract(self._counts(), self._before).tolist()
-        arrays: dict[str, Array] = {}
-        if self._last is not None:
-            last = self._last[0]
-            arrays = {"position": last["position"].copy()}
-            if last["status"] == DRIVE_ON:  # else the controller has neither target nor current
-                error = last["target_position"] - last["position"]
-                turns = np.abs(error @ drives.motor_from_joint.T) / TURN
-                arrays |= {
-                    "following_error": error,
-                    "following_share": turns / guard.following_error,
-                    "current": last["target_current"].copy(),
-                    "current_share": np.abs(last["target_current"]) / guard.current,
-                }
-        self._watch.show(
-            MotionProgress(
-                motion_time=None if math.isnan(motion_time) else motion_time,
-                duration=self._duration,
-                cycles=replied,
-                missed=missed,
-                late=late,
-                not_accepted=not_accepted,
-                state=state,
-                override=self.fraction,
-                rate=None if math.isnan(rate) else rate,
-                held=self.held,
-                **arrays,
-            )
-        )
+STOPPED: Final = "stopped by the operator"
+READY: Final = frozenset((State.CLOSED, State.OPENING, State.OPEN))
+"""States with the drive on. A controller may open its axes at once: they are held where they are
+until a motion is requested."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,72 +75,45 @@ class Progress:
 Watch = Callable[[Progress], object]
 
 
-@dataclass(eq=False)
-class Connection:
-    """State of the controller since the link was opened.
-
-    Attributes:
-        unusable: why the arm cannot be moved, None if it can.
-        differences: figures in which it differs from the cell.
-        refused: the last refusal since a motion was requested.
-        report: receives a line for each refusal at once.
-        cell: of the link, for these lines.
-    """
-
-    init: InitPacket | None = None
-    unusable: str | None = None
-    differences: tuple[str, ...] = ()
-    refused: Refused | None = None
-    report: Callable[[str], object] = str
-    cell: Cell | None = None
-
-    def update(self, event: ExchangeEvent) -> None:
-        """Update the state with an event."""
-        if isinstance(event, InitReceived):
-            self.init, self.unusable = event.init, event.unusable
-            self.differences = event.differences
-        elif isinstance(event, Refused):
-            self.refused = event
-            text = str(event.error) if self.cell is None else refusal_text(self.cell, event.error)
-            self.report(f"{REFUSED}: {text}; {event.error.remedy}")
-
-    def require_usable(self) -> None:
-        """Raise ControllerFault if the controller is not the cell's."""
-        if self.unusable is not None:
-            remedy = "; correct the cell file, or the controller" if self.differences else ""
-            raise ControllerFault(f"the controller cannot be used: {self.unusable}{remedy}")
-
-
-def not_ready(state: State, waited: float) -> ControllerFault:
-    """Return the error of a controller that was not ready for a motion after `waited` s."""
-    after, restart = f"within {waited:.3g} s", "restart the program on the controller"
-    match state:
-        case State.SYNC:
-            problem = (
-                f"did not begin a session {after} (state SYNC): it is silent, or still in one that "
-                f"began before this program; {restart} and try again"
-            )
-        case State.ENDED:
-            problem = f"ended the session {after} before its drive was on; {restart} and try again"
-        case _:
-            problem = f"did not reach drive-on {after} (state {state.name}); switch the drive on"
-            problem += " and try again"
-    return ControllerFault(f"the controller {problem}")
-
-
-class MotionLink(ABC):
+class MotionLink:
     """Connection to a controller: runs motions and archives every cycle of them.
 
     Attributes:
-        cycles: records archived so far.
-        only_simulated: whether only a simulated controller can be connected.
+        cell: the cell.
+        port: of its controller.
+        connection: state of the controller.
+        cycles: records of the archives that were completed.
     """
 
-    cell: Cell
-    connection: Connection
-    cycles: int
-    only_simulated: bool
-    _READY: ClassVar[frozenset[State]]
+    def __init__(self, cell: Cell, port: ControllerPort) -> None:
+        self.cell, self.port, self.cycles = cell, port, 0
+        self.connection = Connection(cell=cell)
+        self._inits = 0  # until the controller was connected
+        self._ended_before = 0
+        self._position: Array | None = None
+
+    @property
+    def is_virtual(self) -> bool:
+        """Whether time is simulated."""
+        return self.port.is_virtual
+
+    @property
+    def only_simulated(self) -> bool:
+        """Whether only a simulated controller can be connected."""
+        return self.port.only_simulated
+
+    def notes(self) -> tuple[str, ...]:
+        """Return what the system refused, in sentences; none of it is needed."""
+        return self.port.notes()
+
+    @property
+    def live(self) -> LiveView | None:
+        """Where viewers connect, None if nowhere."""
+        return self.port.live
+
+    def close(self) -> None:
+        """End the connection; ControllerFault if it did not end properly."""
+        self.port.close()
 
     def connect(self, stop: Stop, timeout: float = 60.0) -> Array:
         """Exchange packets until the drive is on; return the target position (n,) [rad].
@@ -296,26 +122,31 @@ class MotionLink(ABC):
             ControllerFault: the controller was not ready within `timeout` s of the link's time,
                 cannot be used, or a stop was requested.
         """
-        began = self._now()
+        port = self.port
+        port.prepare(stop)
+        began = port.now
         target: Array | None = None
 
         def finished() -> bool:
             nonlocal target
             self._poll()
             self.connection.require_usable()
-            if len(records := self._new_records()):
+            if len(records := port.new_records()):
                 target = records["target_position"][-1].copy()
-            ready = target is not None and self._state() in self._READY
-            return ready or stop.requested or self._now() - began > timeout
+            ready = target is not None and port.status().state in READY
+            return ready or stop.requested or port.now - began > timeout
 
         self._exchange_until(finished, "the controller gets no replies")
         self._poll()
         self.connection.require_usable()
         if stop.requested:
             raise ControllerFault("stopped by the operator before anything moved")
-        if target is None or self._state() not in self._READY:
-            raise not_ready(self._state(), self._now() - began)
+        if target is None or port.status().state not in READY:
+            raise not_ready(port.status().state, port.now - began)
+        self._inits = self.connection.inits
         return target
+
+    # --- one motion; nothing here delays a reply
 
     def run(
         self,
@@ -342,26 +173,117 @@ class MotionLink(ABC):
                 is to be slowed and supports no override.
             ArchiveWriteError: the archive cannot be written; the motion was stopped.
         """
-        steering, self.connection.refused = Steering(source, watch, override, self._counts), None
+        steering = Steering(source, watch, self.port, override)
+        self.connection.refused = None
         steering.begin(stop, self._poll)  # no archive is open during a hold
         self._poll()
-        with self.open_archive(spec, own_motion=False):
+        with self._open_archive(spec, own_motion=False):
             # Opening it may last seconds: the requests are read again.
             while self._may_start(steering, stop):
-                self._new_records()
-                try:
-                    self._submit(source, lambda: steering.unchanged(stop))
-                except WithdrawnError:
-                    continue  # stopped, held or slowed meanwhile, or a new session began
-                except RequestError as error:
-                    self.complete("refused", str(error))
-                    raise ControllerFault(f"{error}; see the outcome of {spec.path}") from error
-                ended, refused = self._supervise(spec, steering, stop), self.connection.refused
+                with self.port.supervision():
+                    try:
+                        self._submit(source, spec, lambda: steering.unchanged(stop))
+                    except WithdrawnError:
+                        continue  # stopped, held or slowed meanwhile, or a new session began
+                    ended = _Supervision(self, spec, steering, stop).end()
+                refused = self.connection.refused
                 if refused is not None and ended.reason == str(refused.error):
                     return replace(ended, reason=refusal_text(self.cell, refused.error))
                 return ended
             self.complete("stopped", NOT_STARTED)
             return MotionEnded("stopped", NOT_STARTED, -1, -1)
+
+    def complete(self, outcome: str, reason: str) -> Recorded:
+        """Complete the archive that is open, and return what it contains."""
+        self._poll()
+        return self._counted(self.port.close_archive(outcome, reason))
+
+    def _counted(self, recorded: Recorded) -> Recorded:
+        self.cycles += recorded.records
+        return recorded
+
+    def _open_archive(
+        self, spec: ArchiveSpec, *, own_motion: bool
+    ) -> AbstractContextManager[object]:
+        self.connection.lost = None
+        return self.port.open_archive(described(spec, self.connection), own_motion=own_motion)
+
+    def _may_start(self, steering: Steering, stop: Stop) -> bool:
+        """Wait for the end of a hold; return whether the motion may be requested now."""
+        try:
+            return steering.begin(stop, self._poll)
+        except ControllerFault as error:
+            self.complete("void", str(error))
+            raise
+        finally:
+            self._poll()
+
+    def _submit(self, source: MotionSource, spec: ArchiveSpec, wanted: Callable[[], bool]) -> None:
+        """Request a motion; raise WithdrawnError where it is not `wanted` when it could start."""
+        if self.connection.inits > self._inits:  # with limits that no motion was checked against
+            reason = "the controller began a new session since it was connected"
+            self.complete("void", reason)
+            raise ControllerFault(
+                f"{reason}; nothing was sent, run again: its limits are checked again"
+            )
+        self._poll()
+        self.port.new_records()
+        self.connection.reset_motion()
+        self._ended_before = self.port.status().ended_count
+
+        def still_wanted() -> bool:
+            self._poll()
+            return self.connection.inits == self._inits and wanted()
+
+        try:
+            self.port.submit(source, still_wanted)
+        except WithdrawnError:
+            raise
+        except RequestError as error:
+            self.complete("refused", str(error))
+            raise ControllerFault(f"{error}; see the outcome of {spec.path}") from error
+        except DriverError as error:
+            self.require_archive(spec)
+            self.port.stop(str(error))
+            self._poll()
+            reason = self.port.failure() or str(error)
+            recorded = self.complete("void", reason)
+            raise ControllerFault(f"{reason}; {spec.path} is {recorded.outcome}") from error
+
+    @property
+    def motion_ended(self) -> bool:
+        """Whether the motion requested last has ended; its event may have been lost."""
+        ended = self.connection.ended is not None
+        return ended or self.port.status().ended_count != self._ended_before
+
+    def require_archive(self, spec: ArchiveSpec) -> None:
+        """Raise ControllerFault if the archive process is gone or hangs; the arm rests first."""
+        if (failure := self.port.archive_failure()) is not None:
+            rests = "the arm was brought to rest"
+            if not self.come_to_rest():
+                state = self.port.status().state.name
+                rests = f"the arm was asked to stop, but was not seen at rest ({state})"
+            readable = f"{spec.path} is readable up to its last part"
+            raise ControllerFault(f"{failure}; {rests}, and {readable}")
+
+    def come_to_rest(self) -> bool:
+        """Stop a motion that is not archived any more; return whether its end was seen."""
+        port, state = self.port, self.port.status
+        port.stop("the archive cannot be written")
+        deadline, closed_by = port.now + REST_TIMEOUT, math.inf
+
+        def finished() -> bool:
+            nonlocal closed_by
+            self._poll()
+            if not self.motion_ended:
+                return port.now > deadline
+            closed_by = min(closed_by, port.now + CLOSE_TIMEOUT)
+            return state().state not in HAS_SET_POINTS or port.now > closed_by
+
+        port.exchange_until(finished)
+        return self.motion_ended
+
+    # --- one recording
 
     def record(
         self,
@@ -381,7 +303,7 @@ class MotionLink(ABC):
         """
         self._await_session(stop, math.inf if wait is None else wait, watch)
         self.connection.require_usable()
-        with self.open_archive(spec, own_motion=True):
+        with self._open_archive(spec, own_motion=True):
             try:
                 recorded = self._record(spec, stop, duration, watch)
             except (ArchiveWriteError, ControllerFault) as error:
@@ -390,99 +312,260 @@ class MotionLink(ABC):
         self._reply_until_rest(stop, watch, "recording complete")
         return recorded
 
-    @abstractmethod
-    def close(self) -> None:
-        """End the connection; ControllerFault if it did not end properly."""
-
-    @abstractmethod
-    def open_archive(self, spec: ArchiveSpec, *, own_motion: bool) -> AbstractContextManager[None]:
-        """Open an archive, of one motion or of the controller's own; nothing moves before."""
-
-    @abstractmethod
-    def complete(self, outcome: str, reason: str) -> Recorded:
-        """Complete the archive that is open, and return what it contains."""
-
-    def _may_start(self, steering: Steering, stop: Stop) -> bool:
-        """Wait for the end of a hold; return whether the motion may be requested now."""
-        try:
-            return steering.begin(stop, self._poll)
-        except ControllerFault as error:
-            self.complete("void", str(error))
-            raise
-        finally:
-            self._poll()
-
     def _await_session(self, stop: Stop, wait: float, watch: Watch) -> None:
         """Exchange packets until the controller's init packet came."""
-        deadline = self._now() + wait
+        port, connection = self.port, self.connection
+        deadline = port.now + wait
 
         def finished() -> bool:
             self._poll()
-            self._show_recording(watch)
-            late = self._now() > deadline
-            return self.connection.init is not None or stop.requested or late
+            if port.due():
+                self._show_recording(watch)
+            return connection.init is not None or stop.requested or port.now > deadline
 
         self._exchange_until(finished, "nothing was recorded")
-        if self.connection.init is None and stop.requested:
+        if connection.init is None and stop.requested:
             raise OperatorStopError("ended before the controller came: nothing was recorded")
-        if self.connection.init is None:
-            raise ControllerFault(f"{self._no_session(wait)}: nothing was recorded")
+        if connection.init is None:
+            problem = "the controller did not start a session"
+            if math.isfinite(wait):
+                problem = f"no init packet within {wait:g} s; {self._waiting()}"
+            raise ControllerFault(f"{problem}: nothing was recorded")
 
-    # --- what the two kinds of link do differently
-
-    def _show_recording(self, watch: Watch, over: str = "") -> None:
-        """Show the state of a recording; in virtual time only when records are archived."""
-        del watch, over
-
-    def _reply_until_rest(self, stop: Stop, watch: Watch, reason: str) -> None:
-        """Continue to reply until the arm rests; in virtual time it may be left at once."""
-        del stop, watch, reason
-
-    @abstractmethod
-    def _now(self) -> float:
-        """Return the time of the link, s."""
-
-    @abstractmethod
-    def _state(self) -> State:
-        """Return the state of the session."""
-
-    @abstractmethod
-    def _poll(self) -> Sequence[ExchangeEvent]:
-        """Receive events, update the connection with them, and return them."""
-
-    @abstractmethod
-    def _new_records(self) -> NDArray[np.void]:
-        """Return the cycle records since the last call."""
-
-    @abstractmethod
-    def _counts(self) -> Counts:
-        """Return the packet counts of the session."""
-
-    @abstractmethod
-    def _exchange_until(self, finished: Callable[[], bool], consequence: str, /) -> None:
-        """Exchange packets until `finished()`; `consequence` ends the message of a failure."""
-
-    @abstractmethod
-    def _submit(self, source: MotionSource, wanted: Callable[[], bool], /) -> None:
-        """Request a motion; withdraw it where it is not `wanted()` when it could start.
-
-        Raises:
-            RequestError: it was not accepted, or withdrawn (WithdrawnError).
-        """
-
-    @abstractmethod
-    def _supervise(self, spec: ArchiveSpec, steering: Steering, stop: Stop) -> MotionEnded:
-        """Wait for the end of the requested motion and of its archive; pass on requests."""
-
-    @abstractmethod
     def _record(
         self, spec: ArchiveSpec, stop: Stop, duration: float | None, watch: Watch
     ) -> Recorded:
         """Record until an end is found, and complete the archive."""
+        port, connection, inits = self.port, self.connection, self.connection.inits
+        limit = math.inf if duration is None else round(duration / self.cell.period)
+        ending: tuple[str, str] | None = None
 
-    @abstractmethod
-    def _no_session(self, wait: float, /) -> str:
-        """Return the problem of a controller that began no session within `wait` s."""
+        def finished() -> bool:
+            nonlocal ending
+            due = port.due()
+            complete = port.status().cycle + 1 >= limit
+            if not (due or complete or stop.requested):
+                return False
+            # First the process: its last message and the last state of the session are known then.
+            failure = port.failure()
+            self._poll()
+            status, lost = port.status(), connection.lost
+            ending = recording_end(
+                restarted=connection.inits > inits,
+                complete=status.cycle + 1 >= limit,
+                ended=status.state is State.ENDED,
+                lost=failure or ("" if lost is None else describe(lost)),
+                stopped=stop.requested,
+                limited=duration is not None,
+                refused=connection.refused,
+            )
+            self._show_recording(watch)
+            if ending is None:
+                port.archived()
+                if (failure := port.archive_failure()) is not None:
+                    raise ControllerFault(f"{failure}; {spec.path} is readable up to its last part")
+            return ending is not None
+
+        if not port.exchange_until(finished):
+            finished()
+        return self.complete(*(ending or ("completed", "the controller ended the session")))
+
+    def _reply_until_rest(self, stop: Stop, watch: Watch, reason: str) -> None:
+        """Reply until the arm has rested for a second or no session is left.
+
+        The controller's own program continues after a recording, and its reaction to a silent PC
+        during a motion is not known. The operator may insist on an earlier end. In virtual time it
+        may be left at once.
+        """
+        port = self.port
+        if port.is_virtual:
+            return
+        stopped, still = stop.requested, Standstill(self.cell.period)
+        drive_on, received = port.now, 1
+        monitor = HeartbeatMonitor(lambda: received, max_interval=MAX_INTERVAL)
+        port.prepare(stop)
+        port.new_records()
+
+        def finished() -> bool:
+            nonlocal drive_on, received
+            if stop.insisted or (stop.requested and not stopped):
+                return True
+            state, now = port.status().state, port.now
+            if state is not State.DRIVE_OFF:
+                drive_on = now
+            if state in NO_SESSION or now - drive_on > OFF:
+                return True
+            self._poll()
+            records = port.new_records()
+            received += len(records) > 0
+            if still.add(records) or monitor.silence() > SILENCE:
+                return True
+            self._show_recording(watch, over=reason, records=records)
+            return False
+
+        port.exchange_until(finished)
+
+    def _show_recording(
+        self, watch: Watch, over: str = "", records: NDArray[np.void] | None = None
+    ) -> None:
+        records = self.port.new_records() if records is None else records
+        if len(records):
+            self._position = records["position"][-1].copy()
+        status = self.port.status()
+        watch(
+            Progress(
+                status.cycle,
+                status.missed,
+                status.state,
+                self._position,
+                late=status.late,
+                not_accepted=status.not_accepted,
+                waiting="" if status.replied else self._waiting(),
+                over=over,
+            )
+        )
+
+    def _waiting(self) -> str:
+        """Return what was received from a controller without a session."""
+        spec, problem = self.cell.link_spec, self.connection.not_understood
+        who = "the controller" if spec is None else spec.description
+        what = f"{who}: {problem}" if problem else f"no packet from {who}"
+        return f"{what} ({self.port.status().foreign} packets from other addresses)"
+
+    # --- both
+
+    def _poll(self) -> None:
+        """Receive events, and update the connection with them."""
+        for event in self.port.poll():
+            self.connection.update(event)
+
+    def _exchange_until(self, finished: Callable[[], bool], consequence: str) -> None:
+        """Exchange packets until `finished()`; `consequence` ends the message of a failure."""
+        if self.port.exchange_until(finished):
+            return
+        self._poll()
+        if (failure := self.port.failure()) is not None:
+            raise ControllerFault(f"{failure}; {consequence}")
+
+
+class _Supervision:
+    """Waits for the end of a motion that was requested, and of its archive; passes on requests."""
+
+    def __init__(self, link: MotionLink, spec: ArchiveSpec, steering: Steering, stop: Stop) -> None:
+        self._link, self._port, self._connection = link, link.port, link.connection
+        self._spec, self._steering, self._stop = spec, steering, stop
+        self._start = StartTimeout(link.port.now)
+        self._guard = active_guard(link.cell, link.connection.init)
+        self._no_start: str | None = None
+        self._recorded: Recorded | None = None
+        self._due = math.inf
+
+    def end(self) -> MotionEnded:
+        """Return how the motion ended, once its archive is complete.
+
+        Raises:
+            ControllerFault: it did not begin, or the link broke.
+            ArchiveWriteError: the archive cannot be written; the arm is at rest.
+        """
+        if not self._port.exchange_until(self._finished):
+            self._await_archive()
+        if self._recorded is None:
+            return self._give_up()
+        return self._ended(self._recorded)
+
+    def _finished(self) -> bool:
+        port, connection = self._port, self._connection
+        due = port.due()
+        if self._stop.requested:
+            port.stop(STOPPED)
+        if not due:
+            return False
+        self._link._poll()
+        self._steer()
+        if not (connection.started or self._link.motion_ended):
+            self._no_start = self._start.no_start(port.status().state, port.now)
+        return self._no_start is not None or self._is_archived()
+
+    def _steer(self) -> None:
+        """Show the motion and apply requests.
+
+        A simulated controller in virtual time waits for its reply: a hold takes no simulated time.
+        """
+        port, steering = self._port, self._steering
+        while True:
+            if steering.due:
+                steering.show(self._link.cell.drive_train, self._guard, port.status())
+            if not self._link.motion_ended:
+                steering.follow()
+            rests = port.is_virtual and steering.held and port.status().rate == 0.0
+            if not rests or self._stop.requested:
+                return
+            time.sleep(REQUEST_PERIOD)
+
+    def _is_archived(self) -> bool:
+        """Return whether the archive is complete; the arm rests before any error of it."""
+        try:
+            recorded = self._port.archived()
+        except Exception:
+            self._link.come_to_rest()
+            raise
+        if recorded is not None:
+            self._recorded = self._link._counted(recorded)
+            return True
+        self._link.require_archive(self._spec)
+        if self._link.motion_ended or self._port.failure() is not None:
+            self._due = min(self._due, self._port.now + REST_TIMEOUT)
+        if self._port.now > self._due:
+            late = f"{self._spec.path} was not completed within {REST_TIMEOUT:g} s"
+            raise ControllerFault(f"the motion has ended, but {late}")
+        return False
+
+    def _await_archive(self) -> None:
+        """Wait for the archive after the last reply: nothing else is left to be done."""
+        while not self._is_archived():
+            time.sleep(REQUEST_PERIOD)
+
+    def _ended(self, recorded: Recorded) -> MotionEnded:
+        """Return how the motion of a completed archive ended."""
+        self._link._poll()
+        ended = self._connection.ended
+        if ended is None and recorded.outcome in get_args(Outcome) and self._link.motion_ended:
+            outcome: Outcome = recorded.outcome  # type: ignore[assignment]
+            ended = MotionEnded(outcome, recorded.reason, recorded.interval, -1)
+        if ended is None:
+            failure = self._port.failure() or recorded.reason
+            raise ControllerFault(
+                f"{failure}; the controller gets no replies and acts by its own watchdog; "
+                f"the archive ({recorded.outcome}) is complete up to then"
+            )
+        if ended.reason == NO_ARCHIVE:
+            return replace(ended, reason=archive_silence(recorded.disk_waited))
+        return ended
+
+    def _give_up(self) -> MotionEnded:
+        """Drop a motion that has not started; without an archive it cannot start any more."""
+        refused, reason = self._connection.refused, self._no_start or NOT_STARTED
+        reason = reason if refused is None else str(refused.error)
+        self._link.complete("void" if refused is None else "refused", reason)
+        self._port.stop(reason)
+        if refused is None:
+            raise ControllerFault(f"{reason}; nothing was sent ({self._spec.path})")
+        return MotionEnded("refused", reason, -1, -1)
+
+
+def archive_silence(disk_waited: float) -> str:
+    """Return why a motion was stopped without heartbeats of the archive process, with a remedy.
+
+    `disk_waited` is the longest time that it waited for its disk [s].
+    """
+    if disk_waited > SLOW_DISK:
+        cause = f"it waited for its disk for {disk_waited:.1f} s: check that disk"
+    else:
+        cause = (
+            "it was suspended, or this PC gave it no processor time: end other programs, and "
+            "check this PC with `hil doctor`"
+        )
+    return f"{NO_ARCHIVE}, for more than {HEARTBEAT_TIMEOUT:g} s ({cause})"
 
 
 def recording_end(
@@ -511,300 +594,37 @@ def recording_end(
     return ("refused", str(refused.error)) if end is not None and refused is not None else end
 
 
-def described(spec: ArchiveSpec, connection: Connection) -> ArchiveSpec:
-    """Return the archive with the init packet."""
-    if connection.init is None:
-        return spec
-    packet = {"init_packet.bin": connection.init.encode()}
-    return replace(spec, attachments={**spec.attachments, **packet})
+SILENCE: Final = 1.0  # s without a packet after which the controller is assumed to have gone
+MAX_INTERVAL: Final = 0.1  # Longest time between two looks that counts as such a silence, s
+NO_SESSION: Final = frozenset((State.SYNC, State.INIT, State.ENDED))  # States without a session
+TARGET_MOVED: Final = 1e-5  # rad; a target at rest does not change, but its rounding may
+REST: Final = 1.0  # s of the controller's time without motion after which the arm is at rest
+OFF: Final = 1.0
+"""s with the drive off after which replies end; a session that is being ended has ended by then."""
 
 
-def active_guard(cell: Cell, init: InitPacket | None) -> Guard:
-    """Return a guard with the narrower limits of the cell and the controller."""
-    guard = Guard(cell.guard_limits, cell.period)
-    if init is not None:
-        current = np.fmin(_stated(cell, init, "current_limit"), cell.drive_train.current_limit)
-        guard.narrow(_stated(cell, init, "following_error"), current)
-    return guard
+class Standstill:
+    """Detects rest of target and arm, with `period` s; unknown positions count as moving."""
+
+    def __init__(self, period: float) -> None:
+        self._cycles = round(REST / period)
+        self._still: NDArray[np.void] | None = None
+
+    def add(self, records: NDArray[np.void]) -> bool:
+        """Return whether the arm has been at rest for `REST` at the end of these records (k,)."""
+        for record in records:
+            last = self._still
+            if (
+                last is None
+                or not record["cycle"] > last["cycle"]
+                or not _close(record, last, "target_position", TARGET_MOVED)
+                or not _close(record, last, "position", ARM_MOVED)
+            ):
+                self._still = record.copy()
+        if self._still is None or not len(records):
+            return False
+        return int(records["cycle"][-1]) - int(self._still["cycle"]) >= self._cycles
 
 
-def active_checks(
-    cell: Cell, connection: Connection, checks: MotionChecks | None = None
-) -> MotionChecks:
-    """Return checks with the narrower current limits of cell and controller.
-
-    `checks` itself is returned where both are the cell's.
-    """
-    checks = MotionChecks.of(cell) if checks is None else checks
-    if connection.init is None:
-        return checks
-    return checks.within(_stated(cell, connection.init, "current_limit"))
-
-
-Limit = Literal["current_limit", "following_error"]
-
-
-def narrower_limits(cell: Cell, connection: Connection, limit: Limit) -> tuple[str, ...]:
-    """Return a sentence for each limit of the controller that is below the cell's.
-
-    No model predicts the following error of a servo: motions cannot be checked against it.
-    """
-    if connection.init is None:
-        return ()
-    stated, own = _stated(cell, connection.init, limit), getattr(cell.drive_table, limit)
-    unit = "A" if limit == "current_limit" else "motor revolutions"
-    return tuple(
-        f"{cell.joint_names[joint]}: {float32_text(stated[joint])} {unit} in the controller, "
-        f"{own[joint]:.9g} in the cell file"
-        for joint in np.flatnonzero(is_narrower(stated, np.array(own)))
-    )
-
-
-def _stated(cell: Cell, init: InitPacket, limit: Limit) -> Array:
-    """Return a limit of the cell's arm in an init packet (n,), NaN where it has none."""
-    values = getattr(init, limit)[cell.controller.arm - 1, : len(cell.joint_names)]
-    return np.asarray(values, dtype=np.float64)
-
-
-DRAIN_CYCLES: Final = 100
-"""Cycles after which records are archived: 100 ms at 1 kHz, the flush period."""
-AFTERMATH_CYCLES: Final = 1000
-"""Most cycles until the archive of a refused or lost motion is complete."""
-
-
-@dataclass(eq=False, repr=False)
-class VirtualLink(MotionLink):
-    """Session, transport and recorder of one connection in virtual time.
-
-    Attributes:
-        guard: the session's, with the active limits.
-        finish: asks the controller to end the session.
-    """
-
-    transport: Transport
-    session: Session
-    ring: CycleRing
-    guard: Guard
-    cell: Cell
-    finish: Callable[[], None] = field(default=lambda: None)
-    cycles: int = 0
-    connection: Connection = field(default_factory=Connection)
-    only_simulated: bool = True
-    _archiving: _Archiving | None = None
-    _READY: ClassVar[frozenset[State]] = frozenset((State.CLOSED,))
-
-    def __post_init__(self) -> None:
-        self.connection.cell = self.cell
-
-    @classmethod
-    def over(
-        cls,
-        transport: SimulatedTransport,
-        cell: Cell,
-        finish: Callable[[], None] = lambda: None,
-        *,
-        only_axis: int | None = None,
-    ) -> VirtualLink:
-        """Return a link to the simulated controller of `cell` (TypeError for a real transport)."""
-        if not isinstance(transport, SimulatedTransport):
-            raise TypeError(
-                f"{type(transport).__name__} is not virtual time: on a real link the exchange "
-                "must not share a thread with the archive"
-            )
-        ring = CycleRing(len(cell.joint_names), capacity=10 * DRAIN_CYCLES)
-        guard = Guard(cell.guard_limits, cell.period)
-        settings = cell.session_settings(only_axis=only_axis)
-        session = Session(cell.drive_train, guard, ring, **settings)
-        return cls(transport, session, ring, guard, cell, finish)
-
-    def close(self) -> None:
-        """Ask the controller to end the session, and reply until it does, at most `END_TIMEOUT` s.
-
-        A restarted controller was not asked, and continues with closed axes.
-
-        Raises:
-            ControllerFault: an axis is still open after that time.
-        """
-        self.finish()
-        deadline = self.transport.now + END_TIMEOUT
-
-        def finished() -> bool:
-            self.ring.drain()
-            return self.transport.now > deadline
-
-        exchange(self.transport, self.session, ends_when=finished)
-        if self.session.state in HAS_SET_POINTS:
-            raise ControllerFault(
-                f"an axis is still open {END_TIMEOUT:g} s after the controller was asked to end"
-            )
-
-    @contextmanager
-    def open_archive(self, spec: ArchiveSpec, *, own_motion: bool) -> Iterator[None]:
-        """See `MotionLink.open_archive`; records of before belong to a recording only."""
-        spec = described(spec, self.connection)
-        with spec.open() as writer:
-            self._archiving = _Archiving(self, writer)
-            if not own_motion:
-                self.ring.drain()
-                self._poll()
-            try:
-                yield
-            finally:
-                self._archiving = None  # which refers to this link
-
-    def complete(self, outcome: str, reason: str) -> Recorded:
-        """See `MotionLink.complete`."""
-        return self._open_archiving.recorder.close(outcome, reason)
-
-    @property
-    def _open_archiving(self) -> _Archiving:
-        assert self._archiving is not None, "no archive is open"
-        return self._archiving
-
-    def _submit(self, source: MotionSource, _wanted: Callable[[], bool], /) -> None:
-        self.session.request(source)
-
-    def _supervise(self, spec: ArchiveSpec, steering: Steering, stop: Stop) -> MotionEnded:
-        archiving = self._open_archiving
-        archiving.steering = steering
-        recorder, start, no_start = archiving.recorder, StartTimeout(self.transport.now), None
-        until_drain, patience = 1, AFTERMATH_CYCLES  # requests apply from the first cycle on
-
-        def finished() -> bool:
-            nonlocal until_drain, patience, no_start
-            if stop.requested:
-                self.session.stop("stopped by the operator")
-            until_drain -= 1
-            if until_drain == 0 or not (self.session.requested or recorder.ended):
-                until_drain = DRAIN_CYCLES
-                archiving.update()
-                self._steer(steering, stop)
-                if not archiving.started:
-                    no_start = start.no_start(self.session.state, self.transport.now)
-            patience -= recorder.ended is not None
-            # A motion stopped while its axes opened has not started; they have to close.
-            complete = recorder.complete and self.session.state not in HAS_SET_POINTS
-            return complete or patience < 0 or no_start is not None
-
-        exchange(self.transport, self.session, ends_when=finished)
-        if no_start is not None:
-            self.session.stop(no_start)
-        archiving.finish()
-        if no_start is not None:
-            self.complete("void", no_start)
-            raise ControllerFault(f"{no_start}; nothing was sent ({spec.path})")
-        ended = recorder.ended or MotionEnded("lost", "the link ended", -1, -1)
-        self.complete(ended.outcome, ended.reason)
-        return ended
-
-    def _steer(self, steering: Steering, stop: Stop) -> None:
-        """Show the motion and apply requests; return when no hold is active.
-
-        The simulated controller waits for its reply: a hold takes no simulated time.
-        """
-        while True:
-            motion_time, rate = progress_of(steering.source)
-            if steering.due:
-                drives, state = self.session.drive_train, self.session.state
-                steering.show(drives, self.guard, state, motion_time, rate)
-            steering.follow(self.session)
-            rests = progress_of(steering.source)[1] == 0.0
-            if not (steering.held and rests) or stop.requested:
-                return
-            time.sleep(REQUEST_PERIOD)
-
-    def _record(
-        self, spec: ArchiveSpec, stop: Stop, duration: float | None, watch: Watch
-    ) -> Recorded:
-        archiving = self._open_archiving
-        recorder, until_drain = archiving.recorder, DRAIN_CYCLES
-        limit = np.inf if duration is None else round(duration / spec.period)
-
-        def finished() -> bool:
-            nonlocal until_drain
-            until_drain -= 1
-            if until_drain == 0:
-                until_drain = DRAIN_CYCLES
-                archiving.update()
-                newest = self.ring.last(1)
-                position = newest["position"][0] if len(newest) else None
-                missed, state = self.session.counters.missed, self.session.state
-                watch(Progress(recorder.records, missed, state, position))
-            full = recorder.records + DRAIN_CYCLES - until_drain >= limit
-            return full or stop.requested or recorder.restarted or recorder.link_lost
-
-        exchange(self.transport, self.session, ends_when=finished)
-        archiving.finish()
-        end = recording_end(
-            restarted=recorder.restarted,
-            complete=recorder.records >= limit,
-            ended=self.session.state is State.ENDED,
-            lost="no packet arrives from the controller any more" if recorder.link_lost else "",
-            stopped=stop.requested,
-            limited=duration is not None,
-            refused=recorder.refused,
-        ) or ("completed", "the controller ended the session")
-        return self.complete(*end)
-
-    def _no_session(self, _wait: float, /) -> str:
-        return "the controller did not start a session"
-
-    def _now(self) -> float:
-        return self.transport.now
-
-    def _state(self) -> State:
-        return self.session.state
-
-    def _poll(self) -> list[Event]:
-        events = self.session.events()
-        for event in events:
-            self.connection.update(event)
-        return events
-
-    def _new_records(self) -> NDArray[np.void]:
-        return self.ring.drain()
-
-    def _exchange_until(self, finished: Callable[[], bool], _consequence: str, /) -> None:
-        exchange(self.transport, self.session, ends_when=finished)
-
-    def _counts(self) -> Counts:
-        counters = self.session.counters
-        late = counters.discarded.get("late", 0) + counters.discarded.get("replied to late", 0)
-        return counters.replied, counters.missed, late, counters.rejected
-
-
-class _Archiving:
-    """Moves records and events from the session into an archive, and to `steering`."""
-
-    def __init__(self, link: VirtualLink, writer: ArchiveWriter) -> None:
-        self.recorder = Recorder(writer, link.session.drive_train)
-        self.started = False
-        self.steering: Steering | None = None
-        self._failure: Exception | None = None
-        self._link = link
-        self._overflow = link.ring.overflow
-
-    def update(self) -> None:
-        """Archive what came since the last call; a failure stops the motion on its path."""
-        link, recorder = self._link, self.recorder
-        events, records, before = link._poll(), link.ring.drain(), recorder.records
-        self.started |= any(isinstance(one, MotionStarted | MotionEnded) for one in events)
-        earlier = self._overflow
-        self._overflow = link.ring.overflow
-        if self.steering is not None:
-            self.steering.add_records(records)
-        if self._failure is not None:
-            recorder.update(events)
-            return
-        try:
-            recorder.record(records, events, self._overflow - earlier)
-        except Exception as error:  # of any kind: the arm comes to rest first
-            self._failure = error
-            link.session.stop("the archive cannot be written")
-        link.cycles += recorder.records - before
-
-    def finish(self) -> None:
-        """Archive the rest, and raise what failed before."""
-        self.update()
-        if self._failure is not None:
-            raise self._failure
+def _close(record: NDArray[np.void], other: NDArray[np.void], name: str, bound: float) -> bool:
+    return bool(np.all(np.abs(record[name] - other[name]) <= bound))

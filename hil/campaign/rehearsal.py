@@ -39,8 +39,8 @@ from identification.validation.prediction import pooled_error, prediction_error
 from sim_fixtures import ServoSettings, UnmodelledEffects
 
 from .folder import CampaignFolder, load_record
-from .link import VirtualLink
 from .oscillation import growing_oscillation
+from .virtual_link import VirtualLink
 
 Array = NDArray[np.float64]
 

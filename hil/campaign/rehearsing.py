@@ -16,7 +16,6 @@ from sim_fixtures import SimulationError
 
 from .errors import CampaignFolderError, MotionFailedError, RepetitionsRejectedError
 from .intervals import planned_intervals, require_runnable
-from .link import VirtualLink
 from .operator import RunWatch, Stop, Unattended
 from .rehearsal import (
     AS_MODELLED,
@@ -33,6 +32,7 @@ from .rehearsal import (
 from .run import run_motions
 from .runner import RunOptions
 from .state import CampaignState
+from .virtual_link import VirtualLink
 
 REPETITIONS: Final = 3
 """Repetitions of the excitation: enough for their scatter, few enough for a minute."""

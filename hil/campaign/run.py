@@ -14,11 +14,11 @@ from hil.cell_link import cell_link
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter
 
+from .connection import active_checks, narrower_limits
 from .dry_run import OVERRIDE, DryRunState
 from .gates import require_as_rehearsed, require_dry_run, require_gates
 from .intervals import Interval, StraightMoves, require_allowed
-from .link import MotionLink, active_checks, narrower_limits
-from .live_link import LiveLink
+from .link import MotionLink
 from .operator import RunWatch
 from .quality import Rejected
 from .runner import RunArchives, Runner, RunOptions
@@ -140,11 +140,10 @@ class _CampaignRun:
         own = cell_link(cell, live=live) if self._link is None else nullcontext(self._link)
         with own as link:
             link.connection.report = reporter.say
-            if isinstance(link, LiveLink):
-                for note in link.notes():
-                    reporter.say(f"note: {note}")
-                if link.live is not None:
-                    reporter.say(link.live.notice)
+            for note in link.notes():
+                reporter.say(f"note: {note}")
+            if link.live is not None:
+                reporter.say(link.live.notice)
             start = link.connect(self._watch.stop)
             require_as_rehearsed(self._campaign, link.connection)
             narrowed = active_checks(cell, link.connection, checks)

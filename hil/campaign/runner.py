@@ -28,7 +28,7 @@ from .dry_run import OVERRIDE, SIMULATED, yes_or_no
 from .errors import MotionFailedError, RepetitionsRejectedError
 from .folder import CampaignFolder
 from .intervals import REPEATED, Interval, StraightMoves, player_of
-from .link import NOT_STARTED, MotionLink, VirtualLink
+from .link import NOT_STARTED, MotionLink
 from .operator import RunWatch
 from .plan import moves_to_dict
 from .quality import ArchiveReview, Problem
@@ -71,7 +71,7 @@ class RunArchives:
         self.simulated = (campaign.cell if link is None else link).only_simulated
         self.names, self.notes, self.cycles = list[str](), list[str](), 0
         in_file = link is None and campaign.cell.controller.transport == "simulated"
-        virtual = in_file or isinstance(link, VirtualLink)
+        virtual = in_file or (link is not None and link.is_virtual)
         self._durable = not virtual if options.durable is None else options.durable
         # The caller knows what a link simulates; the link decides whether a real arm can move.
         own: Mapping[str, str] = {}

@@ -14,7 +14,7 @@ import numpy as np
 import typer
 
 from hil.campaign import Campaign, MotionLink, stop_on_interrupt
-from hil.campaign.link import active_checks, narrower_limits
+from hil.campaign.connection import active_checks, narrower_limits
 from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell import AngleFrame, Cell
 from hil.cell_link import cell_link

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 from .options import Options
 
 if TYPE_CHECKING:
-    from .run import Identification, identify_archives, identify_campaign, identify_paths
+    from hil.identified_campaign import identify_campaign, identify_paths
+
+    from .run import Identification, identify_archives
 
 __all__ = [
     "Identification",
@@ -25,12 +27,12 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import `run`, which needs the report pages, on first use: batch workers never use it."""
+    """Import what needs the report pages on first use: batch workers never use it."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from . import run
-
-    return getattr(run, name)
+    campaigns = name in ("identify_campaign", "identify_paths")
+    home = "hil.identified_campaign" if campaigns else f"{__name__}.run"
+    return getattr(import_module(home), name)
 
 
 def __dir__() -> list[str]:

@@ -21,8 +21,8 @@ from drivers.packets import N_ARMS, InitPacket
 from drivers.transports.base import TransportSpec
 from hil.archive import open_archive
 from hil.campaign import Stop
-from hil.campaign.link import END_TIMEOUT
-from hil.campaign.live_link import ExchangeView
+from hil.campaign.connection import Connection
+from hil.campaign.live_link import END_TIMEOUT, ExchangeMonitor
 from hil.cell.errors import UNKNOWN
 from hil.cell.text import urdf_limits
 from hil.errors import ArchiveError, ControllerFault, OperatorStopError
@@ -271,34 +271,36 @@ def read_init(
     except (DriverError, OSError) as error:
         raise ControllerFault(f"the link cannot be opened: {error}") from error
     try:
-        return _waited_for(ExchangeView(exchange), wait, stop)
+        return _waited_for(exchange, wait, stop)
     finally:
         exchange.finish()
         exchange.wait(END_TIMEOUT)
         exchange.close()
 
 
-def _waited_for(view: ExchangeView, wait: float, stop: Stop) -> InitPacket:
+def _waited_for(exchange: ExchangeProcess, wait: float, stop: Stop) -> InitPacket:
     deadline = time.monotonic() + wait
-    while view.connection.init is None:
-        view.exchange.send_heartbeat()
-        view.poll()
-        if (failure := view.failure()) is not None:
+    connection, monitor = Connection(), ExchangeMonitor(exchange)
+    while connection.init is None:
+        exchange.send_heartbeat()
+        for event in monitor.poll():
+            connection.update(event)
+        if (failure := monitor.failure()) is not None:
             raise ControllerFault(failure)
         if stop.requested:
             raise OperatorStopError(
                 "stopped before a packet of the controller; no file was written."
             )
         if time.monotonic() > deadline:
-            status, text = view.status, f"no init packet within {wait:g} s"
+            status, text = exchange.status(), f"no init packet within {wait:g} s"
             if status.replied or status.malformed or status.stale:
                 text += ", but other packets: a session was already running"
-            text += f"; {view.not_understood}" if view.not_understood else ""
+            text += f"; {connection.not_understood}" if connection.not_understood else ""
             text += "; start this command first, then the controller's Open program"
             text += f" ({status.foreign} packets from other addresses)" if status.foreign else ""
             raise ControllerFault(text)
         time.sleep(_POLL)
-    return view.connection.init
+    return connection.init
 
 
 def _nothing_moves(spec: TransportSpec, n_joints: int, arm: int) -> ExchangeSettings:

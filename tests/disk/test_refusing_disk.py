@@ -21,7 +21,7 @@ from typer.testing import CliRunner, Result
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import open_archive
 from hil.campaign import Campaign, CampaignPlan
-from hil.campaign.link import VirtualLink
+from hil.campaign.virtual_link import VirtualLink
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import ArchiveError, HilError, NotAnArchiveError, OutputError

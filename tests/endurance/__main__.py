@@ -80,8 +80,8 @@ def run_piece(
             ) as link:
                 pids = {
                     "supervisor": os.getpid(),
-                    "exchange": link.exchange.pid,
-                    "archive": link.archive.process.pid,
+                    "exchange": link.port.exchange.pid,
+                    "archive": link.port.archive.process.pid,
                     "controller": simulator.process.pid,
                 }
                 with sampled(link, pids, journal, seconds, stop, task):
@@ -111,7 +111,7 @@ def sampled(
     over, began = threading.Event(), time.monotonic()
 
     def sample() -> None:
-        status = link.exchange.status()
+        status = link.port.exchange.status()
         used = {
             name: {"memory": own_memory(pid), "threads": count(f"/proc/{pid}/task")}
             for name, pid in pids.items()
@@ -159,7 +159,7 @@ def run_campaign(
     campaign: Campaign, link: LiveLink, simulator: SimulatorProcess, stop: Stop
 ) -> dict[str, Any]:
     """Run and resume a campaign until it is complete; return the facts for the journal."""
-    before, errors, complete = link.exchange.status().ended_count, list[str](), False
+    before, errors, complete = link.port.exchange.status().ended_count, list[str](), False
     lasting: Any = Lasting(link)
     while not (complete or stop.requested or len(errors) == TRIES):
         try:
@@ -169,7 +169,7 @@ def run_campaign(
             if stop.requested:
                 break
             errors.append(f"{type(error).__name__}: {error}")
-            if not (link.exchange.alive and link.archive.alive):
+            if not (link.port.exchange.alive and link.port.archive.alive):
                 raise
             simulator.process.send_signal(signal.SIGUSR1)  # drive-on
             campaign = Campaign.open(campaign.folder.root)
@@ -177,7 +177,7 @@ def run_campaign(
         "complete": complete,
         "stopped": not complete and stop.requested,
         "restarts": errors,
-        "motions": link.exchange.status().ended_count - before,
+        "motions": link.port.exchange.status().ended_count - before,
         **archived(campaign.folder.archives),
     }
 

@@ -28,7 +28,8 @@ from hil.campaign import (
     Stop,
 )
 from hil.campaign.intervals import player_of
-from hil.campaign.live_link import LiveLink, archive_silence
+from hil.campaign.link import archive_silence
+from hil.campaign.live_link import LiveLink
 from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.campaign.plan import design
 from hil.cell import Cell
@@ -63,8 +64,8 @@ def test_a_campaign_over_sockets_leaves_gap_free_archives(tmp_path: Path) -> Non
     campaign = campaign_of(tmp_path / "campaign", on_loopback(fast), design(fast, Silent()))
     with loopback_link(campaign.cell, options=PATIENT) as link:
         campaign.run(link, Stop(), Silent(), provenance={"simulated": "yes"}, unrehearsed=True)
-        assert not link.exchange.alive
-        assert not link.archive.alive
+        assert not link.port.exchange.alive
+        assert not link.port.archive.alive
     names = [entry.name for entry in campaign.folder.manifest()]
     assert [name.split("_")[0] for name in names] == [
         "move", "standstill", "excitation", "validation", "move"
@@ -135,7 +136,7 @@ def test_an_archive_that_cannot_be_created_moves_nothing(
         campaign.folder.archives.rmdir()
         with pytest.raises(ArchiveWriteError, match="cannot be created"):
             campaign.run(link, Stop(), Silent(), provenance={}, unrehearsed=True)
-        assert link.exchange.status().program_accepted == 0
+        assert link.port.exchange.status().program_accepted == 0
 
 
 def test_a_port_in_use_is_named(cell: Cell) -> None:
@@ -184,8 +185,8 @@ def test_an_arm_that_stays_open_is_named_beside_the_error(cell: Cell, monkeypatc
         pytest.raises(RuntimeError, match="first") as failed,
         loopback_link(on_loopback(cell), options=PATIENT) as link,
     ):
-        end = link._shut
-        monkeypatch.setattr(link, "_shut", lambda: end() or problem)
+        end = link.port._shut
+        monkeypatch.setattr(link.port, "_shut", lambda: end() or problem)
         raise RuntimeError("the first error")
     assert failed.value.__notes__ == [problem]
 
@@ -284,7 +285,7 @@ def test_a_hold_while_a_motion_is_handed_over_is_applied(
         assert link.only_simulated  # though the cell's own host is none of this computer
         where = link.connect(Stop())
         motion = plan_moves(where, (Move(where + 0.3, speed=0.3),), cell.joint_limits).trajectory
-        submitting = link.exchange.submit
+        submitting = link.port.exchange.submit
 
         def asked(source: MotionSource, *how: Callable[[], bool]) -> int:
             nonlocal held
@@ -292,7 +293,7 @@ def test_a_hold_while_a_motion_is_handed_over_is_applied(
             threading.Timer(1.5, setattr, (stop, "requested", True)).start()
             return submitting(source, *how)
 
-        monkeypatch.setattr(link.exchange, "submit", asked)
+        monkeypatch.setattr(link.port.exchange, "submit", asked)
         path = tmp_path / "held.mcap"
         ended = link.run(player_of(cell, motion), spec_of(cell, path), stop, watch=Holding(Stop()))
         assert (ended.outcome, ended.reason) == ("stopped", "it had not begun")
@@ -303,7 +304,7 @@ def test_a_hold_while_a_motion_is_handed_over_is_applied(
         assert "MotionStarted" not in [event.name for event in archive.events]
 
         monkeypatch.undo()
-        link.view.inits += 1  # another init packet, whose limits were not checked
+        link.connection.inits += 1  # another init packet, whose limits were not checked
         path = tmp_path / "next.mcap"
         with pytest.raises(ControllerFault, match=r"new session .* nothing was sent"):
             link.run(player_of(cell, motion), spec_of(cell, path), Stop())

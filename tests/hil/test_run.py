@@ -34,6 +34,7 @@ from hil.campaign import (
     quality,
 )
 from hil.campaign import link as link_module
+from hil.campaign.connection import active_checks
 from hil.campaign.dry_run import OVERRIDE, DryRunRecord, agreement
 from hil.campaign.errors import (
     AgainstGravityError,
@@ -43,7 +44,6 @@ from hil.campaign.errors import (
 )
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
-from hil.campaign.link import active_checks
 from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.campaign.quality import FIELDS, Executed, RepetitionCheck
 from hil.campaign.rehearsal import Rehearsal

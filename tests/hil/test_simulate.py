@@ -298,7 +298,7 @@ def test_real_hardware_is_simulated_only_where_asked_for():
     real = Cell.load(CELL_PATH).with_link(transport="udp")
     with pytest.raises(CellError, match="real hardware"):
         simulated_link(real)
-    assert simulated_link(real, instead_of_hardware=True).session is not None
+    assert simulated_link(real, instead_of_hardware=True).is_virtual
     assert simulated_controller(real).period == 0.001
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,16 +15,17 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.events import MotionEnded, MotionStarted
-from drivers.exchange import control as control_memory
 from drivers.exchange.event_log import EventsLost
 from drivers.record import cycle_dtype
 from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
-from hil.campaign import Stop, live_link
+from hil.campaign import Stop
+from hil.campaign.connection import StartTimeout
 from hil.campaign.intervals import player_of
-from hil.campaign.link import VirtualLink
-from hil.campaign.live_link import STALL, ExchangeView, Heartbeat, Standstill
+from hil.campaign.link import Standstill
+from hil.campaign.live_link import STALL, Heartbeat
 from hil.campaign.operator import MotionProgress, OperatorRequest, RunStatus, RunWatch
+from hil.campaign.virtual_link import VirtualLink
 from hil.cell import Cell
 from hil.errors import ControllerFault
 from hil.simulation import simulated_link
@@ -231,42 +231,11 @@ def test_a_motion_without_override_is_not_run_slowly(arm: WatchedArm) -> None:
             OperatorRequest(override)
 
 
-class Exchange:
-    """The part of an exchange process that a view reads."""
-
-    alive, state, ended_count = True, State.CLOSED, 3
-
-    def __init__(self) -> None:
-        self.control_fd = control_memory.create()
-        self.queued: list[Any] = []
-
-    def status(self) -> Any:
-        return SimpleNamespace(state=self.state, ended_count=self.ended_count)
-
-    def events(self) -> list[Any]:
-        queued, self.queued = self.queued, []
-        return queued
-
-
 class Clock:
     now = 100.0
 
     def __call__(self) -> float:
         return self.now
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    at = Clock()
-    monkeypatch.setattr(live_link, "time", SimpleNamespace(monotonic=at))
-    return at
-
-
-@pytest.fixture
-def view(clock: Clock) -> ExchangeView:
-    view = ExchangeView(Exchange())  # type: ignore[arg-type]
-    view.reset_motion()
-    return view
 
 
 @pytest.mark.parametrize(
@@ -277,30 +246,27 @@ def view(clock: Clock) -> ExchangeView:
         (State.CLOSED, 59.0, r"did not begin within 60 s"),
     ],
 )
-def test_a_motion_that_does_not_begin_ends(
-    view: ExchangeView, clock: Clock, state: State, waits: float, words: str
-) -> None:
-    view.exchange.state = state  # type: ignore[attr-defined]
-    clock.now += waits
-    assert view.no_start() is None
-    clock.now += 2.0
-    assert words in (view.no_start() or "")
+def test_a_motion_that_does_not_begin_ends(state: State, waits: float, words: str) -> None:
+    start = StartTimeout(now := 100.0)
+    assert start.no_start(state, now + waits) is None
+    assert words in (start.no_start(state, now + waits + 2.0) or "")
 
 
 @pytest.mark.parametrize("event", [MotionStarted(0, 10), EventsLost(1)])
 def test_a_motion_that_may_have_begun_is_waited_for(
-    view: ExchangeView, clock: Clock, event: Any
+    arm: WatchedArm, monkeypatch: pytest.MonkeyPatch, event: Any
 ) -> None:
-    exchange: Any = view.exchange
-    exchange.queued.append(event)
-    view.poll()
-    clock.now += 3600.0
-    assert view.no_start() is None
-    # An end whose event was lost is known from the count.
-    assert not view.motion_ended
-    exchange.ended_count += 1
-    assert view.motion_ended
-    assert view.ended is None
+    """Whatever the state; an end whose event was lost is known from the count."""
+    monkeypatch.setattr(StartTimeout, "no_start", lambda *_: "the motion will not start")
+    link, port = arm.link, arm.link.port
+    monkeypatch.setattr(port, "poll", lambda poll=port.poll: [event, *without_end(poll())])
+    ended = arm.run(Watcher())
+    assert (ended.outcome, ended.reason, ended.cycle) == ("completed", "the motion is complete", -1)
+    assert link.connection.ended is None
+
+
+def without_end(events: Sequence[Any]) -> list[Any]:
+    return [event for event in events if not isinstance(event, MotionEnded)]
 
 
 def test_heartbeats_end_when_the_supervising_loop_stalls() -> None:

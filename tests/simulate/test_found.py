@@ -17,7 +17,7 @@ from drivers.record import cycle_dtype
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveOutcome, ArchiveSpec, open_archive
 from hil.campaign import VirtualLink
-from hil.campaign import link as link_module
+from hil.campaign import virtual_link
 from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.operator import Stop
 from hil.cell import Cell
@@ -86,7 +86,7 @@ def test_a_motion_does_not_wait_for_a_drive_that_went_off(
     where = link.connect(Stop())
     controller.lose_drive("emergency stop")
     packets = iter(range(10))
-    exchange(link.transport, link.session, ends_when=lambda: next(packets, None) is None)
+    exchange(link.port.transport, link.port.session, ends_when=lambda: next(packets, None) is None)
     motion, spec = short_way(cell, where, tmp_path)
     with pytest.raises(ControllerFault, match="went off before the motion began; nothing was sent"):
         link.run(motion, spec, Stop())
@@ -112,11 +112,11 @@ def test_a_motion_stopped_while_axes_open_leaves_them_closed(
             stop.requested |= controller.phase is Phase.OPENING
             return controller.next_packet()
 
-    link.transport = SimulatedTransport(Stopping())
+    link.port.transport = SimulatedTransport(Stopping())
     assert link.run(motion, spec, stop).outcome == "stopped"
     assert Phase.OPENING in phases
     assert Phase.OPEN not in phases
-    assert link.session.state is State.CLOSED
+    assert link.port.session.state is State.CLOSED
 
 
 def test_a_repetition_with_a_stuck_joint_is_run_again(tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ class TestClosedLink:
 
     @pytest.fixture(autouse=True)
     def patience(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(link_module, "END_TIMEOUT", 0.5)
+        monkeypatch.setattr(virtual_link, "END_TIMEOUT", 0.5)
 
     def test_it_does_not_wait_forever_for_a_restarted_controller(
         self, cell: Cell, controller: SimulatedController
@@ -147,15 +147,19 @@ class TestClosedLink:
             SimulatedTransport(controller), cell, lambda: controller.restart(warm=True)
         )
         link.connect(Stop())
-        began = link.transport.now
+        began = link.port.transport.now
         link.close()
-        assert link.transport.now - began == pytest.approx(0.5, abs=0.01)
-        assert link.session.state is State.DRIVE_OFF
+        assert link.port.transport.now - began == pytest.approx(0.5, abs=0.01)
+        assert link.port.session.state is State.DRIVE_OFF
 
     def test_it_reports_open_axes(self, cell: Cell, controller: SimulatedController) -> None:
         link = VirtualLink.over(SimulatedTransport(controller), cell)
         link.connect(Stop())
-        exchange(link.transport, link.session, ends_when=lambda: link.session.state is State.OPEN)
+        exchange(
+            link.port.transport,
+            link.port.session,
+            ends_when=lambda: link.port.session.state is State.OPEN,
+        )
         with pytest.raises(ControllerFault, match=r"an axis is still open 0\.5 s after"):
             link.close()
 

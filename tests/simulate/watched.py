@@ -197,12 +197,12 @@ class SessionLog:
         self._rows: list[bytes] = []
         self._of: dict[int, int] = {}
         self._given: set[int] = set()
-        self._dtype = link.ring.rows.dtype
-        self._tap(link.ring, "commit", self._commit)
+        self._dtype = link.port.ring.rows.dtype
+        self._tap(link.port.ring, "commit", self._commit)
         for name in ("request", "stop", "override", "hold", "resume", "discarded"):
-            self._tap(link.session, name, self._act)
+            self._tap(link.port.session, name, self._act)
         for name in ("tick", "reply", "events"):
-            self._tap(link.session, name, getattr(self, f"_{name}"))
+            self._tap(link.port.session, name, getattr(self, f"_{name}"))
 
     def _tap(self, owner: Any, name: str, instead: Callable[..., Any]) -> None:
         setattr(owner, name, partial(instead, owner, getattr(owner, name)))

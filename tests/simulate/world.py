@@ -22,7 +22,7 @@ from drivers import State
 from drivers.errors import Check
 from drivers.events import MotionEnded
 from hil.archive import writer
-from hil.campaign import Campaign, VirtualLink, link
+from hil.campaign import Campaign, VirtualLink, link, steering
 from hil.campaign import folder as campaign_folder
 from hil.campaign.dry_run import DryRunRecord
 from hil.campaign.errors import MotionFailedError, RepetitionsRejectedError
@@ -341,7 +341,7 @@ class World:
             transport, self._scene.cell, finish=self.controller.controller.finish
         )
         log = SessionLog(connection, transport)
-        self._begun, self._session = first, connection.session
+        self._begun, self._session = first, connection.port.session
         result, error = self._run(connection)
         self._digests = after = _digests(self.folder)
         self._struck += transport.struck
@@ -350,7 +350,7 @@ class World:
             records=log.records,
             acts=tuple(log.acts),
             events=tuple(log.events),
-            counters=connection.session.counters,
+            counters=connection.port.session.counters,
             settings=self._scene.cell.session_settings(),
             first_cycle=first,
             last_cycle=self.controller.cycle,
@@ -448,7 +448,7 @@ def _when(script: Script) -> int:
 def _no_waiting() -> Iterator[None]:
     """Do not sleep while the operator holds the arm."""
     fake = SimpleNamespace(sleep=lambda seconds: None, monotonic=time.monotonic)
-    with patch.object(link, "time", fake):
+    with patch.object(link, "time", fake), patch.object(steering, "time", fake):
         yield
 
 
