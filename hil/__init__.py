@@ -89,13 +89,13 @@ __all__ = [
     "import_rosbag2",
     "open_archive",
     "open_recording",
+    "plan_move",
     "reidentify",
     "reporter",
     "run_study",
     "send",
     "simulated_controller",
     "stop_on_interrupt",
-    "plan_move",
 ]
 
 
@@ -108,5 +108,6 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return all names, also those that are not loaded yet."""
-    return [*globals(), *__all__]
+    """Return all public names, also those that are not loaded yet, and the modules loaded."""
+    helpers = {"Any", "TYPE_CHECKING", "annotations", "import_module"}
+    return sorted({*globals(), *__all__} - helpers)

@@ -175,7 +175,9 @@ def test_the_package_is_a_function_and_stays_a_package() -> None:
     assert hil.identify.Options is Options
     names = [*inspect.signature(hil.identify).parameters]
     assert names[:2] == ["recordings", "urdf"]
-    assert {"identify", "IdentifiedArm", "ImportOptions"} <= set(dir(hil))
+    public = [name for name in dir(hil) if not name.startswith("_")]
+    assert {"identify", "IdentifiedArm", "ImportOptions"} <= {*public}
+    assert len(public) == len({*public}) and not {"Any", "import_module"} & {*public}
 
 
 def test_import_hil_loads_no_library() -> None:
