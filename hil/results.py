@@ -7,6 +7,7 @@ per joint are in the order of `joint_names`, lists per parameter in that of `par
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -311,6 +312,11 @@ class ParameterResult(Frozen):
         return z if math.isfinite(z) else None
 
 
+def by_id(parameters: Sequence[ParameterResult]) -> list[ParameterResult]:
+    """Return parameters in the order of the paper's Table 2, those without a number last."""
+    return sorted(parameters, key=lambda one: one.table2_id or len(parameters) + 1000)
+
+
 class ValidationResult(Frozen):
     """Torque prediction on one held-out motion; lists are per joint."""
 
@@ -456,7 +462,7 @@ class Results(Frozen):
     def not_significant(self) -> list[str]:
         """Labels of parameters whose 95 % interval includes zero."""
         factor = self.uncertainty.interval_factor
-        return [p.label for p in self.parameters if not abs(p.estimate) > factor * p.std]
+        return [p.label for p in by_id(self.parameters) if not abs(p.estimate) > factor * p.std]
 
     @classmethod
     def load(cls, path: Path) -> Results:

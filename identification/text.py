@@ -17,7 +17,7 @@ def filled(template: str, **values: object) -> str:
 
 
 def unit_text(unit: str) -> str:
-    """Replace blanks of a unit: N·m for `N m`."""
+    """Replace blanks of a unit, as files of earlier versions have: N·m for `N m`."""
     return unit.replace(" ", "·")
 
 

@@ -370,7 +370,7 @@ class _Search:
             lines.append(
                 '[torque] file = "FILE"'
                 if current is None
-                else f'[torque] file = "{current}" if it has N.m, or [motor_current] file = '
+                else f'[torque] file = "{current}" if it has N·m, or [motor_current] file = '
                 f'"{current}" with [drive] torque_constant if it has A'
             )
         return (

@@ -145,7 +145,7 @@ def _require_usable(archive: Path, recording: Path) -> None:
     if "torque" not in columns:
         problem = "has motor currents and no joint torque"
         remedy = (
-            "`hil import log` writes its column map: add [drive] torque_constant = [...] (N.m/A, "
+            "`hil import log` writes its column map: add [drive] torque_constant = [...] (N·m/A, "
             "gears included, one for each joint) and give it with --map; or measure the constants "
             "(`hil torque-constants`)"
         )

@@ -291,7 +291,7 @@ class Finding:
                    f'[torque] side = "motor"; [drive] gear_ratio = [{each}] (about; the maker\'s)'),
             Choice("side", "motor current", None,
                    f"[motor_current] in place of [torque]; [drive] torque_constant = [{each}] "
-                   "(about, N.m/A with gears)"),
+                   "(about, N·m/A with gears)"),
         )  # fmt: skip
 
     def entries(self) -> dict[str, Any]:
@@ -350,7 +350,7 @@ def _by_size(readings: Readings) -> float | None:
 def current_only() -> Row:
     """Return the row of a log with motor currents and no torque."""
     return Row("torque", "none; motor currents", "sure", "by name or unit",
-               "[drive] torque_constant of a map (N.m/A), or `hil gains`")  # fmt: skip
+               "[drive] torque_constant of a map (N·m/A), or `hil torque-constants`")  # fmt: skip
 
 
 def channel_rows(delay: DelayEstimate | None, low_pass: Preprocessing | None) -> Iterator[Row]:

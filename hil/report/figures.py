@@ -25,7 +25,7 @@ from hil.report.drawing import (
 )
 from hil.report.numbers import fixed, percent, significant
 from hil.report.series import ReportSeries
-from hil.results import FittedResult, Results, ValidationResult
+from hil.results import FittedResult, Results, ValidationResult, by_id
 
 Array = NDArray[np.float64]
 
@@ -287,4 +287,7 @@ def correlation_matrix(results: Results) -> Panel | None:
     if n == 0:
         return None
     matrix = np.array(results.correlation, dtype=np.float64)[:n, :n]
-    return matrix_panel(matrix, [p.label for p in results.parameters[:n]], "c", "Base parameters")
+    base = results.parameters[:n]
+    order = [base.index(parameter) for parameter in by_id(base)]
+    labels = [base[k].label for k in order]
+    return matrix_panel(matrix[np.ix_(order, order)], labels, "c", "Base parameters")

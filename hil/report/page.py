@@ -13,7 +13,7 @@ from hil.report.drawing import chart_panel
 from hil.report.interactive import chart_data, library
 from hil.report.rendering import environment, page_bytes, template_text
 from hil.report.series import ReportSeries
-from hil.results import ParameterResult, Results, outside_mark
+from hil.results import ParameterResult, Results, by_id, outside_mark
 from identification.excitation import CRITERIA, METHODS
 from identification.selection.inner_prediction import Choice
 
@@ -90,11 +90,6 @@ def grouped_warnings(results: Results) -> dict[str, list[str]]:
         title = _OF_RECORDING if checks.get(warning) in _RECORDING_CHECKS else _OF_MODEL
         groups[title].append(warning)
     return groups if results.verdict.warnings else {}
-
-
-def by_id(parameters: Sequence[ParameterResult]) -> list[ParameterResult]:
-    """Return parameters in the order of the paper's Table 2, those without a number last."""
-    return sorted(parameters, key=lambda one: one.table2_id or len(parameters) + 1000)
 
 
 def joint_of(parameter: ParameterResult, joint_names: Sequence[str]) -> str:

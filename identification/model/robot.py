@@ -119,11 +119,11 @@ class StandardLayout:
         if standard >= self.n_joints * self.width:
             i, j = self.pairs[standard - self.n_joints * self.width]
             sliding = (not self.revolute[i]) + (not self.revolute[j])
-            return ("kg m²", "kg m", "kg")[sliding]
+            return ("kg·m²", "kg·m", "kg")[sliding]
         joint, symbol = divmod(standard, self.width)
         if symbol == _N_LINK:
-            return "kg m²" if self.revolute[joint] else "kg"
-        return {"I": "kg m²", "mc": "kg m", "m": "kg"}[LINK_SYMBOLS[symbol].rstrip("xyz")]
+            return "kg·m²" if self.revolute[joint] else "kg"
+        return {"I": "kg·m²", "mc": "kg·m", "m": "kg"}[LINK_SYMBOLS[symbol].rstrip("xyz")]
 
 
 def _name(symbol: str, joint: int) -> str:

@@ -121,6 +121,20 @@ class TestPercentages:
         assert not wrong, "\n".join(wrong)
 
 
+class TestUnits:
+    """Products of units have a dot at half height; column maps have the names in `UNITS`."""
+
+    WRONG = re.compile(r"\bN\.m\b|\bNm\b|\bN m\b|\bkg\.?m\b|\bkg m(?!\w)")
+    DEFINED = ("importers/units.py", "archive/schema.py")
+
+    def test_messages_have_a_dot_between(self) -> None:
+        wrong: list[str] = []
+        for module in (path for path in MODULES if not str(path).endswith(self.DEFINED)):
+            literals = ((k, text) for k, text, inner in texts(module) if not inner)
+            wrong += found(module, literals, self.WRONG)
+        assert not wrong, "\n".join(wrong)
+
+
 class TestGlossary:
     def test_is_one_page_in_alphabetical_order(self) -> None:
         rows = (ROOT / "docs" / "glossary.md").read_text("utf-8").split("|---|---|\n")[1]

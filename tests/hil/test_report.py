@@ -117,7 +117,7 @@ def real_recording():
 
 
 def _unit(name):
-    units = {"m": "kg m", "I": "kg m²", "f0": "N·m", "f1": "N·m·s/rad", "f2": "N·m·s²/rad²"}
+    units = {"m": "kg·m", "I": "kg·m²", "f0": "N·m", "f1": "N·m·s/rad", "f2": "N·m·s²/rad²"}
     return next(unit for start, unit in units.items() if name.startswith(start))
 
 
@@ -591,6 +591,26 @@ class TestParameters:
         expected = np.abs(np.array(results.correlation)[:40, :40])
         np.testing.assert_allclose(1.0 - pixels.mean(axis=2), expected, atol=0.02)
 
+    def test_figure_and_summary_have_the_order_of_the_table(self, results):
+        """Of the parameters estimated first and last the numbers are exchanged."""
+        parameters = [p.model_dump() for p in results.parameters]
+        first, last = parameters[0], parameters[N_ESSENTIAL - 1]
+        ids = last["table2_id"], first["table2_id"]
+        for parameter, number in zip((first, last), ids, strict=True):
+            values = {"estimate": 0.0, "std": 1.0, "truth": -4.0}
+            parameter |= {"table2_id": number, **values}
+        exchanged = make_results(parameters=parameters)
+        svg = figures.correlation_matrix(exchanged).svg
+        pattern = rf">(\d+ (?:{first['name']}|{last['name']}))<"
+        labels = [*dict.fromkeys(re.findall(pattern, svg))]  # beside rows and columns
+        assert labels == [f"{ids[1]} {last['name']}", f"{ids[0]} {first['name']}"]
+        (furthest,) = re.findall(r"more than 3σ \([^)]*\): ([^.]*)\.", Page(render(exchanged)).text)
+        numbers = [int(label.split()[0]) for label in furthest.split(", ")]
+        assert {*ids} <= {*numbers} and numbers == sorted(numbers)
+        labels = exchanged.not_significant
+        assert {*ids} <= {*(numbers := [int(label.split()[0]) for label in labels])}
+        assert numbers == sorted(numbers)
+
     @pytest.mark.parametrize(
         ("std", "grade"),
         [(0.1, "well"), (0.5, "roughly"), (0.6, "hardly"), (math.inf, "undetermined")],
@@ -610,6 +630,8 @@ class TestParameters:
         ):
             assert words in page.text
         assert_inert(page)
+        names = [row["Name"] for row in page.table("With all parameters")]
+        assert names == ["f1_1 joint_1"]
         (link,) = page.table("Link of")
         assert link["Mass [kg]"] == "12.3" and link["Link of"] == "<script>alert(1)"
         without = rendered(make_results()).text

@@ -410,7 +410,7 @@ class TestBaseParameters:
         assert expression["mc4z"] == "mc4z - mc5y"
         unit = dict(zip(ns16.parameter_names, ns16.units, strict=True))
         names = ("I1yy", "I3m", "mc2x", "f0_1", "f1_6")
-        expected = ["kg m²", "kg m²", "kg m", "N·m", "N·m·s/rad"]
+        expected = ["kg·m²", "kg·m²", "kg·m", "N·m", "N·m·s/rad"]
         assert [unit[name] for name in names] == expected
         sliding = RobotModel.from_urdf(slider("1 0 0"))
         assert sliding.parameter_names == ("m1", "f0_1", "f1_1", "f2_1")
