@@ -2,6 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
+from os import PathLike
+
+
+def typed(path: str | PathLike[str]) -> str:
+    """Return a path as a word of a command line, quoted where a shell needs it."""
+    return shlex.quote(str(path))
+
 
 def plural(number: int, noun: str) -> str:
     """Return number and noun: 1 packet, 2 packets, 2 replies."""

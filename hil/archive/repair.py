@@ -25,6 +25,7 @@ from hil.archive.reader import Scan, open_archive, scan_archive
 from hil.errors import ArchiveError, ArchiveWriteError
 from hil.files import replace_file, sync_folder
 from hil.reading import open_file
+from hil.terminal_text import typed
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,8 @@ def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
     path = Path(path)
     found = scan_archive(path, all_channels=True)[1]
     if not is_intact(path, found):
-        raise ArchiveError(path, "is damaged", remedy="repair it with `hil archive repair`")
+        remedy = f"repair it with `hil archive repair {typed(path)}`"
+        raise ArchiveError(path, "is damaged", remedy=remedy)
     _rewrite(path, found, path, {"outcome": outcome, "reason": reason})
 
 

@@ -23,6 +23,7 @@ from hil.errors import ArchiveError, InputError
 from hil.files import digest, file_digest, json_digest
 from hil.identify.prepared import Settings, stated_delay
 from hil.progress import Reporter
+from hil.terminal_text import typed
 
 from .cache import BESIDE, CacheError, CacheLocation, code_digest
 from .cluster import Cluster, Task, Unused, reason_of
@@ -269,7 +270,7 @@ def open_only(ref: ArchiveRef) -> None:
 def require_complete(archive: Archive, location: str) -> None:
     """Raise an `ArchiveError` with the command of the repair if an archive is damaged."""
     if archive.damage is not None:
-        remedy = f"hil archive repair {location}"
+        remedy = f"hil archive repair {typed(location)}"
         if is_url(location):
             remedy = "repair it where it is stored: hil archive repair"
         raise ArchiveError(location, str(archive.damage), remedy=remedy)

@@ -11,7 +11,7 @@ from drivers.errors import Check, GuardError, RefusalError
 from drivers.events import Refused
 from hil.cell import AngleFrame, Cell
 from hil.errors import ExecutionError, HilError, InputError, UnsafeError
-from hil.terminal_text import plural
+from hil.terminal_text import plural, typed
 
 
 class CampaignFolderError(InputError):
@@ -110,7 +110,7 @@ class AgainstGravityError(DryRunError):
             campaign,
             f"was done, but is not accepted ({', '.join(joints)}: {problem})",
             "correct the cell file and rehearse again, or, if you know that the arm is right and "
-            f"the model is not, run `hil run {campaign} --accept-dry-run {names}`",
+            f"the model is not, run `hil run {typed(campaign)} --accept-dry-run {names}`",
         )
 
 

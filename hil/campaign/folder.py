@@ -26,6 +26,7 @@ from hil.files import (
     write_output,
 )
 from hil.reading import is_not_a_file, open_file, parse_json, parse_toml, path_exists, read_text
+from hil.terminal_text import typed
 from identification.errors import ModelError
 from identification.model.urdf_text import urdf_tree
 
@@ -254,7 +255,7 @@ class CampaignFolder:
     def require_unchanged(self) -> None:
         """Require cell, URDF and plan of the manifest; NotRehearsedError names a changed file."""
         if changed := self._changed():
-            again = f"restore it, or rehearse again (`hil rehearse {self.root}`)"
+            again = f"restore it, or rehearse again (`hil rehearse {typed(self.root)}`)"
             remedy = _RESTORE if self.manifest() else again
             raise NotRehearsedError(self.root, f"was edited: {_ANOTHER.format(changed)}", remedy)
 

@@ -8,6 +8,7 @@ from typing import Any, Final
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError
+from hil.terminal_text import typed
 
 from .connection import Connection, narrower_limits
 from .dry_run import DryRunRecord, not_accepted, yes_or_no
@@ -46,7 +47,7 @@ def require_gates(
             root,
             "was not rehearsed, and its link leads out of this computer",
             "only a simulated controller on this computer (127.0.0.1) is driven without a "
-            f"rehearsal: run `hil rehearse {root}`",
+            f"rehearsal: run `hil rehearse {typed(root)}`",
         )
 
 
@@ -64,7 +65,7 @@ def require_dry_run(
         DryRunError: with the remedy.
     """
     root = folder.root
-    first = f"run `hil run {root} --dry-run`"
+    first = f"run `hil run {typed(root)} --dry-run`"
     if found is None and options.accept_dry_run and not simulated:
         remedy = f"{first}, watch the arm, and accept it then"
         raise DryRunError(root, "cannot be accepted before it was done", remedy)
@@ -85,7 +86,7 @@ def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> R
         CampaignFolderError: its file cannot be read.
     """
     found = Rehearsal.load(folder)
-    rehearse = f"run `hil rehearse {folder.root}`"
+    rehearse = f"run `hil rehearse {typed(folder.root)}`"
     if found is None:
         raise NotRehearsedError(folder.root, "was not rehearsed", rehearse)
     if found.plan_hash != (plan_hash or folder.plan_hash):

@@ -31,6 +31,7 @@ from hil.simulation import (
     simulated_controller,
     simulated_provenance,
 )
+from hil.terminal_text import typed
 from identification.distributions import normal_limit
 from identification.errors import IdentificationError
 from identification.signals.recording import RecordingError
@@ -105,7 +106,7 @@ class Rehearsal(Frozen):
         Raises:
             CampaignFolderError: the file cannot be read.
         """
-        remedy = f"rehearse again (`hil rehearse {folder.root} --again`)"
+        remedy = f"rehearse again (`hil rehearse {typed(folder.root)} --again`)"
         return load_record(cls, folder.rehearsal, remedy, strict=False)
 
     def save(self, path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from hil.cell import Cell
 from hil.errors import HilError
 from hil.reading import path_exists
 from hil.results import ConductResult, Results, StepResult
-from hil.terminal_text import plural
+from hil.terminal_text import plural, typed
 from identification.text import percentage
 
 from .dry_run import DryRunRecord
@@ -78,7 +77,7 @@ def status_of(campaign: CampaignState) -> CampaignStatus:
     folder, again = replace(campaign.folder, digests={}), "rehearse {} --again"
     campaign = replace(campaign, folder=folder)
     folder.manifest()  # one that cannot be read is an error of all steps
-    at = shlex.quote(str(folder.root))
+    at = typed(folder.root)
     # With the command that recreates the file of a step, should it be damaged: none does for the
     # cell or the plan of recordings, nor for an acceptance.
     evaluations: list[tuple[str, Callable[[], Step], str]] = [

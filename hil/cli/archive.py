@@ -15,7 +15,7 @@ from hil.archive.repair import repair as repair_archive
 from hil.cli import exit_code_of
 from hil.cli.arguments import JsonOption, print_json
 from hil.errors import ArchiveError, InputError
-from hil.terminal_text import printable
+from hil.terminal_text import printable, typed
 
 app = typer.Typer(help="Inspect, check and repair archives.", no_args_is_help=True)
 
@@ -128,7 +128,7 @@ def _check_lines(found: Check) -> list[str]:
     lines = [f"{found.path}: {verdict} profile {found.version}, {found.samples} samples"]
     lines += [f"  {fault}" for fault in found.faults]
     if not found.conforms:
-        lines.append(f"  to repair it: hil archive repair {found.path}")
+        lines.append(f"  to repair it: hil archive repair {typed(found.path)}")
     return lines
 
 
@@ -179,7 +179,7 @@ def _info_lines(found: Overview) -> list[str]:
             shown = _cell(value)
             lines.append(f"  {key:<12} {shown}{f' {unit}' if value and unit else ''}")
     if found.damage:
-        lines.append(f"  to repair it: hil archive repair {found.path}")
+        lines.append(f"  to repair it: hil archive repair {typed(found.path)}")
     return lines
 
 

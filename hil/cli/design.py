@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,7 +25,7 @@ from hil.errors import HilError, InputError, OperatorStopError
 from hil.plots import save
 from hil.progress import reporter as make_reporter
 from hil.progress import say
-from hil.terminal_text import printable
+from hil.terminal_text import printable, typed
 
 
 def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
@@ -161,8 +160,8 @@ def design(
         if files:
             reporter.say(f"trajectory files in {folder.root}: {', '.join(files)}")
         elif lacking is None:
-            root = shlex.quote(str(folder.root))
-            reporter.say(f"{folder.root} is now a campaign; next: hil rehearse {root}")
+            command = f"hil rehearse {typed(folder.root)}"
+            reporter.say(f"{folder.root} is now a campaign; next: {command}")
         else:
             reporter.say(f"note: no campaign was created: {lacking}")
         found = design_summary(done, folder) | {

@@ -32,6 +32,7 @@ from hil.new import (
 )
 from hil.progress import say
 from hil.reading import parse_port
+from hil.terminal_text import typed
 
 PORT = 1000
 """Default UDP port of C4G Open."""
@@ -129,11 +130,11 @@ def new(
     if unknown:
         say(f'unknown, marked "?": {", ".join(unknown)}')
         after = "design" if design_only else "doctor"
-        say(f"fill them in, then `hil {after} {output}`, which lists what is still missing")
+        say(f"fill them in, then `hil {after} {typed(output)}`, which lists what is still missing")
     elif made.lifting:
-        say(f"then `hil import log LOG --cell {output} --map MAP.toml`")
+        say(f"then `hil import log LOG --cell {typed(output)} --map MAP.toml`")
     elif design_only:
-        say(f"check the assumed values in it, then `hil design {output}`")
+        say(f"check the assumed values in it, then `hil design {typed(output)}`")
 
 
 def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, quiet: bool) -> Known:

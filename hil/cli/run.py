@@ -19,6 +19,7 @@ from hil.errors import ExecutionError, InputError, OperatorStopError
 from hil.progress import reporter as make_reporter
 from hil.progress import say
 from hil.screen import Screen
+from hil.terminal_text import typed
 
 
 def run(
@@ -94,7 +95,7 @@ def _run(
         except (ExecutionError, OSError) as fault:
             failed = isinstance(fault, MotionFailedError) and fault.outcome != "stopped"
             if stop.requested and not failed:  # an OSError: of a terminal that was closed
-                again = f"Resume with `hil run {campaign.folder.root}`."
+                again = f"Resume with `hil run {typed(campaign.folder.root)}`."
                 raise OperatorStopError(f"{fault} {again}") from fault
             raise
 
@@ -131,5 +132,5 @@ def _print(result: RunResult, *, json: bool) -> None:
     if result.dry_run == "to be accepted":
         known = "".join(f" --accept-torque {joint}" for joint in result.against_gravity)
         why = "you know why, and " if known else ""
-        command = f"`hil run {result.campaign} --accept-dry-run{known}`"
+        command = f"`hil run {typed(result.campaign)} --accept-dry-run{known}`"
         say(f"if {why}the motions looked right, continue with {command}")

@@ -126,7 +126,8 @@ def _outside(
     columns = scipy.optimize.linear_sum_assignment(~fits + 1e-6 * (1.0 - np.eye(len(names))))[1]
     check = "check unit, sign and zero in the column map"
     if far and np.diag(_fits(radians, limits)).all():
-        remedy = 'as degrees read as radians, none would: write unit = "deg"'
+        entry = '[position] unit = "deg" in the column map'
+        remedy = f"as degrees read as radians, none would: write {entry}"
     elif fits[joints, columns].all():
         order = ", ".join(names[int(j)] for j in np.argsort(columns))
         remedy = (

@@ -15,6 +15,7 @@ from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, i
 from hil.importers.robot import Robot, Use
 from hil.look.result import Choice, Look
 from hil.look.run import SETTINGS, look_at
+from hil.terminal_text import typed
 from identification.errors import IdentificationError
 from identification.signals.samples import prepare
 from identification.text import percentage
@@ -112,8 +113,8 @@ def _undecided(source: Path, choices: tuple[Choice, ...]) -> SourceError:
     )
     lines = " or ".join(choice.line for choice in choices)
     remedy = (
-        f"write the map with `hil look {source.name} --urdf ARM.urdf -o map.toml`, add one of the "
-        f"lines {lines}, and give it with --map"
+        f"write the map with `hil look {typed(source.name)} --urdf ARM.urdf -o map.toml`, "
+        f"add one of the lines {lines}, and give it with --map"
     )
     problem = f"two readings fit alike: {readings}"
     return SourceError(source, problem, field=choices[0].aspect, remedy=remedy)

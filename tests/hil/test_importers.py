@@ -937,7 +937,7 @@ class TestWarnings:
         """The ranges of joints 4 and 6 of this arm exclude each other."""
         (sentence, *others) = warnings(panda, position=DEGREES, velocity=DEGREES)
         assert sentence.startswith("as mapped, every row leaves the limits of the URDF")
-        assert 'as degrees read as radians, none would: write unit = "deg"' in sentence
+        assert 'as degrees read as radians, none would: write [position] unit = "deg"' in sentence
         assert all("degrees" in other for other in others)
         found = warnings(replace(panda, position=panda.position[:, ORDER]))
         names = ", ".join(panda.joint_names[j] for j in ORDER)
@@ -1026,7 +1026,7 @@ class TestReplacing:
         status, shown = typed(wrong)
         assert status == 2
         assert "every row leaves the limits of the URDF" in shown
-        assert 'write unit = "deg"' in shown
+        assert 'write [position] unit = "deg"' in shown
         assert (tmp_path / "a.mcap").read_bytes() == before
         status, shown = typed([*wrong, "--outside-limits"])
         assert status == 0
@@ -1102,7 +1102,7 @@ class TestImportCommand:
         assert result.exit_code == 0
         assert "2000 samples in 19.99 s, 100 Hz" in result.stdout
         assert "warning: as mapped" in result.stdout
-        assert 'write unit = "deg"' in result.stdout
+        assert 'write [position] unit = "deg"' in result.stdout
         header = open_archive(tmp_path / "log.mcap").header
         assert header.purpose == "validation"
         assert any("deg" in warning for warning in header.findings.warnings)

@@ -254,7 +254,7 @@ class TestRead:
         position = {"columns": "q{}", "unit": "rad"}
         with pytest.raises(SourceError, match="leaves the limits of the URDF") as refused:
             imported(tmp_path / "log.csv", content, urdf, position=position)
-        unit = re.search(r'write unit = "(\w+)"', str(refused.value))
+        unit = re.search(r'write \[position\] unit = "(\w+)"', str(refused.value))
         assert unit is not None
         position["unit"] = unit[1]
         assert_right(imported(tmp_path / "log.csv", content, urdf, position=position))

@@ -1,0 +1,125 @@
+"""What messages tell a user to type exists: commands, options, entries of the files."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+from collections.abc import Iterator
+
+from pydantic import BaseModel
+
+from hil.cell.schema import CellFile
+from hil.design.settings import DesignSettings
+from hil.importers.column_map import ColumnMap
+from tests.docs.test_words import MODULES, docstrings
+from tests.docs.typed import ROOT, command_of, options
+
+FIELD = "FIELD"
+OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
+COMMAND = re.compile(r"(?:`|[Rr]un )(hil [a-z][^`;]*)")
+ENTRIES = (
+    re.compile(r"\[(?P<table>[a-z_]+)\] (?P<key>[a-z_]{3,})\b(?= =|,|;|$|\)|:)"),
+    re.compile(r"\b(?P<key>[a-z]+(?:_[a-z]+)*)`? (?:of|in|under) \[(?P<table>[a-z_]+)\]"),
+)
+OTHER_WORDS = {"and", "both", "factor", "listed", "parameters", "place", "stated", "that"}
+NOT_OF_HIL = ("hil/report/", "hil/study/run.py", "hil/cli/suggestions.py", "hil/doctor/checks.py")
+"""Variables of a style sheet, misspelt options, commands of the system."""
+
+
+def messages() -> Iterator[tuple[str, str]]:
+    """Place and text of each string that is no docstring; each field of an f-string is FIELD."""
+    for module in MODULES:
+        name = str(module.relative_to(ROOT))
+        if name.startswith(NOT_OF_HIL):
+            continue
+        tree = ast.parse(module.read_text("utf-8"))
+        inner = docstrings(tree)
+        for text in (node for node in ast.walk(tree) if isinstance(node, ast.JoinedStr)):
+            inner |= {id(node) for node in ast.walk(text) if node is not text}
+            parts = [
+                part.value if isinstance(part, ast.Constant) else FIELD for part in text.values
+            ]
+            yield f"{name}:{text.lineno}", "".join(map(str, parts))
+        for node in ast.walk(tree):
+            is_text = isinstance(node, ast.Constant) and isinstance(node.value, str)
+            if is_text and id(node) not in inner:
+                yield f"{name}:{node.lineno}", re.sub(r"{[^{}]*}", FIELD, node.value)
+
+
+MESSAGES = list(messages())
+PATH = re.compile(r"root|path|folder|campaign|output|location|source|file")
+
+
+def keys(model: type[BaseModel], table: str = "") -> Iterator[tuple[str, str]]:
+    """Tables of a file and their entries."""
+    for key, described in model.model_fields.items():
+        yield table, key
+        for kind in re.findall(r"[\w.]+", str(described.annotation)):
+            inner = TABLES.get(kind.rpartition(".")[2])
+            if inner is not None:
+                yield from keys(inner, key)
+
+
+def subclasses(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
+    for below in model.__subclasses__():
+        yield below
+        yield from subclasses(below)
+
+
+TABLES = {model.__name__: model for model in subclasses(BaseModel) if "hil." in model.__module__}
+
+
+def test_every_option_is_one() -> None:
+    wrong = [
+        f"{place}: {name}"
+        for place, text in MESSAGES
+        for name in OPTION.findall(text)
+        if name not in options()
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_command_has_the_options_beside_it() -> None:
+    wrong = []
+    commands = [(place, line) for place, text in MESSAGES for line in COMMAND.findall(text)]
+    assert len(commands) > 30
+    for place, line in commands:
+        command, _ = command_of(shlex.split(line.replace("'", ""))[1:])
+        unknown = {*OPTION.findall(line)} - options(command)
+        wrong += [f"{place}: {name}" for name in unknown]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_entry_is_one_of_a_file() -> None:
+    known = {entry for model in (ColumnMap, CellFile, DesignSettings) for entry in keys(model)}
+    entries = [
+        (place, found["table"], found["key"])
+        for place, text in MESSAGES
+        for pattern in ENTRIES
+        for found in pattern.finditer(text)
+        if found["key"] not in OTHER_WORDS
+    ]
+    assert len(entries) > 30
+    wrong = [f"{place}: [{table}] {key}" for place, table, key in entries
+             if (table, key) not in known]  # fmt: skip
+    assert not wrong, "\n".join(wrong)
+
+
+def test_paths_in_commands_are_quoted() -> None:
+    """A command with a path of the user is typed as it is printed."""
+    wrong = []
+    for module in MODULES:
+        for text in ast.walk(ast.parse(module.read_text("utf-8"))):
+            if isinstance(text, ast.JoinedStr):
+                line = "".join(
+                    str(part.value)
+                    if isinstance(part, ast.Constant)
+                    else "{" + ast.unparse(getattr(part, "value", part)) + "}"
+                    for part in text.values
+                )
+                for command in re.findall(r"\bhil [a-z][a-z -]* (?:[^`;]*)", line):
+                    fields = re.findall(r"{([^{}]*)}", command)
+                    bare = [one for one in fields if PATH.search(one) and "typed(" not in one]
+                    wrong += [f"{module.name}:{text.lineno}: {one}" for one in bare]
+    assert not wrong, "\n".join(wrong)
