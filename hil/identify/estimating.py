@@ -293,8 +293,7 @@ class Posterior:
         if not self.consistent:
             return result
         values = self.values(factor, share)
-        variance = factor.squared_errors(values) / np.maximum(factor.samples, 1)
-        noise = np.where(factor.samples > 0, np.sqrt(variance), np.nan)
+        noise = factor.residual_rms(values)
         return replace(result, estimate=replace(result.estimate, values=values, noise_std=noise))
 
     def values(self, factor: Factor, share: float = 1.0) -> Array:

@@ -339,7 +339,6 @@ def consistent_estimate(
     values = np.concatenate([model.base.grouping @ standard, others])
     rows, target = rows_of(equations)
     excess = float(np.square(rows @ values - target).sum())
-    rms = np.sqrt(factor.squared_errors(values) / np.maximum(factor.samples, 1))
     free = factor.relative_error(unconstrained.values)
     links = model.layout.links
     bodies = reference_bodies(model.nominal[links], model.chain.translation)
@@ -349,7 +348,7 @@ def consistent_estimate(
         estimate=replace(
             unconstrained,
             values=values,
-            noise_std=np.where(factor.samples > 0, rms, np.nan),
+            noise_std=factor.residual_rms(values),
             method="physically consistent (pseudo-inertia, rotor inertia and friction);"
             f" covariance of the unconstrained estimate: {unconstrained.method}",
         ),

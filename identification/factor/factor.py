@@ -207,6 +207,13 @@ class Factor:
         return 1e-12 if self.storage == "qr" else 1e-6
 
     @property
+    def smallest_variance(self) -> Array:
+        """Variance (n,) of the smallest noise, above zero."""
+        torque = self.products(np.eye(self.n_parameters + 1)[:, -1:])[:, 0, 0]
+        floor = self.smallest_noise**2 * torque / np.maximum(self.samples, 1)
+        return np.asarray(np.maximum(floor, np.finfo(np.float64).tiny))
+
+    @property
     def n_joints(self) -> int:
         """Number n of joints."""
         return len(self.matrices)
@@ -230,6 +237,15 @@ class Factor:
             augmented = np.append(-values[used], 1.0)
             squares[joint] = augmented @ self._sums[joint] @ augmented
         return np.maximum(squares, 0.0)
+
+    def residual_rms(self, values: Array) -> Array:
+        """Return the RMS residual of parameters (p,) per joint (n,), NaN without rows.
+
+        At least the smallest noise: sums of squares do not resolve a better fit.
+        """
+        variance = self.squared_errors(values) / np.maximum(self.samples, 1)
+        rms = np.sqrt(np.maximum(variance, self.smallest_variance))
+        return np.where(self.samples > 0, rms, np.nan)
 
     def relative_errors(self, values: Array) -> Array:
         """Return ||e|| / ||tau|| of parameters (p,) per joint (n,), NaN without torque."""
@@ -549,11 +565,8 @@ def residual_variance(factor: Factor, values: Array, root: Array, weights: Array
     """
     squares = factor.products(np.append(-values, 1.0)[:, None])[:, 0, 0]
     spent = weights * np.trace(factor.products(root), axis1=1, axis2=2)
-    torque = factor.products(np.eye(factor.n_parameters + 1)[:, -1:])[:, 0, 0]
-    floor = factor.smallest_noise**2 * torque / np.maximum(factor.samples, 1)
-    floor = np.maximum(floor, np.finfo(np.float64).tiny)
     variance = np.maximum(squares, 0.0) / np.maximum(factor.samples - spent, 1.0)
-    return np.where(factor.samples > 0, np.maximum(variance, floor), np.nan)
+    return np.where(factor.samples > 0, np.maximum(variance, factor.smallest_variance), np.nan)
 
 
 def joint_weights(factor: Factor) -> Array:

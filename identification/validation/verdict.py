@@ -124,9 +124,13 @@ def _facts(names: tuple[str, ...], evidence: Evidence, limit: Thresholds) -> Fac
     error, training, estimate = evidence.held_out, evidence.training, evidence.estimate
     checks, relative, explained = evidence.residuals, error.relative, error.explained
     times = relative / np.maximum(training.relative, 1e-12)
-    grown, large = times > limit.generalisation, relative > limit.axis
+    # An error below that of a pattern is one of rounding or smoothing.
+    grown = (times > limit.generalisation) & (relative > limit.pattern)
+    large = relative > limit.axis
     overall, covered = error.overall > limit.overall, limit.generalisation * training.overall
     minor = _minor(evidence, limit)
+    # Little torque does not excuse an axis that was fitted several times better.
+    lost = _lost_in_noise(evidence, limit)
     none, little = explained <= limit.explained, explained < limit.little_explained
     # Less torque on unseen motion alone raises the share.
     growth = error.rms / np.maximum(training.rms, 1e-300)
@@ -149,7 +153,7 @@ def _facts(names: tuple[str, ...], evidence: Evidence, limit: Thresholds) -> Fac
         "none": none & ~minor, "little": little & ~(none & ~minor),
         "much": any_explained and not little.any(),
         "least": explained[worst], "least_explained": names[worst],
-        "grown_far": grown & far & ~minor, "grown_little": grown & ~(far & ~minor),
+        "grown_far": grown & far & ~lost, "grown_little": grown & ~(far & ~lost),
     }  # fmt: skip
     facts |= _undetermined_facts(evidence)
     if (share := evidence.disagreement) is not None and not estimate.undetermined:
@@ -195,12 +199,18 @@ def _minor(evidence: Evidence, limit: Thresholds) -> NDArray[np.bool_]:
     error = evidence.held_out
     torque = error.torque_rms
     slides = np.isin(np.arange(len(torque)), evidence.prismatic)
-    minor = little_torque(torque, slides, limit)
-    if evidence.noise_floor is not None:
-        minor |= np.nan_to_num(evidence.noise_floor) > 0.5 * limit.axis * torque
+    minor = little_torque(torque, slides, limit) | _lost_in_noise(evidence, limit)
     if (most := evidence.context.torque_limit) is not None:
         minor |= torque < limit.minor_of_limit * np.nan_to_num(most)
     return np.asarray(minor & (error.rows > 0))
+
+
+def _lost_in_noise(evidence: Evidence, limit: Thresholds) -> NDArray[np.bool_]:
+    """Return axes whose torque is lost in its noise (n,)."""
+    torque = evidence.held_out.torque_rms
+    if evidence.noise_floor is None:
+        return np.zeros(len(torque), dtype=np.bool_)
+    return np.asarray(np.nan_to_num(evidence.noise_floor) > 0.5 * limit.axis * torque)
 
 
 def _change_facts(names: tuple[str, ...], evidence: Evidence, known: Facts) -> Facts:

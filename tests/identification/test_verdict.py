@@ -348,9 +348,29 @@ class TestJudgement:
         assert axes(0.03, noise_floor=np.array([0.1, 0.2])).good
         assert axes(0.03, torque_limit=np.array([30.0, 100.0])).good
 
+    def test_an_error_of_rounding_does_not_grow(self):
+        tiny = {"training": an_error(1e-7), "held_out": an_error(1e-6)}
+        assert not {"generalisation", "outliers"} & {
+            one.check for one in judged(**tiny).findings if one.level != "good"
+        }
+
     def test_a_joint_several_times_worse_than_its_fit_is_not_good(self):
         changes = {"training": an_error(np.array([0.05, 0.015])), "held_out": an_error(0.1)}
         assert any("two 6.7 times, 10.0 %" in reason for reason in judged(**changes).reasons)
+
+    def test_nor_is_one_of_little_torque(self):
+        """A hundredth of the other's; but one that is lost in noise is excused."""
+        power = np.array([1.0, 1e-4])
+
+        def small(relative):
+            error = an_error(np.array(relative))
+            return replace(
+                error, squared=error.squared * power, torque_squared=error.torque_squared * power
+            )
+
+        changes = {"training": small([0.01, 0.013]), "held_out": small([0.01, 0.1])}
+        assert any("two 7.7 times, 10.0 %" in reason for reason in judged(**changes).reasons)
+        assert judged(**changes, noise_floor=np.array([0.1, 0.1])).good
 
     @pytest.mark.parametrize(
         ("change", "error", "level", "words"),

@@ -1,0 +1,67 @@
+"""Logs without fault and without noise: no finding complains of them.
+
+Torques are those of the URDF by pinocchio, written with all digits.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from typer.testing import CliRunner
+
+import hil
+from hil.cli import app
+from hil.identified_arm import IdentifiedArm
+from tests.hil.simulated_logs import urdf_path
+from tests.hil.test_log_kinds import URDF
+
+COMPLAINTS = {"resolution", "outliers", "generalisation", "joint order"}
+
+
+def write_clean_log(path: Path, urdf: Path, *, repeated: bool) -> Path:
+    """Write the torques of the URDF's own rigid model; every second stamp may repeat another."""
+    model = pin.buildModelFromUrdf(str(urdf))
+    data, random = model.createData(), np.random.default_rng(0)
+    time = np.arange(2500) / 250.0
+    rate = random.uniform(1.0, 4.0, (3, model.nv))
+    angle = rate * time[:, None, None] + random.uniform(0.0, 6.0, rate.shape)
+    position = 0.25 * np.sin(angle).sum(axis=1)
+    velocity = 0.25 * (rate * np.cos(angle)).sum(axis=1)
+    acceleration = -0.25 * (rate**2 * np.sin(angle)).sum(axis=1)
+    states = zip(position, velocity, acceleration, strict=True)
+    torque = np.array([pin.rnea(model, data, *state) for state in states])
+    stamps = np.repeat(time[::2], 2) if repeated else time
+    np.savez(path, time=stamps, position=position, velocity=velocity, torque=torque)
+    return path
+
+
+@pytest.fixture(scope="module", params=["three joints", "UR5", "UR5, stamps repeated"])
+def arm(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> IdentifiedArm:
+    folder, urdf = tmp_path_factory.mktemp("clean"), urdf_path("ur5_robot.urdf")
+    if request.param == "three joints":
+        urdf = folder / "three.urdf"
+        urdf.write_text(URDF)
+    log = write_clean_log(folder / "log.npz", urdf, repeated="repeated" in request.param)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        return hil.identify(log, urdf=urdf)
+
+
+def test_nothing_is_wrong(arm: IdentifiedArm) -> None:
+    """Positions are not coarse, an error of 0.0 % has no outliers and has not grown."""
+    findings = [one for one in arm.verdict.findings if one.level != "good"]
+    assert arm.verdict.good and not [one for one in findings if one.level == "wrong"]
+    assert not COMPLAINTS & {one.check for one in findings}
+    assert not [one for one in findings if "order" in one.words or "coarse" in one.words]
+
+
+def test_it_is_exported(arm: IdentifiedArm, tmp_path: Path) -> None:
+    folder = arm.save(tmp_path / "result")
+    line = ["export", str(folder), "--to", "urdf", "-o", str(tmp_path / "arm.urdf")]
+    done = CliRunner().invoke(app, line)
+    assert done.exit_code == 0, (done.output, done.exception)
+    assert (tmp_path / "arm.urdf").read_text().startswith("<")
