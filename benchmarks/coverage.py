@@ -1,15 +1,16 @@
 """Whether 95 % intervals of `hil identify` hold the truth of arms that were simulated without hil.
 
 Run with ``python -m benchmarks.coverage [--seeds N] [--arms NAME ...] [--delays MS ...]
-[--quadratic] [--white] [--rate HZ] [--speed SHARE] [--scale SHARE] [--json]``. Each run is a log of
-its own seed, imported and identified with default settings; another motion is held out. Motion,
-dynamics (pinocchio's RNEA), friction and noise share no code with what is tested, only the URDF;
-what the parameters are called and how they are grouped is the project's.
+[--quadratic] [--load SHARE] [--white] [--rate HZ] [--speed SHARE] [--scale SHARE] [--json]``. Each
+run is a log of its own seed, imported and identified with default settings; another motion is held
+out. Motion, dynamics (pinocchio's RNEA), friction and noise share no code with what is tested, only
+the URDF; what the parameters are called and how they are grouped is the project's.
 
 - The arm is not its URDF: masses differ by 10 to 20 %, centres and inertias alike, by a congruence
   of the pseudo-inertia, which keeps a body physically consistent. Its rotors are in no URDF.
 - Friction is Coulomb, viscous and an offset, the law that an import assumes. ``--quadratic`` adds a
-  term with the speed squared, and states all four in the archive.
+  term with the speed squared, and states all four in the archive. ``--load`` lets dry friction grow
+  by a share of the rigid body's torque, which no archive states.
 - The motion is a random Fourier series within the URDF's limits that starts and ends at rest.
   ``--speed`` is the share of the largest speeds that it may use.
 - The scale of each joint's torque is off by 3 % (standard deviation), as an import assumes of one
@@ -95,6 +96,7 @@ class Conditions(NamedTuple):
         rate: of the log [Hz].
         speed: share of the URDF's largest speeds that motions may use.
         scale: standard deviation of the scale of each joint's logged torque, as a share.
+        load: share of the rigid body's torque by which dry friction grows.
     """
 
     quadratic: bool = False
@@ -102,22 +104,24 @@ class Conditions(NamedTuple):
     rate: float = 250.0
     speed: float = 0.7
     scale: float = 0.03
+    load: float = 0.0
 
 
 DEFAULTS: Final = Conditions()
 
 
 class Friction(NamedTuple):
-    """Coefficients (n,) of Coulomb [N·m], viscous, quadratic friction and an offset."""
+    """Coefficients (n,) of Coulomb [N·m], viscous, quadratic friction, an offset and the load."""
 
     coulomb: Array
     viscous: Array
     quadratic: Array
     offset: Array
+    load: Array
 
-    def torque(self, velocity: Array) -> Array:
-        """Torque (m, n) at speeds (m, n)."""
-        dry = self.coulomb * np.tanh(velocity / _DRY_SPEED)
+    def torque(self, velocity: Array, rigid: Array) -> Array:
+        """Torque (m, n) at speeds and torques of the rigid body (m, n)."""
+        dry = (self.coulomb + self.load * np.abs(rigid)) * np.tanh(velocity / _DRY_SPEED)
         fluid = self.viscous * velocity + self.quadratic * np.abs(velocity) * velocity
         return np.asarray(dry + fluid + self.offset)
 
@@ -174,10 +178,10 @@ class Arm:
         data = self.robot.createData()
         states = zip(position, velocity, acceleration, strict=True)
         rigid = np.array([pin.rnea(self.robot, data, *state) for state in states])
-        return rigid + self.friction.torque(velocity)
+        return rigid + self.friction.torque(velocity, rigid)
 
 
-def drawn_arm(kind: ArmType, seed: int, *, quadratic: bool = False) -> Arm:
+def drawn_arm(kind: ArmType, seed: int, conditions: Conditions = DEFAULTS) -> Arm:
     """Draw an arm near its URDF."""
     random = np.random.default_rng([seed, 1])
     robot = robot_from_urdf(urdf(kind.urdf).read_text(encoding="utf-8"), locked=kind.locked)
@@ -192,8 +196,10 @@ def drawn_arm(kind: ArmType, seed: int, *, quadratic: bool = False) -> Arm:
     coulomb, viscous = near(kind.coulomb), near(kind.viscous)
     offset = 0.2 * coulomb * random.uniform(-1.0, 1.0, len(coulomb))
     # At full speed it is as large as a third of the viscous term.
-    share = near([1.0 / 3.0] * len(coulomb)) if quadratic else np.zeros(len(coulomb))
-    return Arm(robot, Friction(coulomb, viscous, share * viscous / robot.velocityLimit, offset))
+    share = near([1.0 / 3.0] * len(coulomb)) if conditions.quadratic else np.zeros(len(coulomb))
+    quadratic = share * viscous / robot.velocityLimit
+    load = np.full(len(coulomb), conditions.load)
+    return Arm(robot, Friction(coulomb, viscous, quadratic, offset, load))
 
 
 def drawn_body(body: Any, random: np.random.Generator) -> Any:
@@ -300,11 +306,10 @@ def true_values(arm: Arm, model: RobotModel) -> dict[str, float]:
     values = dict(
         zip(model.parameter_names, (model.base.grouping @ standard).tolist(), strict=False)
     )
-    symbols = {"f0": "coulomb", "f1": "viscous", "f2": "quadratic", "fo": "offset"}
-    for symbol, name in symbols.items():
-        for joint, coefficient in enumerate(getattr(arm.friction, name).tolist(), 1):
-            if symbol != "f2" or arm.friction.quadratic.any():
-                values[f"{symbol}_{joint}"] = coefficient
+    symbols = dict(zip(("f0", "f1", "f2", "fo", "fl"), arm.friction, strict=True))
+    for symbol, coefficients in symbols.items():
+        if symbol in ("f0", "f1", "fo") or coefficients.any():
+            values |= {f"{symbol}_{j}": value for j, value in enumerate(coefficients.tolist(), 1)}
     return values
 
 
@@ -343,7 +348,7 @@ class Run(NamedTuple):
 def run(name: str, delay: float, seed: int, conditions: Conditions = DEFAULTS) -> Run:
     """Simulate an arm, log it a delay [s] late, import the log and identify it."""
     kind = ARM_TYPES[name]
-    arm = drawn_arm(kind, seed, quadratic=conditions.quadratic)
+    arm = drawn_arm(kind, seed, conditions)
     law = QUADRATIC_LAW if conditions.quadratic else IMPORTED_LAW
     with tempfile.TemporaryDirectory() as scratch:
         robot = Robot.from_urdf(urdf(kind.urdf), friction=law, locked=kind.locked)
@@ -457,13 +462,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--arms", nargs="+", choices=list(ARM_TYPES), default=list(ARM_TYPES))
     parser.add_argument("--delays", nargs="+", type=float, default=DELAYS, metavar="MS")
     parser.add_argument("--quadratic", action="store_true", help="true, and stated in the archive")
+    parser.add_argument("--load", type=float, default=DEFAULTS.load, metavar="SHARE")
     parser.add_argument("--white", action="store_true", help="no coloured noise of the torque")
     parser.add_argument("--rate", type=float, default=DEFAULTS.rate, metavar="HZ")
     parser.add_argument("--speed", type=float, default=DEFAULTS.speed, metavar="SHARE")
     parser.add_argument("--scale", type=float, default=DEFAULTS.scale, metavar="SHARE")
     options = parser.parse_args(arguments)
     conditions = Conditions(
-        options.quadratic, options.white, options.rate, options.speed, options.scale
+        options.quadratic,
+        options.white,
+        options.rate,
+        options.speed,
+        options.scale,
+        options.load,
     )
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     cells: dict[str, dict[str, Any]] = {}

@@ -442,7 +442,8 @@ def _delays(prepared: Prepared) -> results.DelaysResult | None:
     if found is None:
         return None
     every = np.ones(len(prepared.sources.cell.joint_names))
-    known = every if found.determined else np.nan * every
+    # A delay with a wide interval is applied, too, where it predicts better.
+    known = every if found.determined or found.delay == prepared.assumed_delay else np.nan * every
     return results.DelaysResult.of(
         found=found.delay * known,
         interval=found.half_interval * known,

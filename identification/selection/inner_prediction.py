@@ -332,9 +332,12 @@ def choose_settings(
     if "low-pass" in asked:
         now, choices = _compare_low_passes(trial, first, now, choices, asked, low_passes)
     if "friction" in asked:
+        law = now.model.friction.laws
         for decide in (_friction_terms, _load_friction):
             decision = decide(trial, now)
             now, choices = decision.settings, [*choices, decision.choice]
+        if "delay" in asked and now.model.friction.laws != law:
+            now, choices = _confirm_delay(trial, start, now, choices)
     if "ripple" in asked:
         rippled = [replace(now, model=now.model.with_elements(elements)) for elements in ripples]
         decision = trial.decide("torque ripple", [now, *rippled])
@@ -416,6 +419,23 @@ def _compare_delays(
             first = _with(first, torque_delay=delay)
             now, choices = _sweep(trial, first, questions)
     return first, now, [*compared, *choices]
+
+
+def _confirm_delay(
+    trial: _Trial, start: Settings, now: Settings, choices: list[Choice]
+) -> tuple[Settings, list[Choice]]:
+    """Leave out a delay that does not predict better by another friction law.
+
+    It was estimated by the former law, whose error may resemble one: friction that grows with the
+    load is largest where the torque is.
+    """
+    undelayed = _with(now, torque_delay=start.preprocessing.torque_delay)
+    if undelayed.key == now.key:
+        return now, choices
+    pair = [_with(each, left_out="slow") for each in (undelayed, now)]
+    decision = trial.decide(DELAY, pair, 0.0, rows="fitted")
+    others = [choice for choice in choices if choice.name != DELAY]
+    return (undelayed, now)[decision.choice.chosen], [*others, decision.choice]
 
 
 def _compare_low_passes(

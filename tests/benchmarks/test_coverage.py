@@ -30,7 +30,7 @@ class TestArm:
     def test_its_true_values_make_its_torque(self, name: str, quadratic: bool) -> None:
         """By the project's model: names, grouping and order of parameters are understood."""
         kind = ARM_TYPES[name]
-        arm = drawn_arm(kind, 1, quadratic=quadratic)
+        arm = drawn_arm(kind, 1, DEFAULTS._replace(quadratic=quadratic))
         law = coverage.QUADRATIC_LAW if quadratic else IMPORTED_LAW
         text = urdf(kind.urdf).read_text(encoding="utf-8")
         model = RobotModel.from_urdf(text, locked=kind.locked, friction=law)

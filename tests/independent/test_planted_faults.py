@@ -1,0 +1,101 @@
+"""Faults of one part of a recording, planted in logs simulated without code of the project.
+
+No verdict is "well", and the fault is named. Arms, motions and noise are those of
+`benchmarks.coverage`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.arms import urdf
+from benchmarks.coverage import (
+    ARM_TYPES,
+    DEFAULTS,
+    FITTED_TIME,
+    HELD_OUT_TIME,
+    Arm,
+    Logged,
+    drawn_arm,
+    drawn_motion,
+    logged,
+)
+from benchmarks.joint_log import JointLog
+from hil.identify import identify_archives
+from hil.identify.run import Identification
+from hil.importers import IMPORTED_LAW, Robot
+from hil.progress import Silent
+from identification.validation.finding import Finding
+
+GAIN, FRICTION = 1.1, 1.3
+SEEDS = (1, 2, 3)
+
+pytestmark = pytest.mark.slow
+
+
+def with_gain(log: Logged, joint: int) -> Logged:
+    """The torque of one joint is a tenth too large."""
+    scale = np.where(np.arange(log.torque.shape[1]) == joint, GAIN, 1.0)
+    return log._replace(torque=log.torque * scale)
+
+
+def with_friction(log: Logged, arm: Arm, seed: int) -> Logged:
+    """Friction of the held-out motion is larger by three tenths."""
+    motion = drawn_motion(
+        arm.robot, np.random.default_rng([seed, 2, 1]), HELD_OUT_TIME, DEFAULTS.speed
+    )
+    velocity = motion.at(log.time)[1]
+    more = arm.friction._replace(offset=0.0 * arm.friction.offset)
+    return log._replace(
+        torque=log.torque + (FRICTION - 1.0) * more.torque(velocity, 0.0 * velocity)
+    )
+
+
+def identified(name: str, seed: int, fault: str, joint: int, folder: Path) -> Identification:
+    """Plant a fault, import both logs, fit one and predict the other."""
+    kind = ARM_TYPES[name]
+    arm = drawn_arm(kind, seed)
+    robot = Robot.from_urdf(urdf(kind.urdf), friction=IMPORTED_LAW, locked=kind.locked)
+    fitted, held_out = (
+        logged(arm, seed, part, duration, 0.0, DEFAULTS)
+        for part, duration in enumerate((FITTED_TIME, HELD_OUT_TIME))
+    )
+    if fault == "gain":
+        fitted = with_gain(fitted, joint)
+    else:
+        held_out = with_friction(held_out, arm, seed)
+    archives = [
+        JointLog(robot, log.time, log.position, None, log.torque, kind.rated_payload).imported(
+            folder / f"{part}.mcap"
+        )
+        for part, log in enumerate((fitted, held_out))
+    ]
+    return identify_archives(archives[:1], Silent(), predict=archives[1:])
+
+
+def findings(found: Identification, *checks: str) -> list[Finding]:
+    """Those of some checks that are not good."""
+    return [one for one in found.verdict.findings if one.check in checks and one.level != "good"]
+
+
+@pytest.mark.parametrize("name", ARM_TYPES)
+@pytest.mark.parametrize("seed", SEEDS)
+class TestFaultOfOnePart:
+    def test_a_gain_of_one_joint(self, name: str, seed: int, tmp_path: Path) -> None:
+        """Of the last joint as well, whose torque is small and mostly friction."""
+        n = len(ARM_TYPES[name].rotor)
+        joint = (n - 1, 1, 3)[seed % 3]
+        found = identified(name, seed, "gain", joint, tmp_path)
+        assert not found.verdict.good
+        planted = found.results.joint_names[joint]
+        named = findings(found, "sameness", "generalisation")
+        assert any(f"{planted} " in one.words for one in named)
+
+    def test_friction_of_the_held_out_motion(self, name: str, seed: int, tmp_path: Path) -> None:
+        found = identified(name, seed, "friction", 0, tmp_path)
+        assert not found.verdict.good
+        (friction,) = findings(found, "friction")
+        assert friction.level == "wrong" and "springs" not in friction.next_step
