@@ -383,7 +383,7 @@ class CalibrationResult(Frozen):
 class DelaysResult(Frozen):
     """Delay of the torque behind the position; lists are per joint, s."""
 
-    found: list[Known]  #: Estimate; null if undetermined
+    found: list[Known]  #: Estimate; null if undetermined and not applied
     interval: list[Known]  #: Half width of its 95 % interval
     applied: list[float]  #: Used by the fit
 

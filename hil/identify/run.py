@@ -438,16 +438,19 @@ def _fitted(prepared: Prepared, values: Array) -> results.FittedResult:
 
 
 def _delays(prepared: Prepared) -> results.DelaysResult | None:
-    found = prepared.delays
-    if found is None:
-        return None
+    found, applied = prepared.delays, prepared.assumed_delay
     every = np.ones(len(prepared.sources.cell.joint_names))
-    # A delay with a wide interval is applied, too, where it predicts better.
-    known = every if found.determined or found.delay == prepared.assumed_delay else np.nan * every
+    if found is not None:
+        # A delay with a wide interval is applied, too, where it predicts better.
+        known = 1.0 if found.determined or found.delay == applied else np.nan
+        delay, interval = known * found.delay, known * found.half_interval
+    elif applied != prepared.settings.stated_delay:
+        # The lag of a low-pass that predicts as well as the low-pass.
+        delay, interval = applied, np.nan
+    else:
+        return None
     return results.DelaysResult.of(
-        found=found.delay * known,
-        interval=found.half_interval * known,
-        applied=prepared.assumed_delay * every,
+        found=delay * every, interval=interval * every, applied=applied * every
     )
 
 

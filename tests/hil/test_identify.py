@@ -7,6 +7,7 @@ import shutil
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from hil.identify import Options, identify_archives, identify_campaign
 from hil.identify.estimating import estimate_with
 from hil.identify.options import ESTIMATORS, FIXED, friction_from
 from hil.identify.prepared import prepare_sources
+from hil.identify.run import _delays
 from hil.identify.sources import gather_sources
 from hil.importers import Robot
 from hil.outcome import write_outcome
@@ -29,6 +31,7 @@ from hil.results import SCHEMA_VERSION, Results
 from hil.simulation import planted_values
 from identification.errors import IdentificationError
 from identification.estimators.consistent import SolverError
+from identification.estimators.delay import DelayEstimate
 from identification.model.friction import FrictionLaw
 from identification.selection.inner_prediction import Strength
 from sim_fixtures.ns16 import URDF_PATH
@@ -421,6 +424,27 @@ def log(tmp_path_factory):
 @pytest.fixture(scope="module")
 def split(log):
     return identify_archives([log], Silent(), UNFILTERED)
+
+
+@pytest.mark.parametrize(
+    ("wide", "applied", "stated"),
+    [(True, 0.004, 0.004), (True, 0.0, None), (False, 0.002, 0.002)],
+    ids=["wide interval", "not applied", "lag of a low-pass"],
+)
+def test_a_delay_that_was_applied_is_in_the_results(wide, applied, stated):
+    """Also one with an interval too wide to be called determined, or without an estimate."""
+    found = DelayEstimate(
+        delay=0.004, std=1e-3, assumed=0.0, cycle=1e-3, interval_factor=2.0,
+        reason="95 % interval of ± 2 ms", significant=True,
+    )  # fmt: skip
+    prepared = SimpleNamespace(
+        delays=found if wide else None,
+        assumed_delay=applied,
+        settings=SimpleNamespace(stated_delay=0.0),
+        sources=SimpleNamespace(cell=SimpleNamespace(joint_names=("a", "b"))),
+    )
+    delays = _delays(prepared)
+    assert (delays.found, delays.applied) == ([stated] * 2, [applied] * 2)
 
 
 def test_delays_of_the_torque_are_compensated(log, split):

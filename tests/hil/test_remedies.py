@@ -169,16 +169,6 @@ class TestLogs:
         columns = read(urdf.with_name("log.csv")).columns
         assert columns["position"] == pytest.approx(POSITION + 7.0, abs=1e-6)
 
-    def test_positions_in_degrees(self, urdf: Path) -> None:
-        position = 1.0 + 0.5 * POSITION
-        content = text(rows(position=np.degrees(position), cell=lambda value: f"{value:.9f}"))
-        refused = log(urdf, content)
-        assert '[position] unit = "deg"' in refused
-        with_unit = MAP.replace("[position]\n", '[position]\nunit = "deg"\n')
-        assert log(urdf, content, with_unit) == ""
-        columns = read(urdf.with_name("log.csv")).columns
-        assert columns["position"] == pytest.approx(position, abs=1e-6)
-
     def test_a_counter_for_a_time(self, urdf: Path) -> None:
         content = text(rows(time=range(COUNT)))
         refused = log(urdf, content)
