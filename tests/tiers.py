@@ -87,10 +87,8 @@ QUICK: Final = (
     "drivers/test_states.py",
     "drivers/test_session_start.py",
     "drivers/test_udp.py",
-    "simulate/test_seeds_quick.py",
 )
-"""Files of these folders that run at every change all the same: packets, guard, transports and
-eight seeds of the simulation."""
+"""Files of these folders that run at every change all the same: packets, guard and transports."""
 
 
 def tier_of(path: Path) -> Tier | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -40,13 +41,20 @@ def docstrings(tree: ast.AST) -> set[int]:
     }
 
 
-def texts(module: Path) -> Iterator[tuple[int, str, bool]]:
+@cache
+def tree_of(module: Path) -> ast.Module:
+    return ast.parse(module.read_text("utf-8"))
+
+
+@cache
+def texts(module: Path) -> tuple[tuple[int, str, bool], ...]:
     """Line and value of each string, and whether it is a docstring."""
-    tree = ast.parse(module.read_text("utf-8"))
-    inner = docstrings(tree)
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            yield node.lineno, node.value, id(node) in inner
+    inner = docstrings(tree_of(module))
+    return tuple(
+        (node.lineno, node.value, id(node) in inner)
+        for node in ast.walk(tree_of(module))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    )
 
 
 def prose(page: Path) -> Iterator[tuple[int, str]]:
@@ -108,7 +116,7 @@ class TestPercentages:
     def test_messages_have_a_space_before_the_sign(self, package: str) -> None:
         wrong: list[str] = []
         for module in (path for path in MODULES if path.is_relative_to(ROOT / package)):
-            tree = ast.parse(module.read_text("utf-8"))
+            tree = tree_of(module)
             wrong += [f"{module}:{field.lineno}" for field in fields_with_percent(tree)]
             literals = ((k, text) for k, text, inner in texts(module) if not inner)
             wrong += found(module, literals, re.compile(r"[^.{}]\d%(?!})"))

@@ -153,6 +153,7 @@ class TestParts:
 
 
 class TestBlocks:
+    @pytest.mark.long
     @pytest.mark.parametrize("correlation", [0.0, 0.02, 0.05, 0.1])
     def test_95_percent_intervals_cover_90_to_99_percent(self, correlation):
         motion = a_motion()
@@ -347,6 +348,7 @@ class TestRobustEstimate:
         ]
         np.testing.assert_allclose(scale, np.array(middle) / 0.67449, rtol=0.02)
 
+    @pytest.mark.long
     @pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
     @pytest.mark.parametrize("correlation", [0.0, 0.05])
     def test_95_percent_intervals_cover_90_to_99_percent(self, loss, correlation):
@@ -516,6 +518,7 @@ class TestPosterior:
         with pytest.raises(IdentificationError, match="not one usable sample"):
             fit_posterior(MODEL, Factor.zero(MODEL), prior)
 
+    @pytest.mark.long
     @pytest.mark.parametrize("correlation", [0.0, 0.05])
     def test_95_percent_intervals_cover_90_to_99_percent(self, correlation):
         prior = prior_of(KNOWN)

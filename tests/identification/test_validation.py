@@ -183,6 +183,7 @@ def shares(correlation, model_error=0.0, seeds=50):
     return tuple(np.mean(found, axis=0).tolist())
 
 
+@pytest.mark.long
 class TestIntervals:
     """Held-out mean torques are inside their 95 % intervals."""
 

@@ -405,6 +405,7 @@ waits = st.one_of(st.integers(0, 5), st.integers(0, 400))
     end=st.sampled_from(["stop", "resume"]),
     before=st.none() | fractions,
 )
+@pytest.mark.safety
 @settings(max_examples=400)
 @example(
     0, 0.002, [(300, ("hold", 0.0)), (40, ("resume", 0.0)), (20, ("override", 0.3))], "stop", None

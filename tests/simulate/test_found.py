@@ -16,8 +16,7 @@ from drivers.exchange.loop import exchange
 from drivers.record import cycle_dtype
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveOutcome, ArchiveSpec, open_archive
-from hil.campaign import VirtualLink
-from hil.campaign import virtual_link
+from hil.campaign import VirtualLink, virtual_link
 from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.operator import Stop
 from hil.cell import Cell

@@ -1,4 +1,4 @@
-"""Simulated campaigns keep all laws, whatever befalls them: eight seeds for every change."""
+"""Simulated campaigns keep all laws, whatever befalls them: the first eight seeds."""
 
 from __future__ import annotations
 

@@ -276,7 +276,7 @@ class TestAnyDamage:
     @pytest.mark.parametrize(
         ("kind", "count", "whole", "lost"),
         [
-            (flips, 200, 20, 20),
+            pytest.param(flips, 200, 20, 20, marks=pytest.mark.safety),
             (bursts, 60, 0, 10),
             (cuts, 80, 1, 5),
             pytest.param(flips, 10_000, 1000, 1000, marks=pytest.mark.slow),
