@@ -155,9 +155,6 @@ def _checked(name: str, value: ArrayLike, n: int) -> Array:
     return _frozen(array)
 
 
-Ages = NDArray[np.uint16]
-
-
 class ArmWire:
     """Conversion between joints of one arm and slots of a packet.
 
@@ -165,7 +162,6 @@ class ArmWire:
         joint_slots: (n,) slot of each joint.
         opened: (n,) joints that are to be open; only these are written into a frame.
         raw: (8, n) D1..D5, extra1..3 of the packet read last, in wire units.
-        age: (8, n) cycles since each of them was sent; None where all came with this packet.
 
     Raises:
         PacketError: the init packet's axis map is invalid or lacks one of the joints.
@@ -204,15 +200,10 @@ class ArmWire:
         at_zero = -self._motor_offset @ self._to_joint
         self._offset = np.array([at_zero, zero, at_zero, zero])
         self.raw = np.zeros((8, n))
-        self.age: Ages | None = None
 
-    def read(self, received: Floats, measured: Array, ages: Ages | None = None) -> None:
-        """Read a packet's axis blocks (n_axes, 9) into `raw`, and (8, n) into `measured` in SI.
-
-        `ages` (n_axes, 8) are those of the values; None if all were sent with the packet.
-        """
+    def read(self, received: Floats, measured: Array) -> None:
+        """Read a packet's axis blocks (n_axes, 9) into `raw`, and (8, n) into `measured` in SI."""
         raw = self.raw
-        self.age = None if ages is None else ages[self._pick].T
         raw[...] = received[self._pick, D1:].T
         kinematics = measured[:4]
         np.matmul(raw[:4], self._to_joint, out=kinematics)

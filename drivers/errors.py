@@ -155,11 +155,6 @@ class Check(Enum):
         _REST_FIRST,
     )
     STANDSTILL = "velocity at the first set-point", _PER_CYCLE, _REST_FIRST
-    FIRST_AGE = (
-        "age, at the first set-point, of received target, position or velocity",
-        "cycles",
-        _REST_FIRST,
-    )
     ACCEPTED = (
         "distance between received target and the set-points sent last",
         _REVOLUTIONS,
@@ -175,7 +170,6 @@ class Check(Enum):
         "rad/s",
         _LOOK_FOR_LOSSES,
     )
-    GAP_AGE = "age, after a gap, of received target or velocity", "cycles", _LOOK_FOR_LOSSES
 
     def __init__(self, quantity: str, unit: str, remedy: str = RefusalError.remedy) -> None:
         self.quantity = quantity

@@ -256,8 +256,6 @@ class SentSetPoints:
 
 # Rows of `ArmWire.raw`.
 TARGET, TARGET_VELOCITY, ACTUAL, ACTUAL_VELOCITY, CURRENT = range(5)
-_NEEDED_FIRST: Final = (TARGET, ACTUAL, ACTUAL_VELOCITY)
-_NEEDED_AFTER_GAP: Final = (TARGET, TARGET_VELOCITY, ACTUAL_VELOCITY)
 SPREAD: Final = 2
 """Cycles, per step that a controller extrapolated, in which the motion returns to its path.
 Where the motion accelerates, each step leaves the velocity of one cycle of that acceleration across
@@ -378,13 +376,13 @@ class SetPointGenerator:
     def hold_in_pause(self, packet: PacketStatus, cycle: int) -> None:
         """Require, in a pause, that open axes can hold their targets; raises `GuardError`."""
         self._cycle = cycle
-        self.require_holdable(packet.held_joints, packet.held_joints)
+        self.require_holdable(packet.held_joints)
 
     def opening(self) -> None:
         """Hold the axes that are open already, by the safe reply."""
         self.rejected = 0  # set-points of an earlier interval do not matter
         held = self._packet.held_joints
-        self.require_holdable(held, held | self._packet.ready)
+        self.require_holdable(held | self._packet.ready)
         self._record_held(held)
 
     def _record_held(self, held: Joints) -> None:
@@ -392,26 +390,17 @@ class SetPointGenerator:
         self._commanded[0] = np.where(held, self._measured[0], np.nan)
         self._commanded[1] = np.where(held, 0.0, np.nan)
 
-    def require_holdable(self, held: Joints, where: Joints) -> None:
-        """Require new targets for joints `held` (n,), and all of `where` near their targets."""
-        self._require_fresh((TARGET,), Check.FIRST_AGE, held)
+    def require_holdable(self, where: Joints) -> None:
+        """Require all of `where` (n,) near their targets."""
         self._guard.check_hold(self._raw[TARGET], self._raw[ACTUAL], where, self._cycle)
 
     def _require_at_rest(self) -> None:
         """Require the conditions of the first set-point."""
-        self._require_fresh(_NEEDED_FIRST, Check.FIRST_AGE, self._every)
         self._check_start(self._raw[TARGET])
 
     def _check_start(self, target: Array) -> None:
         raw = self._raw
         self._guard.check_start(target, raw[ACTUAL], raw[1:4:2], self._cycle)
-
-    def _require_fresh(self, rows: tuple[int, ...], check: Check, where: Joints) -> None:
-        age = self._wire.age
-        if age is None:
-            return
-        for row in rows:
-            require(where, age[row].astype(np.float64), self._still, check, self._cycle)
 
     def _check_feedback(self, sent: Array, where: Joints | None = None) -> None:
         raw = self._raw
@@ -478,13 +467,9 @@ class SetPointGenerator:
 
     def _check_accepted(self, where: Joints | None = None, *, stopping: bool = False) -> None:
         """Check the target received against the set-points sent, and count lost replies."""
-        target, age = self._raw[TARGET], self._wire.age
         self.rejected = self._history.check(
-            target, self._now.losses.gap, self._cycle, where, stopping=stopping
+            self._raw[TARGET], self._now.losses.gap, self._cycle, where, stopping=stopping
         )
-        if age is not None and age[TARGET].any():
-            # An old target does not show whether the last reply was accepted.
-            self.rejected, self._history.resend_needed = 0, False
 
     def check_after_gap(self, execution: Execution | None) -> None:
         """Compare target and velocity with the set-point sent last, after a long gap.
@@ -493,7 +478,6 @@ class SetPointGenerator:
         have closed since the first set-point are left out.
         """
         cycle, where = self._cycle, self._continuing & self._packet.ready
-        self._require_fresh(_NEEDED_AFTER_GAP, Check.GAP_AGE, where)
         raw, step = self._raw, self._step
         target, velocity = np.where(where, raw[TARGET], self._sent), np.where(where, raw[1:4:2], 0)
         if not (execution is not None and execution.is_resumable and step.any()):
@@ -519,7 +503,6 @@ class SetPointGenerator:
     def check_after_pause(self) -> None:
         """Require after a late packet that the arm moves as the set-points sent last."""
         where = self._continuing & self._packet.ready
-        self._require_fresh((ACTUAL_VELOCITY,), Check.GAP_AGE, where)
         velocity = self._wire.joint_difference(self._raw[ACTUAL_VELOCITY])
         self._guard.check_after_pause(velocity / self._guard.period, self._cycle, where)
 
@@ -527,7 +510,7 @@ class SetPointGenerator:
         """Hold axes that were always open at the last set-point, reopened ones at their target."""
         ready, continuing, held = self._packet.ready, self._continuing, self._packet.held_joints
         continuing &= ready
-        self.require_holdable(held & ~continuing, held | ready)
+        self.require_holdable(held | ready)
         self._record_held(held)
         self._check_feedback(self._sent, continuing)
         self._check_accepted(continuing)

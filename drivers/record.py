@@ -38,10 +38,9 @@ def cycle_dtype(n_joints: int) -> np.dtype[np.void]:
     ``cycle`` controller's cycles since its init packet, missed ones counted in; ``number`` wire
     sequence number; ``arrival`` s, for diagnosis only; ``gap`` packets missed before this one;
     ``interval`` index of the interval in open mode, -1 outside; ``state`` `State` after this
-    packet; ``status`` status byte of the arm; ``mode`` of each joint; ``age`` cycles since the
-    oldest joint value of each of `MEASURED` was sent (0: in this packet). Joint arrays are joint
-    side in SI (rad, rad/s), currents motor side in A, ``diagonal_inertia`` kg·m²; ``commanded_*``
-    are those of the reply, NaN where no set-point was sent.
+    packet; ``status`` status byte of the arm; ``mode`` of each joint. Joint arrays are joint side
+    in SI (rad, rad/s), currents motor side in A, ``diagonal_inertia`` kg·m²; ``commanded_*`` are
+    those of the reply, NaN where no set-point was sent.
     """
     joint = (n_joints,)
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [
@@ -54,7 +53,6 @@ def cycle_dtype(n_joints: int) -> np.dtype[np.void]:
         ("status", "u1"),
         *((name, "<f8", joint) for name in (*MEASURED, *COMMANDED)),
         ("mode", "<i4", joint),
-        ("age", "<u2", (len(MEASURED),)),
     ]
     return np.dtype(fields, align=True)
 
@@ -158,7 +156,6 @@ class CycleRing(RingReader):
         self.state = self.rows["state"]
         self.status = self.rows["status"]
         self.mode = self.rows["mode"]
-        self.age = self.rows["age"]
         self.measured = self._block(MEASURED)
         self.commanded = self._block(COMMANDED)
 

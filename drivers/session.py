@@ -50,7 +50,7 @@ from typing import Final
 import numpy as np
 
 from drivers.controller import Controller, connect
-from drivers.drive_train import Ages, DriveTrain
+from drivers.drive_train import DriveTrain
 from drivers.errors import (
     AxisNotInMode,
     Check,
@@ -374,14 +374,12 @@ class Session:
         self._sequence.broken = True
         self._apply(Input.SILENCE)
 
-    def reply(self, packet: bytes, now: float, ages: Ages | None = None) -> bytes | None:
+    def reply(self, packet: bytes, now: float) -> bytes | None:
         """Return the reply to a packet, or None if it gets none.
 
         Args:
             packet: its bytes.
             now: when it arrived, s on any monotonic clock.
-            ages: (n_axes, 8) cycles since D1..D5, extra1..3 of each slot were sent by the
-                controller; None if all were sent with this packet.
         """
         if self._silent_since is None or now >= self.deadline:
             self.tick(now)
@@ -401,7 +399,7 @@ class Session:
                 if number < INIT_NUMBER and not powered and self._sequence.is_stale(number):
                     # It gets a reply once silence has ended the session before.
                     self.losses.restarting += 1
-                return self._cyclic(packet, number, now, ages)
+                return self._cyclic(packet, number, now)
         except PacketError as error:
             self.counters.malformed += 1
             self._report("malformed", 1, f"{len(packet)} bytes: {error}")
@@ -448,7 +446,7 @@ class Session:
         self._sequence.accept(number)
         return self._finish(packet, echo(packet), now)
 
-    def _cyclic(self, packet: bytes, number: int, now: float, ages: Ages | None) -> bytes | None:
+    def _cyclic(self, packet: bytes, number: int, now: float) -> bytes | None:
         """Run one cycle: decode, record, change state, reply; an error becomes drive-off or 508."""
         controller, ring = self._controller, self._ring
         assert controller is not None
@@ -471,7 +469,7 @@ class Session:
         ring.number[row] = number
         ring.gap[row] = missed
         ring.cycle[row] = self.cycle
-        refusal = self._fill_reply(controller, status, words, ages, row)
+        refusal = self._fill_reply(controller, status, words, row)
         self.in_interval = self.in_interval and status.any_open
         ring.interval[row] = self.interval if self.in_interval else -1
         ring.state[row] = self.state
@@ -487,13 +485,12 @@ class Session:
         controller: Controller,
         status: PacketStatus,
         words: Words,
-        ages: Ages | None,
         row: int,
     ) -> RefusalError | None:
         """Fill in the reply and row `row` of the ring; return why a set-point was refused."""
         refusal: RefusalError | None = None
         try:
-            self._record(controller, status, words, ages, row)
+            self._record(controller, status, words, row)
             if self.losses.missed:
                 self.counters.missed += self.losses.missed
                 self._events.append(GapSeen(self.losses.missed, self.cycle))
@@ -524,13 +521,11 @@ class Session:
         controller: Controller,
         status: PacketStatus,
         words: Words,
-        ages: Ages | None,
         row: int,
     ) -> None:
-        """Write a packet into a row of the ring; commanded values are NaN.
+        """Write the axis blocks of a packet, `words` (n_axes, 9), into a row of the ring.
 
-        `words` (n_axes, 9) are its axis blocks, `ages` (n_axes, 8) cycles since its values were
-        sent; None if with this packet.
+        Commanded values are NaN.
         """
         ring, wire = self._ring, controller.wire
         ring.status[row] = status.status
@@ -538,11 +533,9 @@ class Session:
         if wire is None:
             ring.mode[row] = -1
             ring.measured[row] = math.nan
-            ring.age[row] = 0 if ages is None else ages.max(axis=0)
             return
         ring.mode[row] = status.modes
-        ring.age[row] = 0 if ages is None else ages[wire.joint_slots].max(axis=0)
-        wire.read(words.view(np.float32), ring.measured[row], ages)
+        wire.read(words.view(np.float32), ring.measured[row])
 
     def _reply_in_state(
         self, controller: Controller, status: PacketStatus, words: Words, row: int

@@ -27,8 +27,6 @@ REPLY_TIMEOUT = 60.0  # s that the controller waits for a reply
 class PipeTransport:
     """One message is one packet; the controller sends the next one after the reply."""
 
-    ages = None  # every packet carries all values
-
     def __init__(self, end: Connection, period: float) -> None:
         self.end, self.period, self.packets = end, period, 0
 

@@ -45,7 +45,12 @@ def open_controller_link(
     if kind is None:
         remedy = f"write NAME:ADDRESS; names are {', '.join(LINKS)}"
         raise InputError(None, f"{option} {text!r} names no transport", remedy=remedy)
-    if (fields := kind.parse(address)) is None:
+    try:
+        fields = kind.parse(address)
+    except ValueError as error:
+        problem, _, remedy = str(error).partition("; ")
+        raise InputError(None, f"{option} {text!r}: {problem}", remedy=remedy) from error
+    if fields is None:
         noun, form = kind.form
         raise InputError(None, f"{option} {text!r} is not {noun}", remedy=f"write {form}")
     cycle_ms = round(1e3 * settings.period)

@@ -1,7 +1,7 @@
 """The controller's end of the CAN profile, as a gateway at the controller.
 
-Start packets consist of many frames and take longer than a cycle on a real bus, so replies to them
-are waited for; cyclic packets are timed by the controller.
+The init packet takes longer than a cycle on a real bus, so replies to start packets are waited for;
+cyclic packets are timed by the controller.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from typing import Final
 
 import can
 
-from drivers.transports.can.profile import BusRates, ControllerEnd
+from drivers.transports.can.profile import UP, BusRates, End
 from drivers.transports.can.transport import CanLink, CanSpec, open_bus
 
 START_PATIENCE: Final = 0.25
-"""Least timeout for the reply to a packet sent as segments [s]."""
+"""Least timeout for the reply to a start packet [s]."""
 
 
 class CanControllerLink(CanLink):
     """`sim_fixtures.serve.ControllerLink` on a CAN bus, which `close` closes.
 
-    After a packet sent as segments, the timeout of `receive` is at least `start_patience` [s];
+    After a start packet the timeout of `receive` is at least `start_patience` [s];
     `clock` [s] times frames without time stamp.
     """
 
@@ -34,7 +34,7 @@ class CanControllerLink(CanLink):
         start_patience: float = START_PATIENCE,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        self._end = ControllerEnd(rates)
+        self._end = End(rates, UP)
         super().__init__(bus, self._end, clock=clock)
         self._start_patience = start_patience
         self._awaited = False
@@ -43,13 +43,13 @@ class CanControllerLink(CanLink):
         """Send one packet of the controller unless it is empty; what the bus refuses is lost.
 
         Raises:
-            CanError: an init packet of a session that the profile or the bus cannot carry.
+            CanError: an init packet of a session that the bus cannot carry.
             TransportClosed: closed, or the bus failed.
         """
         if not packet:
             return
-        self.send_frames(self._end.packet(packet))
-        self._awaited = self._end.segmented
+        super().send(packet)
+        self._awaited = len(packet) != self._end.cyclic_length
 
     def receive(self, timeout: float) -> bytes | None:
         """Return the next packet of the PC, or None after `timeout` s.
@@ -68,7 +68,7 @@ class CanControllerLink(CanLink):
 
 
 def open_controller_link(spec: CanSpec, mode: int | None = None) -> CanControllerLink:
-    """Open the controller's end on a bus of python-can; `mode` is None where no axis is opened.
+    """Open the controller's end on a bus of python-can, which carries any `mode`.
 
     Raises:
         TransportError: it cannot be opened, or (`CanError`) cannot carry the session.

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from drivers.drive_train import Ages
 from drivers.errors import TransportClosed
 from drivers.packets import (
     AXIS_LENGTH,
@@ -87,14 +86,10 @@ class _PeerSelection:
 
 
 class Arrival(NamedTuple):
-    """A packet received at time `arrived` on the link's clock, of reception if it is not `stamped`.
-
-    `ages` are those of its values, see `Transport.ages`.
-    """
+    """A packet received at time `arrived` on the link's clock, of reception if not `stamped`."""
 
     packet: bytes
     arrived: float
-    ages: Ages | None
     stamped: bool
 
 
@@ -142,20 +137,16 @@ class ReceiveQueue:
         delayed = queued or now - read_at > _LATE_READ * period or arrived < earliest
         # While any peer is accepted, the queue may hold packets of several.
         if delayed and not _accepts_any_peer(session):
-            return self._newest(self._arrival(packet, stamp, now, copy=True), period)
+            return self._newest(self._arrival(packet, stamp, now), period)
         return (self._arrival(packet, stamp, now),)
 
     def _stamp(self) -> float | None:
         arrived: float | None = getattr(self._transport, "arrived", None)
         return arrived
 
-    def _arrival(
-        self, packet: bytes, stamp: float | None, now: float, *, copy: bool = False
-    ) -> Arrival:
-        ages = self._transport.ages
-        if copy and ages is not None:  # the link may reuse its array for the next packet
-            ages = ages.copy()
-        return Arrival(packet, now if stamp is None else stamp, ages, stamp is not None)
+    @staticmethod
+    def _arrival(packet: bytes, stamp: float | None, now: float) -> Arrival:
+        return Arrival(packet, now if stamp is None else stamp, stamp is not None)
 
     def _newest(self, first: Arrival, period: float) -> tuple[Arrival, ...]:
         """Return the newest of each kind among a packet and those queued behind it."""
@@ -167,7 +158,7 @@ class ReceiveQueue:
             packet = transport.receive(0.0)
             if packet is None:
                 break
-            backlog.add(self._arrival(packet, self._stamp(), transport.now, copy=True))
+            backlog.add(self._arrival(packet, self._stamp(), transport.now))
         arrivals, dropped = tuple(arrival for _, arrival in backlog.newest), backlog.dropped
         if dropped and self._too_old(arrivals, period):
             arrivals, dropped = (), dropped + 1
@@ -303,10 +294,10 @@ def exchange(
                 peers.after_silence()
                 _count_rejected(transport, session)
                 continue
-            for packet, arrived, ages, stamped in arrivals:
+            for packet, arrived, stamped in arrivals:
                 lateness.before_reply(arrived if stamped else math.inf)
                 deadline = session.deadline
-                reply = reply_to(packet, arrived, ages)
+                reply = reply_to(packet, arrived)
                 if reply is not None:
                     now = transport.now
                     # Silence is counted from the reply: the packet may have been queued for long.

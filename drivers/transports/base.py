@@ -6,9 +6,6 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drivers.errors import DriverError
 
 
@@ -36,13 +33,6 @@ class Transport(Protocol):
     @property
     def now(self) -> float:
         """Monotonic time of the link, s."""
-
-    @property
-    def ages(self) -> NDArray[np.uint16] | None:
-        """Ages of the values of the packet received last, in cycles.
-
-        (n_axes, 8) for D1..D5, extra1..3 of each axis; None if each packet has all of them.
-        """
 
     def receive(self, timeout: float) -> bytes | None:
         """Return the next packet, or None after `timeout` s without one.
@@ -92,11 +82,10 @@ class FreePort:
 
 @dataclass(frozen=True)
 class CanBus:
-    """A CAN interface at these bit rates, bit/s; None for those of the profile."""
+    """A CAN FD interface at these bit rates, bit/s; None for those of the profile."""
 
     interface: str
     channel: str
-    profile: str
     bitrate: int | None = None
     data_bitrate: int | None = None
 

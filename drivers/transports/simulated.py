@@ -11,9 +11,6 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Final, Literal, NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drivers.errors import TransportClosed
 
 Direction = Literal["to_pc", "to_controller"]
@@ -169,11 +166,6 @@ class SimulatedTransport:
     def now(self) -> float:
         """Virtual time, s; a count of cycles, so that it does not drift."""
         return self.cycle * self._peer.period + self._waiting
-
-    @property
-    def ages(self) -> NDArray[np.uint16] | None:
-        """None: all values of a packet are of its own cycle."""
-        return None
 
     def rejected(self) -> dict[str, int]:
         """Return nothing: the link discards no packets."""

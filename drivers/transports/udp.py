@@ -15,9 +15,6 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drivers.errors import TransportClosed
 from drivers.packets import HEADER_LENGTH
 from drivers.transports.base import DirectRoute, FreePort, TransportError, TransportSpec
@@ -116,11 +113,6 @@ class UdpTransport:
     def now(self) -> float:
         """CLOCK_MONOTONIC, s."""
         return time.monotonic()
-
-    @property
-    def ages(self) -> NDArray[np.uint16] | None:
-        """None: a datagram carries all values."""
-        return None
 
     def receive(self, timeout: float) -> bytes | None:
         """Return the next datagram of the peer, or None after `timeout` s without one.

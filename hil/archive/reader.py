@@ -608,7 +608,7 @@ class Archive:
         for name in rows.dtype.names or ():
             if name in self.columns:
                 rows[name] = self.columns[name]
-            elif name not in schema.LATER_FIELDS:
+            else:
                 raise ArchiveError(self.path, f"has no column {name}", field=schema.CYCLE)
         return rows
 

@@ -43,9 +43,6 @@ MOTOR_CURRENT = "/motor_currents"
 EVENTS = "/hil/events"
 DESCRIPTION = "/robot_description"
 
-LATER_FIELDS = frozenset(("age",))
-"""Fields of a cycle that older archives do not have; they read as zero."""
-
 _STAMP_TYPES = {"sec": (np.dtype("<i4"),), "nanosec": (np.dtype("<u4"),)}
 
 
@@ -95,9 +92,6 @@ int32 gap                       # packets lost just before this one
 int32 interval                  # index of the interval of open mode
 uint8 state                     # state of the session
 uint8 status                    # status byte of the arm, as on the wire
-uint16[8] age                   # cycles since the oldest joint value of each of these was sent:
-                                # target_position, target_velocity, position, velocity,
-                                # target_current, model_current, diagonal_inertia, extra3
 """
 
 _MOTOR_CURRENT = """\
@@ -273,9 +267,9 @@ def message_layout(
     if topic in (CYCLE, MOTOR_CURRENT):
         expected = fixed_layout(profile(n)[topic].definition).dtype.fields or {}
     for name, (kind, *_) in expected.items():
-        if name not in found and name not in LATER_FIELDS:
+        if name not in found:
             raise LayoutError(f"they have no {name}")
-        if name in found and found[name][0] != kind:
+        if found[name][0] != kind:
             raise LayoutError(f"their {name} is not that of {n} joints")
     return layout
 

@@ -10,7 +10,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    field_validator,
+    model_validator,
+)
 
 from drivers.transports.base import TransportSpec
 from drivers.transports.udp import UdpSpec
@@ -357,6 +365,12 @@ class DriveTrainTable(Table):
     encoder_counts_per_revolution: Whole = field("encoder counts per motor turn", gt=0)
 
 
+CLASSIC: Final = (
+    "classic CAN is not supported any more: its frames do not carry packets whole; write "
+    'profile = "fd" if the adapter has CAN FD, else transport = "udp"'
+)
+
+
 class CanTable(Table):
     """`[controller.can]`: CAN adapter for transport = "can" (`docs/can.md`)."""
 
@@ -364,11 +378,18 @@ class CanTable(Table):
         'adapter by its python-can name, e.g. "socketcan" or "slcan"', min_length=1
     )
     channel: str = field('channel of the adapter, e.g. "can0" or "/dev/ttyACM0"', min_length=1)
-    profile: Literal["fd", "classic"] = field('"fd" or "classic"', "fd")
+    profile: Literal["fd"] = field('"fd", the only one', "fd")
     bitrate: Whole | None = field("bit/s, if the adapter needs it", None, gt=0)
     data_bitrate: Whole | None = field(
         "bit/s of the data phase, if the adapter needs it", None, gt=0
     )
+
+    @field_validator("profile", mode="before")
+    @classmethod
+    def _has_fd(cls, profile: object) -> object:
+        if profile == "classic":
+            raise ValueError(CLASSIC)
+        return profile
 
 
 class ControllerTable(Table):
@@ -409,7 +430,8 @@ class LinkType:
 
     Attributes:
         spec: settings of the link from `[controller]` and the number of axes.
-        parse: fields of `[controller]` from an address of `hil simulate`; None if it is none.
+        parse: fields of `[controller]` from an address of `hil simulate`; None if it is none, and
+            ValueError with problem and remedy for one that is not supported any more.
         form: what such an address is, and how it is written with an example.
         controller: module whose `open_controller_link(spec, mode)` opens the controller's end; a
             name, because `sim_fixtures` is slow to load.
@@ -436,19 +458,22 @@ def _can(table: ControllerTable, n_axes: int) -> TransportSpec:
     from drivers.transports.can.transport import CanSpec  # python-can is slow to load
 
     assert table.can is not None, "the table is checked"
-    return CanSpec(**table.can.model_dump(), period=table.cycle_ms / 1000, n_axes=n_axes)
+    adapter = table.can.model_dump(exclude={"profile"})
+    return CanSpec(**adapter, period=table.cycle_ms / 1000, n_axes=n_axes)
 
 
 def _can_address(text: str) -> dict[str, Any] | None:
     interface, _, rest = text.partition(":")
     channel, _, profile = rest.rpartition(":") if ":" in rest else (rest, "", "fd")
-    if not (interface and channel) or profile not in ("fd", "classic"):
+    if profile == "classic":
+        raise ValueError(CLASSIC)
+    if not (interface and channel) or profile != "fd":
         return None
-    return {"can": {"interface": interface, "channel": channel, "profile": profile}}
+    return {"can": {"interface": interface, "channel": channel}}
 
 
 HOST_PORT: Final = ("an address", "HOST:PORT, for instance 127.0.0.1:2001")
-BUS: Final = ("a bus", "INTERFACE:CHANNEL:fd or :classic, for instance socketcan:can0:fd")
+BUS: Final = ("a bus", "INTERFACE:CHANNEL or INTERFACE:CHANNEL:fd, for instance socketcan:can0")
 LINKS: Final[Mapping[str, LinkType]] = {
     "udp": LinkType(_udp, _udp_address, HOST_PORT, "sim_fixtures.serve"),
     "can": LinkType(_can, _can_address, BUS, "sim_fixtures.can_link"),

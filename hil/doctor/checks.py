@@ -211,7 +211,7 @@ _ARPHRD_CAN = "280"
 def can_check(bus: CanBus, system: System) -> Check:
     """Check that a CAN interface is up at the bit rate of the cell; another one corrupts frames."""
     # An adapter is not opened here: on the bus it would acknowledge frames.
-    name, fd = f"CAN {bus.interface} {bus.channel}", bus.profile == "fd"
+    name = f"CAN {bus.interface} {bus.channel}"
     if bus.interface != "socketcan":
         found = "not a kernel device; it is opened by the exchange only"
         return Check(name, Status.UNKNOWN, found)
@@ -219,9 +219,7 @@ def can_check(bus: CanBus, system: System) -> Check:
     if system.text(f"{folder}/type") != _ARPHRD_CAN:
         look = ("ip -brief link show type can", "sudo modprobe can_raw   # and the card's driver")
         return Check(name, Status.BAD, "is not a CAN interface", look)
-    rates = f"bitrate {bus.bitrate or 1_000_000}"
-    if fd:
-        rates += f" dbitrate {bus.data_bitrate or 5_000_000} fd on"
+    rates = f"bitrate {bus.bitrate or 1_000_000} dbitrate {bus.data_bitrate or 5_000_000} fd on"
     bring_up = f"sudo ip link set {bus.channel} up txqueuelen 100 type can {rates}"
     if system.text(f"{folder}/operstate") == "down":
         return Check(name, Status.BAD, "down", (bring_up,))
@@ -235,8 +233,7 @@ def can_check(bus: CanBus, system: System) -> Check:
         remedy = (f"ip -details link show {bus.channel}",)
         return Check(name, Status.UNKNOWN, "bit rate not stated", remedy)
     found = f"up, {nominal} bit/s" + (f", data {data} bit/s" if data else "")
-    wanted = bus.data_bitrate or data if fd else data
-    if nominal == (bus.bitrate or nominal) and data == wanted and (data or not fd):
+    if nominal == (bus.bitrate or nominal) and data and data == (bus.data_bitrate or data):
         return Check(name, Status.OK, found)
     down = f"sudo ip link set {bus.channel} down"
     return Check(name, Status.BAD, f"{found}; the cell needs {rates}", (down, bring_up))

@@ -43,7 +43,6 @@ class Conduct:
         stopping: a stop was asked for (or a long gap was, or too many replies were not accepted) in
             this interval.
         overridden: a change of override was accepted in this interval.
-        aged: a target in the packet was sent in an earlier cycle: lost replies are not visible.
         tally: how often each law was applied.
     """
 
@@ -60,7 +59,6 @@ class Conduct:
     entitled: bool = False
     stopping: bool = False
     overridden: bool = False
-    aged: bool = False
     barrier: bool = True
     sent: list[np.ndarray] = field(default_factory=list)
     motor: np.ndarray | None = None
@@ -345,7 +343,6 @@ class Conduct:
         """Check a set-point sent again because it was not accepted: the motion waits."""
         lag = self._lag(target)
         assert lag > self.lag, "sent again although it was accepted"
-        assert not self.aged, "sent again though an older target shows no loss"
         self.lost += 1 if self.repeats else lag - self.lag
         self.repeats += 1
         self.stopping = self.stopping or self.lost > self.max_gap
@@ -358,9 +355,6 @@ class Conduct:
         """
         lag = self._lag(target)
         slow = np.abs(self._last_step()).max() <= 4.0 * self.limits.standstill * (1 + 1e-6)
-        if self.aged:
-            self.lag = lag if slow else min(lag, self.lag)
-            return
         assert lag <= self.lag or slow or self.stopping, "a leap after lost answers"
         self.lost += max(0, lag - self.lag)
         self.lag = self.lag if self.repeats and not lag else lag
@@ -407,7 +401,6 @@ class Judged:
     Attributes:
         last: the packet answered afresh last, and its answer.
         now: s, when the packet delivered last arrived.
-        ages: of the values in the next packet, as `Session.reply` takes them.
         source: requested last; counts in `asked` how often it was asked for a set-point.
     """
 
@@ -432,7 +425,6 @@ class Judged:
         self._n_axes, self._period, self._inits = n_axes, period, inits
         self.now = 0.0
         self.last: tuple[bytes, bytes] | None = None
-        self.ages: np.ndarray[Any, Any] | None = None
         self.unanswered = 0
 
     def deliver(self, packet: bytes, elapsed: float | None = None) -> bytes | None:
@@ -448,7 +440,7 @@ class Judged:
         before, last = self.ring.slot, self.reception.last
         kind = self.reception.expect(packet)
         asked = self.source.asked if self.source is not None else 0
-        reply = self.session.reply(packet, self.now, self.ages)
+        reply = self.session.reply(packet, self.now)
         if self.source is not None and self.source.asked > asked:
             assert self.source.asked == asked + 1, "asked twice for one packet"
             assert kind == "cyclic" and self.conduct.all_open(packet), "asked with an axis closed"
@@ -475,7 +467,6 @@ class Judged:
         assert len(reply) == oracle.length(self._n_axes), "length"
         record = self.ring.last(1)[0]
         conduct = self.conduct
-        conduct.aged = self.ages is not None and bool(self.ages[list(conduct.slots), 0].any())
         # Packets that got no answer are gaps to the controller; numbers show most of them.
         conduct.judge(packet, reply, record, max(int(record["gap"]), self.unanswered))
         self.unanswered = 0

@@ -222,7 +222,6 @@ class Rig:
         self.guard = Guard(guard_limits or limits(), period)
         options = {"settle_cycles": 5, **options}
         self.mode = options.get("mode", Mode.POSITION)
-        self.ages = None
         self.session = Session(self.train, self.guard, self.ring, **options)
         self.init = init or init_packet(sample_time=round(1000 * period))
         self.now = 0.0
@@ -254,7 +253,7 @@ class Rig:
     def send(self, packet: bytes) -> bytes | None:
         """Deliver any bytes, one cycle later; return the reply."""
         self.now += self.period
-        reply = self.session.reply(packet, self.now, self.ages)
+        reply = self.session.reply(packet, self.now)
         self.events += self.session.events()
         self.transcript.append((packet, reply))
         return reply

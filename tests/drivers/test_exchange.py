@@ -137,8 +137,6 @@ class TestExchange:
 class Link:
     """A link with packets of a script; `forgotten` has the replies sent at each `forget_peer`."""
 
-    ages = None
-
     def __init__(self, now=0.0):
         self.now = now
         self.sent = []
@@ -341,23 +339,6 @@ class TestBacklog:
         assert len(self.serve(rig, on_time, [late, rig.init.encode()])) == 3
         assert State.INIT in self.states(rig)
 
-    def test_each_packet_of_a_backlog_has_its_own_ages(self):
-        rig, _ = moving()
-        on_time, late = rig.packet(), rig.packet()
-        link = Backlogged([[on_time], [late, rig.init.encode(), b"short"]], rig.now)
-        ages = []
-        link.ages = np.zeros((N, 8), dtype=np.uint16)
-        receive, reply = link.receive, rig.session.reply
-
-        def aging(timeout):
-            link.ages += 1
-            return receive(timeout)
-
-        link.receive = aging
-        rig.session.reply = lambda packet, now, age: ages.append(age[0, 0]) or reply(packet, now)
-        exchange(link, rig.session, ends_when=lambda: False)
-        assert ages == [1, 2, 3, 4]
-
     def test_packet_and_duplicate_get_one_reply(self):
         rig, _ = moving()
         on_time, late = rig.packet(), rig.packet()
@@ -377,7 +358,7 @@ class EchoSession:
         self.discards = {}
         self.stops = []
 
-    def reply(self, packet, now, ages):
+    def reply(self, packet, now):
         return packet
 
     def discarded(self, kind, count):
@@ -420,7 +401,7 @@ class Paced(Link):
         self.number += 1
         return self.number.to_bytes(4, "little") + bytes(224)
 
-    def reply(self, packet, now, ages):
+    def reply(self, packet, now):
         self.now += self.costs.pop(0) * PERIOD
         return packet
 
@@ -486,7 +467,7 @@ def test_estimated_arrivals_count_no_reply_as_late(slower):
     """Nor where the cycle of the controller is slightly longer than stated."""
     link, session = Paced([0.95] * 20_000, stamped=False, slower=slower), EchoSession()
     arrivals = []
-    session.reply = lambda packet, now, ages: arrivals.append(now) or link.reply(packet, now, ages)
+    session.reply = lambda packet, now: arrivals.append(now) or link.reply(packet, now)
     exchange(link, session, ends_when=lambda: False)
     assert session.discards.get("replied to late", 0) == 0
     assert session.stops == []

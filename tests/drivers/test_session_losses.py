@@ -498,15 +498,6 @@ class TestPauses:
             rig.cycle()
             assert rig.state is state
 
-    def test_old_velocity_is_refused(self):
-        rig = at_speed(1200, speed=2.0)
-        rig.ages = np.zeros((N, 8), np.uint16)
-        rig.ages[3, 3] = 1
-        rig.cycle()
-        assert rig.state is State.OPEN
-        rig.now += 0.9
-        assert assert_refused(rig, rig.cycle(), Check.GAP_AGE).joint == 3
-
     def test_arm_that_lags_or_rests_without_a_motion_continues(self):
         """As on a busy computer, whose cycle was longer."""
         rig = at_speed(1200, speed=2.0)

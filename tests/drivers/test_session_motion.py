@@ -8,21 +8,14 @@ import pytest
 from drivers import Mode, MotionEnded, MotionStarted, State
 from drivers.errors import (
     AxisNotInMode,
-    Check,
 )
 from tests.drivers.rig import (
     MOVE,
     PERIOD,
     START,
-    Cruise,
     N,
     Rig,
-    all_drive_off,
-    assert_refused,
     closed,
-    init_packet,
-    kind_of,
-    moving,
     opened,
     resumptions,
     running,
@@ -223,118 +216,3 @@ class TestRecords:
         np.testing.assert_array_equal(record["extra3"], [2, 5, 8, 11, 14, 17])
         assert np.isnan(record["commanded_position"]).all()
         assert np.isnan(record["commanded_velocity"]).all()
-
-
-D1, D2, D3, D4, D5 = range(5)
-
-
-def fresh(n_axes: int = N) -> np.ndarray:
-    return np.zeros((n_axes, 8), np.uint16)
-
-
-class TestAges:
-    """Cycles since a value was sent, on links that send some less often."""
-
-    def test_the_oldest_joint_of_the_arm_counts_in_records(self):
-        axes_map = np.full((4, 10), 0xFF)
-        axes_map[0, :N] = [6, 5, 4, 2, 1, 0]
-        axes_map[1, 0] = 3
-        init = init_packet(n_axes=7, open_axes_map=axes_map)
-        rig = Rig(init=init, slots=axes_map[0, :N], other_axes={(2, 1)})
-        rig.ages = fresh(7)
-        rig.ages[:, 1] = [3, 17, 4, 0, 0, 65535, 2]
-        rig.ages[3] = 50
-        rig.ages[6, 7] = 9
-        rig.close()
-        assert rig.records[-1]["age"].tolist() == [0, 65535, 0, 0, 0, 0, 0, 9]
-        rig.ages = None
-        rig.cycle()
-        assert not rig.records[-1]["age"].any()
-
-    @pytest.mark.parametrize(("mode", "held"), [(4, False), (5, False), (4, True)])
-    @pytest.mark.parametrize("column", [D1, D3, D4])
-    def test_target_position_and_velocity_must_be_new_at_the_start(self, mode, held, column):
-        rig = (opened if held else closed)(mode=mode)
-        rig.ages = fresh()
-        rig.ages[3, column] = 1
-        if held:
-            rig.cycle(5)
-            assert rig.state is State.OPEN
-            rig.session.request(still(5))
-        assert all_drive_off(rig.cycle(mode=mode))
-        error = rig.refusal
-        assert kind_of(error) is Check.FIRST_AGE
-        assert (error.joint, error.value, error.bound, error.unit) == (3, 1.0, 0.0, "cycles")
-        assert rig.state is State.FAULTED
-
-    def test_other_values_may_be_old(self):
-        def replies(ages):
-            rig = running(Cruise())
-            for cycle in range(100):
-                rig.ages = ages(cycle)
-                rig.cycle()
-            return [reply for _, reply in rig.transcript]
-
-        rng = np.random.default_rng(5)
-        assert replies(lambda _: None) == replies(lambda _: rng.integers(0, 99, (N, 8), np.uint16))
-        rig = Rig()
-        rig.ages = fresh()
-        rig.ages[:, [D2, D5, 5, 6, 7]] = 40
-        rig.session.request(smooth_move(MOVE, 300))
-        rig.open()
-        rig.run_to("completed")
-
-    @pytest.mark.parametrize(
-        ("missed", "column", "age", "is_refused"),
-        [
-            *((3, column, age, age > 0) for column in (D1, D2, D4) for age in (0, 1)),
-            (2, D2, 60, False),  # a short gap
-        ],
-    )
-    def test_old_values_after_a_gap_are_refused(self, missed, column, age, is_refused):
-        rig, source = moving()
-        rig.ages = fresh()
-        rig.ages[2, column] = age
-        rig.cycle(5)
-        assert rig.state is State.OPEN
-        rig.miss(missed)
-        answer = rig.cycle()
-        if is_refused:
-            error = assert_refused(rig, answer, Check.GAP_AGE)
-            assert (error.joint, error.value, error.unit) == (2, 1.0, "cycles")
-            assert source.advances == 305
-        else:
-            assert (rig.state, source.stops) == (State.OPEN, missed > 2)
-
-    @pytest.mark.parametrize("leaving", [False, True])
-    def test_old_values_after_a_gap_without_a_motion(self, leaving):
-        rig = opened()
-        if leaving:
-            rig.session.stop()
-            rig.cycle()
-            assert rig.state is State.EXITING
-        rig.ages = fresh() + np.uint16(3)
-        rig.cycle()
-        rig.miss(10)
-        assert all_drive_off(rig.cycle())
-        assert kind_of(rig.refusal) is Check.GAP_AGE
-
-    @pytest.mark.parametrize("reopened", [False, True])
-    def test_old_target_is_not_returned_to_an_axis(self, reopened):
-        """That opens, or has opened again; those that are still open rest at the last set-point."""
-        rig = opened() if reopened else closed()
-        rig.ages = fresh()
-        if reopened:
-            rig.session.stop()
-            rig.cycle()
-            rig.axes["mode"][2] = Mode.CLOSED
-            rig.cycle()
-        rig.ages[np.arange(N) != (-1 if reopened else 2), D1] = 1
-        rig.axes["mode"][2] = Mode.CLOSED if reopened else Mode.POSITION
-        rig.cycle()
-        assert rig.state is (State.EXITING if reopened else State.OPENING)
-        rig.ages[2, D1] = 1
-        rig.axes["mode"][2] = Mode.POSITION
-        assert all_drive_off(rig.cycle())
-        error = rig.refusal
-        assert (kind_of(error), error.joint, error.value) == (Check.FIRST_AGE, 2, 1.0)

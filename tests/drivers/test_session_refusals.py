@@ -541,16 +541,10 @@ class TestLongGap:
 
 def test_records_of_an_arm_without_axis_map():
     rig = started(init=init_packet(open_axes_map=np.full((4, 10), 3)))
-    rig.ages = np.zeros((N, 8), np.uint16)
-    rig.ages[4, 2] = 7
     rig.cycle()
     record = rig.records[-1]
     assert (record["mode"] == -1).all()
     assert np.isnan([record["position"], record["target_position"]]).all()
-    assert record["age"].tolist() == [0, 0, 7, 0, 0, 0, 0, 0]
-    rig.ages = None
-    rig.cycle()
-    assert not rig.records["age"][-1].any()
 
 
 def leaving(axis: int | None = None, mode: int = Mode.POSITION) -> Rig:
@@ -611,33 +605,6 @@ class TestWhileLeaving:
 
 
 EVERY = np.ones(N, dtype=bool)
-
-
-class TestAges:
-    """Cycles since a value was sent, on links that send some less often."""
-
-    TARGET, TARGET_VELOCITY, ACTUAL, VELOCITY = range(4)
-
-    @pytest.mark.parametrize(("age", "lost"), [(0, 1), (1, 0)])
-    def test_old_target_is_no_lost_reply(self, age, lost):
-        rig, _ = moving(100)
-        before = rig.axes.copy()
-        rig.ages = np.zeros((N, 8), np.uint16)
-        rig.cycle()
-        rig.axes[:] = before
-        rig.ages[0, self.TARGET] = age
-        rig.cycle()
-        assert rig.session.counters.rejected == lost
-
-    @pytest.mark.parametrize(("axis", "is_refused"), [(2, False), (3, True)])
-    @pytest.mark.parametrize("column", [TARGET, TARGET_VELOCITY, VELOCITY])
-    def test_closed_axis_after_a_long_gap(self, column, axis, is_refused):
-        rig = leaving(axis=2)
-        rig.miss(10)
-        rig.ages = np.zeros((N, 8), np.uint16)
-        rig.ages[axis, column] = 1
-        rig.cycle()
-        assert [kind_of(event.error) for event in rig.seen(Refused)] == [Check.GAP_AGE] * is_refused
 
 
 class TestIncompleteOpening:

@@ -155,8 +155,8 @@ class LoggedSession:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._session, name)
 
-    def reply(self, packet: bytes, now: float, ages: Any) -> bytes | None:
-        reply = self._session.reply(packet, now, ages)
+    def reply(self, packet: bytes, now: float) -> bytes | None:
+        reply = self._session.reply(packet, now)
         self.replies.append(reply or b"")
         return reply
 
@@ -185,9 +185,9 @@ class JudgedSession(Judged):
     def __getattr__(self, name: str) -> Any:
         return getattr(self._logged, name)
 
-    def reply(self, packet: bytes, now: float, ages: Any) -> bytes | None:
+    def reply(self, packet: bytes, now: float) -> bytes | None:
         if self.broken:
-            return self._logged.reply(packet, now, ages)
+            return self._logged.reply(packet, now)
         self._silent_by(now)
         try:
             self.deliver(packet, now - self.now)

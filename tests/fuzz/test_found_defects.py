@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers import CyclicPacket, InitPacket
-from drivers.transports.can.profile import BusRates, ControllerEnd
+from drivers import CyclicPacket
+from drivers.transports.can.profile import DOWN, UP, BusRates, End
 from hil.archive import Samples, write_samples
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.rehearsal import Rehearsal
@@ -179,8 +179,9 @@ def test_number_out_of_range_is_refused(
 
 
 def test_signalling_nan_is_sent_over_can() -> None:
-    end = ControllerEnd(BusRates("classic"))
-    end.packet(InitPacket.build(1, 2, {}).encode())
+    """To the bit, as any other word."""
+    sender, receiver = End(BusRates(), UP), End(BusRates(), DOWN)
     packet = CyclicPacket.zeros(11, 1)
     packet.axes.view(np.int32)[1] = 0x7F800001
-    assert len(end.packet(packet.encode())) == 2
+    sent = packet.encode()
+    assert [receiver.receive(frame, 0.0) for frame in sender.frames(sent)] == [sent]

@@ -14,7 +14,7 @@ import pytest
 
 from drivers import CyclicPacket, Guard, Session
 from drivers.transports.can import profile
-from drivers.transports.can.profile import ControllerEnd, PcEnd, write_reply
+from drivers.transports.can.profile import End, TransferAssembler, payloads
 from hil.archive import ArchiveHeader, open_archive
 from hil.errors import ArchiveError
 from tests.fuzz import __main__ as command
@@ -30,6 +30,10 @@ def loses_axes(whole: Callable[..., bytes | None]) -> Callable[..., bytes | None
     return emptied
 
 
+def cut_short(packet: bytes, transfer: int) -> list[bytes]:
+    return payloads(packet, transfer)[:-1]
+
+
 encode = CyclicPacket.encode
 IN_THE_CODEC = "AssertionError-tests.fuzz.targets.codec"
 IN_THE_JUDGE = "AssertionError-tests.drivers.judge"
@@ -40,18 +44,14 @@ PLANTED: dict[str, tuple[str, Any, str, Callable[..., Any], str]] = {
         ("session", Session, "_cyclic", lambda *_: 1 // 0, "ZeroDivision"),
     "a codec that changes a byte":
         ("codec", CyclicPacket, "encode", lambda self: encode(self)[:-1] + b"\7", IN_THE_CODEC),
-    "replies by CAN to another packet":
-        ("codec", profile, "write_reply", lambda *a: b"\1\1" + write_reply(*a)[2:], IN_THE_CODEC),
-    "a PC that receives nothing by CAN":
-        ("codec", PcEnd, "receive", lambda *_: None, IN_THE_CODEC),
-    "a controller that receives nothing":
-        ("codec", ControllerEnd, "receive", lambda *_: None, IN_THE_CODEC),
-    "a controller that sends nothing":
-        ("codec", ControllerEnd, "packet", lambda *_: int("none"), "ValueError"),
-    "a PC that loses axes":
-        ("codec", PcEnd, "_packet", loses_axes(PcEnd._packet), IN_THE_CODEC),
-    "a controller that loses axes":
-        ("codec", ControllerEnd, "_packet", loses_axes(ControllerEnd._packet), IN_THE_CODEC),
+    "a link that receives nothing by CAN":
+        ("codec", End, "receive", lambda *_: None, IN_THE_CODEC),
+    "a link that sends nothing by CAN":
+        ("codec", End, "frames", lambda *_: int("none"), "ValueError"),
+    "transfers without their last frame":
+        ("codec", profile, "payloads", cut_short, IN_THE_CODEC),
+    "an assembler that loses axes":
+        ("codec", TransferAssembler, "add", loses_axes(TransferAssembler.add), IN_THE_CODEC),
     "a header whose errors are not named":
         ("archive", ArchiveHeader, "of",
          lambda text: ArchiveHeader.model_validate({**text, "entries": text}), "ValidationError"),

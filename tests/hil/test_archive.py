@@ -252,19 +252,25 @@ class TestBadInput:
             open_archive(tmp_path / NAME)
 
 
-def test_archive_without_ages_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_archive_of_an_earlier_version_with_ages_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cycles had the age of each value, for links that sent some in turn; it is a column."""
     rows = records(300)
-    whole = schema._CYCLE
-    monkeypatch.setattr(schema, "_CYCLE", whole[: whole.index("uint16[8] age")])
+    aged = np.zeros(len(rows), [*rows.dtype.descr, ("age", "<u2", (8,))])
+    for name in rows.dtype.names:
+        aged[name] = rows[name]
+    aged["age"] = np.arange(8)
+    monkeypatch.setattr(schema, "_CYCLE", schema._CYCLE + "uint16[8] age\n")
     schema.profile.cache_clear()
-    path = write(tmp_path / NAME, rows)
+    path = write(tmp_path / NAME, aged)
     monkeypatch.undo()
     schema.profile.cache_clear()
     archive = open_archive(path)
     assert archive.complete
-    assert "age" not in archive.columns
-    rows["age"] = 0
+    np.testing.assert_array_equal(archive.columns["age"], aged["age"])
     assert same(archive.cycles(), rows)
+    assert check_archive(path).damage is None
 
 
 def test_documentation_shows_the_messages() -> None:

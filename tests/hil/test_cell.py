@@ -211,12 +211,27 @@ def test_link_and_session_are_as_the_cell_describes_them(ns16: Cell) -> None:
     again = on_bus.with_link(can=adapter.model_copy(update={"channel": "other"}))
     assert (on_bus.controller.can, again.controller.can.channel) == (adapter, "other")
     assert again.text.count("[controller.can]") == 1
-    classic = ns16.with_link(transport="can", can=adapter.model_copy(update={"profile": "classic"}))
-    with pytest.raises(CellError, match=r"controller\.can"):
-        classic.transport_spec()
+    with pytest.raises(CellError, match=r"controller\.can: CAN: 8 frames .* use a longer cycle"):
+        ns16.with_link(transport="can", cycle_ms=1, can=adapter).transport_spec()
     for host in ("127.0.0.1", "127.1.2.3", "10.2.12.150", "controller"):
         reached = ns16.with_link(transport="udp", host=host)
         assert reached.only_simulated is host.startswith("127.")
+
+
+@pytest.mark.parametrize("profile", ["", 'profile = "fd"', 'profile = "classic"'])
+def test_classic_can_is_refused_with_what_to_write(folder: Path, profile: str) -> None:
+    """Cell files of earlier versions may name it."""
+    adapter = f'[controller.can]\ninterface = "slcan"\nchannel = "/dev/ttyACM0"\n{profile}\n'
+    table = (r"^\[drive_train\]$", f"{adapter}\n[drive_train]")
+    file = edited(folder, (r"^transport = .*$", 'transport = "can"'), table)
+    if "classic" not in profile:
+        assert Cell.load(file).controller.can.profile == "fd"
+        return
+    with pytest.raises(CellError) as refused:
+        Cell.load(file)
+    assert refused.value.field == "controller.can.profile"
+    assert 'write profile = "fd"' in refused.value.remedy
+    assert 'transport = "udp"' in refused.value.remedy
 
 
 def test_the_third_nominal_coefficient_may_be_left_out(folder: Path, ns16: Cell) -> None:

@@ -270,7 +270,7 @@ PARTLY = RealTimeReport("SCHED_FIFO 50", False, True, ("only memory in use now i
 NOTHING = RealTimeReport("ordinary", False, False)
 CPU = "/sys/devices/system/cpu"
 C4G = "10.2.12.150"
-FD = CanBus("socketcan", "can0", "fd", bitrate=1_000_000, data_bitrate=5_000_000)
+FD = CanBus("socketcan", "can0", bitrate=1_000_000, data_bitrate=5_000_000)
 BUS = {"/sys/class/net/can0/type": "280", "/sys/class/net/can0/operstate": "up"}
 
 
@@ -340,7 +340,7 @@ JUDGED = [
         (BUS, UNKNOWN, "not stated", ip()),
         (BUS, OK, "virtual bus", ip({"linkinfo": {"info_kind": "vcan"}})),
     ),
-    *of(lambda s: system_checks.can_check(CanBus("slcan", "x", "fd"), s),
+    *of(lambda s: system_checks.can_check(CanBus("slcan", "x"), s),
         ({}, UNKNOWN, "not a kernel device")),
     *of(port(errno.EACCES), ({}, BAD, "net.ipv4.ip_unprivileged_port_start=1000")),
     *of(port(errno.EADDRINUSE), ({}, BAD, "sudo ss -lunp")),

@@ -311,9 +311,9 @@ def invoke(*options: str) -> Any:
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        (["--can", "virtual:0:classic", "--cycle", "1"], "135.0 % of a cycle of 1 ms"),
-        (["--can", "virtual:0:fd", "--cycle", "2", "--mode", "8"], "mode 8 does not fit"),
-        (["--can", "virtual:can0:foo"], "fd or :classic"),
+        (["--can", "virtual:0:fd", "--cycle", "1"], "135.7 % of a cycle of 1 ms"),
+        (["--can", "virtual:0:classic"], "classic CAN is not supported any more"),
+        (["--can", "virtual:can0:foo"], "INTERFACE:CHANNEL:fd"),
         (["--udp", "127.0.0.1:2001", "--fault", "lose@1x100000000000000000000"], "KIND@CYCLE"),
         ([], "give one of --udp, --can"),
         (["--udp", "127.0.0.1:2001", "--can", "virtual:0"], "give one of"),
@@ -334,7 +334,7 @@ def test_impossible_options_are_refused_first(options, complaint):
 
 
 def test_a_bus_is_named_as_python_can_names_it():
-    for text in ("virtual:simulate", "virtual:simulate:fd", "virtual:simulate:classic"):
+    for text in ("virtual:simulate", "virtual:simulate:fd"):
         link = link_at(can=text)
         assert link.receive(0.001) is None
         link.close()

@@ -10,33 +10,18 @@ import re
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import can
-import numpy as np
 from can.interfaces.slcan import slcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
-from numpy.typing import NDArray
 
 from drivers.errors import TransportClosed
-from drivers.packets import Mode
 from drivers.transports.base import CanBus, TransportError, TransportSpec
-from drivers.transports.can.profile import (
-    MAX_AXES,
-    SEGMENT_DOWN,
-    SEGMENT_UP,
-    BusRates,
-    CanAxesError,
-    CanError,
-    CanModeError,
-    End,
-    Frame,
-    PcEnd,
-    ProfileName,
-)
+from drivers.transports.can.profile import DOWN, BusRates, CanError, End, Frame
 
 logging.getLogger("can").addHandler(logging.NullHandler())  # our errors have its reasons
 
@@ -70,9 +55,7 @@ def open_bus(
         return can.Bus(**_arguments(interface, channel, rates), **options)
     except (can.CanError, OSError, ValueError, TypeError, ImportError, RuntimeError) as error:
         remedy = _REMEDIES.get(interface, "see python-can's documentation of this interface")
-        wanted = f"bitrate {rates.bitrate}"
-        if rates.profile == "fd":
-            wanted += f" dbitrate {rates.data_bitrate} fd on"
+        wanted = f"bitrate {rates.bitrate} dbitrate {rates.data_bitrate} fd on"
         remedy = remedy.format(channel=channel, rates=wanted)
         link = f"CAN bus {interface}:{channel}"
         raise TransportError(link, str(error) or type(error).__name__, remedy) from error
@@ -95,8 +78,6 @@ def _slcan_rates(rates: BusRates) -> dict[str, Any]:
 
     An adapter that is opened first is on the bus with the rates of its last use.
     """
-    if rates.profile != "fd":
-        return {"bitrate": rates.bitrate}
     # Only the rates are sent to the adapter, not the sample points.
     timing = can.BitTimingFd.from_sample_point(
         f_clock=_CLOCK,
@@ -110,9 +91,8 @@ def _slcan_rates(rates: BusRates) -> dict[str, Any]:
 
 def _arguments(interface: str, channel: str, rates: BusRates) -> dict[str, Any]:
     arguments: dict[str, Any] = {"interface": interface, "channel": channel}
-    fd = rates.profile == "fd"
     if interface == "virtual":
-        arguments["protocol"] = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
+        arguments["protocol"] = can.CanProtocol.CAN_FD
     elif interface == "udp_multicast":
         group, _, port = channel.partition("/")
         # Frames must not leave this computer.
@@ -120,11 +100,9 @@ def _arguments(interface: str, channel: str, rates: BusRates) -> dict[str, Any]:
         if port:
             arguments["port"] = int(port)
     elif interface == "socketcan":
-        arguments["fd"] = fd
+        arguments["fd"] = True
     else:
-        arguments.update(bitrate=rates.bitrate, fd=fd)
-        if fd:
-            arguments["data_bitrate"] = rates.data_bitrate
+        arguments.update(bitrate=rates.bitrate, fd=True, data_bitrate=rates.data_bitrate)
     return arguments
 
 
@@ -138,9 +116,9 @@ def _failing_as_closed() -> Iterator[None]:
 
 
 SEND_TIMEOUT: Final = 0.05
-"""Longest wait for a full send queue, s; a frame not accepted by then is lost."""
-SEGMENT_TIMEOUT: Final = 0.5
-"""The same for a segment, s: there are many at once, and nothing moves yet."""
+"""Longest wait for a full send queue, s; a packet not accepted by then is lost."""
+START_TIMEOUT: Final = 0.5
+"""The same before the session has cyclic packets, s: there are many frames, and nothing moves."""
 MAX_QUEUED: Final = 1000
 """Frames read after the time-out."""
 _MAX_ECHOES: Final = 256
@@ -157,7 +135,6 @@ class CanLink:
         self.discarded = end.discarded
         self._bus = bus
         self._frames = end
-        self._fd = end.rates.profile == "fd"
         self._clock = clock
         self._closed = False
         self._waiting: deque[can.Message] = deque()
@@ -204,7 +181,7 @@ class CanLink:
         if message.is_error_frame:
             self.discarded["bus_error"] += 1
             return None
-        if message.is_extended_id or message.is_remote_frame or bool(message.is_fd) != self._fd:
+        if message.is_extended_id or message.is_remote_frame or not message.is_fd:
             self.discarded["foreign"] += 1
             return None
         frame = Frame(message.arbitration_id, bytes(message.data))
@@ -214,12 +191,17 @@ class CanLink:
         # The time on the bus matters, not that of reading.
         return self._frames.receive(frame, message.timestamp or self._clock())
 
-    def send_frames(self, frames: Sequence[Frame]) -> None:
-        """Send frames in order; if the bus does not accept one, the rest is dropped and counted."""
+    def send(self, packet: bytes) -> None:
+        """Send one packet; if the bus does not accept a frame, the rest is dropped and counted.
+
+        Raises:
+            TransportClosed: closed, or the bus failed.
+            CanError: the bus cannot carry the session.
+        """
         self._require_open()
-        for frame in frames:
-            segment = frame.id in (SEGMENT_UP, SEGMENT_DOWN)
-            timeout = SEGMENT_TIMEOUT if segment else SEND_TIMEOUT
+        is_cyclic = len(packet) == self._frames.cyclic_length
+        timeout = SEND_TIMEOUT if is_cyclic else START_TIMEOUT
+        for frame in self._frames.frames(packet):
             try:
                 with _failing_as_closed():
                     self._bus.send(
@@ -227,8 +209,8 @@ class CanLink:
                             arbitration_id=frame.id,
                             data=frame.data,
                             is_extended_id=False,
-                            is_fd=self._fd,
-                            bitrate_switch=self._fd,
+                            is_fd=True,
+                            bitrate_switch=True,
                             check=False,
                         ),
                         timeout,
@@ -299,15 +281,10 @@ def lock_bus(interface: str, channel: str) -> int | None:
     return lock
 
 
-MOVABLE = frozenset((Mode.POSITION, Mode.POSITION_RELATIVE, Mode.DELTA_POSITION))
-"""Open modes whose set-points fit the frames."""
-
-
 class CanTransport(CanLink):
     """The PC's end of the CAN profile on an open bus, which is closed with it, as is `lock`.
 
-    A reply that the frames cannot carry is replaced by a request for drive-off, and the link is
-    closed with the reason. `clock` is that of `CanLink`.
+    `clock` is that of `CanLink`.
     """
 
     def __init__(
@@ -318,19 +295,13 @@ class CanTransport(CanLink):
         clock: Callable[[], float] = time.time,
         lock: int | None = None,
     ) -> None:
-        self._end = PcEnd(rates)
         self._lock = lock
-        super().__init__(bus, self._end, clock=clock)
+        super().__init__(bus, End(rates, DOWN), clock=clock)
 
     @property
     def now(self) -> float:
         """CLOCK_MONOTONIC, s."""
         return time.monotonic()
-
-    @property
-    def ages(self) -> NDArray[np.uint16] | None:
-        """(n_axes, 8) ages of the values of the last cyclic packet, in cycles."""
-        return self._end.ages
 
     def receive(self, timeout: float) -> bytes | None:
         """Return the next packet, or None after `timeout` s without one.
@@ -348,26 +319,22 @@ class CanTransport(CanLink):
         """Send the reply to the packet received last.
 
         Raises:
-            TransportClosed: closed, the bus failed, or it cannot carry the reply: drive-off was
-                requested instead.
+            TransportClosed: closed, the bus failed, or it cannot carry the session.
         """
         try:
-            frames = self._end.reply(packet)
+            super().send(packet)
         except CanError as error:
-            self.send_frames(self._end.drive_off())
             self.close()
             raise TransportClosed(str(error)) from error
-        self.send_frames(frames)
 
     def rejected(self) -> dict[str, int]:
-        """Return frames and sets discarded since the last call, by kind."""
+        """Return frames and packets discarded since the last call, by kind."""
         counts = dict(self.discarded)
         self.discarded.clear()
         return counts
 
     def forget_peer(self) -> None:
-        """Discard the slow values of the lost session."""
-        self._end.forget()
+        """Do nothing: a bus has no addresses."""
 
     def close(self) -> None:
         """Close the bus; may be called again."""
@@ -386,30 +353,28 @@ class CanSpec(TransportSpec):
     Attributes:
         interface: python-can's name of it: "socketcan", "slcan", "pcan", "udp_multicast", ...
         channel: "can0", "/dev/ttyACM0", ...
-        profile: "fd" or "classic".
-        bitrate: bit/s; None for 1 Mbit/s.
-        data_bitrate: bit/s of the data phase on FD; None for 5 Mbit/s.
+        bitrate: bit/s of the arbitration phase; None for 1 Mbit/s.
+        data_bitrate: bit/s of the data phase; None for 5 Mbit/s.
         period: cycle in s.
         options: further arguments of the python-can bus.
     """
 
     interface: str
     channel: str
-    profile: ProfileName = "fd"
     bitrate: int | None = None
     data_bitrate: int | None = None
     period: float = field(kw_only=True)
-    n_axes: int = field(default=MAX_AXES, kw_only=True)
+    n_axes: int = field(default=6, kw_only=True)
     options: Mapping[str, bool | int | float | str] = field(
         default_factory=dict, kw_only=True, hash=False
     )
 
     @property
     def rates(self) -> BusRates:
-        """Profile and bit rates."""
-        standard = BusRates(self.profile)
+        """Bit rates."""
+        standard = BusRates()
         data_bitrate = self.data_bitrate or standard.data_bitrate
-        return BusRates(self.profile, self.bitrate or standard.bitrate, data_bitrate)
+        return BusRates(self.bitrate or standard.bitrate, data_bitrate)
 
     @property
     def description(self) -> str:
@@ -424,22 +389,16 @@ class CanSpec(TransportSpec):
     @property
     def needs(self) -> tuple[CanBus]:
         """The interface at its bit rates."""
-        rates = (self.bitrate, self.data_bitrate)
-        return (CanBus(self.interface, self.channel, self.profile, *rates),)
+        return (CanBus(self.interface, self.channel, self.bitrate, self.data_bitrate),)
 
     def check(self, mode: int | None = None) -> None:
-        """Check that this bus can carry the session, and motions in this open mode.
+        """Check that a cycle is long enough for the frames, which carry any mode.
 
         Raises:
-            CanAxesError: more axes than the frames can carry.
-            CanBusLoadError: the cycle is too short for the frames.
-            CanModeError: the set-points of this mode do not fit the frames.
+            CanBusLoadError: it is not.
         """
-        if not 1 <= self.n_axes <= MAX_AXES:
-            raise CanAxesError(f"the robot has {self.n_axes} axes")
+        del mode
         self.rates.require_load(self.n_axes, self.period)
-        if mode is not None and mode not in MOVABLE:
-            raise CanModeError(f"motion in mode {mode} does not fit the frames")
 
     def open(self) -> CanTransport:
         """Open the bus.

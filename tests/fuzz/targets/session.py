@@ -299,11 +299,8 @@ class Conversation(Judged):
         self.now += count * self.arm.period
         self.run(1)
 
-    def grow_old(self) -> None:
-        ages = [self._draw.below(4) for _ in range(8)]
-        self.ages = np.tile(np.array(ages, np.uint16), (len(self.arm.axes), 1))
-        self.run(1)
-        self.ages = None
+    def wait(self) -> None:
+        self.run(self._draw.between(1, 8))
 
     # What the line does -------------------------------------------------------------------
 
@@ -414,7 +411,7 @@ def _edge(hold: int, share: float) -> np.ndarray:
 _C = Conversation
 ACTS: tuple[Callable[[Conversation], None], ...] = (
     _C.go_on, _C.request_and_open, _C.request, _C.open_properly, _C.stop, _C.override, _C.all_modes,
-    _C.one_mode, _C.drive, _C.disturb, _C.miss, _C.grow_old, _C.again, _C.late, _C.cut, _C.corrupt,
+    _C.one_mode, _C.drive, _C.disturb, _C.miss, _C.wait, _C.again, _C.late, _C.cut, _C.corrupt,
     _C.noise, _C.silence, _C.start_over, _C.sync, _C.go_on, _C.request_and_open,
 )  # fmt: skip
 """What may happen next."""

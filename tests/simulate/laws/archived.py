@@ -90,7 +90,6 @@ def cycle_layout(n: int) -> np.dtype[np.void]:
         ("interval", "<i4", 4),
         ("state", "u1", 1),
         ("status", "u1", 1),
-        ("age", ("<u2", (8,)), 16),
     ):
         names.append(name)
         formats.append(kind)

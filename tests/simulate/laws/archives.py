@@ -28,7 +28,7 @@ from .wire import REFUSALS, Array, Gears
 _EPS: Final = float(np.finfo(np.float64).eps)
 _FLUSHED: Final = 0.1  # duration of a chunk [s]
 _DRAINED: Final = 100  # cycles after which records are passed to the archive
-_SAME: Final = ("arrival", "number", "gap", "interval", "state", "status", "mode", "age")
+_SAME: Final = ("arrival", "number", "gap", "interval", "state", "status", "mode")
 _SI: Final = (
     *("target_position", "target_velocity", "position", "velocity"),
     *("target_current", "model_current", "diagonal_inertia", "extra3"),
