@@ -32,7 +32,7 @@ from benchmarks import parser_of, show, timed
 from benchmarks.archive_files import JOINTS, PERIOD, drive_train, records
 from drivers.exchange import control as control_memory
 from drivers.exchange import event_log
-from drivers.exchange.control import ControlBlock
+from drivers.exchange.control import SharedState
 from drivers.exchange.event_log import EventWriter
 from drivers.record import CycleRing
 from hil.archive import ArchiveSpec, open_archive
@@ -56,7 +56,7 @@ class Exchange:
         self.ring = CycleRing.shared(JOINTS, 20_000)
         self.ring_fd, self.event_fd = self.ring.fd, event_log.create()
         self.control_fd = control_memory.create()
-        self.events, self.control = EventWriter(self.event_fd), ControlBlock(self.control_fd)
+        self.events, self.control = EventWriter(self.event_fd), SharedState(self.control_fd)
         self.pid = os.getpid()
         self._rows = records(0)
 

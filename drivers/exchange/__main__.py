@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from drivers.drive_train import DriveTrain
 from drivers.exchange import realtime
-from drivers.exchange.control import ControlBlock
+from drivers.exchange.control import SharedState
 from drivers.exchange.event_log import EventWriter, ExchangeEnded, ExchangeFailed, ExchangeStarted
 from drivers.exchange.loop import MAX_LATE, exchange
 from drivers.exchange.process import ExchangeSettings
-from drivers.exchange.serving import ControlServer, portable
+from drivers.exchange.serving import CommandHandler, portable
 from drivers.guard import Guard, GuardLimits
 from drivers.motion_source import BoundsName
 from drivers.packets import (
@@ -97,7 +97,7 @@ def warm_up(
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the exchange on descriptors: channel, settings, ring, events, control block."""
+    """Run the exchange on descriptors: channel, settings, ring, events, shared state."""
     channel_fd, settings_fd, ring_fd, event_fd, control_fd = map(int, arguments)
     # The terminal of the supervisor may send these while an arm moves.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -115,8 +115,8 @@ def main(arguments: Sequence[str]) -> int:
         guard = Guard(settings.guard_limits, settings.period)
         session = Session(settings.drive_train, guard, ring, **settings.session)
         transport = settings.transport.open()
-        control = ControlBlock(control_fd)
-        server = ControlServer(
+        control = SharedState(control_fd)
+        server = CommandHandler(
             session,
             transport,
             ring,
@@ -143,7 +143,7 @@ def main(arguments: Sequence[str]) -> int:
     return status
 
 
-def _serve(transport: Transport, session: Session, server: ControlServer, max_late: int) -> int:
+def _serve(transport: Transport, session: Session, server: CommandHandler, max_late: int) -> int:
     try:
         exchange(transport, session, ends_when=server, max_late=max_late)
         server.conclude()

@@ -30,7 +30,7 @@ SHORTEST: Final = 2e-6
 """Upper edge of the first bin, s; each next one is 2 ** (1 / `PER_OCTAVE`) times longer. The last
 contains everything above 5.8 ms."""
 OUTCOMES: Final[tuple[Outcome, ...]] = ("lost", "completed", "stopped", "refused")
-"""Outcome of a motion by its number in a control block; "lost" before the first."""
+"""Outcome of a motion by its number in the shared state; "lost" before the first."""
 
 
 def bin_of(seconds: float) -> int:
@@ -82,7 +82,7 @@ _KINDS: Final[dict[str, Any]] = {
 }
 
 
-class ControlBlock(ctypes.Structure):
+class SharedState(ctypes.Structure):
     """The fields of supervisor, exchange and archive, for readers and writers.
 
     Counts of packets are those of `drivers.events.Counters`.
@@ -118,7 +118,7 @@ class ControlBlock(ctypes.Structure):
         archive_state: an `ArchiveState`.
 
     Raises:
-        ValueError: the memory is not a control block.
+        ValueError: the memory has none.
     """
 
     supervisor_heartbeat: float
@@ -167,7 +167,7 @@ class ControlBlock(ctypes.Structure):
         """Return the block in shared memory."""
         mapped = attach_memory(fd)
         if len(mapped) != ctypes.sizeof(cls):
-            raise ValueError("this memory is not a control block")
+            raise ValueError("this memory has no shared state")
         return cls.from_buffer(mapped)
 
     def __init__(self, fd: int) -> None:
@@ -181,7 +181,7 @@ class ControlBlock(ctypes.Structure):
 
 def create() -> int:
     """Return the descriptor of memory for a block; every field is 0."""
-    return create_memory("hil-control", ctypes.sizeof(ControlBlock))
+    return create_memory("hil-control", ctypes.sizeof(SharedState))
 
 
 MAX_INTERVAL: Final = 0.5

@@ -84,7 +84,7 @@ LONGEST_MESSAGE: Final = 1 << 16
 WITHDRAWN: Final = "it was withdrawn"
 """Reason of a refusal at the request of the supervisor."""
 READ: Final = "read"
-"""Message about a motion that was read and waits for `ControlBlock.program_id`."""
+"""Message about a motion that was read and waits for `SharedState.program_id`."""
 _IDENTITY: Final = struct.Struct("<Q")
 _DESCRIPTOR: Final = struct.Struct("@i")
 

@@ -17,7 +17,7 @@ from typing import Any, Final
 from drivers.drive_train import DriveTrain
 from drivers.errors import DriverError, RequestError
 from drivers.exchange import control, event_log
-from drivers.exchange.control import ControlBlock
+from drivers.exchange.control import SharedState
 from drivers.exchange.event_log import EventReader, ExchangeEvent
 from drivers.exchange.motion_transfer import LONGEST_MESSAGE, READ, WITHDRAWN, hand_over
 from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
@@ -81,7 +81,7 @@ class ExchangeProcess:
         realtime: permissions granted by the system.
         notes: options of the link that the system refused.
         ring_fd: memory of the cycle records, for a `RingReader`.
-        event_fd, control_fd: memory for an `EventReader` and a `ControlBlock`.
+        event_fd, control_fd: memory for an `EventReader` and a `SharedState`.
     """
 
     def __init__(self, settings: ExchangeSettings) -> None:
@@ -90,7 +90,7 @@ class ExchangeProcess:
         self.event_fd = event_log.create()
         self.control_fd = control.create()
         self._log_fd = create_memory("hil-exchange-log", 0)
-        self._control = ControlBlock(self.control_fd)
+        self._control = SharedState(self.control_fd)
         self._events = EventReader(self.event_fd)
         self._offers = 0
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -211,9 +211,9 @@ class ExchangeProcess:
         """Return the events since the last call, in order."""
         return self._events.drain()
 
-    def status(self) -> ControlBlock:
-        """Return a copy of the control block."""
-        return ControlBlock.from_buffer_copy(self._control)
+    def status(self) -> SharedState:
+        """Return a copy of the shared state."""
+        return SharedState.from_buffer_copy(self._control)
 
     @property
     def alive(self) -> bool:

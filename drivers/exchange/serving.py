@@ -20,8 +20,8 @@ from drivers.exchange.control import (
     IDLE_HEARTBEAT_TIMEOUT,
     OUTCOMES,
     ArchiveState,
-    ControlBlock,
     HeartbeatMonitor,
+    SharedState,
     bin_of,
 )
 from drivers.exchange.event_log import (
@@ -62,7 +62,7 @@ _MAY_BE_OPEN: Final = frozenset(
     {State.OPENING, State.OPEN, State.EXITING, State.FREEZING, State.FAULTED}
 )
 _COUNTERS: Final = ("replied", "missed", "duplicates", "stale", "rejected", "refused")
-"""Counters of a session with their own field in the control block."""
+"""Counters of a session with their own field in the shared state."""
 STOPPED: Final = "a stop was requested"
 _Countable = PacketRejected | GapSeen | RepliesLost
 
@@ -108,7 +108,7 @@ def _sum(earlier: _Countable, later: _Countable) -> _Countable:
     return replace(later, **{name: getattr(earlier, name) + getattr(later, name)})
 
 
-class ControlServer:
+class CommandHandler:
     """The end condition of `exchange` in its own process; called after each reply.
 
     Runs the commands of the supervisor and publishes state and events.
@@ -126,7 +126,7 @@ class ControlServer:
         transport: Transport,
         ring: CycleRing,
         events: EventWriter,
-        control: ControlBlock,
+        control: SharedState,
         channel: socket.socket,
         *,
         terminated: Callable[[], bool],

@@ -3,7 +3,7 @@
 It has its own process session and ignores SIGINT and SIGHUP, so that the end of a terminal does not
 end a recording. If the supervisor dies, it continues until the exchange has ended the motion or is
 dead, closes the archive with the true outcome, and ends. If it cannot write, it sets the archive's
-state in the control block to failed, and the exchange stops the arm.
+state in the shared state to failed, and the exchange stops the arm.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.events import InitReceived
-from drivers.exchange.control import ArchiveState, ControlBlock, HeartbeatMonitor
+from drivers.exchange.control import ArchiveState, HeartbeatMonitor, SharedState
 from drivers.exchange.event_log import EventReader, ExchangeEvent
 from drivers.record import RingReader
 from hil.archive.live import LivePublisher, Serve
@@ -95,7 +95,7 @@ class Job:
         number: identifies it to the supervisor.
         until_ended: whether it is closed at the end of the motion.
         overflow: of the reader.
-        accepted, ended_count: of the control block at its begin.
+        accepted, ended_count: of the shared state at its begin.
         last_record, ended: times of the last record and of the end of the motion, monotonic s.
         flushed: whether all records were written to the disk.
     """
@@ -122,7 +122,7 @@ class ArchiveProcess:
         self,
         ring: RingReader,
         events: EventReader,
-        control: ControlBlock,
+        control: SharedState,
         commands: Channel,
         exchange: int,
     ) -> None:
@@ -346,7 +346,7 @@ def main() -> None:
     process = ArchiveProcess(
         RingReader(ring, n_joints),
         EventReader(events),
-        ControlBlock(control),
+        SharedState(control),
         Channel(socket(fileno=commands, type=SOCK_SEQPACKET)),
         exchange,
     )

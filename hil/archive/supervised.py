@@ -17,7 +17,7 @@ from socket import AF_UNIX, SOCK_SEQPACKET, socketpair
 from typing import IO, Any, Protocol
 
 from drivers.drive_train import DriveTrain
-from drivers.exchange.control import ControlBlock, HeartbeatMonitor
+from drivers.exchange.control import HeartbeatMonitor, SharedState
 from hil.archive.live import Serve
 from hil.archive.recorder import ArchiveSpec, Recorded
 
@@ -165,7 +165,7 @@ class ArchiveProcessHandle:
     @classmethod
     def start(cls, memory: SharedMemory, n_joints: int) -> ArchiveProcessHandle:
         """Start the process on the exchange's shared memory."""
-        control = ControlBlock(memory.control_fd)
+        control = SharedState(memory.control_fd)
         monitor = HeartbeatMonitor(lambda: control.archive_heartbeat)
         with contextlib.ExitStack() as undo:
             stderr: IO[bytes] = undo.enter_context(tempfile.TemporaryFile())

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import DriverError
-from drivers.exchange.control import ControlBlock, HeartbeatMonitor
+from drivers.exchange.control import HeartbeatMonitor, SharedState
 from drivers.exchange.event_log import ExchangeEnded, ExchangeEvent, ExchangeFailed, Leaving
 from drivers.exchange.process import ExchangeProcess, ExchangeSettings
 from drivers.exchange.realtime import RealTimeSettings
@@ -125,7 +125,7 @@ class ExchangeMonitor:
     def __init__(self, exchange: ExchangeProcess) -> None:
         self.exchange, self.ended_for = exchange, ""
         self._last_message = ""
-        control = ControlBlock(exchange.control_fd)
+        control = SharedState(exchange.control_fd)
         self._monitor = HeartbeatMonitor(lambda: control.exchange_heartbeat)
         self._events: list[ExchangeEvent] = []
 

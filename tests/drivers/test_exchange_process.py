@@ -21,7 +21,7 @@ import pytest
 
 from drivers import CyclicPacket, Mode, MotionEnded, MotionStarted, RequestError, State
 from drivers.exchange import process, realtime
-from drivers.exchange.control import ArchiveState, ControlBlock
+from drivers.exchange.control import ArchiveState, SharedState
 from drivers.exchange.event_log import (
     ExchangeEnded,
     ExchangeFailed,
@@ -304,7 +304,7 @@ class TestRefusedMotions:
         with running(needs_archive=True) as (exchange, _):
             with pytest.raises(RequestError, match="archive cannot be written"):
                 exchange.submit(still(10))
-            control = ControlBlock(exchange.control_fd)
+            control = SharedState(exchange.control_fd)
             control.archive_state = ArchiveState.READY
             with pytest.raises(RequestError, match="archive process sends no heartbeat"):
                 exchange.submit(still(10))

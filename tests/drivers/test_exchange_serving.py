@@ -29,8 +29,8 @@ from drivers.exchange.control import (
     OUTCOMES,
     SHORTEST,
     ArchiveState,
-    ControlBlock,
     HeartbeatMonitor,
+    SharedState,
     bin_of,
     quantile,
     upper_edge,
@@ -43,7 +43,7 @@ from drivers.exchange.event_log import (
     Leaving,
 )
 from drivers.exchange.loop import POLL
-from drivers.exchange.serving import DETACHED_LINGER, MAX_LINGER, ControlServer, EventLimiter
+from drivers.exchange.serving import DETACHED_LINGER, MAX_LINGER, CommandHandler, EventLimiter
 from drivers.record import CycleRing
 from tests.drivers.rig import Cruise, N, drive_train, limits, still
 
@@ -145,8 +145,8 @@ class TestEventLimiter:
 
 
 def test_control_block():
-    with pytest.raises(ValueError, match="not a control block"):
-        ControlBlock(CycleRing.shared(N, 10).fd)
+    with pytest.raises(ValueError, match="no shared state"):
+        SharedState(CycleRing.shared(N, 10).fd)
     assert sorted(OUTCOMES) == sorted(get_args(Outcome)), "each outcome has a number"
 
 
@@ -292,10 +292,10 @@ class Bench:
         self.session = FakeSession()
         event_fd = event_log.create()
         self.reader = EventReader(event_fd)
-        self.control = ControlBlock(control.create())
+        self.control = SharedState(control.create())
         self.ours, self.theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.terminated = False
-        self.serving = ControlServer(
+        self.serving = CommandHandler(
             self.session,
             self,
             CycleRing.shared(N, 16),

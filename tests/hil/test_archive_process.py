@@ -20,7 +20,7 @@ from drivers.drive_train import DriveTrain
 from drivers.events import MotionEnded, MotionStarted, PacketRejected, RepliesLost
 from drivers.exchange import control as control_memory
 from drivers.exchange import event_log
-from drivers.exchange.control import OUTCOMES, ArchiveState, ControlBlock
+from drivers.exchange.control import OUTCOMES, ArchiveState, SharedState
 from drivers.exchange.event_log import EventWriter
 from drivers.record import CycleRing, cycle_dtype
 from hil.archive import Archive, ArchiveOutcome, ArchiveSpec, ArchiveWriter, open_archive
@@ -47,7 +47,7 @@ class Memory:
         self.event_fd = event_log.create(4096)
         self.control_fd = control_memory.create()
         self.events = EventWriter(self.event_fd)
-        self.control = ControlBlock(self.control_fd)
+        self.control = SharedState(self.control_fd)
         self.exchange = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
         self.pid = self.exchange.pid
         self.cycle = 0

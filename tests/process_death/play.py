@@ -50,8 +50,8 @@ DEFECTS: Final = {
     ),
     "exchange-leaves-the-arm": Defect(
         EXCHANGE,
-        "import os; from drivers.exchange.serving import ControlServer; "
-        "ControlServer._detach = lambda *_: os._exit(0)",
+        "import os; from drivers.exchange.serving import CommandHandler; "
+        "CommandHandler._detach = lambda *_: os._exit(0)",
         "while the arm moved",
     ),
 }

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import record
-from drivers.exchange.control import ControlBlock
+from drivers.exchange.control import SharedState
 from drivers.record import RingReader, cycle_dtype
 from drivers.states import State
 from hil.campaign import Campaign, CampaignPlan, stop_on_interrupt
@@ -89,7 +89,7 @@ class Memory:
     def __init__(self, exchange: int) -> None:
         self._ring = _descriptor(exchange, _RING)
         descriptor = _descriptor(exchange, _CONTROL)
-        self.control = ControlBlock(descriptor)
+        self.control = SharedState(descriptor)
         os.close(descriptor)
         self._words = memoryview(mmap.mmap(self._ring, 4096)).cast("B").cast("q")
 
