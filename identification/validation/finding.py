@@ -1,15 +1,16 @@
-"""Findings of a verdict, and the thresholds of its checks."""
+"""Findings of a verdict, how they name joints and motion, and the thresholds of its checks."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Level = Literal["good", "information", "doubtful", "wrong"]
 Role = Literal["condition", "cause", "symptom"]
 
@@ -31,6 +32,29 @@ def joined(names: Sequence[str], most: int = 6) -> str:
     """Return names separated by commas, the first few of many."""
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
+
+
+@dataclass(frozen=True)
+class Naming:
+    """Names in messages: those of the joints, and of the motion that was predicted."""
+
+    joints: tuple[str, ...]
+    motion: str  # such as "unseen motion"
+
+    def of(self, mask: Mask) -> str:
+        """Return the joints of a mask (n,)."""
+        return joined([self.joints[joint] for joint in np.flatnonzero(mask)])
+
+    def each(self, mask: Mask, entry: Callable[[int], str]) -> str:
+        """Return the joints of a mask (n,), each with its entry: ``joint_1 3 %, joint_2 5 %``."""
+        return joined([f"{self.joints[j]} {entry(j)}" for j in np.flatnonzero(mask).tolist()])
+
+
+class Facts(Protocol):
+    """What evidence says about one subject, with the findings that follow from it."""
+
+    def findings(self, naming: Naming) -> Iterator[Finding]:
+        """Yield the findings in the order of the verdict's reasons."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +112,9 @@ class Thresholds:
 
 def little_torque(
     torque: Array,
-    slides: NDArray[np.bool_],
+    slides: Mask,
     limit: Thresholds = Thresholds(),
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Return the axes whose torque (n,) is too small against the others' to decide alone (n,).
 
     Axes that slide are compared with each other, and those that turn.

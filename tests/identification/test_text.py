@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from identification.text import filled, percentage
+from identification.text import percentage
 
 
 class TestPercentages:
@@ -16,6 +16,6 @@ class TestPercentages:
     def test_have_a_space_before_the_sign(self, share: float, decimals: int, text: str) -> None:
         assert percentage(share, decimals) == text
 
-    def test_of_a_template_have_it_too(self) -> None:
-        text = filled("{a:+.1%} and {b[0]:.2g} {c.real:.0%}", a=0.1, b=[3.0], c=np.float64(1.0))
-        assert text == "+10.0 % and 3 100 %"
+    @pytest.mark.parametrize(("share", "text"), [(0.1, "+10.0 %"), (-0.1, "-10.0 %")])
+    def test_of_a_change_have_a_sign(self, share: float, text: str) -> None:
+        assert percentage(share, 1, signed=True) == text
