@@ -432,6 +432,11 @@ class Prepared:
         """Delay of the torque that the fit used [s]."""
         return self.settings.preprocessing.torque_delay
 
+    def warned(self, *warnings: str) -> Prepared:
+        """Return the same with warnings of later steps."""
+        sources = replace(self.sources, warnings=(*self.sources.warnings, *warnings))
+        return replace(self, sources=sources)
+
 
 def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> Prepared:
     """Determine time base, noise, delay and settings, then smooth every recording.

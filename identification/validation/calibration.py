@@ -71,24 +71,30 @@ class TorqueMeans:
 class Calibration:
     """Coverage of 95 % intervals by held-out mean torques, per joint (n,); NaN without one."""
 
-    blocks: NDArray[np.intp]  # number of held-out means
-    inside: Array  # share inside the interval
-    half_width: Array  # median of half the interval [N·m or N]
-    white_inside: Array  # share inside the intervals of white residuals
+    joint_means: NDArray[np.intp]  #: number of held-out means
+    joint_inside: Array  #: share inside the interval
+    half_width: Array  #: median of half the interval [N·m or N]
+    joint_white_inside: Array  #: share inside the intervals of white residuals
+    block: float = BLOCK  #: time of a mean [s]
 
     @property
-    def overall(self) -> float:
+    def means(self) -> int:
+        """Number of held-out means of all joints."""
+        return int(self.joint_means.sum())
+
+    @property
+    def inside(self) -> float:
         """Share inside over all joints; NaN without intervals."""
-        return self._pooled(self.inside)
+        return self._pooled(self.joint_inside)
 
     @property
-    def white_overall(self) -> float:
+    def white_inside(self) -> float:
         """Share inside with white residuals."""
-        return self._pooled(self.white_inside)
+        return self._pooled(self.joint_white_inside)
 
     def _pooled(self, shares: Array) -> float:
-        total = int(self.blocks.sum())
-        return float(np.nansum(shares * self.blocks) / total) if total else float("nan")
+        means = self.means
+        return float(np.nansum(shares * self.joint_means) / means) if means else float("nan")
 
 
 def calibrate(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from identification.validation.causes import Cause, find_causes
 from identification.validation.changes import Change, find_changes
 from identification.validation.finding import Finding, Thresholds
 from identification.validation.plausibility import (
+    ConsistencyCheck,
     Dissipation,
     Implausible,
     InertiaRatio,
@@ -279,6 +280,7 @@ class Evidence:
     #: error of the nominal (CAD) model on the same unseen motion
     nominal: PredictionError | None = None
     implausible: Implausible = _PLAUSIBLE  #: physically impossible signs of the estimate
+    consistency: ConsistencyCheck | None = None  #: with the nearest consistent parameters
     dissipation: Dissipation | None = None  #: friction of each joint at its top speed
     residuals: ResidualChecks | None = None  #: patterns of the residual
     context: CellContext = CellContext()  #: data on the cell
@@ -312,6 +314,7 @@ def gather(
     in_sample: bool = False,
     names: Sequence[str] = (),
     unseen: Factor | None = None,
+    consistency: ConsistencyCheck | None = None,
 ) -> Evidence:
     """Collect the evidence for a verdict; every recording is read a few times.
 
@@ -319,54 +322,71 @@ def gather(
     noise is measured. `nominal` are parameters (p,); with `in_sample` the held-out motions are the
     training. `unseen` is the sum of the held-out factors, if known.
     """
-    values = result.pooled.values
-    velocity = np.concatenate([run.motion.velocity for run in held_out])
-    if unseen is None:
-        unseen = total_factor(model, held_out)
-    error = pooled_error(prediction_error(model, values, held_out))
-    few, unseen_few = training[:_MOST_RECORDINGS], held_out[:_MOST_RECORDINGS]
-    standard = standard_factor(model, few), standard_factor(model, unseen_few)
+    pooled, others = result.pooled, () if in_sample else held_out
+    values = pooled.values
+    unseen = total_factor(model, held_out) if unseen is None else unseen
+    few, few_unseen = training[:_MOST_RECORDINGS], held_out[:_MOST_RECORDINGS]
+    standard = standard_factor(model, few), standard_factor(model, few_unseen)
     repeated = same_motion and len(result.repetitions) > 1
     noise = repetition_noise(model, values, training, SLOW) if repeated else None
     floor = noise_floor(model, values, few, noise)
-    evidence = Evidence(
-        estimate=result.pooled,
+    error = _error(model, values, held_out)
+    slow = None
+    if noise is not None:
+        slow = _slow_errors(model, result, held_out, error, unseen, noise)
+    speed = np.abs(np.concatenate([run.motion.velocity for run in held_out])).max(axis=0)
+    added, motors = context.added_friction, context.motor_from_joint
+    return Evidence(
+        estimate=pooled,
         held_out=error,
-        training=pooled_error(prediction_error(model, values, training)),
+        training=_error(model, values, training),
+        systematic=None if slow is None else slow.beyond_noise,
+        systematic_without_friction=None if slow is None else slow.without_friction,
+        friction_change=None if slow is None else slow.friction_change,
         noise_floor=floor,
+        disagreement=None if noise is None else _disagreement(result),
         causes=find_causes(model, training, values, names, noise=floor),
-        changes=() if in_sample else find_changes(model, values, training, held_out),
+        changes=find_changes(model, values, training, others) if others else (),
         one_way=_one_way(training),
         gravity=find_gravity(model, *standard),
-        load=find_load(model, few, unseen_few, *standard),
-        nominal=None
-        if nominal is None
-        else pooled_error(prediction_error(model, nominal, held_out)),
-        implausible=implausibilities(
-            model,
-            result.pooled,
-            unseen,
-            error.rms,
-            speed=np.abs(velocity).max(axis=0),
-            added=context.added_friction,
-        ),
-        dissipation=dissipation_of(model, result.pooled, np.abs(velocity).max(axis=0)),
+        load=find_load(model, few, few_unseen, *standard),
+        nominal=None if nominal is None else _error(model, nominal, held_out),
+        implausible=implausibilities(model, pooled, unseen, error.rms, speed=speed, added=added),
+        consistency=consistency,
+        dissipation=dissipation_of(model, pooled, speed),
         residuals=check_residuals(
-            model,
-            values,
-            training,
-            () if in_sample else held_out,
-            same_motion=same_motion,
-            motor_from_joint=context.motor_from_joint,
+            model, values, training, others, same_motion=same_motion, motor_from_joint=motors
         ),
         context=context,
         in_sample=in_sample,
         prismatic=tuple(np.flatnonzero(~model.chain.revolute).tolist()),
     )
-    if noise is None:
-        return evidence
+
+
+def _error(model: RobotModel, values: Array, recordings: Sequence[Samples]) -> PredictionError:
+    return pooled_error(prediction_error(model, values, recordings))
+
+
+class _SlowErrors(NamedTuple):
+    """Errors on held-out motion below 10 Hz, see :class:`Evidence`."""
+
+    beyond_noise: Array  # (n,)
+    without_friction: Array  # (n,)
+    friction_change: Array  # (n,)
+
+
+def _slow_errors(
+    model: RobotModel,
+    result: RepeatedEstimate,
+    held_out: Sequence[Samples],
+    error: PredictionError,
+    unseen: Factor,
+    noise: Array,
+) -> _SlowErrors:
+    """Return the slow part of an error, as a share of the torque, beyond the noise (n,)."""
+    values = result.pooled.values
     slow = [slow_error(model, values, run, SLOW) for run in held_out]
-    changes = np.array([one.friction_change for one in slow])
+    changes = np.array([run.friction_change for run in slow])
     largest = np.abs(changes).argmax(axis=0)[None]
     # Two standard deviations of the estimate are no error.
     explained = noise**2 + (2.0 * _estimation_noise(result, unseen)) ** 2
@@ -376,12 +396,10 @@ def gather(
         excess = np.sqrt(np.maximum(pooled_error(errors).rms ** 2 - explained, 0.0))
         return np.where(tested, excess / np.where(tested, error.torque_rms, 1.0), np.nan)
 
-    return replace(
-        evidence,
-        systematic=beyond_noise(one.error for one in slow),
-        systematic_without_friction=beyond_noise(one.apart for one in slow),
-        friction_change=np.take_along_axis(changes, largest, axis=0)[0],
-        disagreement=_disagreement(result),
+    return _SlowErrors(
+        beyond_noise(run.error for run in slow),
+        beyond_noise(run.apart for run in slow),
+        np.take_along_axis(changes, largest, axis=0)[0],
     )
 
 

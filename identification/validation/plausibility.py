@@ -291,11 +291,13 @@ def check_consistency(
     weights: Array | None = None,
     prior: BodyPrior | None = None,
     design_effect: float = 1.0,
+    in_sample: bool = False,
 ) -> ConsistencyCheck:
     """Compare the physically consistent estimate with an unconstrained one.
 
-    Weights (n,) are by default the inverse residual variances of an ordinary fit; prior and
-    `design_effect` as for :func:`identification.estimators.consistent.consistent_estimate`.
+    Weights (n,) are by default the inverse residual variances of an ordinary fit; with `in_sample`
+    the held-out motion is the training. Prior and `design_effect` as for
+    :func:`identification.estimators.consistent.consistent_estimate`.
 
     Raises:
         IdentificationError: see :func:`identification.estimators.consistent.consistent_estimate`.
@@ -335,6 +337,7 @@ def check_consistency(
             unconstrained.names[k] for k in np.argsort(-shift, kind="stable") if shift[k] > _SIGMAS
         ),
         bounds=tuple(bounds),
+        judged_on="in-sample" if in_sample else "held-out",
         overloaded=_overloaded(model, training, held_out, values, free),
     )
 

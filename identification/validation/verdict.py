@@ -65,7 +65,9 @@ def judge(
     """Return the verdict on axes of these names; `tested_on` describes the held-out motion."""
     naming = Naming(tuple(joint_names), tested_on)
     facts = facts_in_order(evidence, thresholds)
-    findings = _without_explained([finding for group in facts for finding in group.findings(naming)])
+    findings = _without_explained(
+        [finding for group in facts for finding in group.findings(naming)]
+    )
     wrong = [finding for finding in findings if finding.level == "wrong"]
     doubtful = [finding for finding in findings if finding.level == "doubtful"]
     measure = _measure(naming.joints, evidence)

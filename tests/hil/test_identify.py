@@ -22,8 +22,8 @@ from hil.identify import Options, identify_archives, identify_campaign
 from hil.identify.estimating import estimate_with
 from hil.identify.options import ESTIMATORS, FIXED, friction_from
 from hil.identify.prepared import prepare_sources
-from hil.identify.run import _delays
 from hil.identify.sources import gather_sources
+from hil.identify.summary import _delays
 from hil.importers import Robot
 from hil.outcome import write_outcome
 from hil.progress import Silent
@@ -148,7 +148,7 @@ class TestCampaign:
     def test_reports_a_failed_consistent_solution(self, campaign, monkeypatch):
         for name in ("check_consistency", "choose_essential"):
             failing = raiser(IdentificationError("the solver failed"))
-            monkeypatch.setattr(f"hil.identify.run.{name}", failing)
+            monkeypatch.setattr(f"hil.identify.validation.{name}", failing)
         without = identify_campaign(campaign.folder.root, Silent(), FIXED)
         warnings = without.results.verdict.warnings
         assert sum("the solver failed" in one for one in warnings) == 2

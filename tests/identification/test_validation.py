@@ -179,7 +179,7 @@ def shares(correlation, model_error=0.0, seeds=50):
     for seed in range(seeds):
         noise = coloured(np.random.default_rng(seed), LENGTH, 5e-3, correlation)
         one = split(noise + systematic)
-        found.append((one.overall, one.white_overall, float(np.mean(one.half_width / NOISE))))
+        found.append((one.inside, one.white_inside, float(np.mean(one.half_width / NOISE))))
     return tuple(np.mean(found, axis=0).tolist())
 
 
@@ -225,7 +225,7 @@ class TestHeldOutTorque:
         spoiled[CUT:] += 20.0 * NOISE
         sound, off = split(noise), split(spoiled)
         np.testing.assert_array_equal(off.half_width, sound.half_width)
-        assert off.overall == 0.0 < 0.8 < sound.overall
+        assert off.inside == 0.0 < 0.8 < sound.inside
 
 
 class TestInnerFolds:
@@ -563,7 +563,8 @@ class TestConsistencyCheck:
         found = consistency_of(sprung)
         assert found.impossible and found.overloaded == "elbow"
         assert "[[robot.elements]]" in found.remedy and "elbow" in found.remedy
-        verdict = judged(implausible=Implausible((f"no body fits: {found.remedy}",), ()))
+        verdict = judged(consistency=found)
+        assert verdict.reasons == (f"{found.sentence}: {found.remedy}",)
         assert "[[robot.elements]]" in verdict.next_steps[0]
         clean = consistency_of(runs())
         assert clean.remedy == "check signs, torque constants, coupling and URDF"

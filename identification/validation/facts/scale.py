@@ -161,10 +161,14 @@ class PhysicalSignFacts:
     @classmethod
     def of(cls, evidence: Evidence, signs: SignFacts) -> PhysicalSignFacts:
         """Leave out signs that opposite torques explain."""
-        implausible = evidence.implausible
+        implausible, consistency = evidence.implausible, evidence.consistency
         if signs.all_opposite:
             return cls((), (), implausible.added)
-        return cls(implausible.impossible, implausible.doubtful, implausible.added)
+        impossible = list(implausible.impossible)
+        if consistency is not None and consistency.impossible:
+            # No rigid bodies produce the predicted torque.
+            impossible.append(f"{consistency.sentence}: {consistency.remedy}")
+        return cls(tuple(impossible), implausible.doubtful, implausible.added)
 
     def findings(self, _: Naming) -> Iterator[Finding]:
         """Yield each message."""
