@@ -31,9 +31,10 @@ from identification.validation.finding import Thresholds
 
 from .options import Options
 from .payload_settings import NOT_DETERMINED, Load, controller_settings
-from .prepared import prepare_sources, samples_of
+from .prepared import Prepared, prepare_sources, samples_of
 from .sources import (
     Source,
+    Sources,
     aligned,
     archives_in,
     arm_differences,
@@ -249,44 +250,18 @@ def find_payload(
         InputError: archives cannot be used, are of two arms, or have no payload.
         IdentificationError: the recordings do not determine the mass.
     """
-    sides = {False: list(archives_in(bare)), True: list(archives_in(loaded))}
-    if not sides[False] or not sides[True]:
-        problem = "recordings without and with the payload are needed"
-        remedy = "give both: hil payload BARE... --loaded LOADED"
-        raise InputError(None, problem, remedy=remedy)
-    refuse_duplicates([*sides[False], *sides[True]])
-    found = {
-        kind: gather_sources(paths, Options().split, in_sample=True)
-        for kind, paths in sides.items()
-    }
-    bare_cell, loaded_cell = found[False].cell, found[True].cell
-    if differing := arm_differences(bare_cell, loaded_cell):
-        problem = f"is of another arm than {bare_cell.path}: {' and '.join(differing)} differ"
-        remedy = "give bare and loaded recordings of one arm"
-        raise ArchiveError(sides[True][0], problem, field="--loaded", remedy=remedy)
+    sides = _sides(bare, loaded)
+    found = _sources_of(sides)
     training = (*found[False].training, *found[True].training)
-    for source in training:
-        if source.recording.torque is None:
-            problem = "contains no joint torques"
-            remedy = "give drive.torque_constant in the column map"
-            raise ArchiveError(source.path, problem, field="torque", remedy=remedy)
-    cell = bare_cell.without_payload()
+    cell = found[False].cell.without_payload()
     if found[False].plan is None and found[True].plan is None:
         training, _ = aligned(training)
     first, last = training[: len(found[False].training)], training[len(found[False].training) :]
     sources = replace(found[False], cell=cell, training=first, held_out=first)
     prepared = prepare_sources(sources, options, reporter)
-    cell, settings = prepared.sources.cell, prepared.settings
+    cell = prepared.sources.cell
     frame = frame or flange_of(cell.model)
-    runs = []
-    with reporter.task("reducing recordings", len(training)) as task:
-        for source, samples in zip(first, prepared.fitted, strict=True):
-            runs.append(Run.of(source.name, cell.model, samples, frame, loaded=False))
-            task.advance(1, source.name)
-        for source in last:
-            samples = samples_of(source, cell, settings)
-            runs.append(Run.of(source.name, cell.model, samples, frame, loaded=True))
-            task.advance(1, source.name)
+    runs = _runs(prepared, last, frame, reporter)
     simulated = all(side.header.only_simulated for side in found.values())
     recordings = [source.recording for source in training]
     scale = torque_scale(cell, recordings, simulated=simulated)
@@ -302,13 +277,7 @@ def find_payload(
         task.advance(1)
     warnings = (*prepared.sources.warnings, *found[True].warnings)
     if estimate.body is None:
-        low, high = estimate.intervals[0]
-        raise InputError(
-            None,
-            f"the loaded archives show no payload: its mass is between {low:.3g} and {high:.3g} kg",
-            field="--loaded",
-            remedy="give recordings that were made with the payload",
-        )
+        raise _no_payload(estimate)
     return PayloadFound(
         estimate=estimate,
         body=estimate.body,
@@ -322,6 +291,63 @@ def find_payload(
         with_currents=all(one.motor_current is not None for one in recordings),
         warnings=tuple(dict.fromkeys(warnings)),
     )
+
+
+def _no_payload(estimate: PayloadEstimate) -> InputError:
+    low, high = estimate.intervals[0]
+    return InputError(
+        None,
+        f"the loaded archives show no payload: its mass is between {low:.3g} and {high:.3g} kg",
+        field="--loaded",
+        remedy="give recordings that were made with the payload",
+    )
+
+
+def _sides(bare: Sequence[Path], loaded: Sequence[Path]) -> dict[bool, list[Path]]:
+    """Return the archives without (False) and with the payload."""
+    sides = {False: list(archives_in(bare)), True: list(archives_in(loaded))}
+    if not sides[False] or not sides[True]:
+        problem = "recordings without and with the payload are needed"
+        remedy = "give both: hil payload BARE... --loaded LOADED"
+        raise InputError(None, problem, remedy=remedy)
+    refuse_duplicates([*sides[False], *sides[True]])
+    return sides
+
+
+def _sources_of(sides: Mapping[bool, Sequence[Path]]) -> dict[bool, Sources]:
+    """Return the bare (False) and the loaded recordings: of one arm, with torques."""
+    sources = {
+        kind: gather_sources(paths, Options().split, in_sample=True)
+        for kind, paths in sides.items()
+    }
+    bare, loaded = sources[False].cell, sources[True].cell
+    if differing := arm_differences(bare, loaded):
+        problem = f"is of another arm than {bare.path}: {' and '.join(differing)} differ"
+        remedy = "give bare and loaded recordings of one arm"
+        raise ArchiveError(sides[True][0], problem, field="--loaded", remedy=remedy)
+    for source in (*sources[False].training, *sources[True].training):
+        if source.recording.torque is None:
+            problem = "contains no joint torques"
+            remedy = "give drive.torque_constant in the column map"
+            raise ArchiveError(source.path, problem, field="torque", remedy=remedy)
+    return sources
+
+
+def _runs(
+    prepared: Prepared, loaded: Sequence[Source], frame: str, reporter: Reporter
+) -> list[Run]:
+    """Reduce the bare recordings, which are prepared, and the loaded ones."""
+    cell, bare = prepared.sources.cell, prepared.sources.training
+    runs = []
+    with reporter.task("reducing recordings", len(bare) + len(loaded)) as task:
+        for source, samples in zip(bare, prepared.fitted, strict=True):
+            runs.append(Run.of(source.name, cell.model, samples, frame, loaded=False))
+            task.advance(1, source.name)
+        for source in loaded:
+            samples = samples_of(source, cell, prepared.settings)
+            runs.append(Run.of(source.name, cell.model, samples, frame, loaded=True))
+            task.advance(1, source.name)
+    return runs
 
 
 def doubtful_mounting(model: RobotModel, bare: Sequence[Samples]) -> str | None:

@@ -129,11 +129,7 @@ def gather_sources(
         )
     refuse_duplicates([*paths, *predict])
     archives = [open_archive(path) for path in [*paths, *predict]]
-    by_use: defaultdict[str, list[Archive]] = defaultdict(list)
-    for k, archive in enumerate(archives):
-        use = archive.header.purpose if k < len(paths) else "validation"
-        rejected = archive.outcome is not None and archive.outcome.outcome == REJECTED
-        by_use[REJECTED if rejected else use].append(archive)
+    by_use = _by_use(archives, len(paths))
     fitted, predicted = by_use["excitation"], by_use["validation"]
     if in_sample:
         fitted, predicted = [*fitted, *predicted], []
@@ -145,26 +141,50 @@ def gather_sources(
             remedy="give archives of kind excitation or imported",
         )
     cell = cell_of(fitted[0])
+    _require_one_cell(archives)
+    rest = [source_of(archive, cell, to_fit=False).recording for archive in by_use["standstill"]]
+    sources = [(archive, source_of(archive, cell)) for archive in fitted]
+    every = all_fitted(cell, sources, rest[0] if rest else None)
+    held_out = tuple(source_of(archive, cell) for archive in predicted)
+    warnings = (
+        *known_warnings(cell, fitted[0]),
+        *filter(None, map(_incomplete, archives)),
+        *_import_warnings(archives),
+        *filter(None, map(_not_judged, [*fitted, *predicted])),
+    )
+    every = replace(every, warnings=warnings)
+    return every if in_sample else _with_held_out(every, held_out, split)
+
+
+def _by_use(archives: Sequence[Archive], given: int) -> defaultdict[str, list[Archive]]:
+    """Sort archives by purpose; those beyond the first `given` are to be predicted."""
+    by_use: defaultdict[str, list[Archive]] = defaultdict(list)
+    for k, archive in enumerate(archives):
+        use = archive.header.purpose if k < given else "validation"
+        rejected = archive.outcome is not None and archive.outcome.outcome == REJECTED
+        by_use[REJECTED if rejected else use].append(archive)
+    return by_use
+
+
+def _require_one_cell(archives: Sequence[Archive]) -> None:
+    """Raise ArchiveError if an archive has another cell or URDF than the first."""
     for archive in archives[1:]:
         for name in ("robot.urdf", "cell.toml"):
             if archive.attachments.get(name) != archives[0].attachments.get(name):
                 problem = f"has another {name} than {archives[0].path}"
                 remedy = "identify the archives of each cell separately"
                 raise ArchiveError(archive.path, problem, remedy=remedy)
-    rest = [source_of(archive, cell, to_fit=False).recording for archive in by_use["standstill"]]
-    own = [(archive, source_of(archive, cell)) for archive in fitted]
-    every = all_fitted(cell, own, rest[0] if rest else None)
-    held_out = [source_of(archive, cell) for archive in predicted]
-    warnings = [*known_warnings(cell, fitted[0]), *filter(None, map(_incomplete, archives))]
-    warnings += [
-        f"{archive.path.name}: {warning}"
-        for archive in archives
-        for warning in archive.header.findings.warnings
-    ]
-    warnings += filter(None, map(_not_judged, [*fitted, *predicted]))
-    if in_sample:
-        return replace(every, warnings=tuple(warnings))
-    training, tested_on = every.training, "unseen motion"
+
+
+def _import_warnings(archives: Sequence[Archive]) -> Iterator[str]:
+    for archive in archives:
+        for warning in archive.header.findings.warnings:
+            yield f"{archive.path.name}: {warning}"
+
+
+def _with_held_out(every: Sources, held_out: tuple[Source, ...], split: float) -> Sources:
+    """Return sources with these held out; if there are none, a share or the last of the fitted."""
+    training, tested_on, warnings = every.training, "unseen motion", [*every.warnings]
     if not held_out and len(training) == 1:
         tested_on = "the rest of the same motion"
         training, held_out = _split(training[0], split)
@@ -173,14 +193,15 @@ def gather_sources(
             "predicted; another motion would be a stronger test"
         )
     elif not held_out:
-        repeated = every.same_motion
-        tested_on = "a repetition of the fitted motion" if repeated else "another recording"
-        training, held_out = training[:-1], [training[-1]]
+        tested_on = (
+            "a repetition of the fitted motion" if every.same_motion else "another recording"
+        )
+        training, held_out = training[:-1], training[-1:]
         warnings.append(f"no validation run: the last recording, {held_out[0].name}, was held out")
     return replace(
         every,
         training=training,
-        held_out=tuple(held_out),
+        held_out=held_out,
         warnings=tuple(warnings),
         tested_on=tested_on,
         in_sample=False,
@@ -377,7 +398,7 @@ def useful_part(archive: Archive, recording: Recording) -> range | None:
     return range(int(rows[0]), int(rows[-1]) + 1)
 
 
-def _split(whole: Source, share: float) -> tuple[tuple[Source, ...], list[Source]]:
+def _split(whole: Source, share: float) -> tuple[tuple[Source, ...], tuple[Source, ...]]:
     """Split a recording in two parts, each with the complete motion as context.
 
     The first has no torque of the last in it, so that no filter of torques can bring it there.
@@ -401,7 +422,8 @@ def _split(whole: Source, share: float) -> tuple[tuple[Source, ...], list[Source
             context=(context, start),
         )
 
-    return (part("first part", context, 0, cut),), [part("last part", recording, cut, count)]
+    first = part("first part", context, 0, cut)
+    return (first,), (part("last part", recording, cut, count),)
 
 
 def position_noise(cell: Cell, rest: Recording) -> Array:

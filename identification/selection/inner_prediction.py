@@ -343,10 +343,25 @@ def choose_settings(
         decision = trial.decide("torque ripple", [now, *rippled])
         now, choices = decision.settings, [*choices, decision.choice]
     trial.weigh(now)
+    compared, now, decided = _choose_prior(trial, now, asked)
+    if not trial.errors(compared).overall < _MEANINGLESS:
+        return start, ()
+    choices = [*choices, *decided]
+    return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
+
+
+def _choose_prior(
+    trial: _Trial, now: Settings, asked: Collection[str]
+) -> tuple[Settings, Settings, list[Choice]]:
+    """Choose the strength of the prior, then whether bodies must be possible.
+
+    Returns the settings after each of the two, and the decisions.
+    """
+    choices: list[Choice] = []
     if "strength" in asked:
         weights = [replace(now.strength, weight=weight) for weight in STRENGTHS]
         decision = trial.decide(STRENGTH, [replace(now, strength=weight) for weight in weights])
-        now, choices = decision.settings, [*choices, decision.choice]
+        now, choices = decision.settings, [decision.choice]
     compared = now
     if "consistency" in asked:
         possible = replace(now, strength=replace(now.strength, consistent=True))
@@ -356,9 +371,7 @@ def choose_settings(
             now, choices = decision.settings, [*choices, decision.choice]
         else:
             now = possible
-    if not trial.errors(compared).overall < _MEANINGLESS:
-        return start, ()
-    return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
+    return compared, now, choices
 
 
 def _friction_terms(trial: _Trial, now: Settings) -> _Decision:
