@@ -58,7 +58,7 @@ from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.selection.essential import eliminate
-from identification.selection.inner_prediction import Settings, choose_settings
+from identification.selection.inner_prediction import CandidateSettings, choose_settings
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples, prepare
 from identification.validation.prediction import prediction_error
@@ -140,7 +140,7 @@ def _with_low_pass(
     def low_passes(of: RobotModel, how: Preprocessing) -> tuple[Preprocessing, ...]:
         return possible_low_passes(recording, of, options=how)
 
-    start = Settings(model, options)
+    start = CandidateSettings(model, options)
     return choose_settings(ready, start, {"low-pass"}, low_passes)[0].preprocessing
 
 

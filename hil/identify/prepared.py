@@ -23,13 +23,13 @@ from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import (
     RATE,
+    CandidateSettings,
     Choice,
     Known,
     Question,
     Strength,
     choose_settings,
 )
-from identification.selection.inner_prediction import Settings as Candidate
 from identification.signals.clock import time_base
 from identification.signals.recording import Recording
 from identification.signals.samples import (
@@ -183,38 +183,67 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
     sources = replace(sources, training=sources.training[:MAX_RECORDINGS])
     stated = _with_noise_of(stated_settings(sources.cell, options), sources)
     sources = replace(sources, cell=stated.with_friction_law(sources.cell))
-    notes: list[str] = []
-    settings, found = stated, _delays(sources, stated, options, reporter)
-    suggested: tuple[float, ...] = ()
-    if found is not None and options.delay == "auto":
-        notes = _described(found)
-        if found.significant:
-            settings = stated.preprocessed(torque_delay=found.delay)
-            notes.append(f"a delay of {found.delay * 1e3:.3g} ms of all axes was compensated")
-    elif found is not None and options.delay is None:
+    delay = _DelayChoice.of(_delays(sources, stated, options, reporter), sources, stated, options)
+    started = stated.preprocessed(torque_delay=delay.assumed)
+    chosen = _chosen(sources, started, delay.suggested, options, reporter)
+    estimate, notes = delay.confirmed_by(chosen.preprocessing)
+    variance = estimate.variance if estimate is not None and notes else 0.0
+    return Decided(replace(chosen, delay_variance=variance), estimate, notes)
+
+
+@dataclass(frozen=True, eq=False)
+class _DelayChoice:
+    """Use of an estimated delay in the choice of the other settings."""
+
+    estimate: DelayEstimate | None
+    assumed: float  # that the choice begins with [s]
+    suggested: tuple[float, ...]  # that it may choose as well [s]
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls, estimate: DelayEstimate | None, sources: Sources, stated: Settings, options: Options
+    ) -> _DelayChoice:
+        """Compensate a significant estimate if that was requested, else let the data decide."""
+        unused = cls(estimate, stated.preprocessing.torque_delay, (), ())
+        if estimate is None:
+            return unused
+        described = _described(estimate)
+        if options.delay == "auto":
+            if not estimate.significant:
+                return replace(unused, notes=described)
+            notes = (*described, _compensated(estimate.delay))
+            return replace(unused, assumed=estimate.delay, notes=notes)
         # A controller's delay is known; the estimate replaces it only if well determined and
         # different by more than its bias in closed loop.
-        far = abs(found.delay - found.assumed) > Thresholds().delay * found.cycle
-        if sources.cell.file.controller is None or (far and found.determined):
-            notes = _described(found)
-            suggested = (found.delay,) if found.significant else ()
-    assumed = settings.preprocessing.torque_delay
-    chosen = _chosen(sources, settings, suggested, options, reporter)
-    how = chosen.preprocessing
-    lags = how.torque_bandwidth is not None and how.torque_shape.causal
-    compensated = f"a delay of {how.torque_delay * 1e3:.3g} ms of all axes was compensated"
-    unchanged = f"no other delay than the assumed {assumed * 1e3:.3g} ms was applied"
-    if found is not None and lags:
-        # It was estimated without the low-pass, and may be the lag of that.
-        found, notes = None, [f"{unchanged} beside the low-pass of the torque"]
-    elif how.torque_delay in suggested:
-        notes.append(compensated)
-    elif how.torque_delay != assumed:
-        found, notes = None, [compensated]
-    elif found is not None and suggested:
-        found, notes = None, [f"{notes[0]}; not applied, as it predicts worse"]
-    variance = found.variance if found is not None and notes else 0.0
-    return Decided(replace(chosen, delay_variance=variance), found, tuple(notes))
+        far = abs(estimate.delay - estimate.assumed) > Thresholds().delay * estimate.cycle
+        known = sources.cell.file.controller is not None
+        if options.delay is not None or (known and not (far and estimate.determined)):
+            return unused
+        suggested = (estimate.delay,) if estimate.significant else ()
+        return replace(unused, suggested=suggested, notes=described)
+
+    def confirmed_by(self, how: Preprocessing) -> tuple[DelayEstimate | None, tuple[str, ...]]:
+        """Return the estimate if the chosen preprocessing agrees with it, and the notes on it."""
+        if (
+            self.estimate is not None
+            and how.torque_bandwidth is not None
+            and how.torque_shape.causal
+        ):
+            # It was estimated without the low-pass, and may be the lag of that.
+            unchanged = f"no other delay than the assumed {self.assumed * 1e3:.3g} ms was applied"
+            return None, (f"{unchanged} beside the low-pass of the torque",)
+        if how.torque_delay in self.suggested:
+            return self.estimate, (*self.notes, _compensated(how.torque_delay))
+        if how.torque_delay != self.assumed:
+            return None, (_compensated(how.torque_delay),)
+        if self.suggested:
+            return None, (f"{self.notes[0]}; not applied, as it predicts worse",)
+        return self.estimate, self.notes
+
+
+def _compensated(delay: float) -> str:
+    return f"a delay of {delay * 1e3:.3g} ms of all axes was compensated"
 
 
 def carried_over(settings: Settings, sources: Sources, options: Options) -> Settings:
@@ -331,7 +360,7 @@ def _chosen(
             undelayed=settings.preprocessing.torque_delay,
         )
 
-    start = Candidate(cell.model, settings.preprocessing)
+    start = CandidateSettings(cell.model, settings.preprocessing)
     with reporter.task("choosing settings by inner prediction", 1) as task:
         best, choices = choose_settings(
             ready,
@@ -352,7 +381,7 @@ def _chosen(
     )
 
 
-def _friction_of(best: Candidate, questions: Collection[Question]) -> dict[str, Any]:
+def _friction_of(best: CandidateSettings, questions: Collection[Question]) -> dict[str, Any]:
     """Return the friction law that was chosen, as far as it was asked for."""
     law = best.model.friction.laws[0]
     friction: dict[str, Any] = {}
@@ -405,11 +434,11 @@ def _delays(
     return replace(found, cycle=float(np.median(np.diff(source.recording.time))))
 
 
-def _described(found: DelayEstimate) -> list[str]:
-    notes = [f"delay of the torque behind the position, {found.describe()}"]
-    if not found.significant:
-        notes.append(f"no other delay than the assumed {found.assumed * 1e3:.3g} ms was applied")
-    return notes
+def _described(estimate: DelayEstimate) -> tuple[str, ...]:
+    note = f"delay of the torque behind the position, {estimate.describe()}"
+    if estimate.significant:
+        return (note,)
+    return note, f"no other delay than the assumed {estimate.assumed * 1e3:.3g} ms was applied"
 
 
 @dataclass(frozen=True, eq=False)

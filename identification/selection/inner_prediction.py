@@ -133,7 +133,7 @@ class Strength:
 
 
 @dataclass(frozen=True)
-class Settings:
+class CandidateSettings:
     """Chosen settings."""
 
     model: RobotModel  # with its friction
@@ -296,13 +296,13 @@ Known = Mapping[str, tuple[float, float]]
 
 def choose_settings(
     ready: Ready,
-    start: Settings,
+    start: CandidateSettings,
     questions: Collection[Question],
     low_passes: LowPasses,
     delays: Sequence[float] = (),
     ripples: Sequence[Sequence[TorqueRipple]] = (),
     known: Known | None = None,
-) -> tuple[Settings, tuple[Choice, ...]]:
+) -> tuple[CandidateSettings, tuple[Choice, ...]]:
     """Choose settings one after the other, from data that `ready` prepares.
 
     Significant `delays` of the torque [s] are candidates for "delay" that must predict no worse
@@ -351,8 +351,8 @@ def choose_settings(
 
 
 def _choose_prior(
-    trial: _Trial, now: Settings, asked: Collection[str]
-) -> tuple[Settings, Settings, list[Choice]]:
+    trial: _Trial, now: CandidateSettings, asked: Collection[str]
+) -> tuple[CandidateSettings, CandidateSettings, list[Choice]]:
     """Choose the strength of the prior, then whether bodies must be possible.
 
     Returns the settings after each of the two, and the decisions.
@@ -374,7 +374,7 @@ def _choose_prior(
     return compared, now, choices
 
 
-def _friction_terms(trial: _Trial, now: Settings) -> _Decision:
+def _friction_terms(trial: _Trial, now: CandidateSettings) -> _Decision:
     """Choose the terms beside Coulomb and viscous friction, the stated ones first.
 
     A term must also predict fast motion from slower one no worse, and leave friction at all speeds:
@@ -385,13 +385,13 @@ def _friction_terms(trial: _Trial, now: Settings) -> _Decision:
     terms = [stated, *(term for term in FRICTION_TERMS if term != stated)]
     candidates = [_friction(now, **term) for term in terms]
 
-    def possible(term: Settings) -> bool:
+    def possible(term: CandidateSettings) -> bool:
         return trial.fast_error(term) <= trial.fast_error(now) and trial.has_friction(term)
 
     return trial.decide("friction at speed", candidates, TERM_WORTHWHILE, possible=possible)
 
 
-def _load_friction(trial: _Trial, now: Settings) -> _Decision:
+def _load_friction(trial: _Trial, now: CandidateSettings) -> _Decision:
     """Choose whether dry friction grows with the transmitted torque, as in strain-wave gears.
 
     A stated term comes first. Shares that no gear has are refused.
@@ -408,12 +408,12 @@ def _load_friction(trial: _Trial, now: Settings) -> _Decision:
 
 def _compare_delays(
     trial: _Trial,
-    first: Settings,
-    now: Settings,
+    first: CandidateSettings,
+    now: CandidateSettings,
     choices: list[Choice],
     questions: Collection[str],
     delays: Sequence[float],
-) -> tuple[Settings, Settings, list[Choice]]:
+) -> tuple[CandidateSettings, CandidateSettings, list[Choice]]:
     """Compensate a significant delay unless it predicts worse, and choose the other settings again.
 
     Compared on sliding rows, as presliding is similar to a delay. Returns the settings before and
@@ -435,8 +435,8 @@ def _compare_delays(
 
 
 def _confirm_delay(
-    trial: _Trial, start: Settings, now: Settings, choices: list[Choice]
-) -> tuple[Settings, list[Choice]]:
+    trial: _Trial, start: CandidateSettings, now: CandidateSettings, choices: list[Choice]
+) -> tuple[CandidateSettings, list[Choice]]:
     """Leave out a delay that does not predict better by another friction law.
 
     It was estimated by the former law, whose error may resemble one: friction that grows with the
@@ -453,12 +453,12 @@ def _confirm_delay(
 
 def _compare_low_passes(
     trial: _Trial,
-    first: Settings,
-    now: Settings,
+    first: CandidateSettings,
+    now: CandidateSettings,
     choices: list[Choice],
     questions: Collection[str],
     low_passes: LowPasses,
-) -> tuple[Settings, list[Choice]]:
+) -> tuple[CandidateSettings, list[Choice]]:
     """Add a low-pass of the torque, or its delay alone, if that predicts better.
 
     Starts from the bandwidth of the `first` settings: a narrow one chosen `now` would replace a
@@ -492,7 +492,7 @@ def _compare_low_passes(
 
 
 class _Decision(NamedTuple):
-    settings: Settings
+    settings: CandidateSettings
     choice: Choice
 
 
@@ -515,7 +515,7 @@ class _Trial:
         self._effect = 1.0
         self._weighed: tuple[Columns, Preprocessing] | None = None
 
-    def weigh(self, settings: Settings) -> None:
+    def weigh(self, settings: CandidateSettings) -> None:
         """Set how many rows count as one by the correlation of the residuals of settings.
 
         It is the same for all that are compared, so that none wins by a weaker prior.
@@ -529,7 +529,7 @@ class _Trial:
         self._effect = design_effect_of(total, prior) if total.samples.any() else 1.0
         self._errors.clear()
 
-    def duration(self, settings: Settings) -> float:
+    def duration(self, settings: CandidateSettings) -> float:
         """Return the time of motion of the recordings [s], in which at least one joint moves."""
         samples = self.samples(settings)
         return sum(
@@ -541,12 +541,12 @@ class _Trial:
     def decide(
         self,
         name: str,
-        candidates: Sequence[Settings],
+        candidates: Sequence[CandidateSettings],
         share: float | None = None,
         *,
         by_joint: bool = False,
         rows: Literal["all", "fitted"] = "all",
-        possible: Callable[[Settings], bool] | None = None,
+        possible: Callable[[CandidateSettings], bool] | None = None,
         certainty: float = 1.0,
     ) -> _Decision:
         """Return the first candidate, or the best one if it is clearly better, and `possible`.
@@ -568,7 +568,9 @@ class _Trial:
         words = _differences(candidates)
         return _Decision(candidates[chosen], Choice(name, words, tuple(means), chosen))
 
-    def walk(self, candidates: Sequence[Settings], size: Callable[[Settings], float]) -> list[int]:
+    def walk(
+        self, candidates: Sequence[CandidateSettings], size: Callable[[CandidateSettings], float]
+    ) -> list[int]:
         """Return the indices of the first candidate and, to both sides by size, of improvements.
 
         And of the next ones, which are worse: no candidate beyond is tried.
@@ -586,18 +588,18 @@ class _Trial:
                 least = error
         return sorted(visited)
 
-    def best(self, candidates: Sequence[Settings]) -> Settings:
+    def best(self, candidates: Sequence[CandidateSettings]) -> CandidateSettings:
         """Return the candidate with the least error by joint."""
         return min(candidates, key=lambda each: _mean(self.errors(each).joints))
 
-    def errors(self, settings: Settings, rows: Literal["all", "fitted"] = "all") -> Errors:
+    def errors(self, settings: CandidateSettings, rows: Literal["all", "fitted"] = "all") -> Errors:
         """Return the errors of predicting these rows of each segment from the others."""
         key = *settings.key, rows
         if key not in self._errors:
             self._errors[key] = self._predicted(settings, rows)
         return self._errors[key]
 
-    def _predicted(self, settings: Settings, rows: Literal["all", "fitted"]) -> Errors:
+    def _predicted(self, settings: CandidateSettings, rows: Literal["all", "fitted"]) -> Errors:
         reduced = self._reduced(settings)
         n = settings.model.n_joints
         unknown = Errors(np.full((FOLDS, n), np.inf), np.ones((FOLDS, n)))
@@ -609,7 +611,9 @@ class _Trial:
         except (IdentificationError, np.linalg.LinAlgError):
             return unknown
 
-    def _estimator(self, settings: Settings, reduced: _Reduced) -> Callable[[Factor], Array]:
+    def _estimator(
+        self, settings: CandidateSettings, reduced: _Reduced
+    ) -> Callable[[Factor], Array]:
         effect, prior = settings.strength.design_effect(self._effect), reduced.prior
         _, of_all = posterior_values(reduced.folds.fitted, prior.gaussian, effect)
 
@@ -621,7 +625,7 @@ class _Trial:
 
         return estimate
 
-    def fitted_error(self, settings: Settings) -> float:
+    def fitted_error(self, settings: CandidateSettings) -> float:
         """Return the error of the fitted rows themselves; infinite if none can be fitted."""
         reduced = self._reduced(settings)
         try:
@@ -630,7 +634,7 @@ class _Trial:
             return math.inf
         return reduced.folds.fitted.relative_error(values)
 
-    def fast_error(self, settings: Settings) -> float:
+    def fast_error(self, settings: CandidateSettings) -> float:
         """Return the error of fast motion predicted from slower one; zero if there is none."""
         samples = self.samples(settings)
         speeds = [np.abs(each.motion.velocity).max(axis=0) for each in samples]
@@ -641,7 +645,7 @@ class _Trial:
         estimate = self._estimator(settings, self._reduced(settings))
         return folds.predicted.relative_error(estimate(folds.fitted))
 
-    def has_friction(self, settings: Settings) -> bool:
+    def has_friction(self, settings: CandidateSettings) -> bool:
         """Return whether the fitted friction of every joint stays near Coulomb's at all speeds."""
         model, reduced = settings.model, self._reduced(settings)
         values = self._estimator(settings, reduced)(reduced.folds.fitted)
@@ -667,7 +671,7 @@ class _Trial:
                 return False
         return True
 
-    def has_load_shares(self, settings: Settings) -> bool:
+    def has_load_shares(self, settings: CandidateSettings) -> bool:
         """Return whether the fitted shares of load that become friction are those of gears.
 
         Weighted by the torque of their joints: that of a joint with hardly any torque is open.
@@ -684,7 +688,7 @@ class _Trial:
         share, weight = np.array(shares).T
         return bool(0.0 < np.average(share, weights=weight) < _LARGEST_SHARE)
 
-    def samples(self, settings: Settings) -> list[Samples]:
+    def samples(self, settings: CandidateSettings) -> list[Samples]:
         """Return the samples of settings, with direction of friction and transmitted torque.
 
         The load is that of the estimate without friction that depends on it.
@@ -705,7 +709,7 @@ class _Trial:
         values = self._estimator(without, reduced)(reduced.folds.fitted)
         return [each.with_load(without.model, values) for each in samples]
 
-    def _reduced(self, settings: Settings) -> _Reduced:
+    def _reduced(self, settings: CandidateSettings) -> _Reduced:
         key = settings.factor_key
         if key not in self._tables:
             folds = Folds.of(settings.model, self.samples(settings))
@@ -726,8 +730,8 @@ def _clearly_better(errors: Array, first: Array, share: float, certainty: float)
 
 
 def _sweep(
-    trial: _Trial, now: Settings, questions: Collection[str]
-) -> tuple[Settings, list[Choice]]:
+    trial: _Trial, now: CandidateSettings, questions: Collection[str]
+) -> tuple[CandidateSettings, list[Choice]]:
     """Decide interdependent settings in turn until nothing changes."""
     asked = [swept for swept in _SWEPT if swept.question in questions]
     short = trial.duration(now) < SHORT
@@ -759,8 +763,8 @@ class _Swept(NamedTuple):
 
     question: Question
     name: str
-    vary: Callable[[Settings], list[Settings]]  # settings with each candidate
-    size: Callable[[Settings], float] | None = None  # of the setting, if it is a number
+    vary: Callable[[CandidateSettings], list[CandidateSettings]]  # settings with each candidate
+    size: Callable[[CandidateSettings], float] | None = None  # of the setting, if it is a number
 
 
 _SWEPT: Final = (
@@ -789,27 +793,27 @@ _SWEPT: Final = (
 )
 
 
-def _nearby_bandwidths(now: Settings) -> list[Settings]:
+def _nearby_bandwidths(now: CandidateSettings) -> list[CandidateSettings]:
     width = now.preprocessing.torque_bandwidth or math.nan
     return [_with(now, torque_bandwidth=share * width) for share in NEARBY]
 
 
-def _nearby_lags(now: Settings, filtered: Settings) -> list[Settings]:
+def _nearby_lags(now: CandidateSettings, filtered: CandidateSettings) -> list[CandidateSettings]:
     """Return delays near the lag of a causal low-pass, in its place."""
     how, width = filtered.preprocessing, filtered.preprocessing.torque_bandwidth or math.inf
     lag = how.torque_shape.lag(width)
     return [_with(now, torque_delay=how.torque_delay + share * lag) for share in NEARBY]
 
 
-def _friction(settings: Settings, **changes: Any) -> Settings:
+def _friction(settings: CandidateSettings, **changes: Any) -> CandidateSettings:
     return replace(settings, model=settings.model.with_friction(**changes))
 
 
-def _with(settings: Settings, **changes: Any) -> Settings:
+def _with(settings: CandidateSettings, **changes: Any) -> CandidateSettings:
     return replace(settings, preprocessing=replace(settings.preprocessing, **changes))
 
 
-def _differences(candidates: Sequence[Settings]) -> tuple[str, ...]:
+def _differences(candidates: Sequence[CandidateSettings]) -> tuple[str, ...]:
     """Describe candidates by their differences."""
     parts = [each.describe() for each in candidates]
     differ = [len(set(column)) > 1 for column in zip(*parts, strict=True)]

@@ -27,10 +27,10 @@ from identification.selection.inner_prediction import (
     SHORT,
     STRENGTH,
     WORTHWHILE,
+    CandidateSettings,
     Errors,
     Folds,
     Question,
-    Settings,
     Strength,
     _Trial,
     choose_settings,
@@ -249,7 +249,7 @@ def chosen(recording, questions, *, model=MODEL, leaks=False, ripple=(), low_pas
     def possible(model, how):
         return possible_low_passes(fitted, model, options=how) if low_passes is None else low_passes
 
-    start = Settings(model, Preprocessing())
+    start = CandidateSettings(model, Preprocessing())
     return choose_settings(ready, start, questions, possible, ripples=[ripple])
 
 
@@ -366,7 +366,7 @@ class TestChosenSettings:
 def decided(*errors):
     """Index of the candidate that is chosen by its errors in segments (k,) with one joint."""
     trial = _Trial(lambda *_: [], None)
-    start = Settings(MODEL, Preprocessing())
+    start = CandidateSettings(MODEL, Preprocessing())
     candidates = [
         replace(start, preprocessing=Preprocessing(rigid_bandwidth=10.0 + k))
         for k in range(len(errors))

@@ -20,7 +20,7 @@ from identification.estimators.least_squares import fit_least_squares
 from identification.factor.factor import Factor
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
-from identification.selection.inner_prediction import Settings, choose_settings
+from identification.selection.inner_prediction import CandidateSettings, choose_settings
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
 
@@ -219,7 +219,7 @@ class TestDelayBesideOtherSettings:
 
         best, _ = choose_settings(
             ready,
-            Settings(model, Preprocessing()),
+            CandidateSettings(model, Preprocessing()),
             {"delay", "bandwidth", "presliding", "rows"},
             lambda *_: (),
             (found.delay,),
