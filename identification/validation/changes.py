@@ -75,8 +75,9 @@ class _Part(NamedTuple):
             columns = predicted, samples.predicted_torque(model, values, model.friction_columns)
             for table, column in zip(sums, columns, strict=True):
                 column = np.where(usable, column, 0.0)
-                products = (_by_block(block, column, factor) for factor in (left, column))
-                table.append(np.array([*products]))
+                table.append(
+                    np.array([_by_block(block, column, factor) for factor in (left, column)])
+                )
         products = np.array([sum(part.sum(axis=1) for part in table) for table in sums])
         power = np.where(products[:, 1] > 0.0, products[:, 1], np.inf)
         gain, friction = (block_mean(table) for table in sums)
