@@ -89,9 +89,10 @@ class TestLog:
     def test_the_torque_is_late_and_has_the_stated_noise(self) -> None:
         """Without noise it is RNEA of the motion a delay earlier; the noise keeps its memory."""
         arm = drawn_arm(ARM_TYPES["panda"], 1)
-        late = logged(arm, 5, 0, 20.0, 0.004, DEFAULTS)
+        in_scale = DEFAULTS._replace(scale=0.0)
+        late = logged(arm, 5, 0, 20.0, 0.004, in_scale)
         # At 250 Hz the delay is a row.
-        prompt = logged(arm, 5, 0, 20.0, 0.0, DEFAULTS)
+        prompt = logged(arm, 5, 0, 20.0, 0.0, in_scale)
         noise_free = arm.torque(
             *drawn_motion(arm.robot, np.random.default_rng([5, 2, 0]), 20.0, SPEED).at(prompt.time)
         )
