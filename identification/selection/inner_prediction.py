@@ -332,11 +332,11 @@ def choose_settings(
     if "low-pass" in asked:
         now, choices = _compare_low_passes(trial, first, now, choices, asked, low_passes)
     if "friction" in asked:
-        law = now.model.friction.laws
+        had_load = now.model.friction.has_load
         for decide in (_friction_terms, _load_friction):
             decision = decide(trial, now)
             now, choices = decision.settings, [*choices, decision.choice]
-        if "delay" in asked and now.model.friction.laws != law:
+        if "delay" in asked and now.model.friction.has_load and not had_load:
             now, choices = _confirm_delay(trial, start, now, choices)
     if "ripple" in asked:
         rippled = [replace(now, model=now.model.with_elements(elements)) for elements in ripples]
@@ -437,18 +437,17 @@ def _compare_delays(
 def _confirm_delay(
     trial: _Trial, start: CandidateSettings, now: CandidateSettings, choices: list[Choice]
 ) -> tuple[CandidateSettings, list[Choice]]:
-    """Leave out a delay that does not predict better by another friction law.
+    """Leave out a delay that predicts worse beside friction that grows with load, be it by little.
 
-    It was estimated by the former law, whose error may resemble one: friction that grows with the
-    load is largest where the torque is.
+    It was estimated without that friction, whose absence may resemble a delay of some milliseconds.
     """
     undelayed = _with(now, torque_delay=start.preprocessing.torque_delay)
     if undelayed.key == now.key:
         return now, choices
-    pair = [_with(each, left_out="slow") for each in (undelayed, now)]
-    decision = trial.decide(DELAY, pair, 0.0, rows="fitted")
+    pair = [_with(each, left_out="slow") for each in (now, undelayed)]
+    decision = trial.decide(DELAY, pair, 0.0, rows="fitted", certainty=0.0)
     others = [choice for choice in choices if choice.name != DELAY]
-    return (undelayed, now)[decision.choice.chosen], [*others, decision.choice]
+    return (now, undelayed)[decision.choice.chosen], [*others, decision.choice]
 
 
 def _compare_low_passes(
