@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import signal
-import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass, field
@@ -13,8 +10,11 @@ from pathlib import Path
 from socket import AF_INET, SOCK_DGRAM, socket
 from typing import IO, Any
 
+from drivers.child_process import ChildProcess
+
 LOOPBACK = "127.0.0.1"
-SIMULATE = (sys.executable, "-m", "hil", "simulate")
+_SIMULATE = ("-m", "hil", "simulate")
+SIMULATE = (sys.executable, *_SIMULATE)
 END_TIMEOUT = 20.0
 """Time limit for a simulated controller to end its session, s."""
 
@@ -23,57 +23,43 @@ END_TIMEOUT = 20.0
 class SimulatorProcess:
     """A child process that runs `hil simulate`."""
 
-    process: subprocess.Popen[bytes]
-    _stderr: IO[bytes] = field(repr=False)
+    process: ChildProcess
     _stdout: IO[bytes] = field(repr=False)
 
     @classmethod
     def start(cls, cell: Path, *options: str) -> SimulatorProcess:
         """Start a controller for a cell file."""
-        stderr, stdout = (tempfile.TemporaryFile() for _ in range(2))  # noqa: SIM115 - closed in end
-        process = subprocess.Popen(
-            [*SIMULATE, str(cell), "--json", *options],
-            stdin=subprocess.DEVNULL,
-            stdout=stdout,
-            stderr=stderr,
-            start_new_session=True,
-        )
-        return cls(process, stderr, stdout)
+        stdout = tempfile.TemporaryFile()  # noqa: SIM115 - closed in end
+        arguments = (*_SIMULATE, str(cell), "--json", *options)
+        return cls(ChildProcess(arguments, stdout=stdout.fileno()), stdout)
 
     @property
     def running(self) -> bool:
         """Whether the process runs."""
-        return self.process.poll() is None
+        return self.process.alive
 
     def finish(self) -> None:
         """Request the end of the session: arm at rest, drive off, then mode 504."""
-        if self.running:
-            self.process.send_signal(signal.SIGTERM)
+        self.process.terminate()
 
     def failure(self) -> str | None:
         """Return its last error message; None while it runs, or if it succeeded."""
-        if not self.process.poll():
+        if not self.process.status:
             return None
-        lines = [line for line in _lines(self._stderr) if any(letter.isalpha() for letter in line)]
+        output = (line.strip() for line in self.process.errors.splitlines())
+        lines = [line for line in output if any(letter.isalpha() for letter in line)]
         errors = [line for line in lines if line.startswith("error:")]
-        return (errors or lines or [f"exit status {self.process.returncode}"])[-1]
+        return (errors or lines or [f"exit status {self.process.status}"])[-1]
 
     def end(self) -> dict[str, Any]:
         """Wait for the end, or kill it; return its summary (`docs/simulate.md`), {} if killed."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(END_TIMEOUT)
-        if self.running:
+        if self.process.wait(END_TIMEOUT) is None:
             self.process.kill()
-            self.process.wait()
-        lines = _lines(self._stdout)
-        self._stderr.close()
+        self._stdout.seek(0)
+        lines = self._stdout.read().decode(errors="replace").splitlines()
+        self.process.close()
         self._stdout.close()
         return json.loads(lines[-1]) if lines else {}
-
-
-def _lines(file: IO[bytes]) -> list[str]:
-    file.seek(0)
-    return [line.strip() for line in file.read().decode(errors="replace").splitlines()]
 
 
 def free_port() -> int:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import os
 import pickle
-import signal
 import socket
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final
 
+from drivers.child_process import ChildProcess
 from drivers.drive_train import DriveTrain
 from drivers.errors import DriverError, RequestError
 from drivers.exchange import control, event_log
@@ -89,7 +86,6 @@ class ExchangeProcess:
         self.ring_fd = CycleRing.shared(n_joints, settings.ring_capacity).fd
         self.event_fd = event_log.create()
         self.control_fd = control.create()
-        self._log_fd = create_memory("hil-exchange-log", 0)
         self._control = SharedState(self.control_fd)
         self._events = EventReader(self.event_fd)
         self._offers = 0
@@ -99,9 +95,14 @@ class ExchangeProcess:
         try:
             os.pwrite(settings_fd, pickle.dumps(settings, protocol=5), 0)
             fds = [theirs.fileno(), settings_fd, self.ring_fd, self.event_fd, self.control_fd]
-            self._process = _spawn(fds, self._log_fd)
+            # Thread pools would be locked into memory and never used.
+            self._process = ChildProcess(
+                ("-m", "drivers.exchange", *map(str, fds)),
+                descriptors=fds,
+                environment=dict.fromkeys(_THREADS, "1"),
+            )
         except OSError as error:
-            self.close()
+            self._close_memory()
             raise ExchangeError(f"the exchange process cannot be started: {error}") from error
         finally:
             os.close(settings_fd)
@@ -218,13 +219,12 @@ class ExchangeProcess:
     @property
     def alive(self) -> bool:
         """Whether the process runs."""
-        return self._process.poll() is None
+        return self._process.alive
 
     @property
     def log(self) -> str:
         """Its standard error; empty unless something failed."""
-        size = os.fstat(self._log_fd).st_size
-        return os.pread(self._log_fd, size, 0).decode(errors="replace")
+        return self._process.errors
 
     def wait(self, timeout: float) -> int | None:
         """Return its exit status, None if it still runs after `timeout` s; sends heartbeats."""
@@ -232,26 +232,26 @@ class ExchangeProcess:
         while True:
             self.send_heartbeat()
             left = end - time.monotonic()
-            try:
-                return self._process.wait(max(0.0, min(left, _POLL)))
-            except subprocess.TimeoutExpired:
-                if left <= _POLL:
-                    return None
+            status = self._process.wait(max(0.0, min(left, _POLL)))
+            if status is not None or left <= _POLL:
+                return status
 
     def terminate(self) -> None:
         """Request a stop on the path and the end of the process, by signal."""
-        if self.alive:
-            self._process.send_signal(signal.SIGTERM)
+        self._process.terminate()
 
     def kill(self) -> None:
         """Kill it: the controller's own monitoring has to stop an arm in motion."""
         self._process.kill()
-        self._process.wait()
 
     def close(self) -> None:
         """Close socket and memory; a process that still runs stops the arm and ends."""
+        self._process.close()
+        self._close_memory()
+
+    def _close_memory(self) -> None:
         self._channel.close()
-        for name in ("ring_fd", "event_fd", "control_fd", "_log_fd"):
+        for name in ("ring_fd", "event_fd", "control_fd"):
             fd, closed = getattr(self, name), -1
             if fd != closed:
                 os.close(fd)
@@ -289,22 +289,3 @@ class ExchangeProcess:
 
 
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-
-def _spawn(fds: Sequence[int], log: int) -> subprocess.Popen[bytes]:
-    environment = {
-        **os.environ,
-        # The same import path: motions are objects of imported classes.
-        "PYTHONPATH": os.pathsep.join(path or str(Path.cwd()) for path in sys.path),
-        # Thread pools would be locked into memory and never used.
-        **dict.fromkeys(_THREADS, "1"),
-    }
-    return subprocess.Popen(
-        [sys.executable, "-m", "drivers.exchange", *map(str, fds)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=log,
-        pass_fds=fds,
-        start_new_session=True,
-        env=environment,
-    )

@@ -7,15 +7,12 @@ import os
 import pickle
 import select
 import socket
-import subprocess
-import sys
-import tempfile
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 from socket import AF_UNIX, SOCK_SEQPACKET, socketpair
-from typing import IO, Any, Protocol
+from typing import Any, Protocol
 
+from drivers.child_process import ChildProcess
 from drivers.drive_train import DriveTrain
 from drivers.exchange.control import HeartbeatMonitor, SharedState
 from hil.archive.live import Serve
@@ -155,10 +152,9 @@ class SharedMemory(Protocol):
 class ArchiveProcessHandle:
     """Starts, commands and ends the archive process, a child in its own process session."""
 
-    process: subprocess.Popen[bytes]
+    process: ChildProcess
     channel: Channel
     monitor: HeartbeatMonitor
-    _stderr: IO[bytes]
     _gone: bool = False
     _ended_for: str = field(default="")
 
@@ -168,7 +164,6 @@ class ArchiveProcessHandle:
         control = SharedState(memory.control_fd)
         monitor = HeartbeatMonitor(lambda: control.archive_heartbeat)
         with contextlib.ExitStack() as undo:
-            stderr: IO[bytes] = undo.enter_context(tempfile.TemporaryFile())
             exchange = os.pidfd_open(memory.pid)
             undo.callback(os.close, exchange)
             ours, theirs = socketpair(AF_UNIX, SOCK_SEQPACKET)
@@ -176,25 +171,16 @@ class ArchiveProcessHandle:
             undo.callback(ours.close)
             passed = (memory.ring_fd, memory.event_fd, memory.control_fd, theirs.fileno(), exchange)
             numbers = map(str, (*passed, n_joints))
-            import_paths = [path or str(Path.cwd()) for path in sys.path]
-            process = subprocess.Popen(
-                [sys.executable, "-m", "hil.archive.process", *numbers],
-                pass_fds=passed,
-                start_new_session=True,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=stderr,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(import_paths)},
-            )
+            process = ChildProcess(("-m", "hil.archive.process", *numbers), descriptors=passed)
             undo.pop_all()
             os.close(exchange)
             theirs.close()
-        return cls(process, Channel(ours), monitor, stderr)
+        return cls(process, Channel(ours), monitor)
 
     @property
     def alive(self) -> bool:
         """Whether the process runs and its socket is open."""
-        return not self._gone and self.process.poll() is None
+        return not self._gone and self.process.alive
 
     def failure(self) -> str | None:
         """Return the fault of the process, None if it works; one that hangs is killed."""
@@ -202,13 +188,12 @@ class ArchiveProcessHandle:
             self.kill(f"sent no heartbeat for {HUNG:g} s and was ended")
         if self.alive:
             return None
-        return f"the archive process {self._ended_for or 'ended' + self._error_output()}"
+        return f"the archive process {self._ended_for or f'ended ({self.process.last_error})'}"
 
     def kill(self, reason: str) -> None:
         """Kill the process; `reason` continues "the archive process" in messages."""
         self._ended_for, self._gone = reason, True
-        self.process.kill()
-        self._wait(EXIT_TIMEOUT)
+        self.process.kill(EXIT_TIMEOUT)
 
     def send(self, command: Command) -> None:
         """Send a command; `failure` reports one that could not be delivered."""
@@ -238,39 +223,25 @@ class ArchiveProcessHandle:
                 return answer
         return None
 
-    def _error_output(self) -> str:
-        """Return the last line on standard error, or the exit status, in parentheses."""
-        if self._stderr.closed:
-            return ""
-        size = os.fstat(self._stderr.fileno()).st_size
-        text = os.pread(self._stderr.fileno(), 400, max(0, size - 400)).decode(errors="replace")
-        lines = text.strip().splitlines()
-        return f" ({lines[-1]})" if lines else f" (exit status {self.process.poll()})"
-
     def end(self) -> str | None:
         """Close the open archive and end the process, killed if it hangs; return its fault."""
         if self.alive:
             self.send(End())
         deadline = time.monotonic() + END_TIMEOUT
-        while self.process.poll() is None and not self._gone:
+        while self.process.alive and not self._gone:
             if self.monitor.silence() > HUNG:
                 self.kill(f"sent no heartbeat for {HUNG:g} s and was ended")
             elif time.monotonic() > deadline:
                 self.kill(f"did not end within {END_TIMEOUT:g} s and was killed")
             else:
-                self._wait(POLL)
-        status = self.process.poll()
-        if not self._ended_for and status not in (0, None):
-            self._ended_for = f"ended{self._error_output()}"
+                self.process.wait(POLL)
+        if not self._ended_for and self.process.status not in (0, None):
+            self._ended_for = f"ended ({self.process.last_error})"
         self.channel.close()
-        self._stderr.close()
+        self.process.close()
         return f"the archive process {self._ended_for}" if self._ended_for else None
 
     def _lose(self) -> None:
         """Wait for a process that has closed its socket."""
-        self._wait(EXIT_TIMEOUT)
+        self.process.wait(EXIT_TIMEOUT)
         self._gone = True
-
-    def _wait(self, timeout: float) -> None:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(timeout)

@@ -183,7 +183,7 @@ class TestArchiveProcess:
         rig.process.channel.close()  # the supervisor dies
         time.sleep(0.2)
         memory.end()
-        wait(lambda: rig.process.process.poll() is not None)
+        wait(lambda: not rig.process.process.alive)
         found = outcome(path)
         assert (found.outcome, found.reason) == (
             "void", "nothing was sent: the supervising program ended"
@@ -239,7 +239,7 @@ class TestArchiveProcess:
         failure = rig.process.failure()
         assert failure is not None
         assert "accepted no command" in failure
-        assert rig.process.process.poll() is not None
+        assert not rig.process.process.alive
 
 
 FLUSH = 100  # cycles

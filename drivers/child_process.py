@@ -1,0 +1,115 @@
+"""A child process: a new interpreter in its own session, with inherited descriptors."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from drivers.record import create_memory
+
+_LONGEST_OUTPUT: Final = 1 << 20  # bytes of error output that are read
+
+
+class ChildProcess:
+    """A Python program as a child; nothing of this process' main module is imported again in it.
+
+    It is in its own session, so that the end of the terminal and Ctrl-C reach only the parent, and
+    has no standard input. It imports from the same folders. Its standard error is kept in memory.
+    Its death is seen by `alive`; how it detects that of the parent is its own affair (a heartbeat,
+    or the end of a socket).
+
+    Args:
+        arguments: of the interpreter, such as ``("-m", "package.module")``.
+        descriptors: that it inherits, by the same numbers.
+        environment: changes of the environment.
+        stdout: a descriptor for its standard output; none by default.
+
+    Raises:
+        OSError: the system refuses it.
+    """
+
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        *,
+        descriptors: Sequence[int] = (),
+        environment: Mapping[str, str] | None = None,
+        stdout: int = subprocess.DEVNULL,
+    ) -> None:
+        self._errors = create_memory("hil-child-stderr", 0)
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=stdout,
+                stderr=self._errors,
+                pass_fds=descriptors,
+                start_new_session=True,
+                env={**os.environ, "PYTHONPATH": _import_path(), **(environment or {})},
+            )
+        except BaseException:
+            os.close(self._errors)
+            raise
+        self.pid = self._process.pid
+        self._final_errors: str | None = None
+
+    @property
+    def alive(self) -> bool:
+        """Whether it runs."""
+        return self._process.poll() is None
+
+    @property
+    def status(self) -> int | None:
+        """Its exit status, negative for a signal; None while it runs."""
+        return self._process.poll()
+
+    @property
+    def errors(self) -> str:
+        """Its standard error up to now; after `close`, up to then."""
+        if self._final_errors is not None:
+            return self._final_errors
+        size = min(os.fstat(self._errors).st_size, _LONGEST_OUTPUT)
+        return os.pread(self._errors, size, 0).decode(errors="replace")
+
+    @property
+    def last_error(self) -> str:
+        """The last line of its standard error, or its exit status."""
+        lines = self.errors.strip().splitlines()
+        return lines[-1] if lines else f"exit status {self.status}"
+
+    def wait(self, timeout: float | None = None) -> int | None:
+        """Return its exit status, None if it still runs after `timeout` s."""
+        with suppress(subprocess.TimeoutExpired):
+            return self._process.wait(timeout)
+        return None
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal, unless it has ended."""
+        if self.alive:
+            self._process.send_signal(number)
+
+    def terminate(self) -> None:
+        """Request its end by SIGTERM."""
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self, timeout: float | None = None) -> None:
+        """Kill it, and wait for its end, at most `timeout` s: it may hang in the kernel."""
+        self._process.kill()
+        self.wait(timeout)
+
+    def close(self) -> None:
+        """Release the memory of its standard error; may be called again."""
+        if self._final_errors is None:
+            self._final_errors = self.errors
+            os.close(self._errors)
+
+
+def _import_path() -> str:
+    """Return the import path of this process: what is sent are objects of imported classes."""
+    return os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
