@@ -196,9 +196,9 @@ class MotionLink:
     def complete(self, outcome: str, reason: str) -> Recorded:
         """Complete the archive that is open, and return what it contains."""
         self._poll()
-        return self._counted(self.port.close_archive(outcome, reason))
+        return self._add_records(self.port.close_archive(outcome, reason))
 
-    def _counted(self, recorded: Recorded) -> Recorded:
+    def _add_records(self, recorded: Recorded) -> Recorded:
         self.cycles += recorded.records
         return recorded
 
@@ -510,7 +510,7 @@ class _Supervision:
             self._link.come_to_rest()
             raise
         if recorded is not None:
-            self._recorded = self._link._counted(recorded)
+            self._recorded = self._link._add_records(recorded)
             return True
         self._link.require_archive(self._spec)
         if self._link.motion_ended or self._port.failure() is not None:

@@ -270,7 +270,7 @@ def test_archive_of_an_earlier_version_with_ages_is_read(
     assert archive.complete
     np.testing.assert_array_equal(archive.columns["age"], aged["age"])
     assert same(archive.cycles(), rows)
-    assert check_archive(path).damage is None
+    assert check_archive(path).conforms
 
 
 def test_documentation_shows_the_messages() -> None:
