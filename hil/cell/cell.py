@@ -240,8 +240,9 @@ class Cell:
         try:
             spec.check(table.mode)
         except (DriverError, ValueError) as error:
-            remedy = "choose values within the capacity of the bus"
-            raise self.error(f"controller.{table.transport}", None, str(error), remedy) from error
+            problem, _, remedy = str(error).rpartition("; ")
+            field = f"controller.{table.transport}"
+            raise self.error(field, None, problem or remedy, remedy) from error
         return spec
 
     @property

@@ -365,10 +365,7 @@ class DriveTrainTable(Table):
     encoder_counts_per_revolution: Whole = field("encoder counts per motor turn", gt=0)
 
 
-CLASSIC: Final = (
-    "classic CAN is not supported any more: its frames do not carry packets whole; write "
-    'profile = "fd" if the adapter has CAN FD, else transport = "udp"'
-)
+_NO_CLASSIC: Final = "classic CAN is not supported any more: its frames do not carry packets whole"
 
 
 class CanTable(Table):
@@ -388,7 +385,8 @@ class CanTable(Table):
     @classmethod
     def _has_fd(cls, profile: object) -> object:
         if profile == "classic":
-            raise ValueError(CLASSIC)
+            remedy = 'write profile = "fd" if the adapter has CAN FD, else transport = "udp"'
+            raise ValueError(f"{_NO_CLASSIC}; {remedy}")
         return profile
 
 
@@ -466,7 +464,8 @@ def _can_address(text: str) -> dict[str, Any] | None:
     interface, _, rest = text.partition(":")
     channel, _, profile = rest.rpartition(":") if ":" in rest else (rest, "", "fd")
     if profile == "classic":
-        raise ValueError(CLASSIC)
+        remedy = "leave :classic out if the adapter has CAN FD, else use --udp"
+        raise ValueError(f"{_NO_CLASSIC}; {remedy}")
     if not (interface and channel) or profile != "fd":
         return None
     return {"can": {"interface": interface, "channel": channel}}
