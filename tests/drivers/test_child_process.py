@@ -52,7 +52,7 @@ def test_a_signal_ends_it(started: list[ChildProcess]) -> None:
     sleeping.terminate()  # it has ended
 
 
-def test_it_has_the_descriptors_it_was_given_and_a_session_of_its_own(
+def test_it_has_its_descriptors_and_a_session_of_its_own(
     started: list[ChildProcess],
 ) -> None:
     ours, theirs = os.pipe()
@@ -63,7 +63,7 @@ def test_it_has_the_descriptors_it_was_given_and_a_session_of_its_own(
     os.close(ours)
 
 
-def test_it_imports_from_the_same_folders_and_nothing_of_the_main_module(tmp_path: Path) -> None:
+def test_it_imports_from_the_same_folders_not_the_main_module(tmp_path: Path) -> None:
     """A program that starts one at its top level does not start programs without end."""
     (tmp_path / "beside.py").write_text("raise SystemExit(7)\n")
     program = tmp_path / "program.py"

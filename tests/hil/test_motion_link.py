@@ -1,0 +1,240 @@
+"""Endings and time-outs of a motion, the same over every port: here one with a script of events."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.errors import RequestError
+from drivers.events import MotionEnded, MotionStarted
+from drivers.exchange.event_log import NO_ARCHIVE, EventsLost
+from drivers.exchange.process import ExchangeError, WithdrawnError
+from drivers.states import State
+from hil.archive import ArchiveSpec
+from hil.archive.recorder import Recorded
+from hil.campaign import Stop
+from hil.campaign.connection import OFF_TIMEOUT, START_TIMEOUT
+from hil.campaign.link import REST_TIMEOUT, MotionLink
+from hil.campaign.port import PortStatus
+from hil.cell import Cell
+from hil.errors import ArchiveWriteError, ControllerFault
+
+TURN = 0.02
+Happens = Callable[["ScriptedPort"], None]
+
+
+def recorded(outcome: str, reason: str, disk_waited: float = 0.0) -> Recorded:
+    return Recorded(outcome, reason, 0, 1.0, 500, 0, 0, 0, 0, 0, disk_waited)
+
+
+class ScriptedPort:
+    """A port of which things happen at given times [s], with a diary of what was asked of it."""
+
+    is_virtual, only_simulated, live = False, True, None
+
+    def __init__(self, *script: tuple[float, Happens]) -> None:
+        self.now, self.state, self.ended_count = 0.0, State.CLOSED, 0
+        self.script = list(script)
+        self.events: list[Any] = []
+        self.diary: list[str] = []
+        self.complete: Recorded | None = None
+        self.broken: Exception | None = None
+        self.archive_gone: str | None = None
+        self.exchange_gone: str | None = None
+        self.refuses: Exception | None = None
+
+    def status(self) -> PortStatus:
+        return PortStatus(self.state, 0, 1, 0, 0, 0, 0, self.ended_count, np.nan, np.nan)
+
+    def failure(self) -> str | None:
+        return self.exchange_gone
+
+    def poll(self) -> Sequence[Any]:
+        events, self.events = self.events, []
+        return events
+
+    def new_records(self) -> np.ndarray:
+        return np.zeros(0, np.dtype(np.void))
+
+    def exchange_until(self, finished: Callable[[], bool]) -> bool:
+        while not finished():
+            if self.exchange_gone is not None:
+                self.complete = self.complete or recorded("lost", "the exchange process ended")
+                return False
+            self.now += TURN
+            while self.script and self.script[0][0] <= self.now:
+                self.script.pop(0)[1](self)
+        return True
+
+    def due(self) -> bool:
+        return True
+
+    def submit(self, source: object, wanted: Callable[[], bool]) -> None:
+        self.diary.append("submit")
+        if self.refuses is not None:
+            raise self.refuses
+        if not wanted():
+            raise WithdrawnError("closed", "withdrawn")
+
+    @contextmanager
+    def supervision(self) -> Iterator[None]:
+        yield
+
+    def stop(self, reason: str) -> None:
+        if "stop" not in self.diary:
+            self.diary.append("stop")
+
+    @contextmanager
+    def open_archive(self, spec: ArchiveSpec, *, own_motion: bool) -> Iterator[None]:
+        self.diary.append("open")
+        yield
+
+    def archived(self) -> Recorded | None:
+        if self.broken is not None:
+            raise self.broken
+        return self.complete
+
+    def archive_failure(self) -> str | None:
+        return self.archive_gone
+
+    def close_archive(self, outcome: str, reason: str) -> Recorded:
+        self.diary.append(outcome)
+        return recorded(outcome, reason)
+
+
+def started(port: ScriptedPort) -> None:
+    port.state = State.OPEN
+    port.events.append(MotionStarted(0, 10))
+
+
+def ended(outcome: str = "completed", reason: str = "the motion is complete") -> Happens:
+    def happens(port: ScriptedPort) -> None:
+        port.state, port.ended_count = State.CLOSED, port.ended_count + 1
+        port.events.append(MotionEnded(outcome, reason, 0, 500))  # type: ignore[arg-type]
+
+    return happens
+
+
+def archived(outcome: str = "completed", reason: str = "", disk_waited: float = 0.0) -> Happens:
+    return lambda port: setattr(port, "complete", recorded(outcome, reason, disk_waited))
+
+
+def is_set(name: str, value: object) -> Happens:
+    return lambda port: setattr(port, name, value)
+
+
+def run(cell: Cell, port: ScriptedPort, stop: Stop | None = None) -> MotionEnded:
+    spec = ArchiveSpec(Path("a.mcap"), cell.joint_names, cell.period, {}, durable=False)
+    link = MotionLink(cell, port)  # type: ignore[arg-type]
+    return link.run(object(), spec, stop or Stop())  # type: ignore[arg-type]
+
+
+def test_a_motion_ends_with_its_archive(cell: Cell) -> None:
+    port = ScriptedPort((0.1, started), (1.0, ended()), (1.2, archived()))
+    assert run(cell, port).outcome == "completed"
+    assert port.now == pytest.approx(1.2, abs=TURN)
+
+
+@pytest.mark.parametrize("lost", [EventsLost(3), None])
+def test_an_end_whose_event_was_lost_is_that_of_the_archive(cell: Cell, lost: Any) -> None:
+    def ends(port: ScriptedPort) -> None:
+        port.ended_count += 1
+        port.events += [lost] if lost is not None else []
+
+    port = ScriptedPort((0.1, started), (1.0, ends), (1.2, archived("stopped", "requested")))
+    assert run(cell, port) == MotionEnded("stopped", "requested", 0, -1)
+
+
+@pytest.mark.parametrize(
+    ("state", "after", "words"),
+    [
+        (State.DRIVE_OFF, OFF_TIMEOUT, "the drive went off before the motion began"),
+        (State.FAULTED, OFF_TIMEOUT, "a refusal came before the motion began"),
+        (State.CLOSED, START_TIMEOUT, "did not begin within 60 s"),
+    ],
+)
+def test_a_motion_that_does_not_begin_is_dropped(
+    cell: Cell, state: State, after: float, words: str
+) -> None:
+    """First its archive is closed, without which nothing can begin any more; then it is stopped."""
+    port = ScriptedPort((TURN, is_set("state", state)))
+    with pytest.raises(ControllerFault, match=f"{words}.*; nothing was sent"):
+        run(cell, port)
+    assert port.diary == ["open", "submit", "void", "stop"]
+    assert port.now == pytest.approx(after, abs=3 * TURN)
+
+
+@pytest.mark.parametrize(
+    ("fault", "error", "words"),
+    [
+        (is_set("broken", ArchiveWriteError(Path("a.mcap"), "cannot be written", remedy="")),
+         ArchiveWriteError, "cannot be written"),
+        (is_set("archive_gone", "the archive process ended"),
+         ControllerFault, "the archive process ended; the arm was brought to rest"),
+    ],
+)  # fmt: skip
+def test_without_an_archive_the_arm_rests_before_the_error(
+    cell: Cell, fault: Happens, error: type[Exception], words: str
+) -> None:
+    rests = ended("stopped", "a stop was requested")
+    port = ScriptedPort((0.1, started), (0.5, fault), (0.8, rests))
+    with pytest.raises(error, match=words):
+        run(cell, port)
+    assert port.diary == ["open", "submit", "stop"]
+    assert port.now >= 0.8
+
+
+def test_an_arm_that_is_not_seen_at_rest_is_reported_so(cell: Cell) -> None:
+    port = ScriptedPort((0.1, started), (0.5, is_set("archive_gone", "the archive process ended")))
+    with pytest.raises(ControllerFault, match=r"asked to stop, but was not seen at rest \(OPEN\)"):
+        run(cell, port)
+    assert port.now == pytest.approx(0.5 + REST_TIMEOUT, abs=0.1)
+
+
+def test_an_exchange_that_ended_is_a_fault(cell: Cell) -> None:
+    port = ScriptedPort((0.1, started), (0.5, is_set("exchange_gone", "the exchange ended")))
+    with pytest.raises(ControllerFault, match=r"acts by its own watchdog; the archive \(lost\)"):
+        run(cell, port)
+
+
+def test_an_archive_that_never_completes_is_reported(cell: Cell) -> None:
+    port = ScriptedPort((0.1, started), (1.0, ended()))
+    with pytest.raises(ControllerFault, match=r"the motion has ended, but .* was not completed"):
+        run(cell, port)
+    assert port.now == pytest.approx(1.0 + REST_TIMEOUT, abs=0.1)
+
+
+def test_a_stop_for_want_of_heartbeats_names_the_disk(cell: Cell) -> None:
+    over = archived("stopped", NO_ARCHIVE, disk_waited=3.2)
+    port = ScriptedPort((0.1, started), (0.5, ended("stopped", NO_ARCHIVE)), (0.6, over))
+    assert "its disk for 3.2 s: check that disk" in run(cell, port).reason
+
+
+@pytest.mark.parametrize(
+    ("refuses", "words", "outcome"),
+    [
+        (RequestError("closed", "open mode is being left"), "see the outcome of a.mcap", "refused"),
+        (ExchangeError("it did not answer within 5 s"), "within 5 s; a.mcap is void", "void"),
+    ],
+)
+def test_a_motion_that_is_not_accepted_moves_nothing(
+    cell: Cell, refuses: Exception, words: str, outcome: str
+) -> None:
+    port = ScriptedPort()
+    port.refuses = refuses
+    with pytest.raises(ControllerFault, match=words):
+        run(cell, port)
+    assert [entry for entry in port.diary if entry != "stop"] == ["open", "submit", outcome]
+
+
+def test_a_stop_before_the_request_sends_nothing(cell: Cell) -> None:
+    port = ScriptedPort()
+    assert run(cell, port, Stop(requested=True)) == MotionEnded(
+        "stopped", "it had not begun", -1, -1
+    )
+    assert port.diary == ["open", "stopped"]
