@@ -18,8 +18,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests.tiers import tier_of
-
 settings.register_profile(
     "hil", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
 )
@@ -51,9 +49,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if (measured := Path("mutmut-stats.json")).exists():
         seconds = json.loads(measured.read_text())["duration_by_test"]
         items.sort(key=lambda item: seconds.get(item.nodeid, 0.0))
-    for item in items:
-        if (tier := tier_of(item.path)) is not None:
-            item.add_marker(tier)
 
 
 @pytest.fixture(scope="session")

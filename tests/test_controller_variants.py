@@ -18,6 +18,8 @@ from sim_fixtures import Phase
 from tests.fault_matrix import faulty_runs, small_cell
 from tests.fault_matrix.faulty_runs import LIMITS
 
+pytestmark = pytest.mark.safety
+
 HOME = np.array(small_cell.HOME)
 WAY = np.array([0.3, 0.375])
 

@@ -37,6 +37,8 @@ from tests.fault_matrix.faulty_runs import (
     play_at,
 )
 
+pytestmark = pytest.mark.safety
+
 EXPECTED = expected(SITUATIONS[0])
 SHARES = [percentage(share) for share in SPEEDS]
 AT_SPEED = expected(SHARES[0])

@@ -18,6 +18,8 @@ from benchmarks.plain_fit import Measured
 from benchmarks.published import Published, Split, known
 from hil.importers import Robot
 
+pytestmark = pytest.mark.long
+
 URDF = Path(__file__).resolve().parents[2] / "examples" / "two_joints" / "robot.urdf"
 Logs, Archives = dict[str, JointLog], dict[str, Path]
 COULOMB, VISCOUS, ROTOR = np.array([4.0, 2.0]), np.array([2.0, 1.0]), np.array([0.5, 0.2])

@@ -14,6 +14,8 @@ from benchmarks import board, board_page, fetch
 from benchmarks.board_page import Line
 from benchmarks.published import Published, Source, known
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def robot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:

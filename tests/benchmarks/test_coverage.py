@@ -20,6 +20,8 @@ from benchmarks.coverage import (
 from hil.importers import IMPORTED_LAW
 from identification.model.robot import RobotModel
 
+pytestmark = pytest.mark.long
+
 SPEED = DEFAULTS.speed
 ARMS = [pytest.param(name, id=name) for name in ARM_TYPES]
 

@@ -9,6 +9,8 @@ import pytest
 from benchmarks.leave_one_out import ALTERNATIVES, PRESENT, chosen_without, main
 from identification.selection import inner_prediction
 
+pytestmark = pytest.mark.long
+
 
 def test_every_default_is_there_and_has_other_values() -> None:
     for name, values in ALTERNATIVES.items():

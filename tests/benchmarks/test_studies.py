@@ -20,6 +20,8 @@ from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples, prepare
 
+pytestmark = pytest.mark.long
+
 Array = NDArray[np.float64]
 
 

@@ -13,6 +13,8 @@ import pytest
 from benchmarks import plain_fit, whole_run
 from benchmarks.fresh_process import usage
 
+pytestmark = pytest.mark.long
+
 _MEGABYTE = 1_000_000
 
 

@@ -15,6 +15,8 @@ from hil.progress import Silent
 from tests.disk.damage import KINDS, SWAPPED, Undamaged, blamed, broken, campaign, play
 from tests.hil.mcap_bytes import chunks
 
+pytestmark = pytest.mark.safety
+
 HARMED = "archives/excitation_000_a1.mcap"
 
 

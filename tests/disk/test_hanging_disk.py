@@ -23,6 +23,8 @@ from tests.disk.disks import CREATE, SYNC, WRITE, Disk, Rule, processes_disk
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 from tests.hil.loopback import loopback_link
 
+pytestmark = pytest.mark.safety
+
 PATIENCE = 120.0  # s for a process on a loaded computer
 RUN = (sys.executable, "-m", "hil", "run")
 

@@ -40,6 +40,8 @@ from tests.disk.disks import (
 )
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
+pytestmark = pytest.mark.safety
+
 DONE = {
     "*": {CREATE: 15, WRITE: 130, SYNC: 130, RENAME: 8},
     "*.mcap": {CREATE: 7, WRITE: 130, SYNC: 130},

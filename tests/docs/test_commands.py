@@ -23,6 +23,8 @@ from hil.progress import Silent
 from tests.docs.typed import PAGES, ROOT, commands, parse
 from tests.hil.simulated_logs import write_moving_log
 
+pytestmark = pytest.mark.long
+
 TYPED_ELSEWHERE = {
     "campaign.md": "tests/hil/test_campaign_day.py",
     "payload.md": "tests/hil/test_payload_command.py",

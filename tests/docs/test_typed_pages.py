@@ -33,6 +33,8 @@ from tests.hil.simulated_logs import simulate
 from tests.hil.test_payload_command import CENTRE, MASS, archive_of_currents
 from tests.motion_table import MotionTable
 
+pytestmark = pytest.mark.long
+
 
 def page(name: str) -> str:
     return (ROOT / "docs" / name).read_text("utf-8")

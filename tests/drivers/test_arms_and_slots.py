@@ -18,6 +18,8 @@ from drivers import CycleRing, Guard, InitPacket, InitReceived, RequestError, Se
 from tests.drivers import oracle
 from tests.drivers.rig import PERIOD, Table, limits, train_of
 
+pytestmark = pytest.mark.safety
+
 OPEN, CLOSED = 4, 0
 ON = 5
 FOLLOWING_ERROR = np.linspace(1.0, 1.9, 40).reshape(4, 10)  # of each arm and axis

@@ -13,6 +13,8 @@ import pytest
 
 from drivers.child_process import ChildProcess
 
+pytestmark = pytest.mark.safety
+
 LIMIT = 60.0  # s for a new interpreter on a busy computer
 
 

@@ -17,6 +17,8 @@ from tests.fuzz.draw import Draw
 from tests.fuzz.targets import session
 from tests.fuzz.targets.session import Conversation
 
+pytestmark = pytest.mark.safety
+
 
 def random_conversation(seed: int) -> bytes:
     """Return bytes of a conversation in which a motion is requested first."""

@@ -22,6 +22,8 @@ from drivers.states import (
 )
 from tests.drivers.rig import PERIOD, moving
 
+pytestmark = pytest.mark.safety
+
 GAP = 2
 
 

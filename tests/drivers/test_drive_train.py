@@ -8,6 +8,8 @@ from hypothesis.extra.numpy import arrays
 
 from drivers import DriveTrain, DriveTrainError
 
+pytestmark = pytest.mark.safety
+
 TURN = 2.0 * np.pi
 FIELDS = {
     "gear_ratio": [-120.0, 150.0, -110.0, 90.0, 80.0, -60.0],

@@ -23,6 +23,8 @@ from drivers import (
 from drivers.exchange.loop import MAX_KINDS
 from tests.drivers.rig import MOVE, PERIOD, START, Cruise, N, Rig, closed, moving, smooth_move
 
+pytestmark = pytest.mark.safety
+
 
 class Controller:
     """Cold start, drive on, axes open one after the other, leaves on request, ends the session.

@@ -53,6 +53,8 @@ from tests.drivers.rig import (
     still,
 )
 
+pytestmark = pytest.mark.safety
+
 HOST = "127.0.0.1"
 
 

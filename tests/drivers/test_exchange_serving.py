@@ -47,6 +47,8 @@ from drivers.exchange.serving import DETACHED_LINGER, MAX_LINGER, CommandHandler
 from drivers.record import CycleRing
 from tests.drivers.rig import Cruise, N, drive_train, limits, still
 
+pytestmark = pytest.mark.safety
+
 
 def gaps(numbers):
     return [GapSeen(1, number) for number in numbers]

@@ -8,6 +8,8 @@ import pytest
 from drivers import SourceFailed
 from drivers.execution import Execution, execution_of
 
+pytestmark = pytest.mark.safety
+
 N = 2
 SETTLE, STOP = 3, 5
 HERE = np.array([0.5, -0.25])

@@ -35,6 +35,8 @@ from drivers.record import (
 )
 from tests.drivers.rig import Cruise, N, moving
 
+pytestmark = pytest.mark.safety
+
 
 def write(ring: CycleRing, numbers) -> None:
     for number in numbers:

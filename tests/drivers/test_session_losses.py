@@ -34,6 +34,8 @@ from tests.drivers.rig import (
     still,
 )
 
+pytestmark = pytest.mark.safety
+
 OFF = "the drive went off"
 RESTARTED = "the controller restarted: it sent an init packet"
 PAUSED = "the controller paused the exchange"

@@ -32,6 +32,8 @@ from tests.drivers.rig import (
     running,
 )
 
+pytestmark = pytest.mark.safety
+
 
 def only_fields_of(mode: int, answer) -> bool:
     others = [d - 1 for d in range(1, 6) if d not in MODE_FIELDS[mode]]

@@ -47,6 +47,8 @@ from tests.drivers.rig import (
     still,
 )
 
+pytestmark = pytest.mark.safety
+
 NOT_FINITE = [np.nan, np.inf, -np.inf]
 
 

@@ -17,6 +17,8 @@ from tests.endurance.__main__ import main
 from tests.endurance.verdict import PROCESSES, Line, Piece, judge, read_journal
 from tests.journal import Journal
 
+pytestmark = pytest.mark.safety
+
 MIB = 2**20
 SECONDS = 80 * 60
 EDGES = [0.0, *(upper_edge(index) for index in range(BINS))]

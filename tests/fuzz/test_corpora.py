@@ -12,6 +12,8 @@ import pytest
 from tests.fuzz import targets
 from tests.fuzz.targets import CORPORA
 
+pytestmark = pytest.mark.safety
+
 MOST_FILES, MOST_BYTES = 40, 200_000
 
 

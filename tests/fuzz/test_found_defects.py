@@ -31,6 +31,8 @@ from tests.fuzz.targets import documents, importers
 from tests.hil.fast_cell import CELL
 from tests.hil.fast_cell import URDF as CELLS_URDF
 
+pytestmark = pytest.mark.long
+
 JOINTS = ("shoulder", "elbow")
 
 

@@ -21,6 +21,8 @@ from tests.fuzz import __main__ as command
 from tests.fuzz import targets
 from tests.fuzz.test_corpora import inputs
 
+pytestmark = pytest.mark.long
+
 
 def loses_axes(whole: Callable[..., bytes | None]) -> Callable[..., bytes | None]:
     def emptied(*given: object) -> bytes | None:

@@ -34,6 +34,8 @@ from tests.hil.simulated_logs import (
     urdf_path,
 )
 
+pytestmark = pytest.mark.long
+
 Array = NDArray[np.float64]
 LAW = FrictionLaw(third=None, offset=True, standstill=0.02)
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")

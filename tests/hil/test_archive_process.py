@@ -34,6 +34,8 @@ from hil.archive.supervised import (
     Opened,
 )
 
+pytestmark = pytest.mark.long
+
 PERIOD = 0.001
 NAME = "excitation_000_a1.mcap"
 

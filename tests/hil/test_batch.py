@@ -44,6 +44,8 @@ from .batch_work import NOTHING_OPEN, Deadly, Here
 from .conftest import small
 from .mcap_bytes import with_attachment
 
+pytestmark = pytest.mark.long
+
 EXACT = {"rtol": 1e-9, "atol": 0.0}
 UNCACHED = CacheLocation(keep=False)
 SETTINGS = Settings(Preprocessing())

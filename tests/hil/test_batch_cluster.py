@@ -33,6 +33,8 @@ from hil.progress import Silent
 from . import batch_work as work
 from .batch_work import NOTHING_OPEN, HandMade, Here
 
+pytestmark = pytest.mark.long
+
 UNCACHED = CacheLocation(keep=False)
 
 

@@ -54,6 +54,8 @@ from planner import (
 from sim_fixtures import SimulatedController
 from tests.hil.fast_cell import set_points
 
+pytestmark = pytest.mark.safety
+
 Run = Callable[..., Campaign]
 
 

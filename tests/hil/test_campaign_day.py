@@ -37,6 +37,8 @@ from planner import TrajectoryPlayer
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
+pytestmark = pytest.mark.long
+
 DOCUMENT = Path(__file__).parents[2] / "docs" / "campaign.md"
 QUICK = """\
 method = "b"

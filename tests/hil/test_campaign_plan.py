@@ -33,6 +33,8 @@ from planner import FourierSeries, PiecewiseCubic
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize("candidates", [1, 5, 300])
 def test_the_quick_search_tries_no_more_than_it_may(cell: Cell, candidates: int) -> None:

@@ -37,6 +37,8 @@ from .arm_histories import FRICTION, Condition
 from .fast_cell import fast_cell
 from .test_report import HOSTILE, Page, assert_inert, assert_stands_alone
 
+pytestmark = pytest.mark.long
+
 Array = NDArray[np.float64]
 
 MORE = 1.3

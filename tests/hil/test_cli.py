@@ -27,6 +27,8 @@ from hil.progress import reporter
 from hil.results import Results
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 
+pytestmark = pytest.mark.long
+
 
 def hil(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "hil", *map(str, arguments)]

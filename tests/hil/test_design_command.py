@@ -27,6 +27,8 @@ from hil.plots import design_picture
 from identification.excitation import CRITERIA
 from sim_fixtures.ns16 import CELL_PATH
 
+pytestmark = pytest.mark.long
+
 SETTINGS = """\
 method = "b"
 [search]

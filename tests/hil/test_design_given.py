@@ -17,6 +17,8 @@ from identification.excitation import Objective, midpoints
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.conftest import run_campaign, small
 
+pytestmark = pytest.mark.long
+
 SETTINGS = """\
 method = "gradient"
 [search]

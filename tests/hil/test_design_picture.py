@@ -22,6 +22,8 @@ from identification.factor.factor import Factor
 from planner import FourierSeries, Trajectory, plan
 from sim_fixtures.ns16 import CELL_PATH
 
+pytestmark = pytest.mark.long
+
 TWO_LINK = Path(__file__).parents[1] / "identification" / "two_link.urdf"
 TWO_LINK_CELL = """
 [cell]

@@ -16,6 +16,8 @@ from hil.errors import InputError
 from hil.progress import Silent
 from sim_fixtures.ns16 import CELL_PATH
 
+pytestmark = pytest.mark.long
+
 TINY = {"population": 8, "generations": 2, "polish": 0}
 
 

@@ -38,6 +38,8 @@ from sim_fixtures.ns16 import URDF_PATH
 
 from .simulated_logs import archive_of, simulate
 
+pytestmark = pytest.mark.long
+
 PERIOD = 0.004
 
 

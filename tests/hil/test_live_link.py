@@ -43,6 +43,8 @@ from tests.hil.fast_cell import fast_cell, on_path, set_points
 from tests.hil.loopback import loopback_link
 from tests.hil.test_supervision import spec as spec_of
 
+pytestmark = pytest.mark.safety
+
 PATIENT = ("--patience", "2")
 """The controller waits while this computer pauses."""
 

@@ -23,6 +23,8 @@ from tests.docs.typed import ROOT, commands
 from tests.hil.fast_cell import set_points
 from tests.hil.screen_rig import on_terminal
 
+pytestmark = pytest.mark.safety
+
 
 @pytest.fixture(scope="module")
 def ns16() -> Cell:

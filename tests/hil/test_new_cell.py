@@ -38,6 +38,8 @@ from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 from tests.hil.new_cells import TWO_JOINTS, described_robot, filled_in
 from tests.hil.simulated_logs import urdf_path
 
+pytestmark = pytest.mark.long
+
 UR10 = "ur_description/urdf/ur10_robot.urdf"
 PANDA = "panda_description/urdf/panda.urdf"
 TALOS_ARM = "talos_data/robots/talos_left_arm.urdf"

@@ -24,6 +24,8 @@ from identification.model.friction import COULOMB
 from sim_fixtures.ns16 import CELL_PATH, load_truth, urdf_text
 from tests.sim_fixtures.bench import base_from_standard, standard_parameters
 
+pytestmark = pytest.mark.long
+
 slow = pytest.mark.slow
 
 

@@ -25,6 +25,8 @@ from tests.docs.test_commands import QUICK
 from tests.docs.typed import ROOT, commands
 from tests.hil.simulated_logs import Simulated, archive_of, simulate
 
+pytestmark = pytest.mark.long
+
 MASS, CENTRE = 4.0, np.array([0.0, 0.09, 0.12])
 TENSOR = np.diag([0.01, 0.02, 0.015])
 LAW = FrictionLaw(third=None, offset=True)

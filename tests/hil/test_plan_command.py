@@ -19,6 +19,8 @@ from hil.plots import draw_plan
 from planner.moves import Move, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
 
+pytestmark = pytest.mark.long
+
 VIA = """\
 # as on the teach pendant
 joint_1, joint_2, joint_3, joint_4, joint_5, joint_6

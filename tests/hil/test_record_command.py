@@ -35,6 +35,8 @@ from hil.recording import archive_path, record
 from hil.simulation import controller_settings, own_postures, simulated_controller
 from sim_fixtures.ns16 import CELL_PATH
 
+pytestmark = pytest.mark.long
+
 NAME = "excitation_000_a1.mcap"
 
 

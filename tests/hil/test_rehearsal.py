@@ -41,6 +41,8 @@ from sim_fixtures.plant import ElasticPlant, PlantTruth
 from tests.hil.fast_cell import CELL, URDF, fast_campaign, fast_cell
 from tests.hil.new_cells import described_robot, filled_in
 
+pytestmark = pytest.mark.long
+
 GEARS = """
 [simulation.drive_train]
 gear_ratio = [100.0, -80.0]

@@ -39,6 +39,8 @@ from identification.excitation.criteria import Criterion
 from identification.selection.inner_prediction import Choice
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2
 
+pytestmark = pytest.mark.long
+
 JOINTS = [f"joint_{j}" for j in range(1, 7)]
 TORQUE = np.array([496.0, 643.0, 158.0, 17.0, 23.0, 20.0])  # RMS of a fast motion, N·m
 

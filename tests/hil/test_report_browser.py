@@ -8,7 +8,8 @@ from hil.report import report_bytes
 from tests.hil.browser import OpenedPage, chromium, page_count
 from tests.hil.test_report import JOINTS, make_results, make_series, with_joints
 
-pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of the driver's process
+# The process of the browser's driver warns at its end.
+pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore::ResourceWarning")]
 VIEWS = {"torques": "#view-torque", "parts": "#view-parts", "spectra": "#view-spectra"}
 
 

@@ -17,6 +17,8 @@ from hil.cli import app
 from hil.errors import InputError
 from hil.rollout import ROLLOUT, RolloutResult
 
+pytestmark = pytest.mark.long
+
 pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 
 

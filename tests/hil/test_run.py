@@ -73,6 +73,8 @@ from tests.hil.batch_work import Here
 from tests.hil.fast_cell import fast_campaign, fast_cell, mirrored, pass_rehearsal, set_points
 from tests.hil.screen_rig import on_terminal
 
+pytestmark = pytest.mark.safety
+
 Array = NDArray[np.float64]
 Make = Callable[..., Campaign]
 Requests = Callable[[RunStatus], OperatorRequest]

@@ -43,6 +43,8 @@ from sim_fixtures.ns16 import CELL_PATH
 from tests.hil import screen_rig
 from tests.hil.screen_rig import Terminal, on_terminal
 
+pytestmark = pytest.mark.long
+
 NAMES = tuple(f"joint_{number}" for number in range(1, 7))
 
 

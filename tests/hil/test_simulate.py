@@ -38,6 +38,8 @@ from sim_fixtures import ControllerSettings, Phase
 from sim_fixtures.ns16 import CELL_PATH
 from sim_fixtures.serve import Request, ServeCounts
 
+pytestmark = pytest.mark.long
+
 FOREIGN = [sys.executable, str(Path(__file__).with_name("foreign_pc.py"))]
 SLOW_MACHINE = ["--missed", "300"]
 """Pauses of this computer must not end open mode."""

@@ -36,6 +36,8 @@ from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
 from tests.hil.test_report import assert_stands_alone
 
+pytestmark = pytest.mark.long
+
 Array = NDArray[np.float64]
 Whole = tuple[Path, StudyResults]
 

@@ -33,6 +33,8 @@ from hil.testing import faulty_link
 from planner import Move, PiecewiseCubic, plan_moves
 from tests.hil.fast_cell import fast_campaign, fast_cell, on_path
 
+pytestmark = pytest.mark.safety
+
 
 class Watcher:
     """Requests by motion time and number of requests so far."""

@@ -14,6 +14,8 @@ from hil.cell import Cell
 from hil.testing import SessionError, UdpController, shortened
 from sim_fixtures.ns16 import CELL_PATH
 
+pytestmark = pytest.mark.long
+
 DOCUMENT = Path(__file__).parents[2] / "docs" / "testing.md"
 
 

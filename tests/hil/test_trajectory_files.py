@@ -25,6 +25,8 @@ from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.new_cells import TWO_JOINTS
 from tests.motion_table import MotionTable
 
+pytestmark = pytest.mark.long
+
 WITH_SPEED = TWO_JOINTS.replace('velocity="0"', 'velocity="3"')
 
 

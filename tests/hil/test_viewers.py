@@ -26,6 +26,8 @@ from hil.plots.archive_view import (
     view_of,
 )
 
+pytestmark = pytest.mark.long
+
 VIEWERS = Path(__file__).parents[2] / "examples" / "viewers"
 
 

@@ -17,6 +17,8 @@ from identification.model.motion import Motion
 from planner import PlannerError
 from tests.identification.searching import bits, problem
 
+pytestmark = pytest.mark.long
+
 WEIGHTS = np.array([0.75, -0.25])
 SETTINGS = SearchSettings(
     method="gradient", population=12, generations=2, seed=3, weights=(0.75, 0.25), gradient=8

@@ -19,6 +19,8 @@ from identification.signals.smoothing import fit_smoothing_spline
 from tests.identification import two_link
 from tests.identification.two_link import URDF, as_samples, four_sines, truth
 
+pytestmark = pytest.mark.long
+
 TRUTH = truth()
 STEP = 5e-3
 TIME = np.arange(0.0, 10.0, STEP)

@@ -26,6 +26,8 @@ from tests.identification.two_link import (
     values_of,
 )
 
+pytestmark = pytest.mark.long
+
 TILTED = (2.0, -3.0, -9.0)
 INERTIA = (0.05, 0.01, -0.02, 0.04, 0.005, 0.03)
 

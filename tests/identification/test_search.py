@@ -37,6 +37,8 @@ from planner import FourierSeries, JointLimits, check_limits
 from planner.errors import LimitExceeded
 from tests.identification.searching import LIMITS, bits, faulty, problem
 
+pytestmark = pytest.mark.long
+
 SETTINGS = SearchSettings(population=12, generations=4, seed=3)
 
 

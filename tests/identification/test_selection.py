@@ -50,6 +50,8 @@ from tests.identification.two_link import (
     truth,
 )
 
+pytestmark = pytest.mark.long
+
 ARM_NOISE = np.array([3.0, 0.6])
 
 

@@ -16,6 +16,8 @@ from identification.factor.factor import Factor, estimate, joint_weights
 from identification.model.payload import Load, Payload
 from tests.identification.two_link import MODEL, a_motion, as_samples, four_sines, truth
 
+pytestmark = pytest.mark.long
+
 SCALE_STD = np.array([0.03, 0.05])
 DRAWS = 2000
 LOAD = Payload(4.0, (0.2, 0.0, 0.1), (0.02, 0.0, 0.0, 0.03, 0.0, 0.04))

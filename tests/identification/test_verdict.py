@@ -35,6 +35,8 @@ from tests.identification import two_link
 from tests.identification.robots import ns16_values
 from tests.identification.two_link import as_samples, four_sines, sine_motion
 
+pytestmark = pytest.mark.long
+
 COULOMB, VISCOUS = map(np.array, (load_truth().coulomb, load_truth().viscous))
 CURRENT_NOISE = 0.02  # A
 MODEL = RobotModel.from_urdf(urdf_text())

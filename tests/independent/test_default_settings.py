@@ -14,7 +14,7 @@ from benchmarks.coverage import ARM_TYPES, DEFAULTS, DELAYS, Conditions, Run, fi
 SEEDS = (1, 2, 3)
 QUADRATIC = DEFAULTS._replace(quadratic=True)
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.long, pytest.mark.slow]
 
 
 def figures_of(delays: tuple[float, ...], conditions: Conditions) -> dict[str, Any]:

@@ -24,6 +24,8 @@ from identification.selection.inner_prediction import CandidateSettings, choose_
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
 
+pytestmark = pytest.mark.long
+
 Array = NDArray[np.float64]
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -33,7 +33,7 @@ from identification.validation.finding import Finding
 GAIN, FRICTION = 1.1, 1.3
 SEEDS = (1, 2, 3)
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.long, pytest.mark.slow]
 
 
 def with_gain(log: Logged, joint: int) -> Logged:

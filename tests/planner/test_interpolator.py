@@ -27,6 +27,8 @@ from planner.interpolator import (
 from planner.moves import Move, Overrides, plan_moves
 from tests.planner.six_axes import SIX_AXES, random_points
 
+pytestmark = pytest.mark.long
+
 PERIOD = 0.002
 
 

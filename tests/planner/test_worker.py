@@ -24,6 +24,8 @@ from planner.worker import (
 )
 from tests.planner.six_axes import SIX_AXES, join, random_points
 
+pytestmark = pytest.mark.long
+
 # Legal states that crash community ruckig 0.19.4: |a| exactly at its limit.
 CRASH = {
     "position": -2.8452037956537097,

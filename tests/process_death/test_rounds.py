@@ -33,6 +33,8 @@ from tests.process_death.play import DEFECTS, NOISE, SHORT, finished
 from tests.process_death.rig import Death, Seen, Strike, made, run
 from tests.process_death.rounds import VICTIMS, Moment, Victim, round_of
 
+pytestmark = pytest.mark.safety
+
 CYCLES = 3000
 
 

@@ -27,6 +27,8 @@ from sim_fixtures import Phase, SimulatedController
 from tests.hil.fast_cell import fast_cell
 from tests.simulate.verdicts import Stage
 
+pytestmark = pytest.mark.safety
+
 
 @pytest.fixture
 def cell(tmp_path: Path) -> Cell:

@@ -27,6 +27,8 @@ from tests.simulate.script import parse_script
 from tests.simulate.verdicts import LAWS
 from tests.simulate.world import NEIGHBOURS, Twin, play, twin_of
 
+pytestmark = pytest.mark.safety
+
 SEED = 5
 FAULTS = (
     "duplicate@300x2",

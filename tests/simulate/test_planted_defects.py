@@ -21,6 +21,8 @@ from tests.simulate.many import stage_folder
 from tests.simulate.scenes import NEIGHBOURS
 from tests.simulate.verdicts import Stage, judged
 
+pytestmark = pytest.mark.safety
+
 SEED = 6
 """Its controller extrapolates the motion over up to eight missing answers."""
 Plant = Callable[[pytest.MonkeyPatch], None]

@@ -8,6 +8,8 @@ import pytest
 
 from tests.simulate.test_seeds_quick import failures
 
+pytestmark = pytest.mark.safety
+
 GROUPS: Final = (
     *(1, 2, 3, 4, 6, 8, 11, 13, 14, 15, 16, 18, 19),
     *(20, 22, 23, 28, 29, 30, 32, 33, 37, 83, 85, 148, 200),

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.simulate.many import stage_folder
 from tests.simulate.scenes import NEIGHBOURS
 from tests.simulate.verdicts import Stage
+
+pytestmark = pytest.mark.safety
 
 
 def failures(group: int) -> list[str]:

@@ -17,6 +17,8 @@ from tests.simulate.script import DRAWS, Story, draw_script, kind_of, parse_scri
 from tests.simulate.verdicts import Stage, Verdict, judged, shrunk, summary
 from tests.simulate.world import SceneError, _twin, twin_of
 
+pytestmark = pytest.mark.safety
+
 STORY = Story(900, tuple(range(100, 800)), 3, 120, 40, 6, 6)
 
 

@@ -21,6 +21,8 @@ from sim_fixtures import Phase
 from sim_fixtures.can_link import CanControllerLink
 from tests.drivers.can_bench import HOME, MOVE, PERIOD, Cycles, Run, UnstampedBus
 
+pytestmark = pytest.mark.safety
+
 REPLY_IDS = {0x100}  # Identifier of the PC (`docs/can.md`)
 _channels = count()
 

@@ -51,6 +51,8 @@ from identification.excitation import Journal
 from planner import PlannerError
 from tests.hil.fast_cell import fast_campaign, fast_cell
 
+pytestmark = pytest.mark.safety
+
 
 @pytest.fixture(scope="session")
 def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:

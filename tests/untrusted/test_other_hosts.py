@@ -20,6 +20,8 @@ from hil.archive import ArchiveOutcome, open_archive
 from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
 from tests.hil.fast_cell import fast_cell
 
+pytestmark = pytest.mark.safety
+
 OTHER_HOST = "127.0.0.2"
 PATIENCE = 240.0  # s for commands on a loaded computer
 INIT = InitPacket.build(2, 2, {}).encode()

@@ -16,6 +16,8 @@ from hil.archive import live
 from tests.hil.live_viewer import Viewer
 from tests.hil.test_live_view import records, served
 
+pytestmark = pytest.mark.safety
+
 REQUESTS = (
     {"op": "advertise", "channels": [{"id": 1, "topic": "/x", "encoding": "json"}]},
     {"op": "setParameters", "parameters": [{"name": "override", "value": 2.0}]},
