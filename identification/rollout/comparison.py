@@ -16,7 +16,7 @@ from identification.export.simulators import rigid_torque, unsupported_torque
 from identification.model.kinematics import pinocchio_model
 from identification.model.robot import RobotModel
 from identification.rollout.servo import Servo, command_of
-from identification.rollout.simulation import LARGEST_ERROR, Feedback, Inputs, SimulatedArm
+from identification.rollout.simulation import LARGEST_ERROR, Feedback, SimulatedArm
 from identification.rollout.windows import Stretch, Windows, stretches_of
 from identification.signals.samples import Samples
 
@@ -35,32 +35,34 @@ class RecordedMotion:
     servo: Servo | None = None  #: in place of the recorded torque
     later: int = 0  #: instants by which the recorded torque is applied later
 
-    def inputs(self, arm: Arm, extra: Array | float = 0.0) -> Inputs:
-        """Return the inputs of an arm, with an additional torque (w, K, n).
+    def force(self, arm: Arm, simulated: SimulatedArm) -> Array:
+        """Return what acts on the joints of an arm in MuJoCo (w, K, n).
 
         What MuJoCo cannot simulate acts as along the measured motion, as does the part of the
         arm's torque that a low-pass took from the record.
         """
-        windows = self.windows
-        stretches = windows.stretches
-        beside = windows.cut(
-            [
-                _removed(one, samples, arm) + _late(one, arm) - unsupported_torque(arm, one.motion)
-                for one, samples in zip(stretches, self.samples, strict=True)
-            ]
-        )
-        change = windows.cut([one.after - one.motion.velocity for one in stretches])
-        if self.servo is None:
-            rate = windows.cut([one.after for one in stretches])
-            torque = windows.cut([_shifted(one.torque, self.later) for one in stretches])
-            return Inputs(torque + beside + extra, windows.position, rate, change)
-        commands = [command_of(one, self.servo.delay) for one in stretches]
-        position = windows.cut([command for command, _ in commands])
-        rate = windows.cut([rate for _, rate in commands])
-        error = position[:, :1] - windows.position[:, :1]
-        slip = rate[:, :1] - windows.cut([one.after for one in stretches])[:, :1]
-        held = windows.torque[:, :1] - self.servo.kp * error - self.servo.kd * slip
-        return Inputs(held + beside + extra, position, rate, change)
+        windows, servo, parts = self.windows, self.servo, []
+        for stretch, samples in zip(windows.stretches, self.samples, strict=True):
+            beside = _removed(stretch, samples, arm) + _late(stretch, arm)
+            beside = beside - unsupported_torque(arm, stretch.motion)
+            if servo is None:
+                beside = beside + _shifted(stretch.torque, self.later)
+                position, rate = stretch.motion.position, stretch.after
+            else:
+                position, rate = command_of(stretch, servo.delay)
+            change = stretch.after - stretch.motion.velocity
+            parts.append(simulated.force(beside, position, rate, change))
+        force = windows.cut(parts)
+        return force if servo is None else force + self._held(servo)
+
+    def _held(self, servo: Servo) -> Array:
+        """Return the constant torque beside a servo in each window (w, 1, n)."""
+        torque = []
+        for one in self.windows.stretches:
+            position, rate = command_of(one, servo.delay)
+            error, slip = position - one.motion.position, rate - one.after
+            torque.append(one.torque - servo.kp * error - servo.kd * slip)
+        return self.windows.at_start(torque)[:, None]
 
 
 def recorded_stretches(
@@ -94,8 +96,9 @@ def simulate(
     """
     windows = motion.windows
     simulated = SimulatedArm.of(arm, windows.step, feedback)
-    found = simulated.simulate(windows.position[:, 0], windows.start, motion.inputs(arm, extra))
-    return found[:, horizon_rows(windows)]
+    force = motion.force(arm, simulated) + extra
+    positions = simulated.simulate(windows.position[:, 0], windows.start, force, windows.position)
+    return positions[:, horizon_rows(windows)]
 
 
 def horizon_rows(windows: Windows) -> list[int]:
@@ -106,7 +109,7 @@ def horizon_rows(windows: Windows) -> list[int]:
 def _removed(stretch: Stretch, samples: Samples, arm: Arm) -> Array:
     """Return the part of an arm's torque (g, n) that the low-pass of the record removed."""
     if samples.torque_bandwidth is None:
-        return np.zeros(stretch.motion.position.shape)
+        return np.zeros_like(stretch.motion.position)
     model, motion, load = arm.model, samples.motion, None
     if model.friction.has_load:
         load = model.gear_torque(arm.values, *motion[1:4])

@@ -32,15 +32,6 @@ class Feedback(NamedTuple):
     damping: Array  # N·m·s/rad or N·s/m
 
 
-class Inputs(NamedTuple):
-    """What acts on w windows in K steps."""
-
-    torque: Array  # on the joints (w, K, n) [N·m or N]
-    position: Array  # reference of the feedback before each step (w, K, n) [rad or m]
-    velocity: Array  # likewise, half a step later (w, K, n) [rad/s or m/s]
-    change: Array  # of the measured velocity in half a step (w, K, n) [rad/s or m/s]
-
-
 @dataclass(frozen=True, eq=False)
 class SimulatedArm:
     """An arm in MuJoCo without limits, contacts and motors; torques act on its joints."""
@@ -78,18 +69,25 @@ class SimulatedArm:
         model.dof_damping[places] += feedback.damping
         return cls(model, places, model.qpos_spring[places].copy(), viscous, step, feedback)
 
-    def simulate(self, start: Array, velocity: Array, inputs: Inputs) -> Array:
+    def force(self, torque: Array, position: Array, velocity: Array, change: Array) -> Array:
+        """Return what acts on the joints beside friction and springs of the state (m, n).
+
+        Of a torque, and of the reference of the feedback: position before each step, velocity half
+        a step later; `change` is that of the measured velocity in half a step.
+        """
+        # The viscous friction of a step is that of the velocity after it, half a step late.
+        force = torque + self.feedback.damping * velocity + self.viscous * change
+        return np.asarray(force + self.feedback.stiffness * (position - self.rest))
+
+    def simulate(self, start: Array, velocity: Array, force: Array, reference: Array) -> Array:
         """Return the positions after each step (w, K, n); NaN from where on they are unstable.
 
-        From positions and, half a step before, velocities (w, n).
+        From positions and, half a step before, velocities (w, n), under a force (w, K, n). They
+        are unstable where they are far from a reference (w, K, n).
         """
         mujoco = load_mujoco()
         from mujoco import rollout  # optional dependency
 
-        stiffness, damping = self.feedback
-        # The viscous friction of a step is that of the velocity after it, half a step late.
-        force = inputs.torque + damping * inputs.velocity + self.viscous * inputs.change
-        force = force + stiffness * (inputs.position - self.rest)
         n = len(self.order)
         size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         state = np.zeros((len(start), size))
@@ -106,8 +104,7 @@ class SimulatedArm:
                 applied,
                 control_spec=mujoco.mjtState.mjSTATE_QFRC_APPLIED,
             )
-        position = states[:, :, 1 + self.order]
-        return _without_unstable(position, inputs.position)
+        return _without_unstable(states[:, :, 1 + self.order], reference)
 
 
 @contextmanager
@@ -123,7 +120,9 @@ def _without_messages(mujoco: Any) -> Iterator[None]:
 
 def _without_unstable(position: Array, reference: Array) -> Array:
     """Return positions with NaN from the first on that is far from the reference."""
-    with np.errstate(invalid="ignore"):
-        near = (np.abs(position - reference) < LARGEST_ERROR).all(axis=2)
-    stable = np.logical_and.accumulate(near, axis=1)
-    return np.asarray(np.where(stable[:, :, None], position, np.nan))
+    with np.errstate(invalid="ignore", over="ignore"):
+        distance = np.abs(np.subtract(position, reference))
+        near = (distance < LARGEST_ERROR).all(axis=2)
+    for window in np.flatnonzero(~near.all(axis=1)):
+        position[window, int(np.argmin(near[window])) :] = np.nan
+    return position

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -72,24 +73,26 @@ class Windows:
             found[inside] = values[self.first[inside][:, None] + offsets]
         return found
 
-    @property
+    def at_start(self, parts: Sequence[Array]) -> Array:
+        """Return arrays at the instants of each stretch (g, n) where each window starts (w, n)."""
+        return np.array([parts[k][row] for k, row in zip(self.stretch, self.first, strict=True)])
+
+    @cached_property
     def position(self) -> Array:
         """Measured positions before each step (w, K, n) [rad or m]."""
         return self.cut([one.motion.position for one in self.stretches])
 
-    @property
+    @cached_property
     def reached(self) -> Array:
         """Measured positions after each step (w, K, n) [rad or m]."""
         return self.cut([one.motion.position for one in self.stretches], 1)
 
-    @property
+    @cached_property
     def start(self) -> Array:
         """Measured velocity half a step before each window (w, n) [rad/s or m/s]."""
-        return np.array(
-            [self.stretches[k].before[row] for k, row in zip(self.stretch, self.first, strict=True)]
-        )
+        return self.at_start([one.before for one in self.stretches])
 
-    @property
+    @cached_property
     def torque(self) -> Array:
         """Recorded torque, mean over a step about each instant (w, K, n) [N·m or N]."""
         return self.cut([one.torque for one in self.stretches])
