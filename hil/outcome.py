@@ -22,7 +22,7 @@ from hil.identify import Identification
 from hil.progress import Reporter
 from hil.reading import open_file
 from hil.report import ReportSeries, report_bytes
-from hil.results import ExportResult, OccasionResult, Results
+from hil.results import ExportResult, OccasionResult, Results, SettingsResult
 from identification import Estimate, IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
 from identification.export.friction import median_load
@@ -49,7 +49,13 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
         provenance={**origin, **occasion.entries()},
         load=median_load(found.cell.model, found.estimate.pooled.values, found.prepared.fitted),
     )
-    results = found.results.model_copy(update={"exports": exports.result, "occasion": occasion})
+    results = found.results.model_copy(
+        update={
+            "exports": exports.result,
+            "occasion": occasion,
+            "settings": settings_result(found),
+        }
+    )
     files = {
         **exports.contents,
         RESULTS: results.to_json(),
@@ -76,6 +82,21 @@ def occasion_of(found: Identification) -> OccasionResult:
         operator=cell.operator,
         serial_number=cell.serial_number,
         notes=cell.notes,
+    )
+
+
+def settings_result(found: Identification) -> SettingsResult:
+    """Return what the identification used, for exports and rollouts."""
+    sources, first = found.prepared.sources, found.prepared.sources.training[0]
+    fitted = {source.path for source in sources.training}
+    predicted = {source.path for source in sources.held_out} - fitted
+    return SettingsResult(
+        archives=[path.name for path in found.paths],
+        predicted=[path.name for path in found.paths if path in predicted],
+        split=first.recording.n_samples / first.whole.n_samples,
+        in_sample=sources.in_sample,
+        estimator=found.estimation.estimator,
+        settings=found.prepared.settings.to_dict(),
     )
 
 

@@ -422,6 +422,17 @@ class UncertaintyResult(Frozen):
     interval_factor: float  #: Half width of a 95 % interval in standard deviations
 
 
+class SettingsResult(Frozen):
+    """What the identification used, so that exports and rollouts need no other one."""
+
+    archives: list[str]  #: File names, in the order in which they were given
+    predicted: list[str]  #: Those of them that were held out as a whole
+    split: float  #: Fitted share of the first fitted recording
+    in_sample: bool
+    estimator: str
+    settings: dict[str, Any]  #: :meth:`hil.identify.prepared.Settings.to_dict`
+
+
 class Results(Frozen):
     """Results of one identification."""
 
@@ -457,6 +468,7 @@ class Results(Frozen):
     judgement: JudgementResult
     conduct: ConductResult | None = None  #: Null without a campaign folder
     occasion: OccasionResult | None = None  #: Null in files of earlier versions
+    settings: SettingsResult | None = None  #: Likewise
 
     @property
     def not_significant(self) -> list[str]:

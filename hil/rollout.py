@@ -13,9 +13,8 @@ from pydantic import Field, ValidationError
 
 from hil.cell import Cell
 from hil.errors import InputError
-from hil.exporting import arm_of, consistent_of, ensemble_of
 from hil.files import write_files
-from hil.identify import Identification
+from hil.identified_model import IdentifiedModel, ensemble_of
 from hil.identify.cell_context import nominal_of
 from hil.identify.prepared import Prepared
 from hil.identify.sources import Source
@@ -213,26 +212,25 @@ def _milli(value: float | None) -> str:
     return "-" if value is None else f"{1e3 * value:.3g}"
 
 
-def roll_out(found: Identification, options: RolloutOptions, reporter: Reporter) -> RolloutResult:
+def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter) -> RolloutResult:
     """Simulate the held-out motion of an identification.
 
     Raises:
         InputError: there are no consistent parameters, no window, or no servo where one is asked.
         NotSimulatedError: MuJoCo does not accept the identified arm.
     """
-    consistent, prepared = consistent_of(found), found.prepared
-    arm = arm_of(found.cell, consistent, prepared.fitted)
-    motion, feedback, drive = _motion_of(found, arm, options)
+    arm, prepared = model.arm, model.prepared
+    motion, feedback, drive = _motion_of(model, options)
     windows, tool = motion.windows, ToolFrame(arm)
     measured = windows.reached[:, horizon_rows(windows)]
     positions = simulate(arm, motion, feedback)
-    nominal, reason, notes = _nominal(found.cell, arm, motion, feedback, measured, tool)
-    ensemble, simulated = _simulated_ensemble(found, arm, motion, feedback, options, reporter)
+    nominal, reason, notes = _nominal(model.cell, arm, motion, feedback, measured, tool)
+    ensemble, simulated = _simulated_ensemble(model, motion, feedback, options, reporter)
     few = windows.some(_FEW_WINDOWS)
     measured_few = few.reached[:, horizon_rows(few)]
     joint = leading_joint(positions[:, _JUDGED], measured[:, _JUDGED], tool)
     return RolloutResult(
-        cell=found.cell.name,
+        cell=model.name,
         simulated=prepared.sources.header.only_simulated,
         joint_names=list(arm.model.joint_names),
         drive=drive,
@@ -257,23 +255,23 @@ def roll_out(found: Identification, options: RolloutOptions, reporter: Reporter)
 
 
 def _motion_of(
-    found: Identification, arm: Arm, options: RolloutOptions
+    model: IdentifiedModel, options: RolloutOptions
 ) -> tuple[RecordedMotion, Feedback, str]:
     """Return the windows of the held-out motion, the feedback, and what drives the arm."""
-    prepared, sources = found.prepared, found.prepared.sources
+    arm, prepared, sources = model.arm, model.prepared, model.prepared.sources
     recordings = _with_commands(sources.held_out, prepared.held_out)
     stretches, owners = recorded_stretches(arm.model, recordings, STEP)
     try:
-        servo, drive = _servo_of(found, arm, options)
+        servo, drive = _servo_of(model, options)
         if servo is not None and any(one.commanded is None for one in stretches):
             raise NoServoError("the held-out recordings have no commanded positions")
         windows = windows_of(stretches, STEP, HORIZONS[-1], _STRIDE).some(MOST_WINDOWS)
     except NoServoError as error:
         remedy = "omit --servo: the recorded torque drives the arm then"
-        raise InputError(found.paths[0], str(error), field="--servo", remedy=remedy) from error
+        raise InputError(model.paths[0], str(error), field="--servo", remedy=remedy) from error
     except IdentificationError as error:
         remedy = f"hold out a longer recording (--predict), or fit less of it; {HORIZONS[-1]:g} s"
-        raise InputError(found.paths[-1], str(error), remedy=f"{remedy} are needed") from error
+        raise InputError(model.paths[-1], str(error), remedy=f"{remedy} are needed") from error
     feedback = light_feedback(arm, STEP, options.feedback)
     if servo is not None:
         feedback = Feedback(servo.kp, servo.kd)
@@ -282,8 +280,8 @@ def _motion_of(
     return RecordedMotion(windows, tuple(owners), servo), feedback, drive
 
 
-def _servo_of(found: Identification, arm: Arm, options: RolloutOptions) -> tuple[Servo | None, str]:
-    prepared = found.prepared
+def _servo_of(model: IdentifiedModel, options: RolloutOptions) -> tuple[Servo | None, str]:
+    arm, prepared = model.arm, model.prepared
     if options.servo is None:
         return None, ""
     if isinstance(options.servo, Servo):
@@ -344,23 +342,23 @@ def _nominal(
 
 
 def _simulated_ensemble(
-    found: Identification,
-    arm: Arm,
+    model: IdentifiedModel,
     motion: RecordedMotion,
     feedback: Feedback,
     options: RolloutOptions,
     reporter: Reporter,
 ) -> tuple[Ensemble, tuple[Array, Array]]:
     """Return the drawn arms, and their positions (N, w, h, n) without and with residual torque."""
-    ensemble = ensemble_of(found, options.samples, options.seed)
+    ensemble = ensemble_of(model, options.samples, options.seed)
     random = np.random.default_rng(options.seed)
     few = replace(motion, windows=motion.windows.some(_FEW_WINDOWS))
-    values = found.estimate.pooled.values
-    residual = ResidualTorque.of(arm, values, found.prepared.fitted, motion.windows)
+    residual = ResidualTorque.of(
+        model.cell.model, model.estimate.values, model.prepared.fitted, motion.windows
+    )
     alone, disturbed = [], []
     with reporter.task("simulating", len(ensemble)) as task:
         for standard, parameters in zip(ensemble.standard, ensemble.values, strict=True):
-            sample = replace(arm, standard=standard, values=parameters)
+            sample = replace(model.arm, standard=standard, values=parameters)
             alone.append(simulate(sample, few, feedback))
             torque = residual.draw(len(motion.windows), random)
             disturbed.append(simulate(sample, motion, feedback, -1.0 * torque))

@@ -23,9 +23,9 @@ from hil.exporting import (
     default_output,
     export_ensemble,
     export_model,
-    model_for_export,
 )
-from hil.identify import Options, identify_paths
+from hil.identified_model import read_or_identify
+from hil.identify import Options
 from hil.progress import reporter as make_reporter
 from hil.progress import say
 
@@ -65,18 +65,14 @@ def export(
     """
     reporter = make_reporter(quiet=quiet or json)
     options = how.options(estimator=estimator)
-    if ensemble is not None:
-        target = output or default_output(archives, to, ensemble=True)
-        identified = identify_paths(archives, reporter, options)
-        exported_ensemble = export_ensemble(identified, target, to, ensemble, seed)
-        print_export(exported_ensemble, json=json, quiet=quiet)
-        if not identified.verdict.good:
-            raise typer.Exit(NOT_GOOD)
-        return
     as_usual = options == Options() and not again
-    found = model_for_export(archives, options, reporter, reuse=as_usual)
-    target = output or default_output(archives, to)
-    exported = export_model(found, target, to)
+    found = read_or_identify(archives, options, reporter, reuse=as_usual)
+    target = output or default_output(archives, to, ensemble=ensemble is not None)
+    exported = (
+        export_model(found, target, to)
+        if ensemble is None
+        else export_ensemble(found, target, to, ensemble, seed)
+    )
     print_export(exported, json=json, quiet=quiet)
     if not found.good:
         raise typer.Exit(NOT_GOOD)

@@ -17,7 +17,8 @@ from hil.cli.arguments import (
 from hil.cli.identify_options import EstimatorOption, Identifying, servo_from
 from hil.cli.verdict import NOT_GOOD
 from hil.files import make_folder
-from hil.identify import identify_paths
+from hil.identified_model import read_or_identify
+from hil.identify import Options
 from hil.plots.plan_picture import save
 from hil.plots.rollout_picture import draw_rollout
 from hil.progress import reporter as make_reporter
@@ -38,6 +39,7 @@ def rollout(
     estimator: EstimatorOption = "auto",
     *,
     how: Identifying,
+    again: bool = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -45,7 +47,8 @@ def rollout(
 
     Windows start at measured states; after 0.1, 0.2, 0.5 and 1 s the positions are compared with
     the measured ones, for the identified arm, the nominal one, and arms drawn from the posterior.
-    The arm is driven by the recorded torque and a light feedback, or by a servo. Writes
+    The arm is driven by the recorded torque and a light feedback, or by a servo. Parameters and
+    settings are those of results.json and parameters.json in a folder, as for `hil export`. Writes
     rollout.json and rollout.png. Exit status 5 if the model is not good.
 
     **Example:** `hil rollout runs/demo`
@@ -62,6 +65,7 @@ def rollout(
             in s, or identified from commanded and measured positions.
         split: Fraction of the recording that is fitted if there is no validation run; the rest is
             simulated.
+        again: Identify again even if results.json and parameters.json are there.
     """
     reporter = make_reporter(quiet=quiet or json)
     asked = RolloutOptions(samples, seed, feedback, servo_from(servo))
@@ -70,7 +74,8 @@ def rollout(
         output = output or archives[0]
     if output is not None:
         make_folder(output)
-    found = identify_paths(archives, reporter, options, predict=predict or ())
+    as_usual = options == Options() and not again
+    found = read_or_identify(archives, options, reporter, reuse=as_usual, predict=predict or ())
     result = roll_out(found, asked, reporter)
     if output is not None:
         write_rollout(output, result)
@@ -82,5 +87,5 @@ def rollout(
             say(line)
         if output is not None:
             reporter.say(f"written to {output}: {ROLLOUT}, {PICTURE}")
-    if not found.verdict.good:
+    if not found.good:
         raise typer.Exit(NOT_GOOD)

@@ -124,11 +124,7 @@ def with_transmitted_load(prepared: Prepared) -> Prepared:
     if not model.friction.has_load:
         return prepared
     loaded = fit_with_transmitted_load(cell, prepared.fitted, prepared.settings.strength)
-    values = loaded.result.values
-    training = tuple(samples.with_load(model, values) for samples in prepared.training)
-    held_out = training
-    if not prepared.sources.in_sample:
-        held_out = tuple(samples.with_load(model, values) for samples in prepared.held_out)
+    carrying = prepared.with_load(loaded.result.values)
     notes = prepared.notes
     if not loaded.converged:
         notes += (
@@ -136,9 +132,7 @@ def with_transmitted_load(prepared: Prepared) -> Prepared:
             f"{percentage(loaded.change, 1)} in"
             f" pass {loaded.passes}",
         )
-    return replace(
-        prepared, fitted=loaded.samples, training=training, held_out=held_out, notes=notes
-    )
+    return replace(carrying, fitted=loaded.samples, notes=notes)
 
 
 def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> Estimation:
@@ -163,7 +157,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
             result, warnings = _instrumental(model, prepared, fitted)
         elif name in _LOSSES:
             result, warnings = _robust(model, fitted, name)
-        elif name in _OF_PRIOR:
+        elif name in OF_PRIOR:
             pooled = beside.estimate
             result = _posterior(model, fitted, posterior, pooled, factors)
             warnings = unsolved
@@ -171,11 +165,11 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
             result, warnings = _by_factor(model, fitted, name)
         if prepared.sources.same_motion:
             result = result.with_scatter()
-        precision = posterior.precision if name in _OF_PRIOR else None
+        precision = posterior.precision if name in OF_PRIOR else None
         if variance:
             result = _with_uncertain_delay(model, result, fitted, variance, precision)
         task.advance(1, "prior")
-        if name in _OF_PRIOR:
+        if name in OF_PRIOR:
             beside = replace(beside, estimate=result.pooled)
         else:
             beside = posterior.fit(result.factor)
@@ -185,7 +179,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         held_out = tuple(Factor.by_time(model, samples) for samples in prepared.held_out)
         task.advance(1)
     pooled = result.pooled
-    if name not in _OF_PRIOR and not pooled.undetermined and pooled.condition > QR_CONDITION:
+    if name not in OF_PRIOR and not pooled.undetermined and pooled.condition > QR_CONDITION:
         warnings.append(
             f"the scaled condition number is {pooled.condition:.2g}: the motion separates some"
             " parameters poorly (solved by QR)"
@@ -257,7 +251,7 @@ class Posterior:
     consistent: bool  #: whether parameters that no bodies have are excluded
 
     @classmethod
-    def of(cls, cell: Cell, factor: Factor, name: Estimator, strength: Strength) -> Posterior:
+    def of(cls, cell: Cell, factor: Factor, name: str, strength: Strength) -> Posterior:
         """Return the posterior of an estimator; all but "auto" have the strength of the residuals.
 
         The bodies are as uncertain as `[nominal]` states; the estimator "prior" trusts them to
@@ -334,7 +328,7 @@ def refit_of(model: RobotModel, name: Estimator, posterior: Posterior) -> Refit:
 
     Robust losses and instruments need samples; weighted least squares represents them.
     """
-    if name in _OF_PRIOR:
+    if name in OF_PRIOR:
         return posterior.values
     if name == "ols":
         return lambda factor: factor.solve(np.ones(model.n_joints)).values
@@ -343,7 +337,7 @@ def refit_of(model: RobotModel, name: Estimator, posterior: Posterior) -> Refit:
     return lambda factor: factor.solve(joint_weights(factor)).values
 
 
-_OF_PRIOR: Final = ("auto", "prior")
+OF_PRIOR: Final = ("auto", "prior")
 
 
 def _posterior(

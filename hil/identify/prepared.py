@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from hil.cell import Cell
 from hil.cell.robot import ripples
@@ -72,9 +73,25 @@ class Settings:
         """Return these settings with changes of the preprocessing."""
         return replace(self, preprocessing=replace(self.preprocessing, **changes))
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the settings for JSON, without the choices that led to them."""
+        return _SETTINGS.dump_python(replace(self, choices=()), mode="json")
+
+    @classmethod
+    def from_dict(cls, entries: Mapping[str, Any]) -> Settings:
+        """Return the settings of :meth:`to_dict`.
+
+        Raises:
+            ValueError: they are others.
+        """
+        return _SETTINGS.validate_python(dict(entries))
+
     def with_friction_law(self, cell: Cell) -> Cell:
         """Return the cell with the friction law of these settings."""
         return cell.with_friction(**self.friction) if self.friction else cell
+
+
+_SETTINGS: Final = TypeAdapter(Settings)
 
 
 def stated_delay(cell: Cell) -> float:
@@ -466,6 +483,21 @@ class Prepared:
         sources = replace(self.sources, warnings=(*self.sources.warnings, *warnings))
         return replace(self, sources=sources)
 
+    def with_load(self, values: Array) -> Prepared:
+        """Return samples that carry the torque that the gears transmit by parameters (p,).
+
+        Unchanged without friction that grows with it.
+        """
+        model = self.sources.cell.model
+        if not model.friction.has_load:
+            return self
+        groups = (self.fitted, self.training, () if self.sources.in_sample else self.held_out)
+        fitted, training, held_out = (
+            tuple(samples.with_load(model, values) for samples in group) for group in groups
+        )
+        held_out = held_out or training
+        return replace(self, fitted=fitted, training=training, held_out=held_out)
+
 
 def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> Prepared:
     """Determine time base, noise, delay and settings, then smooth every recording.
@@ -490,7 +522,19 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
     if sources.noise_variance is not None:
         noise = "the noise of the positions was measured at standstill"
     decided = decide(sources, options, reporter)
-    settings, cell = decided.settings, decided.settings.with_friction_law(sources.cell)
+    prepared = prepared_with(sources, decided.settings, reporter)
+    _require_slow_rows(stated, prepared.fitted)
+    notes += [noise, *decided.notes, *prepared.notes]
+    return replace(prepared, delays=decided.delays, notes=tuple(notes))
+
+
+def prepared_with(sources: Sources, settings: Settings, reporter: Reporter) -> Prepared:
+    """Smooth every recording by settings that are decided.
+
+    Raises:
+        RecordingError: a recording cannot be prepared.
+    """
+    cell = settings.with_friction_law(sources.cell)
     sources = replace(sources, cell=cell)
     unseen = () if sources.in_sample else sources.held_out
     # Parts of one recording share its arrays, and have its motion.
@@ -500,7 +544,6 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
         for source in sources.training:
             fitted.append(samples_of(source, cell, settings, motions=motions[source.motion_key]))
             task.advance(1, source.name)
-        _require_slow_rows(stated, fitted)
         for source in unseen:
             held_out.append(validation_samples(source, cell, settings, motions[source.motion_key]))
             task.advance(1, source.name)
@@ -519,10 +562,10 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
         training=tuple(training),
         held_out=tuple(training if sources.in_sample else held_out),
         settings=settings,
-        delays=decided.delays,
+        delays=None,
         masked=masked,
         rows=rows,
-        notes=(*notes, noise, *decided.notes, *_excluded(sources, masked, rows)),
+        notes=tuple(_excluded(sources, masked, rows)),
     )
 
 

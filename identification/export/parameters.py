@@ -11,6 +11,8 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Final
 
+import numpy as np
+
 from identification.errors import IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
 from identification.export.urdf import not_in_urdf
@@ -165,3 +167,25 @@ def _finite(content: Any) -> Any:
     if isinstance(content, float) and not math.isfinite(content):
         return "NaN" if math.isnan(content) else "Infinity" if content > 0.0 else "-Infinity"
     return content
+
+
+def estimate_in(content: Mapping[str, Any]) -> Estimate:
+    """Return the estimate in the content of :func:`parameters_json`.
+
+    Raises:
+        LookupError, TypeError, ValueError: it is none.
+    """
+    parameters = content["parameters"]
+    return Estimate(
+        tuple(str(one["name"]) for one in parameters),
+        tuple(str(one["unit"]) for one in parameters),
+        # "Infinity" and "NaN" are numbers to float()
+        np.array([float(one["value"]) for one in parameters]),
+        np.array([[float(value) for value in row] for row in content["covariance"]]),
+        np.array([float(value) for value in content["noise_std"]]),
+        np.array(content["samples"], dtype=np.intp),
+        str(content["method"]),
+        float(content["condition"]),
+        tuple(str(name) for name in content["undetermined"]),
+        float(content["interval_factor"]),
+    )

@@ -222,12 +222,12 @@ class ResidualTorque:
 
     @classmethod
     def of(
-        cls, arm: Arm, values: Array, fitted: Sequence[Samples], windows: Windows
+        cls, model: RobotModel, values: Array, fitted: Sequence[Samples], windows: Windows
     ) -> ResidualTorque:
         """Return measured minus predicted torque of parameters (p,)."""
         found = []
         for samples in fitted:
-            residual = samples.torque - samples.predicted_torque(arm.model, values)
+            residual = samples.torque - samples.predicted_torque(model, values)
             parts = stretches_of(samples, np.zeros_like(samples.torque), windows.step)
             found += [one.mean_about_instants(residual[one.part]) for one in parts]
         return cls(tuple(one for one in found if len(one) >= windows.steps), windows.steps)

@@ -121,8 +121,7 @@ def _without_messages(mujoco: Any) -> Iterator[None]:
 def _without_unstable(position: Array, reference: Array) -> Array:
     """Return positions with NaN from the first on that is far from the reference."""
     with np.errstate(invalid="ignore", over="ignore"):
-        distance = np.abs(np.subtract(position, reference))
-        near = (distance < LARGEST_ERROR).all(axis=2)
+        near = np.all(np.abs(position - reference) < LARGEST_ERROR, axis=2)
     for window in np.flatnonzero(~near.all(axis=1)):
         position[window, int(np.argmin(near[window])) :] = np.nan
     return position

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 from typer.testing import CliRunner
 
-from hil import exporting
+from hil import identified_model
 from hil.cli import app
 from hil.identify import Identification
 from hil.importers import ColumnMap, Robot, import_log
@@ -266,7 +266,7 @@ class TestReuse:
         def identify(*_: object, **__: object) -> Identification:
             raise AssertionError("the parameters are there")
 
-        monkeypatch.setattr(exporting, "identify_paths", identify)
+        monkeypatch.setattr(identified_model, "identify_paths", identify)
         reused = command("export", folder, "--to", "urdf", "-o", stored)
         assert f"parameters: from {folder}/results.json and parameters.json" in reused.stdout
         assert stored.read_text() == new.read_text()

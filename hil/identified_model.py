@@ -1,0 +1,284 @@
+"""An identified arm and what it was identified from: just found, or read from its files.
+
+`results.json` has the settings that an identification chose, `parameters.json` what it estimated.
+With these and the archives, exports and rollouts need no other identification.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.campaign.folder import CampaignFolder
+from hil.cell import Cell
+from hil.cell.text import urdf_limits
+from hil.errors import HilError, InputError
+from hil.identify import Identification, Options, identify_paths
+from hil.identify.cell_context import torque_limits
+from hil.identify.estimating import OF_PRIOR, Posterior
+from hil.identify.prepared import Prepared, Settings, prepared_with
+from hil.identify.sources import gather_sources
+from hil.outcome import PARAMETERS_JSON, RESULTS, archive_digests, provenance_of, single_line
+from hil.progress import Reporter
+from hil.reading import parse_json, path_exists, read_text
+from hil.results import Results, SettingsResult
+from identification import Estimate, Factor, Samples
+from identification.errors import IdentificationError
+from identification.estimators.consistent import ConsistentEstimate
+from identification.estimators.ensemble import Ensemble, draw_ensemble
+from identification.estimators.prior import BodyPrior
+from identification.export.arm import Arm, Ranges
+from identification.export.friction import median_load
+from identification.export.parameters import estimate_in
+from identification.factor.factor import total_factor
+from identification.model.regressor import LINK_SYMBOLS
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedModel:
+    """An identified arm with its samples, as found or as read from the files of an identification.
+
+    Raises:
+        InputError: there are no physically consistent parameters.
+    """
+
+    cell: Cell  #: with the friction law that was chosen
+    arm: Arm  #: physically consistent
+    estimate: Estimate  #: with the uncertainty of the torque's scale
+    estimator: str  #: of `hil.identify.options.Estimator`
+    prepared: Prepared
+    paths: tuple[Path, ...]  #: of the archives
+    provenance: Mapping[str, str]
+    verdict: str
+    good: bool
+    origin: str = ""  #: where it was read from
+
+    @property
+    def name(self) -> str:
+        """Name of the cell."""
+        return self.cell.name
+
+    @cached_property
+    def factor(self) -> Factor:
+        """Sums over the fitted rows."""
+        return total_factor(self.cell.model, self.prepared.fitted)
+
+    @cached_property
+    def prior(self) -> BodyPrior:
+        """The prior of a posterior estimate.
+
+        Raises:
+            InputError: the estimator has none.
+        """
+        if self.estimator not in OF_PRIOR:
+            raise InputError(
+                self.paths[0],
+                f"the estimator {self.estimator} has no posterior to draw arms from",
+                field="--estimator",
+                remedy="use auto or prior",
+            )
+        strength = self.prepared.settings.strength
+        return Posterior.of(self.cell, self.factor, self.estimator, strength).prior
+
+
+def consistent_of(found: Identification) -> ConsistentEstimate:
+    """Return the physically consistent parameters of an identification, or raise InputError."""
+    if isinstance(found.consistency, str):
+        raise InputError(
+            found.paths[0],
+            f"there are no physically consistent parameters: {found.consistency}",
+            remedy="see the verdict of `hil identify`",
+        )
+    return found.consistency.consistent
+
+
+def model_of(found: Identification) -> IdentifiedModel:
+    """Return the arm of an identification.
+
+    Raises:
+        InputError: there are no physically consistent parameters.
+    """
+    consistent, fitted = consistent_of(found), found.prepared.fitted
+    return IdentifiedModel(
+        found.cell,
+        arm_with(found.cell, consistent.standard, consistent.estimate.values, fitted),
+        found.estimation.stated,
+        found.estimation.estimator,
+        found.prepared,
+        found.paths,
+        provenance_of(found.results, found.paths),
+        found.verdict.line,
+        found.verdict.good,
+    )
+
+
+def arm_with(cell: Cell, standard: Array, values: Array, fitted: Sequence[Samples]) -> Arm:
+    """Return an arm of parameters, standard (s,) and all (p,), with the limits of its cell or URDF.
+
+    Friction that grows with the load is that of the fitted motion.
+    """
+    described, efforts = urdf_limits(cell.urdf, cell.joint_names), cell.torque_limit
+    if efforts is None:
+        found = torque_limits(cell)
+        efforts = described.effort if found is None else np.nan_to_num(found, nan=np.inf)
+    limits = described if cell.file.limits is None else cell.joint_limits
+    ranges = Ranges(limits.lower, limits.upper, limits.velocity, efforts)
+    return Arm(
+        cell.urdf, cell.model, standard, values, ranges, median_load(cell.model, values, fitted)
+    )
+
+
+def ensemble_of(model: IdentifiedModel, count: int, seed: int) -> Ensemble:
+    """Draw arms from the posterior of an identification.
+
+    Raises:
+        InputError: it has another estimator than a posterior.
+    """
+    return draw_ensemble(model.cell.model, model.prior, model.estimate, model.factor, count, seed)
+
+
+def read_or_identify(
+    paths: Sequence[Path],
+    options: Options,
+    reporter: Reporter,
+    *,
+    reuse: bool,
+    predict: Sequence[Path] = (),
+) -> IdentifiedModel:
+    """Return the arm in the files of a folder if `reuse`, else identify it from the archives.
+
+    `predict` are archives that are held out.
+
+    Raises:
+        InputError: the archives cannot be used, or give no physically consistent parameters.
+    """
+    if reuse and len(paths) == 1 and paths[0].is_dir():
+        try:
+            return stored_model(paths[0], reporter, predict)
+        except NotReusableError as error:
+            reporter.say(f"{paths[0]}: identified again: {error}")
+    return model_of(identify_paths(paths, reporter, options, predict=predict))
+
+
+class NotReusableError(Exception):
+    """Why the files of an earlier identification are not those of its archives."""
+
+
+def stored_model(folder: Path, reporter: Reporter, predict: Sequence[Path] = ()) -> IdentifiedModel:
+    """Return the arm in `results.json` and `parameters.json` of a folder with its archives.
+
+    Raises:
+        NotReusableError: they are missing, of other archives, or without consistent parameters.
+        InputError: the archives cannot be read.
+    """
+    results, content, provenance = _files_of(folder)
+    settings = results.settings
+    if settings is None:
+        raise NotReusableError(f"{RESULTS} is of an earlier version, without settings")
+    paths = _archives_of(folder, settings)
+    present = provenance_of(results, paths)
+    if archive_digests(provenance) != archive_digests(present):
+        raise NotReusableError("its archives are others than those that were identified")
+    if provenance.get("verdict") != single_line(present["verdict"]):
+        raise NotReusableError(f"{RESULTS} and {PARAMETERS_JSON} are not of one identification")
+    try:
+        used = Settings.from_dict(settings.settings)
+    except ValueError as error:
+        raise NotReusableError(f"{RESULTS} has other settings ({error})") from error
+    by_use: dict[bool, list[Path]] = {True: [], False: []}
+    for path in paths:
+        by_use[path.name in settings.predicted].append(path)
+    # If all of the first was fitted, another is held out, and this share means nothing.
+    sources = gather_sources(
+        by_use[False],
+        settings.split,
+        predict or by_use[True],
+        in_sample=settings.in_sample and not predict,
+    )
+    try:
+        prepared = prepared_with(sources, used, reporter)
+        cell = prepared.sources.cell
+        standard, values = _stored_values(cell, content)
+        estimate = estimate_in(content)
+    except (HilError, IdentificationError, ValueError, LookupError, TypeError) as error:
+        raise NotReusableError(f"{PARAMETERS_JSON} is not of this arm ({error})") from error
+    program = results.software.get("hil", "an unknown version of hil")
+    return IdentifiedModel(
+        cell,
+        arm_with(cell, standard, values, prepared.fitted),
+        estimate,
+        settings.estimator,
+        prepared.with_load(estimate.values),
+        tuple(paths),
+        present,
+        results.verdict.line,
+        results.verdict.good,
+        f"from {folder / RESULTS} and {PARAMETERS_JSON}, identified by hil {program}; "
+        "--again identifies again",
+    )
+
+
+def _files_of(folder: Path) -> tuple[Results, Mapping[str, Any], Mapping[str, str]]:
+    """Return results, parameters and their provenance of a folder, or raise NotReusableError."""
+    for name in (RESULTS, PARAMETERS_JSON):
+        if not path_exists(folder / name):
+            raise NotReusableError(f"there is no {name}")
+    try:
+        results = Results.load(folder / RESULTS)
+        content = parse_json(read_text(folder / PARAMETERS_JSON))
+        provenance = {str(key): str(text) for key, text in content["provenance"].items()}
+    except (InputError, OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise NotReusableError(f"its files cannot be read ({error})") from error
+    return results, content, provenance
+
+
+def _archives_of(folder: Path, settings: SettingsResult) -> list[Path]:
+    """Return the archives that `hil identify` uses of a folder, or those of its results beside it.
+
+    Raises:
+        NotReusableError: there are none.
+    """
+    if path_exists(folder / "manifest.json"):
+        campaign = CampaignFolder(folder)
+        kinds = ("excitation", "validation", "standstill")
+        return [path for kind in kinds for path in campaign.completed(kind)]
+    inside = sorted(folder.glob("*.mcap"))
+    beside = [folder.resolve().parent / name for name in settings.archives]
+    archives = inside or [path for path in beside if path_exists(path)]
+    if not archives:
+        raise NotReusableError(f"there is none of its archives ({', '.join(settings.archives)})")
+    return archives
+
+
+def _stored_values(cell: Cell, content: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Return the physically consistent parameters, standard (s,) and all (p,)."""
+    stored = content["standard"]
+    if stored is None:
+        raise ValueError("it has no physically consistent parameters")
+    model = cell.model
+    layout, links, motors = model.layout, stored["links"], stored["motor_friction"]
+    if [entry["name"] for entry in content["parameters"]] != list(model.parameter_names):
+        raise ValueError("its parameters are others")
+    standard = np.zeros(layout.size)
+    standard[layout.links] = [[link[symbol] for symbol in LINK_SYMBOLS] for link in links]
+    if layout.rotor_inertia:
+        standard[layout.rotors] = [link["rotor_inertia"] for link in links]
+    for index in layout.couplings:
+        standard[index] = stored["coupling_inertia"][layout.names[index]]
+    friction = [
+        motors[term.name] if term.motor else links[term.owner]["friction"][term.symbol]
+        for term in model.friction.terms
+    ]
+    elements = [stored["elements"][name] for name in model.elements.names]
+    values = np.concatenate([model.base.grouping @ standard, friction, elements])
+    if not np.isfinite(values).all():
+        raise ValueError("it has numbers that are not finite")
+    return standard, values
