@@ -19,6 +19,7 @@ from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.cell.text import urdf_limits
 from hil.errors import HilError, InputError
+from hil.files import file_digest
 from hil.identify import Identification, Options, identify_paths
 from hil.identify.cell_context import torque_limits
 from hil.identify.estimating import OF_PRIOR, Posterior
@@ -60,6 +61,7 @@ class IdentifiedModel:
     verdict: str
     good: bool
     origin: str = ""  #: where it was read from
+    parameters_digest: str = ""  #: SHA-256 of the `parameters.json` that it was read from
 
     @property
     def name(self) -> str:
@@ -223,6 +225,7 @@ def stored_model(folder: Path, reporter: Reporter, predict: Sequence[Path] = ())
         results.verdict.good,
         f"from {folder / RESULTS} and {PARAMETERS_JSON}, identified by hil {program}; "
         "--again identifies again",
+        file_digest(folder / PARAMETERS_JSON),
     )
 
 

@@ -20,9 +20,10 @@ from hil.errors import InputError
 from hil.files import file_digest, write_files
 from hil.identify import Identification
 from hil.progress import Reporter
-from hil.reading import open_file
+from hil.reading import open_file, path_exists
 from hil.report import ReportSeries, report_bytes
 from hil.results import ExportResult, OccasionResult, Results, SettingsResult
+from hil.rollout_result import ROLLOUT, RolloutResult
 from identification import Estimate, IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
 from identification.export.friction import median_load
@@ -100,12 +101,33 @@ def settings_result(found: Identification) -> SettingsResult:
     )
 
 
+def is_of_report(folder: Path, rollout: RolloutResult) -> bool:
+    """Return whether a rollout is of the parameters that the report of a folder is about."""
+    parameters = folder / PARAMETERS_JSON
+    reported = path_exists(parameters) and path_exists(folder / SERIES)
+    return reported and rollout.parameters == file_digest(parameters)
+
+
+def _rollout_in(folder: Path) -> RolloutResult | None:
+    """Return the rollout for the report of a folder, if there is one."""
+    if not path_exists(folder / ROLLOUT):
+        return None
+    rollout = RolloutResult.load(folder / ROLLOUT)
+    return rollout if is_of_report(folder, rollout) else None
+
+
 def rewrite_report(folder: Path) -> Results:
-    """Create the report again from results and series in a folder; InputError, OutputError."""
+    """Create the report again from results, series and rollout in a folder.
+
+    Raises:
+        InputError: one of them cannot be read.
+        OutputError: the report cannot be written.
+    """
     results = Results.load(folder / RESULTS)
     series = _load_series(folder / SERIES, len(results.joint_names))
+    rollout = _rollout_in(folder)
     try:
-        page = report_bytes(results, series)
+        page = report_bytes(results, series, rollout)
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:
         # For example lists of unequal length in an edited file.
         problem = f"contains values that a report cannot show ({error})"

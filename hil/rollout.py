@@ -9,7 +9,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
 
 from hil.cell import Cell
 from hil.errors import InputError
@@ -18,16 +17,15 @@ from hil.identified_model import IdentifiedModel, ensemble_of
 from hil.identify.cell_context import nominal_of
 from hil.identify.prepared import Prepared
 from hil.identify.sources import Source
+from hil.outcome import REPORT, is_of_report, rewrite_report
 from hil.progress import Reporter
-from hil.reading import read_text
-from hil.results import Frozen, Known
+from hil.rollout_result import JUDGED, ROLLOUT, ArmErrors, RolloutResult
 from identification import IdentificationError, Samples
 from identification.estimators.ensemble import Ensemble
 from identification.export.arm import Arm
 from identification.model.pseudo_inertia import margin
 from identification.rollout.comparison import (
     HORIZONS,
-    Errors,
     RecordedMotion,
     ResidualTorque,
     ToolFrame,
@@ -41,21 +39,17 @@ from identification.rollout.comparison import (
     variants,
 )
 from identification.rollout.servo import NoServoError, Servo, identify_servo
-from identification.rollout.simulation import Feedback
+from identification.rollout.simulation import LARGEST_ERROR, Feedback
 from identification.rollout.windows import STEP, windows_of
-from identification.text import percentage
 
 Array = NDArray[np.float64]
 
-ROLLOUT, PICTURE = "rollout.json", "rollout.png"
+PICTURE: Final = "rollout.png"
 MOST_WINDOWS: Final = 1000
 """Windows that are simulated at most."""
 _FEW_WINDOWS: Final = 200  # of which the error of each sample is computed
 _STRIDE: Final = 0.1  # s between the starts of windows
 _LEADS: Final = 0.1  # share of the mean square error that mending an effect has to remove
-_JUDGED: Final = 2  # index of the horizon at which joint and effect are named: 0.5 s
-_BAND: Final = 1  # index of the horizon of the band: 0.2 s
-_WANTED: Final = (0.88, 0.99)  # share of measured positions in a 95 % band
 
 
 @dataclass(frozen=True)
@@ -66,150 +60,6 @@ class RolloutOptions:
     seed: int = 1
     feedback: float = 1.0  #: natural frequency of the feedback that keeps the arm near [Hz]
     servo: Servo | str | None = None  #: in place of the recorded torque; "identified" from the log
-
-
-class ArmErrors(Frozen):
-    """Errors of an arm; lists over the horizons."""
-
-    joints: list[list[float]]  #: root mean square position error per joint, rad or m
-    tool: list[Known]  #: that of the tool in stable windows, m; null without any
-    unstable: int  #: windows in which the simulation became unstable
-
-    @classmethod
-    def of_errors(cls, errors: Errors) -> ArmErrors:
-        """Return the section of computed errors."""
-        return cls(
-            joints=errors.joints.tolist(),
-            tool=errors.tool.tolist(),
-            unstable=errors.unstable,
-        )
-
-    def overall(self, horizon: int) -> float:
-        """Return the root mean square over all joints at a horizon, rad or m."""
-        return float(np.sqrt(np.mean(np.square(self.joints[horizon]))))
-
-
-class RolloutResult(Frozen):
-    """Result of a rollout, `rollout.json`."""
-
-    cell: str
-    simulated: bool
-    joint_names: list[str]
-    drive: str  #: what acts on the joints
-    tool: str  #: link whose origin is the tool
-    windows: int
-    step: float = Field(gt=0.0)  #: s
-    horizons: list[float]  #: s
-    identified: ArmErrors
-    nominal: ArmErrors | None
-    no_nominal: str  #: why there is no nominal arm; empty
-    samples: int
-    seed: int
-    sample_errors: list[ArmErrors]
-    widened: float  #: factor of the deviations of the drawn arms
-    inside: list[
-        list[float]
-    ]  #: share of measured positions in the 95 % band, per horizon and joint
-    leading_joint: str
-    leading_effect: str  #: empty if no single one
-    notes: list[str]
-
-    @property
-    def ratio(self) -> list[float] | None:
-        """Error of the identified over that of the nominal arm at the horizons."""
-        if self.nominal is None:
-            return None
-        return [
-            self.identified.overall(k) / max(self.nominal.overall(k), 1e-300)
-            for k in range(len(self.horizons))
-        ]
-
-    @property
-    def band(self) -> float:
-        """Share of measured positions in the 95 % band at 0.2 s."""
-        return float(np.mean(self.inside[_BAND]))
-
-    @property
-    def message(self) -> str:
-        """The result in two sentences."""
-        return f"{self._against_nominal} {self._leading}"
-
-    @property
-    def _against_nominal(self) -> str:
-        if self.ratio is None:
-            return f"There is no nominal arm to compare with: {self.no_nominal}."
-        worse = [h for h, ratio in zip(self.horizons, self.ratio, strict=True) if ratio >= 1.0]
-        if worse:
-            return f"From {worse[0]:g} s on the identified arm is no better than the nominal one."
-        return (
-            f"The identified arm is better than the nominal one up to {self.horizons[-1]:g} s:"
-            f" {self.ratio[_JUDGED]:.2f} of its position error at {self.horizons[_JUDGED]:g} s."
-        )
-
-    @property
-    def _leading(self) -> str:
-        effect = self.leading_effect or "neither dry nor viscous friction nor delay alone"
-        return (
-            f"{self.leading_joint} leads the error of the tool; what leads its error is {effect}."
-        )
-
-    def lines(self) -> list[str]:
-        """Return the result as lines of text."""
-        columns = "".join(f"{f'{h:g} s':>10}" for h in self.horizons)
-        lines = [
-            f"{self.windows} windows of {self.cell}, driven by {self.drive}",
-            *self.notes,
-            f"{'position error (rms)':42}{columns}",
-        ]
-        arms = {"identified": self.identified, "nominal": self.nominal}
-        for name, arm in arms.items():
-            if arm is None:
-                continue
-            for joint, label in enumerate(self.joint_names):
-                row = "".join(f"{_milli(at[joint]):>10}" for at in arm.joints)
-                lines.append(_row(f"{name:10} {label[:17]:17} [mrad or mm]", row))
-            tool = "".join(f"{_milli(at):>10}" for at in arm.tool)
-            lines.append(_row(f"{name:10} {self.tool[:17]:17} [mm]", tool))
-            if arm.unstable:
-                lines.append(
-                    f"{name}: unstable in {arm.unstable} of {self.windows} windows, which count"
-                    " with an error of pi"
-                )
-        if self.sample_errors:
-            spread = [
-                [arm.overall(k) for arm in self.sample_errors] for k in range(len(self.horizons))
-            ]
-            row = "".join(f"{_milli(float(np.median(errors))):>10}" for errors in spread)
-            lines.append(_row(f"{self.samples} samples, median [mrad or mm]", row))
-            unstable = sum(arm.unstable for arm in self.sample_errors)
-            if unstable:
-                lines.append(f"samples: {unstable} of their windows are unstable")
-            shares = "".join(f"{percentage(float(np.mean(at)), 1):>10}" for at in self.inside)
-            lines.append(_row("measured positions in their 95 % band", shares))
-            if not _WANTED[0] <= self.band <= _WANTED[1]:
-                lines.append(
-                    f"warning: {percentage(self.band, 1)} at {self.horizons[_BAND]:g} s is not"
-                    f" {percentage(_WANTED[0])} to {percentage(_WANTED[1])}: do not rely on this "
-                    "band"
-                )
-        return [*lines, self.message]
-
-    @classmethod
-    def load(cls, path: Path) -> RolloutResult:
-        """Read a `rollout.json`; InputError if it is none."""
-        try:
-            return cls.model_validate_json(read_text(path))
-        except (OSError, ValueError, ValidationError) as error:
-            problem = f"cannot be read as a rollout ({str(error).splitlines()[0]})"
-            raise InputError(path, problem, remedy="run `hil rollout` again") from error
-
-
-def _row(head: str, figures: str) -> str:
-    return f"{head:42}{figures}"
-
-
-def _milli(value: float | None) -> str:
-    return "-" if value is None else f"{1e3 * value:.3g}"
 
 
 def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter) -> RolloutResult:
@@ -228,28 +78,32 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
     ensemble, simulated = _simulated_ensemble(model, motion, feedback, options, reporter)
     few = windows.some(_FEW_WINDOWS)
     measured_few = few.reached[:, horizon_rows(few)]
-    joint = leading_joint(positions[:, _JUDGED], measured[:, _JUDGED], tool)
+    identified = errors_of(positions, measured, tool)
+    joint = leading_joint(positions[:, JUDGED], measured[:, JUDGED], tool)
+    if 2 * identified.unstable_joints.max() > len(windows):
+        joint = int(np.argmax(identified.unstable_joints))
     return RolloutResult(
         cell=model.name,
         simulated=prepared.sources.header.only_simulated,
         joint_names=list(arm.model.joint_names),
+        units=["rad" if turns else "m" for turns in arm.model.chain.revolute],
+        parameters=model.parameters_digest,
         drive=drive,
         tool=tool.name,
         windows=len(windows),
         step=windows.step,
         horizons=list(HORIZONS),
-        identified=ArmErrors.of_errors(errors_of(positions, measured, tool)),
+        identified=ArmErrors.of(identified),
         nominal=nominal,
         no_nominal=reason,
         samples=len(ensemble),
         seed=options.seed,
-        sample_errors=[
-            ArmErrors.of_errors(errors_of(one, measured_few, tool)) for one in simulated[0]
-        ],
+        sample_errors=[ArmErrors.of(errors_of(one, measured_few, tool)) for one in simulated[0]],
         widened=ensemble.widened,
         inside=coverage(simulated[1], measured).tolist(),
         leading_joint=arm.model.joint_names[joint],
         leading_effect=_leading_effect(arm, motion, feedback, positions, measured, joint),
+        polish=None,
         notes=[*notes, *_about(motion, prepared)],
     )
 
@@ -338,7 +192,7 @@ def _nominal(
         positions = simulate(described, motion, feedback)
     except IdentificationError as error:
         return None, str(error), []
-    return ArmErrors.of_errors(errors_of(positions, measured, tool)), "", notes
+    return ArmErrors.of(errors_of(positions, measured, tool)), "", notes
 
 
 def _simulated_ensemble(
@@ -377,7 +231,8 @@ def _leading_effect(
     """Return the effect of which a change lessens the error of a joint most; empty if none does."""
 
     def square(found: Array) -> float:
-        error = np.nan_to_num((found - measured)[:, _JUDGED, joint], nan=np.pi)
+        at = found[:, JUDGED, joint]
+        error = np.where(np.isfinite(at), at - measured[:, JUDGED, joint], LARGEST_ERROR)
         return float(np.mean(error**2))
 
     before, effect = square(positions), ""
@@ -399,6 +254,15 @@ def _about(motion: RecordedMotion, prepared: Prepared) -> list[str]:
     return notes
 
 
-def write_rollout(folder: Path, result: RolloutResult) -> None:
-    """Write `rollout.json`."""
+def write_rollout(folder: Path, result: RolloutResult) -> str:
+    """Write `rollout.json` and the section of the report, or return why that has no section.
+
+    The report is that of the parameters that were simulated.
+    """
     write_files(folder, {ROLLOUT: result.to_json()})
+    if not result.parameters:
+        return f"not in {REPORT}: the arm was identified for this rollout"
+    if not is_of_report(folder, result):
+        return f"not in {REPORT}: {folder} has none of these parameters"
+    rewrite_report(folder)
+    return ""

@@ -19,11 +19,13 @@ from hil.cli.verdict import NOT_GOOD
 from hil.files import make_folder
 from hil.identified_model import read_or_identify
 from hil.identify import Options
+from hil.outcome import REPORT
 from hil.plots.plan_picture import save
 from hil.plots.rollout_picture import draw_rollout
 from hil.progress import reporter as make_reporter
 from hil.progress import say
-from hil.rollout import PICTURE, ROLLOUT, RolloutOptions, roll_out, write_rollout
+from hil.rollout import PICTURE, RolloutOptions, roll_out, write_rollout
+from hil.rollout_result import ROLLOUT
 
 
 @with_options(Identifying, "how")
@@ -48,8 +50,9 @@ def rollout(
     Windows start at measured states; after 0.1, 0.2, 0.5 and 1 s the positions are compared with
     the measured ones, for the identified arm, the nominal one, and arms drawn from the posterior.
     The arm is driven by the recorded torque and a light feedback, or by a servo. Parameters and
-    settings are those of results.json and parameters.json in a folder, as for `hil export`. Writes
-    rollout.json and rollout.png. Exit status 5 if the model is not good.
+    settings are those of results.json and parameters.json in a folder, as for `hil export`; its
+    report receives a section. Writes rollout.json and rollout.png. Exit status 5 if the model is
+    not good.
 
     **Example:** `hil rollout runs/demo`
 
@@ -78,7 +81,7 @@ def rollout(
     found = read_or_identify(archives, options, reporter, reuse=as_usual, predict=predict or ())
     result = roll_out(found, asked, reporter)
     if output is not None:
-        write_rollout(output, result)
+        missing = write_rollout(output, result)
         save(draw_rollout(result), output / PICTURE)
     if json:
         print_json(result.model_dump(mode="json"))
@@ -87,5 +90,6 @@ def rollout(
             say(line)
         if output is not None:
             reporter.say(f"written to {output}: {ROLLOUT}, {PICTURE}")
+            reporter.say(missing or f"section of the report: {output / REPORT}")
     if not found.good:
         raise typer.Exit(NOT_GOOD)

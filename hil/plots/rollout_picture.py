@@ -9,7 +9,7 @@ from matplotlib.ticker import StrMethodFormatter
 
 from hil.plots import style
 from hil.report.drawing import label
-from hil.rollout import ArmErrors, RolloutResult
+from hil.rollout_result import ArmErrors, RolloutResult
 
 _WIDTH, _HEIGHT = 9.0, 3.4  # inch
 _FLOOR: Final = 1e-3  # mrad or mm, of logarithmic axes

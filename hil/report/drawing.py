@@ -279,6 +279,10 @@ class Trace:
     #: may leave the plot, as the error of a poor model beside that of a good one
     loose: bool = False
 
+    def over(self, x: Array) -> Trace:
+        """Return the line over other values of x (m,)."""
+        return replace(self, x=x)
+
 
 @dataclass(frozen=True, eq=False)
 class Plot:
@@ -356,7 +360,8 @@ def chart_panel(chart: Chart, bins: int = _BINS) -> Panel:
             if trace.dots:
                 axes.dots(x, values, trace.colour, trace.width)
             else:
-                points = thinned(x, values, bins)
+                # A line with its own places may be several, with gaps between them.
+                points = thinned(x, values, bins) if trace.x is None else (x, values)
                 axes.line(*points, trace.colour, trace.width, dashed=trace.dashed)
         panels.append(axes)
         top += plot.height + _GAP

@@ -12,8 +12,10 @@ from hil.report import figures
 from hil.report.drawing import chart_panel
 from hil.report.interactive import chart_data, library
 from hil.report.rendering import environment, page_bytes, template_text
+from hil.report.rollout import ROLLOUT_LEGENDS, rollout_charts
 from hil.report.series import ReportSeries
 from hil.results import ParameterResult, Results, by_id, outside_mark
+from hil.rollout_result import RolloutResult
 from identification.excitation import CRITERIA, METHODS
 from identification.selection.inner_prediction import Choice
 
@@ -33,8 +35,12 @@ _RECORDING_CHECKS: Final = frozenset(
 """Checks whose findings describe how it was recorded."""
 
 
-def report_bytes(results: Results, series: ReportSeries) -> bytes:
+def report_bytes(
+    results: Results, series: ReportSeries, rollout: RolloutResult | None = None
+) -> bytes:
     """Return the report as one HTML file; the same input gives the same bytes.
+
+    With a rollout it has a section about it.
 
     Raises:
         SeriesError: series and results have different numbers of joints.
@@ -48,10 +54,13 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
         "spectra": figures.spectrum_charts(series, joints),
         "friction": figures.friction_charts(series, joints),
         "excitation": figures.excitation_charts(series, joints),
+        "rollout_errors": [] if rollout is None else rollout_charts(rollout),
     }
     errors = np.array([[r.overall_relative_error, r.all_rows_relative_error] for r in runs])
     context = {
         "results": results,
+        "rollout": rollout,
+        "rollout_legends": ROLLOUT_LEGENDS,
         "series": series,
         "shown_candidates": shown_candidates,
         "has_truth": any(p.truth is not None for p in results.parameters),

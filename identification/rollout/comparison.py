@@ -33,7 +33,7 @@ class RecordedMotion:
     windows: Windows
     samples: tuple[Samples, ...]  #: of each stretch
     servo: Servo | None = None  #: in place of the recorded torque
-    later: int = 0  #: instants by which the recorded torque is applied later
+    delay: float = 0.0  #: by which the recorded torque is applied later [s]
 
     def force(self, arm: Arm, simulated: SimulatedArm) -> Array:
         """Return what acts on the joints of an arm in MuJoCo (w, K, n).
@@ -46,7 +46,7 @@ class RecordedMotion:
             beside = _removed(stretch, samples, arm) + _late(stretch, arm)
             beside = beside - unsupported_torque(arm, stretch.motion)
             if servo is None:
-                beside = beside + _shifted(stretch.torque, self.later)
+                beside = beside + _delayed(stretch, self.delay)
                 position, rate = stretch.motion.position, stretch.after
             else:
                 position, rate = command_of(stretch, servo.delay)
@@ -89,7 +89,7 @@ def light_feedback(arm: Arm, step: float, frequency: float) -> Feedback:
 def simulate(
     arm: Arm, motion: RecordedMotion, feedback: Feedback, extra: Array | float = 0.0
 ) -> Array:
-    """Return the positions of an arm at the horizons (w, h, n), NaN where it is unstable.
+    """Return the positions of an arm at the horizons (w, h, n), not finite where it is unstable.
 
     Raises:
         NotSimulatedError: MuJoCo does not accept the arm.
@@ -126,9 +126,13 @@ def _late(stretch: Stretch, arm: Arm) -> Array:
     return np.asarray(late + load(*before[1:4]) - load(*stretch.motion[1:4]))
 
 
-def _shifted(values: Array, instants: int) -> Array:
-    rows = np.clip(np.arange(len(values)) - instants, 0, len(values) - 1)
-    return values[rows]
+def _delayed(stretch: Stretch, delay: float) -> Array:
+    """Return the recorded torque (g, n) of so many seconds before."""
+    if delay == 0.0:
+        return stretch.torque
+    time = stretch.motion.time
+    columns = [np.interp(time - delay, time, column) for column in stretch.torque.T]
+    return np.column_stack(columns)
 
 
 # Errors
@@ -141,20 +145,23 @@ class Errors:
     joints: Array  #: position (h, n) [rad or m]; where unstable, `LARGEST_ERROR`
     tool: Array  #: distance of the tool (h,) [m] in stable windows; NaN without any
     unstable: int  #: windows in which it became unstable
+    unstable_joints: NDArray[np.intp]  #: of these, by the joint that left first (n,)
 
 
 def errors_of(positions: Array, measured: Array, tool: ToolFrame) -> Errors:
     """Return the errors of simulated positions (w, h, n)."""
-    difference = np.nan_to_num(positions - measured, nan=LARGEST_ERROR)
-    stable = np.asarray(np.isfinite(positions).all(axis=2))
+    stable = np.isfinite(positions)
+    difference = np.where(stable, positions - measured, LARGEST_ERROR)
+    whole = np.all(stable, axis=2)
     distances = np.full(len(HORIZONS), np.nan)
     for k in range(len(HORIZONS)):
-        rows = stable[:, k]
+        rows = whole[:, k]
         if rows.any():
             away = tool.positions(positions[rows, k]) - tool.positions(measured[rows, k])
             distances[k] = np.sqrt(np.mean(np.sum(away**2, axis=1)))
     rms = np.sqrt(np.mean(difference**2, axis=0))
-    return Errors(rms, distances, int(np.count_nonzero(~stable[:, -1])))
+    first = np.count_nonzero(np.isinf(positions[:, -1]), axis=0)
+    return Errors(rms, distances, int(np.count_nonzero(~whole[:, -1])), first)
 
 
 class ToolFrame:
@@ -201,7 +208,7 @@ def coverage(ensemble: Array, measured: Array) -> Array:
     """
     count = np.count_nonzero(np.isfinite(ensemble), axis=0)
     known = count >= _FEWEST
-    filled = np.nan_to_num(ensemble)
+    filled = np.where(np.isfinite(ensemble), ensemble, 0.0)
     mean = filled.sum(axis=0) / np.maximum(count, 1)
     deviation = np.where(np.isfinite(ensemble), ensemble - mean, 0.0)
     variance = np.sum(deviation**2, axis=0) / np.maximum(count - 1, 1)
@@ -262,7 +269,10 @@ def variants(joint: int) -> list[Variant]:
         return change
 
     def delayed(instants: int) -> Callable[..., tuple[Arm, RecordedMotion]]:
-        return lambda arm, motion: (arm, replace(motion, later=instants))
+        return lambda arm, motion: (
+            arm,
+            replace(motion, delay=motion.delay + instants * motion.windows.step),
+        )
 
     return [
         *(("dry friction", scaled(("f0", "fl"), factor)) for factor in (0.7, 1.3)),

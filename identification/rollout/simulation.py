@@ -80,7 +80,7 @@ class SimulatedArm:
         return np.asarray(force + self.feedback.stiffness * (position - self.rest))
 
     def simulate(self, start: Array, velocity: Array, force: Array, reference: Array) -> Array:
-        """Return the positions after each step (w, K, n); NaN from where on they are unstable.
+        """Return the positions after each step (w, K, n), not finite where they are unstable.
 
         From positions and, half a step before, velocities (w, n), under a force (w, K, n). They
         are unstable where they are far from a reference (w, K, n).
@@ -119,9 +119,15 @@ def _without_messages(mujoco: Any) -> Iterator[None]:
 
 
 def _without_unstable(position: Array, reference: Array) -> Array:
-    """Return positions with NaN from the first on that is far from the reference."""
+    """Return positions that are not finite from the first on that is far from the reference.
+
+    Those of the joint that is the first to be so are infinite, those of the others NaN.
+    """
     with np.errstate(invalid="ignore", over="ignore"):
-        near = np.all(np.abs(position - reference) < LARGEST_ERROR, axis=2)
-    for window in np.flatnonzero(~near.all(axis=1)):
-        position[window, int(np.argmin(near[window])) :] = np.nan
+        near = np.abs(position - reference) < LARGEST_ERROR
+    for window in np.flatnonzero(~np.all(near, axis=(1, 2))):
+        first = int(np.argmin(np.all(near[window], axis=1)))
+        joint = int(np.argmin(near[window, first]))
+        position[window, first:] = np.nan
+        position[window, first:, joint] = np.inf
     return position

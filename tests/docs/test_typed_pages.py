@@ -27,7 +27,7 @@ from hil.cli import app
 from hil.demo_link import free_port
 from hil.progress import Silent
 from hil.results import Results
-from hil.rollout import RolloutResult
+from hil.rollout_result import RolloutResult
 from tests.docs.typed import ROOT, commands
 from tests.hil.simulated_logs import simulate
 from tests.hil.test_payload_command import CENTRE, MASS, archive_of_currents

@@ -15,7 +15,7 @@ from hil.archive.schema import MEASURED
 from hil.campaign import Campaign
 from hil.cli import app
 from hil.errors import InputError
-from hil.rollout import ROLLOUT, RolloutResult
+from hil.rollout_result import ROLLOUT, RolloutResult
 
 pytestmark = pytest.mark.long
 
