@@ -13,7 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from hil.files import make_folder, write_files
-from hil.identified_model import IdentifiedModel, ensemble_of, model_of
+from hil.identified_model import IdentifiedModel, ensemble_of, model_of, remarks_of
 from hil.identify import Identification
 from identification import Samples
 from identification.estimators.ensemble import Ensemble
@@ -102,7 +102,7 @@ def export_model(found: Identification | IdentifiedModel, output: Path, to: Form
     model = found if isinstance(found, IdentifiedModel) else model_of(found)
     form, arm = FORMATS[to], model.arm
     make_folder(output.parent)
-    text = form.write(arm, model.name, _remarks(model))
+    text = form.write(arm, model.name, remarks_of(model))
     try:
         comparison: Comparison | str = compare(text, form, arm, _motion(model.prepared.held_out))
     except MISSING as error:
@@ -110,15 +110,6 @@ def export_model(found: Identification | IdentifiedModel, output: Path, to: Form
     write_files(output.parent, {output.name: text})
     units = tuple("N·m" if turns else "N" for turns in arm.model.chain.revolute)
     return Exported(output, arm.model.joint_names, units, comparison, model.verdict, model.origin)
-
-
-def _remarks(model: IdentifiedModel) -> tuple[str, ...]:
-    unknown = ", ".join(model.estimate.undetermined)
-    return (
-        "Identified by hil; bodies are physically consistent parameters.",
-        *([f"Not determined by the data: {unknown}."] if unknown else []),
-        *(" ".join(f"{key}: {value}".split()) for key, value in model.provenance.items()),
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +204,7 @@ def _ensemble_texts(
     ):
         arm = replace(model.arm, standard=standard, values=values)
         remark = f"Arm {k} of {len(ensemble)} drawn from the posterior with seed {seed}."
-        text = form.write(arm, model.name, (remark, *_remarks(model)))
+        text = form.write(arm, model.name, (remark, *remarks_of(model)))
         texts[f"arm_{k:0{digits}}{form.suffix}"] = text
         if not missing:
             try:

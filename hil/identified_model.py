@@ -138,6 +138,16 @@ def arm_with(cell: Cell, standard: Array, values: Array, fitted: Sequence[Sample
     )
 
 
+def remarks_of(model: IdentifiedModel) -> tuple[str, ...]:
+    """Return what a file of the arm states in a comment."""
+    unknown = ", ".join(model.estimate.undetermined)
+    return (
+        "Identified by hil; bodies are physically consistent parameters.",
+        *([f"Not determined by the data: {unknown}."] if unknown else []),
+        *(" ".join(f"{key}: {value}".split()) for key, value in model.provenance.items()),
+    )
+
+
 def ensemble_of(model: IdentifiedModel, count: int, seed: int) -> Ensemble:
     """Draw arms from the posterior of an identification.
 

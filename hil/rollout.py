@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,19 +13,28 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import write_files
-from hil.identified_model import IdentifiedModel, ensemble_of
+from hil.identified_model import IdentifiedModel, ensemble_of, remarks_of
 from hil.identify.cell_context import nominal_of
 from hil.identify.prepared import Prepared
 from hil.identify.sources import Source
 from hil.outcome import REPORT, is_of_report, rewrite_report
+from hil.polishing import polish
 from hil.progress import Reporter
-from hil.rollout_result import JUDGED, ROLLOUT, ArmErrors, RolloutResult
+from hil.rollout_result import (
+    JUDGED,
+    ROLLOUT,
+    ArmErrors,
+    PolishResult,
+    RolloutResult,
+)
 from identification import IdentificationError, Samples
 from identification.estimators.ensemble import Ensemble
 from identification.export.arm import Arm
+from identification.export.simulators import FORMATS, read_back
 from identification.model.pseudo_inertia import margin
 from identification.rollout.comparison import (
     HORIZONS,
+    Errors,
     RecordedMotion,
     ResidualTorque,
     ToolFrame,
@@ -38,17 +47,19 @@ from identification.rollout.comparison import (
     simulate,
     variants,
 )
+from identification.rollout.polish import Driven
 from identification.rollout.servo import NoServoError, Servo, identify_servo
 from identification.rollout.simulation import LARGEST_ERROR, Feedback
 from identification.rollout.windows import STEP, windows_of
 
 Array = NDArray[np.float64]
 
-PICTURE: Final = "rollout.png"
+PICTURE, POLISHED = "rollout.png", "polished.xml"
 MOST_WINDOWS: Final = 1000
 """Windows that are simulated at most."""
 _FEW_WINDOWS: Final = 200  # of which the error of each sample is computed
 _STRIDE: Final = 0.1  # s between the starts of windows
+_POLISHED_WINDOWS: Final = 60  # of the fitted motion
 _LEADS: Final = 0.1  # share of the mean square error that mending an effect has to remove
 
 
@@ -60,9 +71,18 @@ class RolloutOptions:
     seed: int = 1
     feedback: float = 1.0  #: natural frequency of the feedback that keeps the arm near [Hz]
     servo: Servo | str | None = None  #: in place of the recorded torque; "identified" from the log
+    polish: bool = False  #: fit friction, rotors, servo and delay to windows of the fitted motion
 
 
-def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter) -> RolloutResult:
+class Rollout(NamedTuple):
+    """A rollout, and the arm that was polished on the way."""
+
+    result: RolloutResult
+    polished: Arm | None  #: if it was kept
+    remarks: tuple[str, ...]  #: for its file
+
+
+def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter) -> Rollout:
     """Simulate the held-out motion of an identification.
 
     Raises:
@@ -82,7 +102,11 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
     joint = leading_joint(positions[:, JUDGED], measured[:, JUDGED], tool)
     if 2 * identified.unstable_joints.max() > len(windows):
         joint = int(np.argmax(identified.unstable_joints))
-    return RolloutResult(
+    polished = None
+    if options.polish:
+        driven = Driven(arm, motion, feedback)
+        polished = _polish(model, driven, identified, reporter)
+    result = RolloutResult(
         cell=model.name,
         simulated=prepared.sources.header.only_simulated,
         joint_names=list(arm.model.joint_names),
@@ -103,8 +127,12 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
         inside=coverage(simulated[1], measured).tolist(),
         leading_joint=arm.model.joint_names[joint],
         leading_effect=_leading_effect(arm, motion, feedback, positions, measured, joint),
-        polish=None,
+        polish=None if polished is None else polished[0],
         notes=[*notes, *_about(motion, prepared)],
+    )
+    kept = polished is not None and polished[0].kept
+    return Rollout(
+        result, polished[1] if polished is not None and kept else None, remarks_of(model)
     )
 
 
@@ -220,6 +248,20 @@ def _simulated_ensemble(
     return ensemble, (np.stack(alone), np.stack(disturbed))
 
 
+def _polish(
+    model: IdentifiedModel, driven: Driven, identified: Errors, reporter: Reporter
+) -> tuple[PolishResult, Arm]:
+    """Fit to windows of the fitted motion, and judge on the held-out ones."""
+    sources = model.prepared.sources
+    recordings = _with_commands(sources.training, model.prepared.fitted)
+    stretches, owners = recorded_stretches(model.arm.model, recordings, STEP)
+    windows = windows_of(stretches, STEP, HORIZONS[-1], _STRIDE).some(_POLISHED_WINDOWS)
+    fitted = replace(driven.motion, windows=windows, samples=tuple(owners))
+    return polish(
+        replace(driven, motion=fitted), driven, identified, reporter, in_sample=sources.in_sample
+    )
+
+
 def _leading_effect(
     arm: Arm,
     motion: RecordedMotion,
@@ -254,12 +296,22 @@ def _about(motion: RecordedMotion, prepared: Prepared) -> list[str]:
     return notes
 
 
-def write_rollout(folder: Path, result: RolloutResult) -> str:
-    """Write `rollout.json` and the section of the report, or return why that has no section.
+def write_rollout(folder: Path, rollout: Rollout) -> str:
+    """Write `rollout.json`, `polished.xml` of a polish that was kept, and a section of the report.
 
-    The report is that of the parameters that were simulated.
+    Returns:
+        why the report of the folder has no section; empty if it has.
+
+    Raises:
+        WriteBackError: MuJoCo reads the polished arm otherwise.
     """
-    write_files(folder, {ROLLOUT: result.to_json()})
+    result, text = rollout.result, None
+    if rollout.polished is not None:
+        form = FORMATS["mjcf"]
+        remarks = ("Polished on simulated windows by hil rollout.", *rollout.remarks)
+        text = form.write(rollout.polished, result.cell, remarks)
+        read_back(text, form, rollout.polished)
+    write_files(folder, {ROLLOUT: result.to_json(), POLISHED: text})
     if not result.parameters:
         return f"not in {REPORT}: the arm was identified for this rollout"
     if not is_of_report(folder, result):

@@ -24,7 +24,7 @@ from hil.plots.plan_picture import save
 from hil.plots.rollout_picture import draw_rollout
 from hil.progress import reporter as make_reporter
 from hil.progress import say
-from hil.rollout import PICTURE, RolloutOptions, roll_out, write_rollout
+from hil.rollout import PICTURE, POLISHED, RolloutOptions, roll_out, write_rollout
 from hil.rollout_result import ROLLOUT
 
 
@@ -37,6 +37,7 @@ def rollout(
     seed: Annotated[int, typer.Option(min=0)] = 1,
     feedback: Annotated[float, typer.Option(min=0.0, max=20.0, metavar="HZ")] = 1.0,
     servo: Annotated[str | None, typer.Option(metavar="KP,KD,DELAY")] = None,
+    polish: bool = False,
     split: Annotated[float, typer.Option(min=0.1, max=0.9)] = 0.7,
     estimator: EstimatorOption = "auto",
     *,
@@ -66,12 +67,14 @@ def rollout(
             motion; 0 for none.
         servo: A servo in place of the recorded torque: gains in N·m/rad and N·m·s/rad and delay
             in s, or identified from commanded and measured positions.
+        polish: Fit friction, rotor inertia, servo gains and delay to simulated windows of the
+            fitted motion, and write polished.xml if the held-out windows are predicted better.
         split: Fraction of the recording that is fitted if there is no validation run; the rest is
             simulated.
         again: Identify again even if results.json and parameters.json are there.
     """
     reporter = make_reporter(quiet=quiet or json)
-    asked = RolloutOptions(samples, seed, feedback, servo_from(servo))
+    asked = RolloutOptions(samples, seed, feedback, servo_from(servo), polish)
     options = how.options(split=split, estimator=estimator)
     if len(archives) == 1 and archives[0].is_dir():
         output = output or archives[0]
@@ -79,9 +82,10 @@ def rollout(
         make_folder(output)
     as_usual = options == Options() and not again
     found = read_or_identify(archives, options, reporter, reuse=as_usual, predict=predict or ())
-    result = roll_out(found, asked, reporter)
+    simulated = roll_out(found, asked, reporter)
+    result = simulated.result
     if output is not None:
-        missing = write_rollout(output, result)
+        missing = write_rollout(output, simulated)
         save(draw_rollout(result), output / PICTURE)
     if json:
         print_json(result.model_dump(mode="json"))
@@ -89,7 +93,8 @@ def rollout(
         for line in result.lines()[-1 if quiet else 0 :]:
             say(line)
         if output is not None:
-            reporter.say(f"written to {output}: {ROLLOUT}, {PICTURE}")
+            polished = [POLISHED] if simulated.polished is not None else []
+            reporter.say(f"written to {output}: {', '.join([ROLLOUT, PICTURE, *polished])}")
             reporter.say(missing or f"section of the report: {output / REPORT}")
     if not found.good:
         raise typer.Exit(NOT_GOOD)

@@ -77,12 +77,16 @@ def recorded_stretches(
     return stretches, owners
 
 
+def joint_inertia(arm: Arm, step: float) -> Array:
+    """Return the inertia that each joint turns at its zero position (n,) [kg·m² or kg]."""
+    none = np.zeros(arm.model.n_joints)
+    simulated = SimulatedArm.of(arm, step, Feedback(none, none))
+    return np.asarray(simulated.model.dof_M0[simulated.order])
+
+
 def light_feedback(arm: Arm, step: float, frequency: float) -> Feedback:
     """Return a critically damped feedback of some natural frequency [Hz] for each joint alone."""
-    n = arm.model.n_joints
-    simulated = SimulatedArm.of(arm, step, Feedback(np.zeros(n), np.zeros(n)))
-    inertia = simulated.model.dof_M0[simulated.order]
-    rate = 2.0 * np.pi * frequency
+    inertia, rate = joint_inertia(arm, step), 2.0 * np.pi * frequency
     return Feedback(rate**2 * inertia, 2.0 * rate * inertia)
 
 

@@ -1,0 +1,172 @@
+r"""Friction, rotor inertia, servo and delay fitted to simulated windows, from a regression on.
+
+.. math:: \hat x = \arg\min \sum_{w,h,j} (e_{whj}(x) / s_{hj})^2 + N_w \lambda^2 \lVert x \rVert^2
+
+over position errors e at the horizons; s is their root mean square before, so that every joint and
+horizon counts alike, and x are changes in units of what they may be wrong by. The minimiser is that
+of MuJoCo's system identification, `mujoco.minimize`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.export.arm import Arm
+from identification.export.simulators import load_mujoco
+from identification.rollout.comparison import (
+    RecordedMotion,
+    horizon_rows,
+    joint_inertia,
+    simulate,
+)
+from identification.rollout.servo import LONGEST_DELAY
+from identification.rollout.simulation import LARGEST_ERROR, Feedback
+
+Array = NDArray[np.float64]
+
+_WEIGHT: Final = 0.03  # lambda: of a change by one unit, beside an error that stays as it is
+_UNIT: Final = 0.3  # of the logarithm of friction and gains
+_DELAY_UNIT: Final = 5e-3  # s
+_ROTOR_UNIT: Final = 0.1  # of the inertia that the joint turns
+_STEP: Final = 0.02  # of finite differences: dry friction makes the error rough
+_LARGEST: Final = 5.0  # change of a quantity, in its units
+_ITERATIONS: Final = 8
+_SETTLED: Final = 1e-3  # relative change
+_DRY, _VISCOUS = ("f0", "fl"), ("f1", "f2")
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """An arm and what drives it along a motion."""
+
+    arm: Arm
+    motion: RecordedMotion
+    feedback: Feedback
+
+    def on(self, motion: RecordedMotion) -> Driven:
+        """Return the arm, its servo and its delay on the windows of another motion."""
+        own = self.motion
+        return replace(self, motion=replace(motion, servo=own.servo, delay=own.delay))
+
+    def positions(self) -> Array:
+        """Return the simulated positions at the horizons (w, h, n)."""
+        return simulate(self.arm, self.motion, self.feedback)
+
+    def residuals(self) -> Array:
+        """Return position errors at the horizons (w, h, n), `LARGEST_ERROR` where unstable."""
+        windows, found = self.motion.windows, self.positions()
+        measured = windows.reached[:, horizon_rows(windows)]
+        return np.where(np.isfinite(found), found - measured, LARGEST_ERROR)
+
+
+class Quantity(NamedTuple):
+    """What a polish changes, by a number in its unit."""
+
+    change: Callable[[Driven, float], Driven]
+    lower: float = -_LARGEST
+    upper: float = _LARGEST
+
+
+def polished(start: Driven) -> Driven:
+    """Return the arm with friction, rotors, servo and delay of least error on its windows.
+
+    Raises:
+        NotSimulatedError: MuJoCo does not accept the arm.
+        MissingMujocoError: MuJoCo is not installed.
+    """
+    load_mujoco()
+    from mujoco import minimize  # optional dependency
+
+    quantities = _quantities(start)
+    size = np.sqrt(np.mean(start.residuals() ** 2, axis=0))
+    scale = np.where(size > 0.0, size, 1.0) * np.sqrt(len(start.motion.windows))
+
+    def residuals(columns: Array) -> Array:
+        found = []
+        for changes in np.atleast_2d(columns.T):
+            errors = _changed(start, quantities, changes).residuals() / scale
+            found.append(np.concatenate([errors.ravel(), _WEIGHT * changes]))
+        return np.column_stack(found)
+
+    best, _ = minimize.least_squares(
+        np.zeros(len(quantities)),
+        residuals,
+        bounds=[np.array([getattr(one, end) for one in quantities]) for end in ("lower", "upper")],
+        eps=_STEP,
+        xtol=_SETTLED,
+        max_iter=_ITERATIONS,
+        verbose=minimize.Verbosity.SILENT,
+    )
+    return _changed(start, quantities, np.asarray(best).ravel())
+
+
+def _changed(start: Driven, quantities: list[Quantity], changes: Array) -> Driven:
+    driven = start
+    for quantity, change in zip(quantities, changes.tolist(), strict=True):
+        driven = quantity.change(driven, change)
+    return driven
+
+
+def _quantities(start: Driven) -> list[Quantity]:
+    """Return what a polish changes; friction that was identified as none stays so."""
+    arm, servo = start.arm, start.motion.servo
+    model, found = arm.model, list[Quantity]()
+    for joint in range(model.n_joints):
+        for symbols in (_DRY, _VISCOUS):
+            chosen = [one.owner == joint and one.symbol in symbols for one in model.friction.terms]
+            rows = model.friction_part.start + np.flatnonzero(chosen)
+            if arm.values[rows].any():
+                found.append(Quantity(partial(_with_friction, rows)))
+    if model.layout.rotor_inertia:
+        rotors = arm.standard[model.layout.rotors]
+        for joint, inertia in enumerate(joint_inertia(arm, start.motion.windows.step)):
+            unit = _ROTOR_UNIT * float(inertia)
+            least = max(-float(rotors[joint]) / unit, -_LARGEST)
+            found.append(Quantity(partial(_with_rotor, joint, unit), least))
+    if servo is None:
+        return [*found, Quantity(_with_delay)]
+    for joint in range(model.n_joints):
+        found += [Quantity(partial(_with_gain, name, joint)) for name in ("kp", "kd")]
+    ends = (np.array([0.0, LONGEST_DELAY]) - servo.delay) / _DELAY_UNIT
+    return [*found, Quantity(_with_delay, *ends.tolist())]
+
+
+def _with_friction(rows: NDArray[np.intp], driven: Driven, change: float) -> Driven:
+    values = driven.arm.values.copy()
+    values[rows] *= np.exp(_UNIT * change)
+    return replace(driven, arm=replace(driven.arm, values=values))
+
+
+def _with_rotor(joint: int, unit: float, driven: Driven, change: float) -> Driven:
+    arm, model = driven.arm, driven.arm.model
+    standard, values = arm.standard.copy(), arm.values.copy()
+    rotors = standard[model.layout.rotors]
+    rotors[joint] = max(0.0, rotors[joint] + unit * change)
+    standard[model.layout.rotors] = rotors
+    values[: model.base.rank] = model.base.grouping @ standard
+    return replace(driven, arm=replace(arm, standard=standard, values=values))
+
+
+def _with_gain(name: str, joint: int, driven: Driven, change: float) -> Driven:
+    servo = driven.motion.servo
+    assert servo is not None
+    gains = getattr(servo, name).copy()
+    gains[joint] *= np.exp(_UNIT * change)
+    servo = servo._replace(**{name: gains})
+    motion = replace(driven.motion, servo=servo)
+    return replace(driven, motion=motion, feedback=Feedback(servo.kp, servo.kd))
+
+
+def _with_delay(driven: Driven, change: float) -> Driven:
+    motion, later = driven.motion, _DELAY_UNIT * change
+    if motion.servo is None:
+        motion = replace(motion, delay=motion.delay + later)
+    else:
+        motion = replace(motion, servo=motion.servo._replace(delay=motion.servo.delay + later))
+    return replace(driven, motion=motion)
