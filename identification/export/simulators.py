@@ -43,6 +43,7 @@ _SEED: Final = 20140903
 _ANYWHERE, _SPEED, _ACCELERATION = math.pi, 2.0, 10.0
 _DRY: Final = (COULOMB, TANH)
 _DRY_LABELS: Final = tuple(term.label for term in _DRY)
+_OF_SPEED: Final = (QUADRATIC, CUBIC)
 _TIMESTEP: Final = 1e-3  # s
 _FRICTION_STEPS: Final = 2.0  # time constant of MuJoCo's dry friction, at least 2 steps
 _THICKNESS: Final = 0.03  # m, radius of the capsules that show the arm
@@ -79,7 +80,8 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = (), *, step: float = _TIM
         third = {term.symbol: term for term in model.friction.laws[j].terms}.get("f2")
         damping = [  # of v, v |v| and v³
             friction.get("f1", 0.0),
-            *(friction["f2"] if third == kind else 0.0 for kind in (QUADRATIC, CUBIC)),
+            # A negative one would accelerate a joint that is faster than the recorded motion.
+            *(max(0.0, friction["f2"]) if third == kind else 0.0 for kind in _OF_SPEED),
         ]
         lower, upper, most = ranges.lower[j], ranges.upper[j], ranges.effort[j]
         limited = math.isfinite(lower) and math.isfinite(upper) and lower < upper
@@ -221,6 +223,7 @@ def random_states(arm: Arm, count: int = STATES) -> Motion:
 
 
 _BEYOND: Final = "beyond that at the load for which it is written"
+_ACCELERATES: Final = "where its coefficient is negative and would accelerate a joint"
 _REVERSALS: Final = "dry friction between the two directions (velocity reversals, standstill)"
 _ROUNDED: Final = "effect of rounded angles of the URDF on the base parameters"
 _MOST_ROUNDED: Final = 2000  # rows that show whether there is one
@@ -234,10 +237,17 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[Part]:
     """Yield the parts of the model along a motion."""
     model, q, qdd, terms = arm.model, motion.position, motion.acceleration, arm.model.friction.terms
     yield "the links", lambda: rigid_torque(arm, motion), True
+    brakes = _brakes(arm)
     for kind in model.friction.kinds:
         if kind not in _DRY or kind not in form.friction:
             description = f"{kind.description}, {_BEYOND}" if kind.of_load else kind.description
-            yield description, partial(_friction_of, arm, motion, kind), kind in form.friction
+            chosen = np.array([t.term.label == kind.label and not t.motor for t in terms], np.bool_)
+            written = kind in form.friction
+            left = chosen & ~brakes if written else np.zeros_like(chosen)
+            torque = partial(_friction_of, arm, motion, kind)
+            yield description, partial(torque, chosen & ~left), written
+            if left.any():
+                yield f"{kind.description}, {_ACCELERATES}", partial(torque, left), False
     diagonal = np.diag(np.diag(arm.rotors))
     coupled = arm.rotors - diagonal
     motors = [one.motor and not (form.drives and one.term.label in _DRY_LABELS) for one in terms]
@@ -255,12 +265,16 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[Part]:
         yield description, partial(_element_torque, arm, motion, one), supported
 
 
-def _friction_of(arm: Arm, motion: Motion, kind: FrictionTerm) -> Array:
-    """Return the torque (m, n) of a kind of friction of the joints, beyond that at the load."""
-    terms = arm.model.friction.terms
-    torque = _friction(
-        arm, motion, [one.term.label == kind.label and not one.motor for one in terms]
-    )
+def _brakes(arm: Arm) -> NDArray[np.bool_]:
+    """Return whether each friction term is no power of the speed with a negative coefficient."""
+    terms, values = arm.model.friction.terms, arm.values[arm.model.friction_part]
+    of_speed = np.array([one.term in _OF_SPEED for one in terms], dtype=np.bool_)
+    return np.asarray(~(of_speed & (values < 0.0)))
+
+
+def _friction_of(arm: Arm, motion: Motion, kind: FrictionTerm, chosen: NDArray[np.bool_]) -> Array:
+    """Return the torque (m, n) of friction terms of a kind, beyond that at the load."""
+    torque = _friction(arm, motion, chosen.tolist())
     return torque - _at_load(arm, motion) if kind.of_load else torque
 
 

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +12,23 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from typer.testing import CliRunner
 
+from hil import identified_model
 from hil.annotate import FOLDER, PREDICTED, RESIDUAL
 from hil.archive.schema import MEASURED
 from hil.campaign import Campaign
 from hil.cli import app
-from hil.errors import InputError
-from hil.rollout_result import ROLLOUT, RolloutResult
+from hil.errors import HilError, InputError
+from hil.outcome import PARAMETERS_JSON, REPORT
+from hil.rollout import POLISHED
+from hil.rollout_result import ROLLOUT, ArmErrors, RolloutResult
+from identification.text import percentage
 
 pytestmark = pytest.mark.long
 
 pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
+
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +53,117 @@ def test_a_rollout_is_better_than_the_nominal_arm(folder: Path) -> None:
     assert "is better than the nominal one up to 1 s" in found.message
     assert all(np.isfinite(at).all() for at in found.identified.joints)
     assert "nan" not in (folder / ROLLOUT).read_text().lower()
+
+
+def test_it_reads_what_was_identified(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results and archives are there: no other identification, and the same figures."""
+    run("identify", folder, "-q")
+    anew = json.loads(run("rollout", folder, "--samples", "3", "--again", "--json").stdout)
+
+    def identify(*_: object, **__: object) -> None:
+        raise AssertionError("the parameters are there")
+
+    monkeypatch.setattr(identified_model, "identify_paths", identify)
+    done = run("rollout", folder, "--samples", "3", "--json")
+    assert done.exit_code in (0, 5), done.exception
+    read = json.loads(done.stdout)
+    assert read["parameters"] != ""
+    assert anew["parameters"] == ""
+    assert read["identified"]["joints"] == pytest.approx(
+        np.array(anew["identified"]["joints"]), rel=1e-6
+    )
+    assert read["inside"] == pytest.approx(np.array(anew["inside"]), abs=0.02)
+
+
+class TestSectionOfTheReport:
+    def test_the_rollout_writes_it(self, folder: Path) -> None:
+        run("identify", folder, "-q")
+        assert "Simulated motion" not in (folder / REPORT).read_text()
+        run("rollout", folder, "--samples", "3")
+        page, found = (folder / REPORT).read_text(), RolloutResult.load(folder / ROLLOUT)
+        assert found.message in page
+        assert "arms drawn from the posterior" in page
+        assert page.count('<div class="panel" data-chart="rollout-') == len(found.joint_names) + 1
+        assert "nan" not in page.split('<section id="rollout">')[1].split("</section>")[0].lower()
+
+    def test_it_counts_an_arm_that_explodes(self, folder: Path) -> None:
+        run("identify", folder, "-q")
+        run("rollout", folder, "--samples", "3")
+        found = RolloutResult.load(folder / ROLLOUT)
+        count, others = found.windows, len(found.joint_names) - 1
+        lost = ArmErrors(
+            joints=[[np.pi] * (others + 1)] * len(found.horizons),
+            tool=[None] * len(found.horizons),
+            unstable=count,
+            unstable_joints=[count, *[0] * others],
+        )
+        path = folder / ROLLOUT
+        path.write_text(found.model_copy(update={"identified": lost}).to_json())
+        run("report", folder)
+        section = (folder / REPORT).read_text().split('<section id="rollout">')[1]
+        section = section.split("</section>")[0]
+        assert f"makes {count} of {count} windows unstable" in section
+        assert f"unstable in {count} of {count} windows (first {found.joint_names[0]}" in section
+        assert "nan" not in section.lower()
+
+    def test_another_identification_removes_it(self, folder: Path) -> None:
+        run("identify", folder, "-q")
+        run("rollout", folder, "--samples", "3")
+        run("identify", folder, "-q", "--friction", "coulomb,viscous,offset")
+        run("report", folder)
+        assert "Simulated motion" not in (folder / REPORT).read_text()
+
+    def test_an_arm_identified_for_the_rollout_is_not_that_of_the_report(
+        self, folder: Path
+    ) -> None:
+        run("identify", folder, "-q")
+        done = run("rollout", folder, "--samples", "3", "--again")
+        assert "not in report.html: the arm was identified for this rollout" in done.output
+        assert "Simulated motion" not in (folder / REPORT).read_text()
+
+
+def test_to_identify_imports_nothing_of_mujoco() -> None:
+    script = "import hil.cli.identify, hil.report, hil.outcome, sys; print('mujoco' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout == "False\n", done.stderr
+
+
+def test_a_polish_is_judged_on_held_out_windows(folder: Path) -> None:
+    done = run("rollout", folder, "--samples", "3", "--polish")
+    assert done.exit_code in (0, 5), done.exception
+    found = RolloutResult.load(folder / ROLLOUT)
+    assert found.polish is not None
+    assert found.polish.kept == (found.polish.change < 0.0)
+    assert (folder / POLISHED).exists() == found.polish.kept
+    verdict = "kept." if found.polish.kept else "not kept."
+    assert verdict in found.message
+    assert f"held-out position error by {percentage(abs(np.expm1(found.polish.change)), 1)}" in (
+        found.message
+    )
+
+
+def test_a_log_without_torque_and_command_is_named(tmp_path: Path) -> None:
+    time = np.arange(0.0, 5.0, 0.01)
+    log, urdf = tmp_path / "log.csv", ROOT / "examples" / "two_joints" / "robot.urdf"
+    columns = np.column_stack([time, np.sin(time), np.cos(time)])
+    np.savetxt(log, columns, delimiter=",", header="t,q1,q2", comments="")
+    refused = run("identify", log, "--urdf", urdf)
+    assert isinstance(refused.exception, HilError)
+    assert "log.csv: torque: no channel is named as torque" in str(refused.exception)
+    assert "record it, since nothing can be identified without" in str(refused.exception)
+    refused = run("rollout", log)
+    assert isinstance(refused.exception, HilError)
+    assert "log.csv: is not an MCAP file" in str(refused.exception)
+
+
+def test_parameters_of_no_possible_arm_are_named(folder: Path) -> None:
+    """Without a physically consistent arm in the files it is identified again, and says why."""
+    run("identify", folder, "-q")
+    path = folder / PARAMETERS_JSON
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"standard": None}))
+    done = run("rollout", folder, "--samples", "3")
+    assert "identified again" in done.output
+    assert "it has no physically consistent parameters" in done.output
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from identification.export.arm import Arm, Ranges
+from identification.export.simulators import FORMATS, compare, mjcf
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.rollout.comparison import (
@@ -20,6 +21,7 @@ from identification.rollout.comparison import (
     recorded_stretches,
     simulate,
 )
+from identification.rollout.polish import Driven, polished
 from identification.rollout.servo import NoServoError, identify_servo
 from identification.rollout.simulation import LARGEST_ERROR, Feedback
 from identification.rollout.windows import (
@@ -82,9 +84,43 @@ def test_an_unstable_arm_is_counted_and_silent(capfd) -> None:
     light = replace(arm, standard=1e-6 * arm.standard, values=1e-6 * arm.values)
     errors = final_errors(light, motion)
     assert errors.unstable == len(motion.windows)
+    assert errors.unstable_joints.sum() == len(motion.windows)
     assert np.isfinite(errors.joints).all()
     assert errors.joints[-1].max() == pytest.approx(LARGEST_ERROR)
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_polish_finds_friction_rotor_and_delay() -> None:
+    true, motion = an_arm(coulomb=3.0), a_recording(an_arm(coulomb=3.0), 0.005)
+    values = true.values.copy()
+    values[MODEL.friction_part] *= 1.4
+    start = Driven(replace(true, values=values), replace(motion, delay=0.004), NOTHING)
+    best = polished(start)
+    before, after = (np.sqrt(np.mean(one.residuals() ** 2)) for one in (start, best))
+    assert after < 0.2 * before
+    friction = best.arm.values[MODEL.friction_part] / true.values[MODEL.friction_part]
+    assert friction[true.values[MODEL.friction_part] != 0.0] == pytest.approx(1.0, abs=0.15)
+    assert best.motion.delay == pytest.approx(0.0, abs=1e-3)
+
+
+def test_friction_that_accelerates_acts_as_measured() -> None:
+    """A negative coefficient of the speed squared is no damper of the simulated arm."""
+    model = RobotModel.from_urdf(URDF, friction=FrictionLaw(third="quadratic"))
+    standard = model.nominal
+    standard[model.layout.rotors] = (0.4, 0.1)
+    friction = [{"f0": 0.1, "f1": 0.1, "f2": -3.0}.get(t.symbol, 0.0) for t in model.friction.terms]
+    values = np.concatenate([model.base.grouping @ standard, friction])
+    arm = Arm(URDF, model, standard, values, NO_LIMITS)
+    motion = four_sines(np.arange(0.0, 3.0, 0.001), 0.5)
+    stretches, owners = recorded_stretches(model, [(simulated(model, values, motion), None)], 0.005)
+    recorded = RecordedMotion(windows_of(stretches, 0.005, 1.0, 0.2), tuple(owners))
+    errors = final_errors(arm, recorded)
+    assert errors.unstable == 0
+    assert errors.joints[:3].max() < 5e-3
+    text = mjcf(arm, "arm")
+    assert 'damping="0.1 0 0"' in text
+    left = compare(text, FORMATS["mjcf"], arm, motion).left_out
+    assert [name for name in left if "would accelerate a joint" in name]
 
 
 def test_the_joint_that_moves_the_tool_leads() -> None:
