@@ -109,7 +109,7 @@ def fit_by_sysid(arm: Arm, motion: RecordedMotion, feedback: Feedback, iteration
     residual = sysid.build_residual_fn(
         models_sequences=[_sequences(spec, arm, motion, feedback)],
         resample_true=False,
-        enabled_observations=[(name, sysid.SignalType.MjStateQPos) for name in names],
+        enabled_observations=[(f"{name}_qpos", sysid.SignalType.MjStateQPos) for name in names],
     )
     evaluations = 0
 
@@ -147,21 +147,25 @@ def _sequences(spec: Any, arm: Arm, motion: RecordedMotion, feedback: Feedback) 
         [bare.force(s.torque, s.motion.position, s.after, 0.0 * s.after) for s in windows.stretches]
     )
     times = STEP * np.arange(windows.steps + 1)
-    signals = [(name, sysid.SignalType.MjStateQPos) for name in names]
+    signals = [(f"{name}_qpos", sysid.SignalType.MjStateQPos) for name in names]
+    coordinates = {
+        "qpos_names": [f"{name}_qpos" for name in names],
+        "qvel_names": [f"{name}_qvel" for name in names],
+    }
     states, controls, measured = [], [], []
     for k in range(len(windows)):
         position = np.concatenate([windows.position[k, :1], windows.reached[k]])
         states.append(
-            sysid.create_initial_state(
-                model, position[0], windows.start[k], qpos_names=names, qvel_names=names
-            )
+            sysid.create_initial_state(model, position[0], windows.start[k], **coordinates)
         )
         # The last control is not applied.
         control = np.concatenate([force[k], force[k, -1:]])
         controls.append(sysid.TimeSeries.from_control_names(times, control, model, names))
         measured.append(sysid.TimeSeries.from_names(times, position, model, signals))
     labels = [str(k) for k in range(len(windows))]
-    return sysid.ModelSequences("arm", spec, labels, states, controls, measured)
+    return sysid.ModelSequences(
+        "arm", spec, labels, states, controls, measured, allow_missing_sensors=True
+    )
 
 
 def positions_of(fitted: Fitted, arm: Arm, motion: RecordedMotion, feedback: Feedback) -> Array:

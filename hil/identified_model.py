@@ -33,12 +33,12 @@ from identification import Estimate, Factor, Samples
 from identification.errors import IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
 from identification.estimators.ensemble import Ensemble, draw_ensemble
-from identification.estimators.prior import BodyPrior
 from identification.export.arm import Arm, Ranges
 from identification.export.friction import median_load
 from identification.export.parameters import estimate_in
-from identification.factor.factor import total_factor
+from identification.factor.factor import FINE_BLOCK, fine_blocks, total_factor
 from identification.model.regressor import LINK_SYMBOLS
+from identification.selection.inner_prediction import FOLDS
 
 Array = NDArray[np.float64]
 
@@ -74,8 +74,8 @@ class IdentifiedModel:
         return total_factor(self.cell.model, self.prepared.fitted)
 
     @cached_property
-    def prior(self) -> BodyPrior:
-        """The prior of a posterior estimate.
+    def posterior(self) -> Posterior:
+        """Prior and strength of a posterior estimate.
 
         Raises:
             InputError: the estimator has none.
@@ -88,7 +88,29 @@ class IdentifiedModel:
                 remedy="use auto or prior",
             )
         strength = self.prepared.settings.strength
-        return Posterior.of(self.cell, self.factor, self.estimator, strength).prior
+        return Posterior.of(self.cell, self.factor, self.estimator, strength)
+
+    def predicted_residuals(self) -> list[Array]:
+        """Return measured minus predicted torque (m, n) of each fitted recording.
+
+        Each tenth of the rows is predicted from the others: what was fitted leaves too little.
+
+        Raises:
+            InputError: the estimator has no posterior.
+        """
+        total, model, fitted = self.factor, self.cell.model, self.prepared.fitted
+        rows = total.counts.sum(axis=1)
+        before = np.cumsum(rows) - 0.5 * rows
+        fold = np.minimum(np.floor(FOLDS * before / rows.sum()).astype(np.intp), FOLDS - 1)
+        length = round(total.block / FINE_BLOCK)
+        folds = [fold[fine_blocks(samples) // length] for samples in fitted]
+        residuals = [np.empty(samples.torque.shape) for samples in fitted]
+        for k in range(FOLDS):
+            values = self.posterior.values(total.without(fold == k))
+            for samples, own, residual in zip(fitted, folds, residuals, strict=True):
+                error = samples.torque - samples.predicted_torque(model, values)
+                residual[own == k] = error[own == k]
+        return residuals
 
 
 def consistent_of(found: Identification) -> ConsistentEstimate:
@@ -154,7 +176,9 @@ def ensemble_of(model: IdentifiedModel, count: int, seed: int) -> Ensemble:
     Raises:
         InputError: it has another estimator than a posterior.
     """
-    return draw_ensemble(model.cell.model, model.prior, model.estimate, model.factor, count, seed)
+    return draw_ensemble(
+        model.cell.model, model.posterior.prior, model.estimate, model.factor, count, seed
+    )
 
 
 def read_or_identify(

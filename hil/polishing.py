@@ -30,10 +30,10 @@ def polish(
     measured = windows.reached[:, horizon_rows(windows)]
     errors = errors_of(best.on(held_out.motion).positions(), measured, ToolFrame(best.arm))
     change = float(np.mean(np.log(errors.joints / identified.joints)))
-    kept = change < 0.0 and errors.unstable <= identified.unstable and not in_sample
+    accepted = change < 0.0 and errors.unstable <= identified.unstable and not in_sample
     return PolishResult(
-        kept=kept,
-        reason=_reason(change, errors, identified, kept=kept, in_sample=in_sample),
+        accepted=accepted,
+        reason=_reason(change, errors, identified, accepted=accepted, in_sample=in_sample),
         windows=len(fitted.motion.windows),
         change=change,
         errors=ArmErrors.of(errors),
@@ -42,7 +42,7 @@ def polish(
 
 
 def _reason(
-    change: float, errors: Errors, identified: Errors, *, kept: bool, in_sample: bool
+    change: float, errors: Errors, identified: Errors, *, accepted: bool, in_sample: bool
 ) -> str:
     """Return why a polish was kept or not."""
     if in_sample:
@@ -53,9 +53,9 @@ def _reason(
         f"Polishing {direction} the held-out position error by {factor} (geometric mean over joints"
         " and horizons)"
     )
-    if not kept and change < 0.0:
+    if not accepted and change < 0.0:
         result += f", but makes {errors.unstable} windows unstable instead of {identified.unstable}"
-    return f"{result}: {'kept' if kept else 'not kept'}."
+    return f"{result}: {'kept' if accepted else 'not kept'}."
 
 
 def _parameters(start: Driven, best: Driven) -> list[PolishedParameter]:

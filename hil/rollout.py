@@ -130,9 +130,9 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
         polish=None if polished is None else polished[0],
         notes=[*notes, *_about(motion, prepared)],
     )
-    kept = polished is not None and polished[0].kept
+    accepted = polished is not None and polished[0].accepted
     return Rollout(
-        result, polished[1] if polished is not None and kept else None, remarks_of(model)
+        result, polished[1] if polished is not None and accepted else None, remarks_of(model)
     )
 
 
@@ -234,9 +234,8 @@ def _simulated_ensemble(
     ensemble = ensemble_of(model, options.samples, options.seed)
     random = np.random.default_rng(options.seed)
     few = replace(motion, windows=motion.windows.some(_FEW_WINDOWS))
-    residual = ResidualTorque.of(
-        model.cell.model, model.estimate.values, model.prepared.fitted, motion.windows
-    )
+    fitted = model.prepared.fitted
+    residual = ResidualTorque.of(model.predicted_residuals(), fitted, motion.windows)
     alone, disturbed = [], []
     with reporter.task("simulating", len(ensemble)) as task:
         for standard, parameters in zip(ensemble.standard, ensemble.values, strict=True):

@@ -45,7 +45,7 @@ class PolishedParameter(Frozen):
 class PolishResult(Frozen):
     """Parameters that were fitted to simulated windows of the fitted motion."""
 
-    kept: bool  #: whether the held-out windows are predicted better
+    accepted: bool  #: whether the held-out windows are predicted better
     reason: str  #: why it was kept or not, one sentence
     windows: int  #: of the fitted motion
     change: float  #: mean of the logarithms of held-out errors, polished over identified

@@ -22,9 +22,9 @@ from hil.identify import Options
 from hil.outcome import REPORT
 from hil.plots.plan_picture import save
 from hil.plots.rollout_picture import draw_rollout
+from hil.progress import Reporter, say
 from hil.progress import reporter as make_reporter
-from hil.progress import say
-from hil.rollout import PICTURE, POLISHED, RolloutOptions, roll_out, write_rollout
+from hil.rollout import PICTURE, POLISHED, Rollout, RolloutOptions, roll_out, write_rollout
 from hil.rollout_result import ROLLOUT
 
 
@@ -83,18 +83,21 @@ def rollout(
     as_usual = options == Options() and not again
     found = read_or_identify(archives, options, reporter, reuse=as_usual, predict=predict or ())
     simulated = roll_out(found, asked, reporter)
-    result = simulated.result
     if output is not None:
-        missing = write_rollout(output, simulated)
-        save(draw_rollout(result), output / PICTURE)
+        _write(output, simulated, reporter)
     if json:
-        print_json(result.model_dump(mode="json"))
+        print_json(simulated.result.model_dump(mode="json"))
     else:
-        for line in result.lines()[-1 if quiet else 0 :]:
+        for line in simulated.result.lines()[-1 if quiet else 0 :]:
             say(line)
-        if output is not None:
-            polished = [POLISHED] if simulated.polished is not None else []
-            reporter.say(f"written to {output}: {', '.join([ROLLOUT, PICTURE, *polished])}")
-            reporter.say(missing or f"section of the report: {output / REPORT}")
     if not found.good:
         raise typer.Exit(NOT_GOOD)
+
+
+def _write(output: Path, simulated: Rollout, reporter: Reporter) -> None:
+    """Write all files of a rollout, and report them."""
+    missing = write_rollout(output, simulated)
+    save(draw_rollout(simulated.result), output / PICTURE)
+    polished = [POLISHED] if simulated.polished is not None else []
+    reporter.say(f"written to {output}: {', '.join([ROLLOUT, PICTURE, *polished])}")
+    reporter.say(missing or f"section of the report: {output / REPORT}")

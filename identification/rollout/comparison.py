@@ -233,12 +233,11 @@ class ResidualTorque:
 
     @classmethod
     def of(
-        cls, model: RobotModel, values: Array, fitted: Sequence[Samples], windows: Windows
+        cls, residuals: Sequence[Array], fitted: Sequence[Samples], windows: Windows
     ) -> ResidualTorque:
-        """Return measured minus predicted torque of parameters (p,)."""
+        """Return the residuals (m, n) of recordings, for windows."""
         found = []
-        for samples in fitted:
-            residual = samples.torque - samples.predicted_torque(model, values)
+        for residual, samples in zip(residuals, fitted, strict=True):
             parts = stretches_of(samples, np.zeros_like(samples.torque), windows.step)
             found += [one.mean_about_instants(residual[one.part]) for one in parts]
         return cls(tuple(one for one in found if len(one) >= windows.steps), windows.steps)

@@ -133,9 +133,9 @@ def test_a_polish_is_judged_on_held_out_windows(folder: Path) -> None:
     assert done.exit_code in (0, 5), done.exception
     found = RolloutResult.load(folder / ROLLOUT)
     assert found.polish is not None
-    assert found.polish.kept == (found.polish.change < 0.0)
-    assert (folder / POLISHED).exists() == found.polish.kept
-    verdict = "kept." if found.polish.kept else "not kept."
+    assert found.polish.accepted == (found.polish.change < 0.0)
+    assert (folder / POLISHED).exists() == found.polish.accepted
+    verdict = "kept." if found.polish.accepted else "not kept."
     assert verdict in found.message
     assert f"held-out position error by {percentage(abs(np.expm1(found.polish.change)), 1)}" in (
         found.message
