@@ -118,7 +118,7 @@ def test_friction_that_accelerates_acts_as_measured() -> None:
     assert errors.unstable == 0
     assert errors.joints[:3].max() < 5e-3
     text = mjcf(arm, "arm")
-    assert 'damping="0.1 0 0"' in text
+    assert 'damping="0.1 0.0 0.0"' in text
     left = compare(text, FORMATS["mjcf"], arm, motion).left_out
     assert [name for name in left if "would accelerate a joint" in name]
 
