@@ -32,10 +32,17 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, identified_campaign: Campaign) -> Path:
+def identified(tmp_path_factory, identified_campaign: Campaign) -> Path:
     copy = tmp_path_factory.mktemp("twin") / "campaign"
     shutil.copytree(identified_campaign.folder.root, copy)
+    run("identify", copy, "-q")
     return copy
+
+
+@pytest.fixture
+def folder(identified: Path, tmp_path: Path) -> Path:
+    """A campaign with the files of its identification, to change."""
+    return Path(shutil.copytree(identified, tmp_path / "campaign"))
 
 
 def run(*arguments: str):
@@ -57,7 +64,6 @@ def test_a_rollout_is_better_than_the_nominal_arm(folder: Path) -> None:
 
 def test_it_reads_what_was_identified(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Results and archives are there: no other identification, and the same figures."""
-    run("identify", folder, "-q")
     anew = json.loads(run("rollout", folder, "--samples", "3", "--again", "--json").stdout)
 
     def identify(*_: object, **__: object) -> None:
@@ -77,7 +83,6 @@ def test_it_reads_what_was_identified(folder: Path, monkeypatch: pytest.MonkeyPa
 
 class TestSectionOfTheReport:
     def test_the_rollout_writes_it(self, folder: Path) -> None:
-        run("identify", folder, "-q")
         assert "Simulated motion" not in (folder / REPORT).read_text()
         run("rollout", folder, "--samples", "3")
         page, found = (folder / REPORT).read_text(), RolloutResult.load(folder / ROLLOUT)
@@ -87,7 +92,6 @@ class TestSectionOfTheReport:
         assert "nan" not in page.split('<section id="rollout">')[1].split("</section>")[0].lower()
 
     def test_it_counts_an_arm_that_explodes(self, folder: Path) -> None:
-        run("identify", folder, "-q")
         run("rollout", folder, "--samples", "3")
         found = RolloutResult.load(folder / ROLLOUT)
         count, others = found.windows, len(found.joint_names) - 1
@@ -107,7 +111,6 @@ class TestSectionOfTheReport:
         assert "nan" not in section.lower()
 
     def test_another_identification_removes_it(self, folder: Path) -> None:
-        run("identify", folder, "-q")
         run("rollout", folder, "--samples", "3")
         run("identify", folder, "-q", "--friction", "coulomb,viscous,offset")
         run("report", folder)
@@ -116,7 +119,6 @@ class TestSectionOfTheReport:
     def test_an_arm_identified_for_the_rollout_is_not_that_of_the_report(
         self, folder: Path
     ) -> None:
-        run("identify", folder, "-q")
         done = run("rollout", folder, "--samples", "3", "--again")
         assert "not in report.html: the arm was identified for this rollout" in done.output
         assert "Simulated motion" not in (folder / REPORT).read_text()
@@ -158,7 +160,6 @@ def test_a_log_without_torque_and_command_is_named(tmp_path: Path) -> None:
 
 def test_parameters_of_no_possible_arm_are_named(folder: Path) -> None:
     """Without a physically consistent arm in the files it is identified again, and says why."""
-    run("identify", folder, "-q")
     path = folder / PARAMETERS_JSON
     path.write_text(json.dumps(json.loads(path.read_text()) | {"standard": None}))
     done = run("rollout", folder, "--samples", "3")
