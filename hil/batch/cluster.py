@@ -253,7 +253,7 @@ class Cluster:
                     f"the Dask scheduler {place} does not answer any more; start it and run the"
                     " command again: what was computed is in the cache"
                 )
-            if future.status == "error" and not died(future):
+            if future.status == "error" and not _died(future):
                 raise _unexpected(future.exception())
             yield future
             del future
@@ -299,10 +299,11 @@ class Cluster:
 
         for future in self.completed(submitted()):
             number = places[future.key]
-            if died(future):
+            result = outcome_of(future)
+            if isinstance(result, Death):
                 deaths.append(number)
             else:
-                results[number] = future.result()
+                results[number] = result
             if done is not None:
                 done(1)
         for number in deaths:  # another task of the process may have ended it
@@ -311,9 +312,9 @@ class Cluster:
 
     def _alone(self, task: Task[T], archives: int) -> T | Unused:
         (future,) = self.completed(iter([self.submit(task, archives=archives)]))
-        if died(future):
+        result: T | Unused | Death = outcome_of(future)
+        if isinstance(result, Death):
             return Unused(task.path, "ended the process that read it, twice")
-        result: T | Unused = future.result()
         return result
 
 
@@ -327,11 +328,27 @@ def _unexpected(error: BaseException) -> BaseException:
     )
 
 
-def died(future: Future) -> bool:
-    """Return whether a task, or one that it depends on, repeatedly ended its process."""
+class Death:
+    """In place of a result: the task, or one that it depends on, ended its process repeatedly."""
+
+
+def outcome_of(future: Future) -> Any:
+    """Return the result of a task that is done, or a `Death`.
+
+    A result that is lost with its worker is computed again, which may end in one, too.
+    """
     from distributed import KilledWorker
 
-    return future.status == "error" and isinstance(future.exception(), KilledWorker)
+    try:
+        return future.result()
+    except KilledWorker:
+        return Death()
+
+
+def _died(future: Future) -> bool:
+    from distributed import KilledWorker
+
+    return isinstance(future.exception(), KilledWorker)
 
 
 def dask_setup(worker: Worker) -> None:

@@ -22,7 +22,7 @@ from hil.identify.sources import Source, Sources, all_fitted
 from hil.progress import Reporter, Silent
 
 from .cache import CacheLocation, code_digest
-from .cluster import Cluster, Task, Unused, died, reason_of
+from .cluster import Cluster, Death, Task, Unused, outcome_of, reason_of
 from .discovery import (
     ArchiveRef,
     CellTexts,
@@ -354,8 +354,9 @@ class _Batch:
                 yield from self._submit(arm, receivers, archives, advance)
 
         for future in self.cluster.completed(submitted()):
-            if not died(future):
-                receivers[future.key](future)
+            result = outcome_of(future)
+            if not isinstance(result, Death):
+                receivers[future.key](result)
         for arm in arms:
             if any(campaign.key not in arm.results for campaign in arm.campaigns):
                 damaged.append(arm)
@@ -461,9 +462,8 @@ def _advance(
     return lambda _: advance(count, note)
 
 
-def _receive_campaign(arm: _ArmWork, key: GroupKey) -> Callable[[Future], None]:
-    def receive(future: Future) -> None:
-        result = future.result()
+def _receive_campaign(arm: _ArmWork, key: GroupKey) -> Callable[[Any], None]:
+    def receive(result: CampaignResult | Unused) -> None:
         if isinstance(result, Unused):
             result = CampaignResult((), (result,), 0, 0)
         arm.results[key] = result
@@ -471,8 +471,8 @@ def _receive_campaign(arm: _ArmWork, key: GroupKey) -> Callable[[Future], None]:
     return receive
 
 
-def _receive_pooled(arm: _ArmWork) -> Callable[[Future], None]:
-    def receive(future: Future) -> None:
-        arm.pooled = future.result()
+def _receive_pooled(arm: _ArmWork) -> Callable[[Any], None]:
+    def receive(result: Any) -> None:
+        arm.pooled = result
 
     return receive

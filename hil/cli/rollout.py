@@ -76,10 +76,7 @@ def rollout(
     reporter = make_reporter(quiet=quiet or json)
     asked = RolloutOptions(samples, seed, feedback, servo_from(servo), polish)
     options = how.options(split=split, estimator=estimator)
-    if len(archives) == 1 and archives[0].is_dir():
-        output = output or archives[0]
-    if output is not None:
-        make_folder(output)
+    output = _folder(output, archives)
     as_usual = options == Options() and not again
     found = read_or_identify(archives, options, reporter, reuse=as_usual, predict=predict or ())
     simulated = roll_out(found, asked, reporter)
@@ -92,6 +89,15 @@ def rollout(
             say(line)
     if not found.good:
         raise typer.Exit(NOT_GOOD)
+
+
+def _folder(output: Path | None, archives: list[Path]) -> Path | None:
+    """Return the folder for the files, which exists then: a campaign's own by default."""
+    if len(archives) == 1 and archives[0].is_dir():
+        output = output or archives[0]
+    if output is not None:
+        make_folder(output)
+    return output
 
 
 def _write(output: Path, simulated: Rollout, reporter: Reporter) -> None:

@@ -75,7 +75,8 @@ class Settings:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings for JSON, without the choices that led to them."""
-        return _SETTINGS.dump_python(replace(self, choices=()), mode="json")
+        entries: dict[str, Any] = _SETTINGS.dump_python(replace(self, choices=()), mode="json")
+        return entries
 
     @classmethod
     def from_dict(cls, entries: Mapping[str, Any]) -> Settings:

@@ -116,9 +116,7 @@ class TestSectionOfTheReport:
         run("report", folder)
         assert "Simulated motion" not in (folder / REPORT).read_text()
 
-    def test_an_arm_identified_for_the_rollout_is_not_that_of_the_report(
-        self, folder: Path
-    ) -> None:
+    def test_an_arm_of_the_rollout_is_not_that_of_the_report(self, folder: Path) -> None:
         done = run("rollout", folder, "--samples", "3", "--again")
         assert "not in report.html: the arm was identified for this rollout" in done.output
         assert "Simulated motion" not in (folder / REPORT).read_text()
