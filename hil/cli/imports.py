@@ -206,12 +206,24 @@ class Reading:
         ),
     ] = None
     outside_limits: OutsideOption = False
+    drop_missing: Annotated[
+        bool,
+        typer.Option(
+            "--drop-missing",
+            help="Leave out rows of a log in which a number is missing or is other text.",
+            rich_help_panel=CHANNELS,
+        ),
+    ] = False
 
     @property
     def options(self) -> ImportOptions:
         """How recordings are read; InputError for an option that is not understood."""
         at_most_one(map=self.columns, columns=self.channels)
         at_most_one(map=self.columns, sample_rate=self.sample_rate)
+        if self.columns is not None and self.drop_missing:
+            remedy = 'write [format] missing = "drop" into the map'
+            problem = "is for logs without a map"
+            raise InputError(None, problem, field="--drop-missing", remedy=remedy)
         if self.sample_rate is not None and not 0.0 < self.sample_rate < math.inf:
             remedy = "give a rate above 0 Hz"
             raise InputError(None, "is not a rate", field="--sample-rate", remedy=remedy)
@@ -222,6 +234,7 @@ class Reading:
             self.topic,
             _names(self.rename or []),
             self.outside_limits,
+            self.drop_missing,
         )
 
     def refuse_without_robot(self) -> None:
@@ -233,6 +246,7 @@ class Reading:
             "--topic": self.topic,
             "--rename": self.rename,
             "--outside-limits": self.outside_limits,
+            "--drop-missing": self.drop_missing,
         }
         for option, value in given.items():
             if value:

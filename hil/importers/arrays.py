@@ -18,7 +18,7 @@ from hil.errors import SourceError
 from hil.importers import mcap_messages
 from hil.importers.column_map import Column
 from hil.importers.document_messages import ENCODINGS, columns_of_trees, trees
-from hil.importers.matlab import NUMBERS, mat_array, mat_shapes, script_matrices
+from hil.importers.matlab import NUMBERS, lost_bytes, mat_array, mat_shapes, script_matrices
 from hil.importers.ros_messages import MessageError, columns_of, decoded, typestore_of
 from hil.reading import open_file
 
@@ -225,6 +225,12 @@ def _head(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
 
 
 def _mat(path: Path) -> dict[str, Stored]:
+    if lost := lost_bytes(path):
+        problem = (
+            f"its data are lost: of MATLAB 7.3 it has the header, and then {lost} bytes that are "
+            "all zero, as after an interrupted copy or on a full disk"
+        )
+        raise SourceError(path, problem, remedy="copy it again, or save it again in MATLAB")
     return {
         name: Stored(shape, partial(mat_array, path, name))
         for name, shape in mat_shapes(path).items()

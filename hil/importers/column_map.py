@@ -119,7 +119,9 @@ class Drive(_Table):
         return bool(self.gear_ratio or self.motor_from_joint)
 
 
-HOLE: Final = 'correct it, or leave such rows out: [format] missing = "drop"'
+HOLE: Final = (
+    'correct it, or leave such rows out: --drop-missing, or with a map [format] missing = "drop"'
+)
 """Remedy for a number that is missing."""
 
 

@@ -30,6 +30,9 @@ _ASSIGNED: Final = re.compile(r"\b([A-Za-z]\w*)\s*=\s*\[([^\[\]]*)\]")
 _COMMENT: Final = re.compile(r"[%#].*")
 _MEMORY: Final = 8 * 2**30  # bytes of the process that reads a .mat: the largest array and its copy
 _TIMEOUT: Final = 120.0  # s
+_HDF5: Final = b"\x89HDF\r\n\x1a\n"
+_HDF5_AT: Final = 512  # behind MATLAB's own header
+_CHUNK: Final = 1 << 16
 
 
 def mat_shapes(path: Path) -> dict[str, tuple[int, ...]]:
@@ -39,6 +42,19 @@ def mat_shapes(path: Path) -> dict[str, tuple[int, ...]]:
     ValueError, OSError and others: the file is damaged, or takes too long.
     """
     return _in_child(_shapes, str(path), path.stat().st_mtime_ns)
+
+
+def lost_bytes(path: Path) -> int:
+    """Return how many zeros follow the signature of HDF5 in a .mat; 0 where anything else does."""
+    with path.open("rb") as file:
+        if not file.read(_HDF5_AT + len(_HDF5)).endswith(_HDF5):
+            return 0
+        size = 0
+        while chunk := file.read(_CHUNK):
+            if any(chunk):
+                return 0
+            size += len(chunk)
+    return size
 
 
 def mat_array(path: Path, name: str) -> NDArray[Any]:

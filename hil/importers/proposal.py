@@ -15,7 +15,7 @@ from typing import Final, NoReturn
 
 from hil.errors import SourceError
 from hil.importers.channels import CHANNEL_NAMES, Channel, channels_of, kind_of
-from hil.importers.column_map import ColumnMap, ready_map, ready_maps
+from hil.importers.column_map import ColumnMap, Format, ready_map, ready_maps
 from hil.importers.robot import Robot
 from hil.importers.units import UNITS, Kind, unit_of, without_unit
 from hil.reading import parse_toml
@@ -93,26 +93,28 @@ def proposed_map(
     chosen: Mapping[str, str] | None = None,
     *,
     sample_rate: float | None = None,
+    drop_missing: bool = False,
 ) -> Proposal:
     """Return the column map that the channels of a log suggest for a robot.
 
     A ready map whose columns the log has comes first, then the names of
     :data:`hil.importers.channels.CHANNEL_NAMES`. `chosen` are channels by quantity that are given:
     a name with ``{}`` for the joint, or names separated by commas. `sample_rate` [Hz] replaces the
-    time.
+    time; `drop_missing` leaves out rows in which a number is missing.
 
     Raises:
         SourceError: the log cannot be read, or its channels leave a quantity open.
     """
     chosen = dict(chosen or {})
     joints = robot.joint_names
-    groups = _groups(channels_of(log), joints)
-    if not chosen and sample_rate is None:
+    form = Format(missing="drop") if drop_missing else None
+    groups = _groups(channels_of(log, form), joints)
+    if not chosen and sample_rate is None and form is None:
         ready = _matching_ready_map(groups, len(joints))
         if ready is not None:
             return _of_ready_map(ready)
     search = _Search(log, joints, groups, chosen, sample_rate)
-    return search.proposal()
+    return search.proposal(form)
 
 
 def kinds_of_file(path: Path) -> list[Kind]:
@@ -203,8 +205,8 @@ class _Search:
         self._lines: list[str] = []
         self._used: set[str] = set()
 
-    def proposal(self) -> Proposal:
-        """Return the map, or raise SourceError with what is missing."""
+    def proposal(self, form: Format | None) -> Proposal:
+        """Return the map, or raise SourceError with what is missing; `form` is stated in it."""
         columns: dict[str, _Columns] = {}
         kinds: list[Kind] = [*(("time",) if self._rate is None else ()), *_JOINT_KINDS]
         for kind in kinds:
@@ -227,6 +229,8 @@ class _Search:
         else:
             time = columns["time"]
             table["time"] = {"column": time if isinstance(time, str) else time[0]}
+        if form is not None:
+            table["format"] = form.model_dump(exclude_defaults=True)
         comment = "Proposed by hil from the names and units of the channels"
         text = to_text(table, {"": comment})
         return Proposal(text, ColumnMap.model_validate(parse_toml(text)), tuple(self._lines))

@@ -35,6 +35,7 @@ class ImportOptions:
         topic: of the joint states of a bag.
         joint_names: in the URDF by name in the bag, where they differ.
         outside_limits: accept positions of which no row is within the limits of the URDF.
+        drop_missing: leave out rows of a log in which a number is missing or is other text.
     """
 
     columns: Path | None = None
@@ -43,6 +44,7 @@ class ImportOptions:
     topic: str | None = None
     joint_names: Mapping[str, str] = field(default_factory=dict)
     outside_limits: bool = False
+    drop_missing: bool = False
 
 
 @dataclass(frozen=True)
@@ -115,8 +117,13 @@ def import_recording(
         columns, text = ColumnMap.load(options.columns), map_text(options.columns)
     else:
         robot = robot_of(partial(_no_joints, source))
-        rate = options.sample_rate
-        proposal = proposed_map(source, robot, options.chosen, sample_rate=rate)
+        proposal = proposed_map(
+            source,
+            robot,
+            options.chosen,
+            sample_rate=options.sample_rate,
+            drop_missing=options.drop_missing,
+        )
         columns, text, lines = proposal.columns, proposal.text, proposal.lines
     import_log(
         source,

@@ -312,5 +312,5 @@ def _check(samples: Samples, source: Path, joints: Sequence[str]) -> None:
             )
             remedy = f"cut the recording there, or leave out the quantity (largest: {_MOST:g})"
             if not np.isfinite(values[row, column]):
-                remedy += ', or of a log such rows: [format] missing = "drop"'
+                remedy += ', or of a log such rows: --drop-missing, or [format] missing = "drop"'
             raise SourceError(source, problem, remedy=remedy)

@@ -13,10 +13,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
-import numpy as np
-
 from hil.archive import open_archive
-from hil.errors import InputError, SourceError
+from hil.errors import InputError
 from hil.files import convert_write_errors, replace_file, write_output
 from hil.importers.recording import (
     ImportedRecording,
@@ -26,13 +24,12 @@ from hil.importers.recording import (
     is_archive,
 )
 from hil.importers.robot import Use
+from hil.importers.usable import require_motion, require_torque
 from hil.look.conclusions import concluded
 from hil.progress import Reporter
 
 MAP: Final = "map.toml"
 """File of the column map in a folder of results."""
-
-_SHORTEST: Final = 1.0  # s
 
 
 @dataclass
@@ -106,7 +103,8 @@ def staged(
                     continue
                 archive = _free(Path(folder), path)
                 recording = import_recording(path, archive, robot_of, options, use=use)
-                _require_usable(archive, path)
+                require_motion(archive, path)
+                require_torque(archive, path)
                 recording = concluded(recording, path, robot_of, options, use)
                 _report(recording, path, reporter)
                 archives.append(archive)
@@ -130,36 +128,6 @@ def _free(folder: Path, recording: Path) -> Path:
     while path.exists():
         path, number = folder / f"{stem}-{number}.mcap", number + 1
     return path
-
-
-def _require_usable(archive: Path, recording: Path) -> None:
-    """Raise SourceError for a recording that nothing can be identified from."""
-    imported = open_archive(archive, fields=("position", "torque"))
-    columns, stamp = imported.columns, imported.columns["stamp"]
-    duration = float(stamp[-1] - stamp[0]) * 1e-9
-    if duration < _SHORTEST:
-        samples = f"{len(stamp)} {'sample' if len(stamp) == 1 else 'samples'}"
-        problem = f"has {samples} in {duration:.3g} s, too few to identify from"
-        remedy = "record a motion of all joints, of 10 s or more"
-        raise SourceError(recording, problem, remedy=remedy)
-    if "torque" not in columns:
-        problem = "has motor currents and no joint torque"
-        remedy = (
-            "`hil import log` writes its column map: add [drive] torque_constant = [...] (N·m/A, "
-            "gears included, one for each joint) and give it with --map; or measure the constants "
-            "(`hil torque-constants`)"
-        )
-        raise SourceError(recording, problem, field="torque", remedy=remedy)
-    if not np.ptp(np.asarray(columns["position"]), axis=0).any():
-        problem = "no joint moves: every position is constant"
-        remedy = "check which channels hold the measured positions (--columns 'position=NAME{}')"
-        raise SourceError(recording, problem, field="position", remedy=remedy)
-    torque = np.asarray(columns["torque"])
-    if not np.ptp(torque, axis=0).any():
-        values = ", ".join(f"{value:g}" for value in torque[0])
-        problem = f"the torque of each joint is constant ({values})"
-        remedy = "check which channels hold the measured torque (--columns 'torque=NAME{}')"
-        raise SourceError(recording, problem, field="torque", remedy=remedy)
 
 
 def _report(recording: ImportedRecording, source: Path, reporter: Reporter) -> None:

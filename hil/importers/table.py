@@ -51,6 +51,16 @@ _DAY: Final = r"\d{1,4}([-./])(?:\d{1,2}|[A-Za-z]{3})\1\d{1,4}"
 _CLOCK: Final = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d+)?)?(?:\s*[AaPp][Mm])?\s*(?:Z|[+-]\d{2}:?\d{2})?"
 _DATE: Final = re.compile(rf"(?:{_DAY}(?:[ T]+{_CLOCK})?|{_CLOCK})")
 _QUOTES: Final = "\"'"
+_MARKUP: Final = re.compile(r"\ufeff?\s*<[?!A-Za-z]")
+
+
+def _description(path: Path, text: str) -> SourceError:
+    """Return the error for XML in place of rows."""
+    if "<robot" in text:
+        remedy = f"give the recording first: LOG --urdf {path.name}"
+        return SourceError(path, "is a robot description (URDF), not a recording", remedy=remedy)
+    remedy = "give a table of numbers (CSV), .npz, .mat, .parquet or a bag"
+    return SourceError(path, "is XML, not a table of numbers", remedy=remedy)
 
 
 class Dialect(NamedTuple):
@@ -103,6 +113,8 @@ class Table:
             SourceError: it cannot be read, or has no row of numbers.
         """
         text = _text(path, form)
+        if _MARKUP.match(text):
+            raise _description(path, text)
         numbered = [
             (number, line)
             for number, line in enumerate(text.splitlines(), 1)

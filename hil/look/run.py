@@ -14,6 +14,7 @@ from hil.cell import Cell
 from hil.errors import SourceError
 from hil.identify.sources import Source, cell_of, source_of
 from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, import_recording
+from hil.importers.usable import require_motion
 from hil.look import physics, signals
 from hil.look.maps import with_entries
 from hil.look.result import Look, Row
@@ -29,7 +30,6 @@ from identification.validation.readings import Axes, Readings, find_readings
 SETTINGS: Final = Preprocessing(14.0, left_out="rests")
 """Preparation of a recording whose readings are compared."""
 _DELAY_SAMPLES: Final = 20_000
-_LEAST_MOTION: Final = 1.0  # s
 MOUNTINGS: Final = {
     "": (0.0, 0.0, 0.0),
     "upside down": (0.0, 0.0, 9.81),
@@ -53,6 +53,7 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
         robot = robot_of or (lambda _: undescribed_robot(source, options))
         lenient = replace(options, outside_limits=True)
         imported = import_recording(source, archive, robot, lenient)
+        require_motion(archive, source)
         opened = open_archive(archive)
         notes = opened.header.findings.lines
         cell = cell_of(opened)
@@ -86,9 +87,6 @@ def _with_torque(
     if recording.torque is None:
         rows.append(physics.current_only())
         return Look(source.name, tuple(rows), (), (), imported.map_text)
-    if recording.time[-1] - recording.time[0] < _LEAST_MOTION or not recording.torque.any():
-        row = Row("torque", "not examined", "open", "less than a second, or zero throughout")
-        return Look(source.name, (*rows, row), (), (), imported.map_text)
     readings = _readings(cell, recording, imported)
     axes = Axes.of((step.change for step in readings.steps), model.n_joints)
     finding = physics.Finding(cell, recording, readings, axes, imported.map_text, source)

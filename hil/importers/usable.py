@@ -1,0 +1,58 @@
+"""Whether anything can be concluded from an imported recording, or identified from it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from hil.archive import open_archive
+from hil.errors import SourceError
+
+_SHORTEST: Final = 1.0  # s
+
+
+def require_motion(archive: Path, recording: Path) -> None:
+    """Check that the archive of a recording has a motion, and torques that vary if it has any.
+
+    Raises:
+        SourceError: it is shorter than a second, no joint moves, or all torques are constant.
+    """
+    columns = open_archive(archive, fields=("position", "torque")).columns
+    stamp = columns["stamp"]
+    duration = float(stamp[-1] - stamp[0]) * 1e-9
+    if duration < _SHORTEST:
+        samples = f"{len(stamp)} {'sample' if len(stamp) == 1 else 'samples'}"
+        problem = f"has {samples} in {duration:.3g} s, too few to identify from"
+        remedy = "record a motion of all joints, of 10 s or more"
+        raise SourceError(recording, problem, remedy=remedy)
+    if not np.ptp(np.asarray(columns["position"]), axis=0).any():
+        problem = "no joint moves: every position is constant"
+        remedy = "check which channels hold the measured positions (--columns 'position=NAME{}')"
+        raise SourceError(recording, problem, field="position", remedy=remedy)
+    if "torque" not in columns:
+        return
+    torque = np.asarray(columns["torque"])
+    if not np.ptp(torque, axis=0).any():
+        values = ", ".join(f"{value:g}" for value in torque[0])
+        problem = f"the torque of each joint is constant ({values})"
+        remedy = "check which channels hold the measured torque (--columns 'torque=NAME{}')"
+        raise SourceError(recording, problem, field="torque", remedy=remedy)
+
+
+def require_torque(archive: Path, recording: Path) -> None:
+    """Check that the archive of a recording has joint torques.
+
+    Raises:
+        SourceError: it has motor currents only.
+    """
+    if "torque" in open_archive(archive, fields=("torque",)).columns:
+        return
+    problem = "has motor currents and no joint torque"
+    remedy = (
+        "`hil import log` writes its column map: add [drive] torque_constant = [...] (N·m/A, "
+        "gears included, one for each joint) and give it with --map; or measure the constants "
+        "(`hil torque-constants`)"
+    )
+    raise SourceError(recording, problem, field="torque", remedy=remedy)
