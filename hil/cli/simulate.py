@@ -288,7 +288,6 @@ def _sentences(served: Served) -> list[str]:
     late = f"; {plural(summary.own_late, 'cycle')} started late by the simulation"
     if summary.own_late:
         late += f", {summary.slips} of them by a full cycle"
-    foreign = f", {served.foreign} from other addresses" if served.foreign else ""
     again = f" after {plural(served.starts, 'start')}" if served.starts > 1 else ""
     extended = (
         f"; {plural(summary.stretched, 'cycle')} extended by up to "
@@ -298,12 +297,30 @@ def _sentences(served: Served) -> list[str]:
     )
     return [
         f"{end}{because}; open mode was reached {plural(served.intervals, 'time')}{again}",
-        f"{plural(summary.cycles, 'cycle')}, {summary.replies} replies, {summary.missed} missed, "
-        f"{summary.late} late, {summary.surplus} surplus, {summary.rejected} rejected"
-        f"{foreign}{extended}",
+        f"{plural(summary.cycles, 'cycle')}, {_replies(served)}{extended}",
         f"time to reply: {_times(summary.reply)}",
         f"time to simulate a cycle: {_times(summary.cost)}{late}",
     ]
+
+
+def _replies(served: Served) -> str:
+    """Return how many cycles had a valid reply, and which packets were of no use."""
+    summary = served.summary
+    if not summary.missed:
+        text = "each with a valid reply in time"
+    else:
+        text = f"{summary.missed} without a valid reply in time"
+    unused = {
+        "too late": summary.late,
+        "a further one in its cycle": summary.surplus,
+        "of wrong number, length or content": summary.rejected,
+    }
+    replies = [f"{count} {reason}" for reason, count in unused.items() if count]
+    if replies:
+        text += f"; replies not used: {', '.join(replies)}"
+    if served.foreign:
+        text += f"; {plural(served.foreign, 'packet')} from other addresses not read"
+    return text
 
 
 def _times(times: Latencies) -> str:

@@ -27,12 +27,12 @@ from typer.testing import CliRunner
 
 from hil.cell import Cell, CellError
 from hil.cli import exit_code_of, main
-from hil.cli.simulate import WORDS, Status, simulate
+from hil.cli.simulate import WORDS, Status, _sentences, simulate
 from hil.demo_link import free_port
 from hil.errors import InputError
 from hil.motion_checks import MotionChecks
 from hil.progress import say_at_once
-from hil.serving import Buttons, open_controller_link
+from hil.serving import Buttons, Served, open_controller_link
 from hil.simulation import controller_settings, own_postures, simulated_controller, simulated_link
 from sim_fixtures import ControllerSettings, Phase
 from sim_fixtures.ns16 import CELL_PATH
@@ -382,3 +382,24 @@ def test_foreign_and_lost_datagrams_are_ignored():
     link = link_at("255.255.255.255:9")  # broadcast is not permitted
     link.send(b"x")
     link.close()
+
+
+class TestClosing:
+    """The last lines of a session: words of a manual, and only counts that are not zero."""
+
+    @staticmethod
+    def lines(foreign: int = 0, **counts: int) -> str:
+        controller: Any = SimpleNamespace(reason="")
+        summary = ServeCounts(cycles=1164, knocks=3, replies=1164, ended=True, **counts)
+        return "\n".join(_sentences(Served(controller, summary, 1, 1, foreign)))
+
+    def test_of_a_session_without_losses(self) -> None:
+        text = self.lines()
+        assert "1164 cycles, each with a valid reply in time" in text
+        assert not re.search("knock|slip|foreign|surplus|rejected", text)
+
+    def test_of_replies_that_were_of_no_use(self) -> None:
+        text = self.lines(2, missed=4, late=1, rejected=3)
+        assert "1164 cycles, 4 without a valid reply in time" in text
+        assert "replies not used: 1 too late, 3 of wrong number, length or content" in text
+        assert "2 packets from other addresses not read" in text
