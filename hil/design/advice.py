@@ -10,6 +10,7 @@ from hil.cell import AngleFrame
 from hil.errors import UnsafeError
 from hil.motion_checks import always_so, violation_text
 from identification import excitation
+from identification.model.kinematics import Chain
 
 from .settings import DesignSettings
 
@@ -47,11 +48,16 @@ def no_excitation(
     frame: AngleFrame,
     checker: excitation.CollisionChecker | None,
     settings: DesignSettings,
+    chain: Chain | None = None,
 ) -> NoExcitationError:
-    """Return the error of a search without a result, with violations and remedies."""
+    """Return the error of a search without a result, with violations and remedies.
+
+    A `chain` of several arms is advised to be designed for one.
+    """
     contact = error.nearest.get("collision")
     always = None if contact is None or checker is None else always_so(contact, checker)
-    advice = "; ".join(_advice(error, settings, always))
+    of_arms = None if chain is None else advice_on_branches(chain)
+    advice = "; ".join([*filter(None, [of_arms]), *_advice(error, settings, always)])
     text = infeasible_text(error, frame)
     return NoExcitationError(f"{text}. Possible changes: {advice}" if advice else text)
 
@@ -59,6 +65,32 @@ def no_excitation(
 def infeasible_text(error: excitation.NoFeasibleMotionError, frame: AngleFrame) -> str:
     """Return the message of an error with angles in a frame."""
     return error.sentence(partial(violation_text, frame=frame))
+
+
+def advice_on_branches(chain: Chain) -> str | None:
+    """Return how one arm of several is designed for; None if the joints form a single chain."""
+    parents = set(chain.parents.tolist())
+    ends = [joint for joint in range(chain.n_joints) if joint not in parents]
+    if len(ends) < 2:
+        return None
+    branches = [_branch(chain, end) for end in ends]
+    kept = max(branches, key=len)
+    others = [name for k, name in enumerate(chain.joint_names) if k not in kept]
+    fixing = " ".join(f"--fix {name}" for name in others)
+    last = ", ".join(chain.joint_names[end] for end in ends)
+    return (
+        f"the {chain.n_joints} joints form {len(ends)} arms, with the last joints {last}: move one "
+        f"at a time, with a cell whose other joints are fixed (`hil new ARM.urdf {fixing}`)"
+    )
+
+
+def _branch(chain: Chain, end: int) -> set[int]:
+    """Return the joints from the base to one of them."""
+    joints, joint = set(), end
+    while joint >= 0:
+        joints.add(joint)
+        joint = int(chain.parents[joint])
+    return joints
 
 
 def _advice(

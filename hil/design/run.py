@@ -256,7 +256,8 @@ def run_search(
                 raise OperatorStopError(
                     f"stopped before a feasible motion was found: {infeasible_text(error, frame)}"
                 ) from error
-            raise no_excitation(error, frame, checker, asked) from error
+            chain = cell.model.chain
+            raise no_excitation(error, frame, checker, asked, chain) from error
         if design.complete:  # with fewer motions than the limit
             task.advance(total - done, "done")
     if design.exhausted:

@@ -277,7 +277,7 @@ def find_payload(
         task.advance(1)
     warnings = (*prepared.sources.warnings, *found[True].warnings)
     if estimate.body is None:
-        raise _no_payload(estimate)
+        raise _no_payload(estimate, mounting)
     return PayloadFound(
         estimate=estimate,
         body=estimate.body,
@@ -293,13 +293,14 @@ def find_payload(
     )
 
 
-def _no_payload(estimate: PayloadEstimate) -> InputError:
+def _no_payload(estimate: PayloadEstimate, mounting: str | None) -> InputError:
     low, high = estimate.intervals[0]
     return InputError(
         None,
         f"the loaded archives show no payload: its mass is between {low:.3g} and {high:.3g} kg",
         field="--loaded",
-        remedy="give recordings that were made with the payload",
+        remedy="give recordings that were made with the payload"
+        + ("" if mounting is None else f"; or the mounting is another: {mounting}"),
     )
 
 

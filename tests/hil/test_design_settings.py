@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hil.cell import AngleFrame, Cell
 from hil.design import METHODS, load_settings, preset, problem_of, search_settings
-from hil.design.advice import NoExcitationError, no_excitation
+from hil.design.advice import NoExcitationError, advice_on_branches, no_excitation
 from hil.design.settings import SettingsError, preset_text, settings_of
 from hil.toml_text import to_text
 from identification.excitation import NoFeasibleMotionError, Violation
@@ -202,3 +203,14 @@ def test_too_large_currents_at_home_are_reported(cell):
     folded = SINES.replaced(sines={"offset": [0.0, 90.0, -165.0, 0.0, 90.0, 0.0]})
     with pytest.raises(NoExcitationError, match=r"in the mean posture of the sines: collision of"):
         problem_of(cell, folded)
+
+
+def test_a_tree_of_two_arms_is_advised_to_move_one(cell: Cell) -> None:
+    """Of a joint on the base, then two arms of two and one joints."""
+    assert advice_on_branches(cell.model.chain) is None
+    names = ("turn", "left_1", "left_2", "right_1")
+    tree = replace(cell.model.chain, joint_names=names, parents=np.array([-1, 0, 1, 0]))
+    advice = advice_on_branches(tree)
+    assert advice is not None
+    assert "the 4 joints form 2 arms, with the last joints left_2, right_1" in advice
+    assert "`hil new ARM.urdf --fix right_1`" in advice
