@@ -345,9 +345,9 @@ def log(
         coupled=not uncoupled,
         force=force,
     )
-    proposed = reading.columns is None and recording.map_text is not None
+    proposed = reading.columns is None and recording.text is not None
     if proposed:
-        write_output(recording.archive.with_suffix(".map.toml"), recording.map_text or "")
+        write_output(recording.archive.with_suffix(".map.toml"), recording.text or "")
     _print(recording.archive, recording.lines, json=json)
     if proposed and not json:
         say(f"wrote {recording.archive.with_suffix('.map.toml')}")

@@ -10,6 +10,7 @@ from typing import Final
 
 from hil.archive import open_archive
 from hil.errors import ArchiveError, NotAnArchiveError, SourceError
+from hil.importers.bag_map import BagMap
 from hil.importers.bags import open_bag
 from hil.importers.channels import channels_of
 from hil.importers.column_map import ColumnMap, map_text
@@ -54,12 +55,19 @@ class ImportedRecording:
     Attributes:
         archive: that was written.
         map_text: the column map, TOML; None for joint states of a bag, which need none.
+        bag: how those were read; None for a log.
         lines: one for each group of channels that was concluded: name, quantity, unit, reason.
     """
 
     archive: Path
     map_text: str | None
     lines: tuple[str, ...]
+    bag: BagMap | None = None
+
+    @property
+    def text(self) -> str | None:
+        """The map with which the recording is read again as it was, TOML."""
+        return self.map_text if self.bag is None else self.bag.text
 
 
 def is_archive(path: Path) -> bool:
@@ -109,8 +117,12 @@ def import_recording(
         SourceError: it cannot be read, or its channels leave a quantity open.
         ArchiveWriteError: the archive exists or cannot be written.
     """
+    stated = None if options.columns is None else BagMap.load(options.columns)
+    if stated is not None:
+        return _import_bag(source, output, robot_of, stated, options, held_joints, use, force=force)
     if options.columns is None and has_joint_states(source) and not _read_as_log(source, options):
-        return _import_bag(source, output, robot_of, options, held_joints, use, force=force)
+        bag = BagMap(topic=options.topic, rename=options.joint_names)
+        return _import_bag(source, output, robot_of, bag, options, held_joints, use, force=force)
     lines: tuple[str, ...] = ()
     if options.columns is not None:
         robot = robot_of(partial(_joints_of_map, options.columns))
@@ -154,31 +166,37 @@ def _import_bag(
     source: Path,
     output: Path,
     robot_of: RobotOf,
+    stated: BagMap,
     options: ImportOptions,
     held_joints: Sequence[str],
     use: Use,
     *,
     force: bool,
 ) -> ImportedRecording:
-    robot = robot_of(lambda: recorded_joints(source, options.topic, options.joint_names))
+    topic, names = stated.topic, stated.rename
     import_rosbag2(
         source,
         output,
-        robot=robot,
-        topic=options.topic,
-        joint_names=options.joint_names,
+        robot=robot_of(lambda: recorded_joints(source, topic, names)),
+        topic=topic,
+        effort=stated.effort,
+        clock=stated.clock,
+        joint_names=names,
         held_joints=held_joints,
         use=use,
         force=force,
         outside_limits=options.outside_limits,
     )
+    entries = open_archive(output, fields=()).header.entries
+    read = {key: entries[key] for key in ("topic", "clock", "effort")}
+    bag = BagMap.model_validate({**read, "rename": dict(names)})
     lines = tuple(
         f"{channel.name}: {channel.kind}, {next(iter(UNITS[channel.kind]))}, by the field of the "
         "joint states; joints by their names"
         for channel in channels_of(source)
-        if channel.kind is not None and options.topic in (None, channel.name.rpartition("/")[0])
+        if channel.kind is not None and topic in (None, channel.name.rpartition("/")[0])
     )
-    return ImportedRecording(output, None, lines)
+    return ImportedRecording(output, None, lines, bag)
 
 
 def _joints_of_map(columns: Path) -> tuple[str, ...]:

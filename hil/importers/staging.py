@@ -68,7 +68,7 @@ class Staging:
             for archive, place in places.items():
                 with replace_file(place) as temporary:
                     shutil.copyfile(archive, temporary)
-        texts = {place: self.recordings[archive].map_text for archive, place in places.items()}
+        texts = {place: self.recordings[archive].text for archive, place in places.items()}
         different = set(filter(None, texts.values()))
         for place, text in texts.items():
             if text is not None:

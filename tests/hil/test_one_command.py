@@ -249,6 +249,41 @@ def test_a_bag_needs_no_map(tmp_path: Path, urdf: Path) -> None:
     assert all(np.array_equal(first[name], second[name]) for name in second)
 
 
+def test_a_bag_leaves_how_it_was_read(tmp_path: Path, urdf: Path) -> None:
+    """Its map says the topic of two, the stamps and the content of the effort field."""
+    source = tmp_path / "x.db3"
+    bag(source, {"/arm": (STATE, WHOLE), "/gripper": (STATE, WHOLE[:20])})
+    first = hil(
+        "import", "log", source, "--urdf", urdf, "--topic", "/arm", "-o", tmp_path / "a.mcap"
+    )
+    assert first.exit_code == 0, (first.output, first.exception)
+    text = (tmp_path / "a.map.toml").read_text()
+    assert 'topic = "/arm"' in text
+    assert 'clock = "header"' in text
+    again = ("--map", tmp_path / "a.map.toml", "-o", tmp_path / "b.mcap")
+    second = hil("import", "log", source, "--urdf", urdf, *again)
+    assert second.exit_code == 0, (second.output, second.exception)
+    columns = [open_archive(tmp_path / f"{name}.mcap").columns for name in "ab"]
+    assert all(np.array_equal(columns[0][name], columns[1][name]) for name in columns[1])
+
+
+def test_a_bag_is_identified_again_with_its_map(tmp_path: Path, urdf: Path) -> None:
+    source, folder = tmp_path / "x.db3", tmp_path / "out"
+    bag(source, {"/joint_states": (STATE, WHOLE)})
+    result = hil("identify", source, "--urdf", urdf, "--output", folder)
+    assert result.exit_code in (0, 5), (result.output, result.exception)
+    again = ("--map", folder / "map.toml", "--output", tmp_path / "again")
+    assert hil("identify", source, "--urdf", urdf, *again).exit_code == result.exit_code
+
+
+def test_a_map_of_a_bag_with_a_wrong_entry(tmp_path: Path, urdf: Path) -> None:
+    (tmp_path / "m.toml").write_text('[bag]\nclock = "sun"\n')
+    bag(tmp_path / "x.db3", {"/joint_states": (STATE, WHOLE)})
+    given = ("--urdf", urdf, "--map", tmp_path / "m.toml")
+    refused = hil("import", "log", tmp_path / "x.db3", *given, "-o", tmp_path / "a.mcap")
+    assert "bag.clock" in str(refused.exception)
+
+
 class TestIdentify:
     def test_a_log_and_a_urdf_are_enough(self, tmp_path: Path, urdf: Path) -> None:
         """One log fitted, one predicted; the folder holds what the next run needs."""

@@ -1,0 +1,59 @@
+"""How the joint states of a bag were read, as a file with which they are read so again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from hil.cell.errors import first_error
+from hil.errors import SourceError
+from hil.importers.column_map import map_text
+from hil.importers.rosbag2 import Clock, Effort
+from hil.reading import parse_toml
+from hil.toml_text import to_text
+
+_COMMENT: Final = "How hil read the joint states of the bag; joints by their names"
+_DOCUMENTATION: Final = "docs/bring-your-own-robot.md"
+
+
+class BagMap(BaseModel):
+    """The table ``[bag]`` of a map, in place of the quantities of a column map.
+
+    Attributes:
+        topic: of the joint states; None where the bag has only one.
+        clock: stamps that were used: ``header`` of the messages, or those of the ``bag``.
+        effort: content of the effort field.
+        rename: joint in the URDF by name in the bag, where they differ.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    topic: str | None = None
+    clock: Clock = "auto"
+    effort: Effort = "torque"
+    rename: Mapping[str, str] = {}
+
+    @property
+    def text(self) -> str:
+        """The map, TOML."""
+        return to_text({"bag": self.model_dump(exclude_defaults=True)}, {"": _COMMENT})
+
+    @classmethod
+    def load(cls, path: Path) -> BagMap | None:
+        """Read the table of a map; None if the map has none.
+
+        Raises:
+            SourceError: it is not valid.
+        """
+        try:
+            table = parse_toml(map_text(path)).get("bag")
+            return None if table is None else cls.model_validate(table)
+        except ValidationError as error:
+            wrong = first_error(path, error, cls, documentation=_DOCUMENTATION)
+            field = f"bag.{wrong.field}"
+            raise SourceError(path, wrong.problem, field=field, remedy=wrong.remedy) from error
+        except (OSError, ValueError):
+            return None  # the column map says what is wrong with the file
