@@ -8,6 +8,7 @@ readings that fit alike; *wrong*: a row that is called sure says something else 
 
 from __future__ import annotations
 
+import re
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -37,6 +38,7 @@ Array = NDArray[np.float64]
 
 _SEED: Final = 20261126
 _CUT: Final = 3.0  # Hz
+_NEAR: Final = 10.0  # deg
 _LATE: Final = 0.03  # s
 _AHEAD: Final = 0.025  # s
 _EXPECTED: Final = {
@@ -149,7 +151,10 @@ def plants(arm: Arm) -> Iterator[Planted]:
     for joint, angle in ((1, 0.6), (2, -0.6), (3, np.pi / 2.0)):
         zero = np.zeros(n)
         zero[joint] = angle
-        yield of(f"zero of joint {joint + 1}", "zero", names[joint], position=q + zero)
+        yield of(
+            f"zero of joint {joint + 1}", "zero", f"{np.degrees(-angle):.0f} deg: {names[joint]}",
+            position=q + zero,
+        )  # fmt: skip
 
 
 def _wrapped(q: Array) -> Array:
@@ -199,7 +204,7 @@ def judged(arm: Arm, planted: Planted, folder: Path) -> dict[str, object]:
     except HilError as error:
         return {**row, "right": False, "wrong": "", "said": f"refused: {error}"}
     said = _said(found, planted.aspect)
-    right = all(any(word in text for text in said) for word in planted.words)
+    right = all(any(_says(text, word) for text in said) for word in planted.words)
     return {
         **row,
         "right": right,
@@ -207,6 +212,22 @@ def judged(arm: Arm, planted: Planted, folder: Path) -> dict[str, object]:
         "seconds": round(time.process_time() - begin, 1),
         "said": " | ".join(said),
     }
+
+
+def _says(text: str, words: str) -> bool:
+    """Return whether a text contains words; the angle of a zero to `_NEAR`.
+
+    That the torque does not show the zero of the joint is right as well.
+    """
+    angle, _, joint = words.partition(" deg: ")
+    if not joint:
+        return words in text
+    if joint in text.partition("not shown: ")[2].split(" (")[0].split(", "):
+        return True
+    said = [
+        float(size) for size, name in re.findall(r"(-?\d+) deg: ([\w.-]+)", text) if name == joint
+    ]
+    return any(abs((size - float(angle) + 180.0) % 360.0 - 180.0) <= _NEAR for size in said)
 
 
 def _said(found: Look, aspect: str) -> list[str]:
@@ -231,7 +252,7 @@ def _wrong(found: Look, planted: Planted) -> str:
         right = [_EXPECTED[row.aspect]]
         if row.aspect in planted.aspect and planted.meaning != "as it is":
             right = [*planted.words, *(right if row.aspect == "angle unit" else ())]
-        if not any(word in row.reading for word in right):
+        if not any(_says(row.reading, word) for word in right):
             wrong.append(row.aspect)
     return ", ".join(wrong)
 

@@ -86,7 +86,8 @@ def advice_on_branches(chain: Chain) -> str | None:
 
 def _branch(chain: Chain, end: int) -> set[int]:
     """Return the joints from the base to one of them."""
-    joints, joint = set(), end
+    joints: set[int] = set()
+    joint = end
     while joint >= 0:
         joints.add(joint)
         joint = int(chain.parents[joint])

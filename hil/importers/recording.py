@@ -173,7 +173,8 @@ def _import_bag(
     *,
     force: bool,
 ) -> ImportedRecording:
-    topic, names = stated.topic, stated.rename
+    topic = stated.topic
+    names = stated.rename
     import_rosbag2(
         source,
         output,

@@ -111,11 +111,15 @@ def _undecided(source: Path, choices: tuple[Choice, ...]) -> SourceError:
     readings = " or ".join(
         choice.reading + error for choice, error in zip(choices, errors, strict=True)
     )
-    lines = " or ".join(choice.line for choice in choices)
-    remedy = (
-        f"write the map with `hil look {typed(source.name)} --urdf ARM.urdf -o map.toml`, "
-        f"add one of the lines {lines}, and give it with --map"
-    )
+    remedy = "name the joint, unit and sign of each column in a map (--map map.toml)"
+    if all(choice.entries for choice in choices):
+        lines = " or ".join(choice.line for choice in choices)
+        remedy = (
+            f"write the map with `hil look {typed(source.name)} --urdf ARM.urdf -o map.toml`, "
+            f"add one of the lines {lines}, and give it with --map"
+        )
+    elif any(choice.line.startswith("--") for choice in choices):
+        remedy = f"state {' or '.join(choice.line for choice in choices if choice.line)}"
     problem = f"two readings fit alike: {readings}"
     return SourceError(source, problem, field=choices[0].aspect, remedy=remedy)
 

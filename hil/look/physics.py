@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -21,15 +21,46 @@ from identification.factor.factor import Factor
 from identification.model.regressor import LINK_SYMBOLS
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing
+from identification.text import percentage
 from identification.validation.plausibility import NominalScale, nominal_scale
-from identification.validation.readings import Axes, Change, Meaning, Readings, Step
+from identification.validation.readings import (
+    EXPLAINED,
+    SEPARATE,
+    Axes,
+    Change,
+    Meaning,
+    Readings,
+    Step,
+)
 
 Array = NDArray[np.float64]
 
-_SEPARATE: Final = 3.0  # standard errors
+MOUNTINGS: Final = {
+    "": (0.0, 0.0, 0.0),
+    "upside down": (0.0, 0.0, 9.81),
+    "on a wall, +x down": (9.81, 0.0, 0.0),
+    "on a wall, -x down": (-9.81, 0.0, 0.0),
+    "on a wall, +y down": (0.0, 9.81, 0.0),
+    "on a wall, -y down": (0.0, -9.81, 0.0),
+    "upright": (0.0, 0.0, -9.81),
+}
+"""Gravity in the base frame by mounting [m/s²]; "" for a torque without gravity."""
+_ASPECTS: Final[Mapping[Meaning, str]] = {
+    "torque sign": "signs",
+    "position sign": "signs",
+    "axis sign": "signs",
+    "torque order": "order",
+    "position order": "order",
+    "joint order": "order",
+    "degrees": "angle unit",
+    "radians": "angle unit",
+    "zero": "zero",
+    "no gravity": "gravity",
+    "mounting": "mounting",
+}
+"""The row of the table that a change belongs to."""
 _HALF: Final = 0.5
 _ALIKE: Final = 1.02  # error ratio of readings of which the recording does not choose one
-_UNSEEN: Final = 0.002  # change of the error ratio of a zero that the torque does not show
 _OTHER_UNIT: Final = 3.0  # factor beyond which the masses of a URDF do not explain a torque
 _THOUSAND: Final = 1000.0
 _WEAK: Final = 0.9  # posterior over prior deviation of a parameter that the recording hardly moves
@@ -91,6 +122,8 @@ class Finding:
             self._payload(),
         ]
         error = self.readings.score.overall
+        if error > EXPLAINED:
+            found = [_no_longer_sure(row, error) for row in found]
         found.append(
             Row("as read", f"torque predicted to {100.0 * error:.2g} % from other parts", "sure",
                 "with free parameters, before a fit of the friction law")
@@ -113,7 +146,7 @@ class Finding:
         certainty: Certainty = "sure" if all(step.sure for step in steps) else "open"
         nearest = self.readings.nearest
         rivals = [nearest[step.change.meaning] for step in steps if step.change.meaning in nearest]
-        if any(rival[1].sigmas < _SEPARATE and _repeats(rival[0], steps) for rival in rivals):
+        if any(rival[1].sigmas < SEPARATE and _repeats(rival[0], steps) for rival in rivals):
             certainty = "open"
         reason = f"error {ratio:.2f} times that as recorded ({-sigmas:.0f} standard errors)"
         if ratio > 1.0 - 0.05:
@@ -128,9 +161,9 @@ class Finding:
             return Row(aspect, reading, "likely", "not examined", decide)
         change, against = min(rivals, key=lambda rival: rival[1].sigmas)
         reason = f"next best: {self.described(change)}, error {against.ratio:.2f} times"
-        if against.sigmas > _SEPARATE:
+        if against.sigmas > SEPARATE:
             return Row(aspect, reading, "sure", reason)
-        if against.sigmas < _HALF * _SEPARATE or against.ratio < _ALIKE:
+        if against.sigmas < _HALF * SEPARATE or against.ratio < _ALIKE:
             both = f"{reading}, or {self.described(change)}"
             return Row(aspect, both, "open", reason, decide)
         return Row(aspect, reading, "likely", reason, decide)
@@ -151,6 +184,11 @@ class Finding:
             "zero": f"zero moved by {np.degrees(change.size):.0f} deg",
         }
         text = texts[change.meaning]
+        if len(change.joints) > 2 and change.order:
+            names = self.cell.joint_names
+            pairs = zip(change.joints, change.order, strict=True)
+            listing = ", ".join(f"{names[joint]} in place of {names[at]}" for joint, at in pairs)
+            return f"{text.removesuffix(' exchanged')} in another order: {listing}"
         return f"{text}: {self.names(change)}" if change.joints else text
 
     def _order(self) -> Row:
@@ -176,7 +214,7 @@ class Finding:
             text = "; ".join(self.described(step.change) for step in steps)
             return self._found("signs", steps, text, "push one joint by hand and see its torque")
         friction, share = self.readings.score.friction, self.readings.score.share
-        dissipates = (friction > _SEPARATE) & (share > 0.0)
+        dissipates = (friction > SEPARATE) & (share > 0.0)
         if dissipates.all():
             return Row(
                 "signs", "as the URDF's axes", "sure", "friction takes energy in every joint"
@@ -198,17 +236,18 @@ class Finding:
 
     def _zero(self) -> Row:
         steps = self.steps("zero")
-        if not steps and "zero" in self.readings.nearest:
-            change, against = self.readings.nearest["zero"]
-            if abs(against.ratio - 1.0) < _UNSEEN:
-                text = f"as the URDF; the torque does not show that of {self.names(change)}"
-                decide = "compare a posture with the URDF's (viewer)"
-                return Row("zero", text, "likely", "its error is the same for other zeros", decide)
-        if not steps:
-            return self._unchanged("zero", "as the URDF", "zero",
-                              decide="compare a posture with the URDF's (viewer)")  # fmt: skip
-        text = "; ".join(self.described(step.change) for step in steps)
-        return self._found("zero", steps, text, "compare a posture with the URDF's (viewer)")
+        decide = "compare a posture with the URDF's (viewer)"
+        unseen = [self.cell.joint_names[joint] for joint in self.readings.unseen_zeros]
+        if steps:
+            text = "; ".join(self.described(step.change) for step in steps)
+            return self._found("zero", steps, text, decide)
+        row = self._unchanged("zero", "as the URDF", "zero", decide=decide)
+        if not unseen:
+            return row
+        text = f"as the URDF where the torque shows it; not shown: {', '.join(unseen)}"
+        change, against = self.readings.nearest["zero"]
+        reason = f"{self.described(change)}: error {against.ratio:.2f} times"
+        return Row("zero", text, "open", reason, decide)
 
     def _gravity(self) -> Row:
         steps = self.steps("no gravity")
@@ -280,7 +319,11 @@ class Finding:
             else f"{key} = {_toml(value)}"
             for key, value in entries.items()
         )
-        return Choice("signs", self.described(change), error, line, tuple(entries.items()))
+        if not line and change.meaning in ("no gravity", "mounting"):
+            gravity = (0.0, 0.0, 0.0) if change.meaning == "no gravity" else MOUNTINGS[change.name]
+            line = f"--gravity {' '.join(f'{part:g}' for part in gravity)}"
+        aspect = _ASPECTS[change.meaning]
+        return Choice(aspect, self.described(change), error, line, tuple(entries.items()))
 
     def _sides(self) -> tuple[Choice, ...]:
         ratio = 1.0 / (self.common or 1.0)
@@ -313,6 +356,14 @@ class Finding:
         if not steps:
             return ()
         return (f"--gravity {' '.join(f'{part:g}' for part in self.readings.model.gravity)}",)
+
+
+def _no_longer_sure(row: Row, error: float) -> Row:
+    """Return a row that rests on a torque which the arm does not explain."""
+    if row.certainty != "sure" or row.aspect == "payload":
+        return row
+    reason = f"{row.reason}; but {percentage(error)} of the torque stays unexplained"
+    return replace(row, certainty="likely", reason=reason)
 
 
 def _repeats(change: Change, steps: list[Step]) -> bool:

@@ -30,16 +30,6 @@ from identification.validation.readings import Axes, Readings, find_readings
 SETTINGS: Final = Preprocessing(14.0, left_out="rests")
 """Preparation of a recording whose readings are compared."""
 _DELAY_SAMPLES: Final = 20_000
-MOUNTINGS: Final = {
-    "": (0.0, 0.0, 0.0),
-    "upside down": (0.0, 0.0, 9.81),
-    "on a wall, +x down": (9.81, 0.0, 0.0),
-    "on a wall, -x down": (-9.81, 0.0, 0.0),
-    "on a wall, +y down": (0.0, 9.81, 0.0),
-    "on a wall, -y down": (0.0, -9.81, 0.0),
-    "upright": (0.0, 0.0, -9.81),
-}
-"""Gravity in the base frame by mounting [m/s²]; "" for a torque without gravity."""
 
 
 def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> Look:
@@ -107,7 +97,7 @@ def _readings(cell: Cell, recording: Recording, imported: ImportedRecording) -> 
     stated = any("position" in line and "no unit stated" not in line for line in imported.lines)
     mountings = {
         name: _mounted(cell, gravity)
-        for name, gravity in MOUNTINGS.items()
+        for name, gravity in physics.MOUNTINGS.items()
         if not np.allclose(gravity, cell.model.gravity)
     }
     return find_readings(

@@ -1,11 +1,12 @@
 """Other readings of a recording: sign, order, unit and zero of its joints, gravity in its torque.
 
-The torque of every fifth block is predicted from the others, as in
-:mod:`identification.validation.causes`, whose corrections of signs and orders are used: as read and
-with one reading after the other. Signs are also decided by friction, which takes energy from a
-joint. The best reading is adopted if it is significant, and the search is repeated with it.
-Parameters have the prior of :mod:`identification.estimators.prior`, so that geometry alone is
-enough and masses help where they are known.
+The arm is fitted to the torque as read and with one reading after the other, with the corrections
+of :mod:`identification.validation.causes`. Parameters have the prior of
+:mod:`identification.estimators.prior`, in which ten rows count as one: geometry alone is enough,
+masses help where they are known, and a wrong reading is not explained by bodies that no arm has.
+All readings have as many parameters, so the errors of their fits are compared, block by block.
+Among readings that fit alike, those in which friction takes energy from every joint come first. The
+best reading is adopted if it is significant, and the search is repeated with it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.estimators.prior import GaussianPrior, body_prior, posterior_values
+from identification.estimators.prior import body_prior, posterior_values
 from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
@@ -44,30 +45,33 @@ Meaning = Literal[
 SURE: Final = 4.5
 """Standard errors over the blocks of a reading that is sure, whatever the number tried: with 19
 degrees of freedom one of 4 000 exceeds it by chance."""
-_SEPARATE: Final = 3.0  # standard errors by which the second best reading is worse
+SEPARATE: Final = 3.0
+"""Standard errors by which the second best reading is worse."""
+EXPLAINED: Final = 0.15
+"""Error of the torque above which no reading is sure: the arm does not explain the torque."""
 _LEAST_GAIN: Final = 0.02  # relative reduction of the error of a reading that is adopted
 _ALIKE: Final = 0.05  # the same, of readings that fit alike
 _HARM: Final = 1.1  # error ratio of a joint beyond which a reading spoils it
 _DISSIPATES: Final = 4.0  # standard errors of a friction that drives a joint
 _LEAST_FRICTION: Final = 0.02  # of the torque of a joint
 _ROWS: Final = 700
+_FEWER_ROWS: Final = 250  # on which all readings are tried first
 _BLOCKS: Final = 20
 _FOLDS: Final = 5
-# Rows that count as one beside the prior: seven in all. A wrong reading needs bodies that no arm
-# has, which a weak prior would allow.
-_ROWS_PER_FACT: Final = 100.0
-_LARGE: Final = 0.15  # relative reduction of the error that chance alone does not make
-_CLEAR: Final = 3.0  # standard errors of a reading that reduces the error so much
-_POOR: Final = 0.15  # error of the torque from which on whole orders are always searched for
-_STARTS: Final = 8
-_FEWER_ROWS: Final = 200  # on which orders are tried
+# Rows that count as one beside the prior, as many as a hundredth of a second has at 1 kHz: the
+# correlation of residuals is longer, so that the prior counts for more rather than less.
+_ROWS_PER_FACT: Final = 10.0
+_STARTS: Final = 3  # of the search for an order: as read, and two at random
 _IMPROVES: Final = 0.98  # error ratio of one exchange from which a whole order is searched for
-_CLOSER: Final = 24  # changes of least error on a fifth of the blocks, which are tried on all
+_ORDERS: Final = 2  # best orders of each kind that are compared
+_CLOSER: Final = 12  # changes of least error on fewer rows, which are compared
 _MOST_STEPS: Final = 6
 _SPEED: Final = 0.9  # quantile of the speed at which friction is judged
-_ZEROS: Final = (-90.0, -45.0, -20.0, 20.0, 45.0, 90.0, 180.0)  # deg
+_ZEROS: Final = (-135.0, -90.0, -45.0, -20.0, 20.0, 45.0, 90.0, 135.0, 180.0)  # deg
 _NEARER: Final = (-0.5, -0.25, 0.25, 0.5)  # of a zero, tried about it
 _DEGREE: Final = np.pi / 180.0
+_SIGNS: Final[tuple[Meaning, ...]] = ("torque sign", "position sign", "axis sign")
+_IN_ORDER: Final[tuple[Meaning, ...]] = ("torque order", "position order", "joint order")
 
 
 class Change(NamedTuple):
@@ -91,7 +95,7 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Errors of predicted blocks under one reading.
+    """Errors of the blocks under one reading, fitted or predicted.
 
     Attributes:
         squares: squared errors (B, n).
@@ -115,6 +119,17 @@ class Score:
     def overall(self) -> float:
         """Error over all joints as a share of the torque."""
         return float(np.sqrt(self.squares.sum() / max(self.torque.sum(), 1e-300)))
+
+    @property
+    def sum_of_logarithms(self) -> float:
+        """Sum over the joints of the logarithm of the squared error."""
+        squares = self.squares.sum(axis=0)
+        return float(np.log(np.where(squares > 0.0, squares, 1.0)).sum())
+
+    @property
+    def driven(self) -> NDArray[np.bool_]:
+        """Whether friction would drive each joint (n,)."""
+        return (self.friction < -_DISSIPATES) & (self.share < -_LEAST_FRICTION)
 
 
 class Comparison(NamedTuple):
@@ -158,8 +173,8 @@ class Step:
 
     @property
     def sure(self) -> bool:
-        """Whether nothing else fits alike."""
-        return not self.alike
+        """Whether nothing else fits alike, and the arm explains the torque."""
+        return not self.alike and self.error < EXPLAINED
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +187,7 @@ class Readings:
         samples: few rows, as read.
         score: of these.
         nearest: by meaning, the change that comes nearest to the reading found, compared with it.
+        unseen_zeros: joints of which the torque shows no zero: others fit alike.
     """
 
     steps: tuple[Step, ...]
@@ -179,6 +195,7 @@ class Readings:
     samples: Samples
     score: Score
     nearest: Mapping[Meaning, tuple[Change, Comparison]]
+    unseen_zeros: tuple[int, ...] = ()
 
 
 def find_readings(
@@ -193,7 +210,7 @@ def find_readings(
     `mountings` are models with another gravity, by name ("" without gravity); `unit_is_open`
     whether nothing states the unit of the positions.
     """
-    few = samples.thinned(max(1, len(samples.torque) // _ROWS))
+    few = _thinned(samples, _ROWS)
 
     def started() -> _Search:
         return _Search(model, few, mountings or {}, unit_is_open=unit_is_open)
@@ -210,7 +227,11 @@ def find_readings(
         single = again.single_as_good_as(search.score)
         if single is not None:
             search, steps = again, [single]
-    return Readings(tuple(steps), search.model, search.samples, search.score, search.nearest())
+    nearest = search.nearest()
+    score = score_of(search.model, search.samples)
+    return Readings(
+        tuple(steps), search.model, search.samples, score, nearest, search.unseen_zeros()
+    )
 
 
 class _Search:
@@ -227,51 +248,57 @@ class _Search:
         self.model, self.samples = model, samples
         self._mountings = mountings
         self._unit_is_open = unit_is_open
-        self.score = score_of(model, samples)
-        self._prior = _prior(model, samples)
+        self.score = fit_score(model, samples)
         self._trials: list[Trial] | None = None
 
     def by_friction(self) -> Step | None:
         """Adopt the sign of joints that friction would drive; None if it drives none."""
-        driven = (self.score.friction < -_DISSIPATES) & (self.score.share < -_LEAST_FRICTION)
-        joints = tuple(np.flatnonzero(driven).tolist())
+        score = score_of(self.model, self.samples)  # deviations of the fit itself are too small
+        joints = tuple(np.flatnonzero(score.driven).tolist())
         if not joints:
             return None
-        moved = np.abs(self.score.friction) > _DISSIPATES
+        moved = np.abs(score.friction) > _DISSIPATES
         kinds: tuple[Meaning, ...] = ("torque sign", "position sign")
-        if int(driven.sum()) >= max(2, int(moved.sum())):
+        if len(joints) >= max(2, int(moved.sum())):
             kinds = ("torque sign",)
             joints = tuple(range(self.model.n_joints))
         trials = [self._try(Change(kind, joints)) for kind in kinds]
         best = min(trials, key=lambda trial: trial.against.ratio)
         if best.against.ratio > 1.0 + _ALIKE or best.against.sigmas > SURE:
             return None
-        return self._adopt(best)
+        return self._adopt(best, trials)
 
     def by_prediction(self) -> Step | None:
-        """Adopt the change that predicts best; None if none is significant."""
+        """Adopt the change that fits best; None if none is significant."""
         trials = self._tried()
-        trials = [*trials, *self._orders(trials)]
-        good = [trial for trial in trials if _is_better(trial.against)]
-        good = [trial for trial in good if not self._is_spoilt(trial)]
+        good = [
+            trial
+            for trial in trials
+            if trial.against.ratio < 1.0 - _LEAST_GAIN
+            and trial.against.sigmas < -SURE
+            and not self._is_spoilt(trial)
+        ]
         if not good:
             return None
         best = min(good, key=lambda trial: trial.against.ratio)
+        close = [trial for trial in good if self._are_alike(trial, best)]
+        best = min(close, key=lambda trial: (int(trial.score.driven.sum()), trial.against.ratio))
         if best.change.meaning == "zero":
             best = self._nearer(best)
-        return self._adopt(best)
+        return self._adopt(best, good)
 
     def single_as_good_as(self, score: Score) -> Step | None:
-        """Adopt the one change that predicts as well as several do; None if none does."""
+        """Adopt the one change that fits as well as several do; None if none does."""
         trials = [
             trial
             for trial in self._tried()
-            if compare(trial.score, score, self.model).sigmas < _SEPARATE
+            if compare(trial.score, score, self.model).sigmas < SEPARATE
             and trial.score.overall < (1.0 + _ALIKE) * score.overall
+            and trial.score.driven.sum() <= score.driven.sum()
         ]
         if not trials:
             return None
-        return self._adopt(min(trials, key=lambda trial: trial.score.overall))
+        return self._adopt(min(trials, key=lambda trial: trial.score.overall), trials)
 
     def nearest(self) -> dict[Meaning, tuple[Change, Comparison]]:
         """Return by meaning the change that comes nearest to the reading found."""
@@ -282,30 +309,47 @@ class _Search:
                 nearest[meaning] = trial.change, trial.against
         return nearest
 
+    def unseen_zeros(self) -> tuple[int, ...]:
+        """Return the joints of which other zeros fit alike."""
+        joints = np.flatnonzero(self.model.chain.revolute).tolist()
+        unseen = []
+        for joint in joints:
+            trials = [self._try(Change("zero", (joint,), s * 45.0 * _DEGREE)) for s in (-1.0, 1.0)]
+            if min(trial.against.sigmas for trial in trials) < SEPARATE:
+                unseen.append(joint)
+        return tuple(unseen)
+
+    def _are_alike(self, trial: Trial, best: Trial) -> bool:
+        """Whether two changes fit alike, so that the recording does not choose one."""
+        return (
+            compare(trial.score, best.score, self.model).sigmas < SEPARATE
+            and trial.score.overall < (1.0 + _ALIKE) * best.score.overall
+        )
+
     def _orders(self, trials: Sequence[Trial]) -> Iterator[Trial]:
         """Yield whole orders: from several starts, the best exchange while the error falls."""
-        kinds: tuple[Meaning, ...] = ("torque order", "position order", "joint order")
-        is_poor = self.score.overall > _POOR
-        for kind in kinds:
+        is_poor = self.score.overall > EXPLAINED
+        for kind in _IN_ORDER:
             own = [trial for trial in trials if trial.change.meaning == kind]
             if not is_poor and not any(trial.against.ratio < _IMPROVES for trial in own):
                 continue
-            order = self._best_order(kind, _STARTS if is_poor else 1)
-            change = _order_change(kind, order)
-            if len(change.joints) > 2:
-                yield self._try(change)
+            tried = {_whole_order(trial.change, self.model.n_joints) for trial in own}
+            for order in self._best_orders(kind, _STARTS if is_poor else 1):
+                change = _order_change(kind, order)
+                if change.joints and order not in tried:
+                    yield self._try(change)
 
-    def _best_order(self, kind: Meaning, starts: int) -> tuple[int, ...]:
-        """Return the order of least error on few rows."""
-        few = self.samples.thinned(max(1, len(self.samples.torque) // _FEWER_ROWS))
-        known: dict[tuple[int, ...], float] = {}
+    def _best_orders(self, kind: Meaning, starts: int) -> list[tuple[int, ...]]:
+        """Return the orders of least error on few rows."""
+        few = _thinned(self.samples, _FEWER_ROWS)
+        errors: dict[tuple[int, ...], float] = {}
 
         def error(order: tuple[int, ...]) -> float:
-            if order not in known:
+            if order not in errors:
                 change = _order_change(kind, order)
                 samples = _reordered(self.model, few, change) if change.joints else few
-                known[order] = _error_of(score_of(self.model, samples, folds=1, prior=self._prior))
-            return known[order]
+                errors[order] = fit_score(self.model, samples).sum_of_logarithms
+            return errors[order]
 
         n, rng = self.model.n_joints, np.random.default_rng(0)
         for start in range(starts):
@@ -316,56 +360,58 @@ class _Search:
                 if error(best) >= error(order):
                     break
                 order = best
-        return min(known, key=lambda order: known[order])
+        return sorted(errors, key=lambda order: errors[order])[:_ORDERS]
 
     def _is_spoilt(self, trial: Trial) -> bool:
-        """Whether a change that concerns few joints predicts another one worse."""
-        orders = trial.change.meaning.endswith("order")
-        return trial.against.spoils and not orders
+        """Whether a change that concerns few joints fits another one worse, or drives one."""
+        if trial.change.meaning in _IN_ORDER:
+            return False
+        driven = int(trial.score.driven.sum()) > int(self.score.driven.sum())
+        return trial.against.spoils or driven
 
-    def _adopt(self, best: Trial) -> Step:
-        """Adopt a change, with those that fit alike."""
-        others = []
+    def _adopt(self, best: Trial, others: Sequence[Trial]) -> Step:
+        """Adopt a change, with those of others that fit alike."""
+        alternatives: list[Trial] = []
         if len(best.change.joints) < self.model.n_joints:  # an arm and its mirror image move alike
-            others = [self._try(change) for change in _alternatives(best.change)]
-        alike = [
-            (other.change, other.score.overall)
-            for other in others
+            alternatives = [self._try(change) for change in _alternatives(best.change)]
+            alternatives += [other for other in others if _differs(other.change, best.change)]
+        alike = {
+            other.change: other.score.overall
+            for other in alternatives
             if not self._is_spoilt(other)
-            and compare(other.score, best.score, self.model).sigmas < _SEPARATE
-            and other.score.overall < (1.0 + _ALIKE) * best.score.overall
-        ]
+            and self._are_alike(other, best)
+            and other.score.driven.sum() <= best.score.driven.sum()
+        }
         before = self.score.overall
         self.model, self.samples, self.score = best.model, best.samples, best.score
-        self._prior, self._trials = _prior(self.model, self.samples), None
+        self._trials = None
         ratio, sigmas, _ = best.against
-        return Step(best.change, best.score.overall, before, ratio, sigmas, tuple(alike))
+        ranked = sorted(alike.items(), key=lambda pair: pair[1])
+        return Step(best.change, best.score.overall, before, ratio, sigmas, tuple(ranked))
 
     def _tried(self) -> list[Trial]:
-        """Return the changes of least error, tried on all blocks."""
+        """Return the changes of least error, tried on all rows."""
         if self._trials is None:
-            changes = list(self._changes())
-            few = {change: self._error_of_few(change) for change in changes}
-            ranked = sorted(changes, key=lambda change: few[change])
+            few = _thinned(self.samples, _FEWER_ROWS)
+            errors: dict[Change, float] = {}
+            for change in self._changes():
+                model, samples = self._changed(change, few)
+                errors[change] = fit_score(model, samples).sum_of_logarithms
+            ranked = sorted(errors, key=lambda change: errors[change])
             closer = ranked[:_CLOSER]
             meanings = {change.meaning for change in closer}
             for change in ranked:
                 if change.meaning not in meanings:
                     meanings.add(change.meaning)
                     closer.append(change)
-            self._trials = [self._try(change) for change in closer]
+            trials = [self._try(change) for change in closer]
+            self._trials = [*trials, *self._orders(trials)]
         return self._trials
-
-    def _error_of_few(self, change: Change) -> float:
-        """Return the sum of the logarithms of squared errors of one fold with a change."""
-        model, samples = self._changed(change)
-        prior = self._prior if model is self.model else None
-        return _error_of(score_of(model, samples, folds=1, prior=prior))
 
     def _nearer(self, best: Trial) -> Trial:
         """Return the trial of a zero with an angle that fits better."""
         for scale in (1.0, 0.25):
-            sizes = [best.change.size * (1.0 + scale * part) for part in _NEARER]
+            sizes = [best.change.size + 45.0 * _DEGREE * scale * part for part in _NEARER]
             trials = [self._try(best.change._replace(size=size)) for size in sizes]
             best = min([best, *trials], key=lambda trial: trial.against.ratio)
         return best
@@ -378,28 +424,26 @@ class _Search:
         yield from (Change("mounting", (), 0.0, name) for name in self._mountings if name)
         if "" in self._mountings:
             yield Change("no gravity")
-        signs: tuple[Meaning, ...] = ("torque sign", "position sign", "axis sign")
-        orders: tuple[Meaning, ...] = ("torque order", "position order", "joint order")
+        yield Change("torque sign", tuple(range(n)))
         for joint in range(n):
             if joint in moved:
-                yield from (Change(kind, (joint,)) for kind in signs)
+                yield from (Change(kind, (joint,)) for kind in _SIGNS)
             if self.model.chain.revolute[joint]:
                 yield from (Change("zero", (joint,), angle * _DEGREE) for angle in _ZEROS)
         for pair in combinations(moved, 2):
-            yield from (Change(kind, pair) for kind in orders)
+            yield from (Change(kind, pair) for kind in _IN_ORDER)
 
     def _try(self, change: Change) -> Trial:
-        model, samples = self._changed(change)
-        score = score_of(model, samples)
+        model, samples = self._changed(change, self.samples)
+        score = fit_score(model, samples)
         return Trial(change, model, samples, score, compare(score, self.score, self.model))
 
-    def _changed(self, change: Change) -> tuple[RobotModel, Samples]:
-        model, samples, meaning = self.model, self.samples, change.meaning
-        if meaning == "mounting":
+    def _changed(self, change: Change, samples: Samples) -> tuple[RobotModel, Samples]:
+        if change.meaning == "mounting":
             return self._mountings[change.name], samples
-        if meaning == "no gravity":
+        if change.meaning == "no gravity":
             return self._mountings[""], samples
-        return model, _moved(model, samples, change)
+        return self.model, _moved(self.model, samples, change)
 
 
 def _moved(model: RobotModel, samples: Samples, change: Change) -> Samples:
@@ -446,11 +490,6 @@ def _reordered(model: RobotModel, samples: Samples, change: Change) -> Samples:
     return samples
 
 
-def _error_of(score: Score) -> float:
-    squares = score.squares.sum(axis=0)
-    return float(np.log(np.where(squares > 0.0, squares, 1.0)).sum())
-
-
 def _exchanged(order: tuple[int, ...], pair: tuple[int, int]) -> tuple[int, ...]:
     places = list(order)
     first, second = pair
@@ -464,11 +503,22 @@ def _order_change(meaning: Meaning, order: tuple[int, ...]) -> Change:
     return Change(meaning, joints, order=tuple(order[joint] for joint in joints))
 
 
-def _is_better(against: Comparison) -> bool:
-    """Whether a change reduces the error by more than chance, of all that are tried."""
-    if against.ratio < 1.0 - _LARGE and against.sigmas < -_CLEAR:
-        return True
-    return against.ratio < 1.0 - _LEAST_GAIN and against.sigmas < -SURE
+def _whole_order(change: Change, joints: int) -> tuple[int, ...]:
+    """Return the places of all n joints under a change of order."""
+    order = list(range(joints))
+    for joint, place in zip(change.joints, change.places, strict=True):
+        order[joint] = place
+    return tuple(order)
+
+
+def _differs(change: Change, other: Change) -> bool:
+    """Whether two changes are not angles of one zero."""
+    is_zero = change.meaning == other.meaning == "zero" and change.joints == other.joints
+    return change != other and not is_zero
+
+
+def _thinned(samples: Samples, rows: int) -> Samples:
+    return samples.thinned(max(1, len(samples.torque) // rows))
 
 
 def _factor(model: RobotModel, samples: Samples) -> Factor:
@@ -476,56 +526,67 @@ def _factor(model: RobotModel, samples: Samples) -> Factor:
     return Factor.of(model, samples, index=index)
 
 
-def _prior(model: RobotModel, samples: Samples) -> GaussianPrior:
-    return body_prior(model, _factor(model, samples)).gaussian
-
-
-def score_of(
-    model: RobotModel,
-    samples: Samples,
-    *,
-    folds: int = _FOLDS,
-    prior: GaussianPrior | None = None,
-) -> Score:
-    """Predict every fifth of `_BLOCKS` blocks of samples from the others, or of `folds` of them.
-
-    `prior` is that of :func:`identification.estimators.prior.body_prior` if it is known.
-    """
+def fit_score(model: RobotModel, samples: Samples) -> Score:
+    """Fit samples with the arm's prior; errors by `_BLOCKS` blocks."""
     factor = _factor(model, samples)
-    prior = prior or body_prior(model, factor).gaussian
-    squares, weights, estimates = np.zeros((len(factor), factor.n_joints)), None, []
-    for fold in range(folds):
+    prior = body_prior(model, factor).gaussian
+    values, weights = posterior_values(factor, prior, _ROWS_PER_FACT)
+    columns = _friction_columns(model, samples)
+    information = factor.weighted(weights).A + _ROWS_PER_FACT * prior.information
+    scale = np.sqrt(np.maximum(np.diag(information), np.finfo(np.float64).tiny))
+    inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)
+    spread = columns / scale
+    variance = _ROWS_PER_FACT * np.einsum("jp,pq,jq->j", spread, inverse, spread)
+    squares = _squares(factor, values, slice(None))
+    return _score(factor, squares, columns @ values, np.sqrt(np.maximum(variance, 0.0)))
+
+
+def score_of(model: RobotModel, samples: Samples) -> Score:
+    """Predict every fifth of `_BLOCKS` blocks of samples from the others."""
+    factor = _factor(model, samples)
+    prior = body_prior(model, factor).gaussian
+    squares = np.zeros((len(factor), factor.n_joints))
+    weights: Array | None = None
+    estimates: list[Array] = []
+    for fold in range(_FOLDS):
         left_out = np.arange(len(factor)) % _FOLDS == fold
         values, weights = posterior_values(factor.without(left_out), prior, _ROWS_PER_FACT, weights)
         estimates.append(values)
-        for joint, (gram, columns) in enumerate(zip(factor.matrices, factor.columns, strict=True)):
-            residual = np.append(-values[columns], 1.0)
-            squares[left_out, joint] = (gram[left_out] @ residual) @ residual
+        squares[left_out] = _squares(factor, values, left_out)
+    friction = np.array(estimates) @ _friction_columns(model, samples).T
+    deviation = np.sqrt((_FOLDS - 1) * friction.var(axis=0))
+    return _score(factor, squares, friction.mean(axis=0), deviation)
+
+
+def _squares(factor: Factor, values: Array, blocks: slice | NDArray[np.bool_]) -> Array:
+    """Return the squared errors of parameters in some blocks (B, n)."""
+    squares = []
+    for gram, columns in zip(factor.matrices, factor.columns, strict=True):
+        residual = np.append(-values[columns], 1.0)
+        squares.append((gram[blocks] @ residual) @ residual)
+    return np.maximum(np.column_stack(squares), 0.0)
+
+
+def _score(factor: Factor, squares: Array, friction: Array, deviation: Array) -> Score:
     torque = factor.gram[:, -1, -1]
-    friction, deviation = _friction(model, samples, np.array(estimates))
     rms = np.sqrt(torque / np.maximum(factor.samples, 1))
     return Score(
-        np.maximum(squares, 0.0),
+        squares,
         torque,
         friction / np.maximum(deviation, 1e-300),
         friction / np.maximum(rms, 1e-300),
     )
 
 
-def _friction(model: RobotModel, samples: Samples, estimates: Array) -> tuple[Array, Array]:
-    """Return the friction of each joint at a usual speed and its jackknife deviation (n,), (n,).
-
-    `estimates` are the parameters without each fold (F, p).
-    """
+def _friction_columns(model: RobotModel, samples: Samples) -> Array:
+    """Return the friction of each joint at a usual speed as a sum of the parameters (n, p)."""
     speed = np.quantile(np.abs(samples.motion.velocity), _SPEED, axis=0)
     columns = np.zeros((model.n_joints, model.n_parameters))
     for place, (_, term, joint, motor, _) in enumerate(model.friction.terms, model.base.rank):
         if not motor and term.is_friction and not term.of_load:
             law, here = model.friction.laws[joint], speed[joint : joint + 1]
             columns[joint, place] = term.column(here, law.sign(here))[0]
-    friction = estimates @ columns.T
-    count = len(estimates)
-    return friction.mean(axis=0), np.sqrt((count - 1) * friction.var(axis=0))
+    return columns
 
 
 def compare(score: Score, other: Score, model: RobotModel) -> Comparison:
@@ -551,9 +612,7 @@ def compare(score: Score, other: Score, model: RobotModel) -> Comparison:
 
 def _alternatives(change: Change) -> Iterator[Change]:
     """Yield the changes that may have the same effect as one that was found."""
-    signs: tuple[Meaning, ...] = ("torque sign", "position sign")
-    orders: tuple[Meaning, ...] = ("torque order", "position order", "joint order")
-    for kinds in (signs, orders):
+    for kinds in (_SIGNS[:2], _IN_ORDER):
         if change.meaning in kinds:
             yield from (change._replace(meaning=kind) for kind in kinds if kind != change.meaning)
 

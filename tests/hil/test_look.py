@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
+import subprocess
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -179,3 +183,44 @@ def test_axes_of_changes_become_entries_of_a_map(tmp_path: Path) -> None:
     assert entries["torque.scale"] == [1.0, -1.0, 1.0]
     assert entries["position.offset"] == [0.5, 0.0, 0.0]
     assert concluded is not None
+
+
+class TestTerminal:
+    """Two readings that fit alike are asked for where a person can answer."""
+
+    @staticmethod
+    def asked(answer: str, *command: object) -> tuple[int, str]:
+        """Run `hil` on a pseudo-terminal; return exit status and screen after one answer."""
+        leader, follower = pty.openpty()
+        with subprocess.Popen(
+            [sys.executable, "-m", "hil", *map(str, command)],
+            stdin=follower, stdout=follower, stderr=follower,
+            env={**os.environ, "TERM": "dumb", "COLUMNS": "200"},
+        ) as process:  # fmt: skip
+            os.close(follower)
+            screen = b""
+            while True:
+                try:
+                    part = os.read(leader, 4096)
+                except OSError:  # of Linux, where the other end is closed
+                    break
+                if not part:
+                    break
+                screen += part
+                if screen.endswith(b"[0]: "):
+                    os.write(leader, f"{answer}\n".encode())
+            status = process.wait(timeout=60)
+        os.close(leader)
+        return status, screen.decode()
+
+    @pytest.mark.parametrize(("answer", "status"), [("0", 2), ("2", 0)])
+    def test_it_asks_which_of_two(
+        self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats], answer: str, status: int
+    ) -> None:
+        path = tmp_path / "a.csv"
+        columns = {**table, **of_motors(table)}
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *columns.values())
+        code, screen = self.asked(answer, "look", path, "--urdf", urdf)
+        assert "two readings fit alike" in screen
+        assert "side: 1 or 2, or 0 if unknown" in screen
+        assert code == status

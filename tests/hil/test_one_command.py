@@ -24,7 +24,7 @@ from hil.output_folder import SOURCES, folder_beside, sources_text
 from tests.hil.simulated_logs import urdf_path, write_moving_log
 from tests.hil.simulated_logs import write_log as log
 from tests.hil.test_bag_kinds import WHOLE
-from tests.hil.test_importers_rosbag2 import DEFINITION, STATE, bag, mcap
+from tests.hil.test_importers_rosbag2 import DEFINITION, STATE, bag, mcap, state
 from tests.hil.test_log_kinds import JOINTS, POSITION, SLOPE, TIME, TORQUE, URDF
 
 Floats = NDArray[np.float64]
@@ -269,7 +269,13 @@ def test_a_bag_leaves_how_it_was_read(tmp_path: Path, urdf: Path) -> None:
 
 def test_a_bag_is_identified_again_with_its_map(tmp_path: Path, urdf: Path) -> None:
     source, folder = tmp_path / "x.db3", tmp_path / "out"
-    bag(source, {"/joint_states": (STATE, WHOLE)})
+    rows = np.loadtxt(moving(tmp_path / "a.csv"), delimiter=",", skiprows=1)
+    stamps = (10**9 + np.rint(1e9 * rows[:, 0])).astype(int).tolist()
+    messages = [
+        (at, state(at, row[1:4], velocity=row[4:7], effort=row[7:], names=JOINTS)[1])
+        for at, row in zip(stamps, rows, strict=True)
+    ]
+    bag(source, {"/joint_states": (STATE, messages)})
     result = hil("identify", source, "--urdf", urdf, "--output", folder)
     assert result.exit_code in (0, 5), (result.output, result.exception)
     again = ("--map", folder / "map.toml", "--output", tmp_path / "again")

@@ -1,0 +1,96 @@
+"""Readings of a simulated recording with one meaning planted: named, and nothing else."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from identification import Recording, RobotModel
+from identification.signals.samples import Preprocessing, prepare
+from identification.validation.readings import Change, find_readings
+
+Floats = NDArray[np.float64]
+NAMES = ("hip", "knee", "ankle")
+TIME = np.arange(0.0, 6.0, 0.015)
+
+
+@cache
+def model(gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)) -> RobotModel:
+    """Three parallel axes, whose masses the description has."""
+    bodies = "".join(
+        f"<link name='l{name}'><inertial><mass value='{mass}'/><origin xyz='0 0 0.2'/>"
+        "<inertia ixx='0.1' iyy='0.1' izz='0.1' ixy='0' ixz='0' iyz='0'/></inertial></link>"
+        f"<joint name='{name}' type='revolute'><parent link='{parent}'/><child link='l{name}'/>"
+        "<origin xyz='0 0 0.4'/><axis xyz='0 1 0'/>"
+        "<limit lower='-3' upper='3' effort='99' velocity='9'/></joint>"
+        for name, parent, mass in zip(NAMES, ("base", "lhip", "lknee"), (3, 2, 1), strict=True)
+    )
+    urdf = f"<robot name='three'><link name='base'/>{bodies}</robot>"
+    return RobotModel.from_urdf(urdf, gravity=gravity)
+
+
+@cache
+def motion() -> tuple[Floats, Floats, Floats]:
+    """Positions, torque of the nominal bodies with friction and noise, and that of gravity."""
+    robot, rng = model(), np.random.default_rng(0)
+    rate = rng.uniform(2.0, 8.0, (3, 3))
+    angle = rate * TIME[:, None, None] + rng.uniform(0.0, 6.0, rate.shape)
+    q = 0.3 * np.sin(angle).sum(axis=1)
+    v = 0.3 * (rate * np.cos(angle)).sum(axis=1)
+    a = -0.3 * (rate**2 * np.sin(angle)).sum(axis=1)
+    values = np.zeros(robot.n_parameters)
+    values[: robot.base.rank] = robot.base.grouping @ robot.nominal
+    torque = robot.torque(values, q, v, a) + 0.4 * np.sign(v) + 0.2 * v
+    torque += rng.normal(0.0, 0.02, v.shape)
+    return q, torque, robot.torque(values, q, np.zeros_like(q), np.zeros_like(q))
+
+
+KNEE = np.array([0.0, 1.0, 0.0])
+ROTATED = [1, 2, 0]
+ANGLE = 0.6  # rad
+CASES: dict[str, tuple[Change, ...]] = {
+    "as it is": (),
+    "negated": (Change("torque sign", (0, 1, 2)),),
+    "knee torque negated": (Change("torque sign", (1,)),),
+    "knee position negated": (Change("position sign", (1,)),),
+    "torques permuted": (Change("torque order", (0, 1, 2), order=(2, 0, 1)),),
+    "joints permuted": (Change("joint order", (0, 1, 2), order=(2, 0, 1)),),
+    "zero of the knee": (Change("zero", (1,), -ANGLE),),
+    "gravity removed": (Change("no gravity"),),
+}
+
+
+def planted(case: str) -> tuple[Floats, Floats]:
+    q, torque, weight = motion()
+    return {
+        "as it is": (q, torque),
+        "negated": (q, -torque),
+        "knee torque negated": (q, torque * (1.0 - 2.0 * KNEE)),
+        "knee position negated": (q * (1.0 - 2.0 * KNEE), torque),
+        "torques permuted": (q, torque[:, ROTATED]),
+        "joints permuted": (q[:, ROTATED], torque[:, ROTATED]),
+        "zero of the knee": (q + ANGLE * KNEE, torque),
+        "gravity removed": (q, torque - weight),
+    }[case]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_it_is_found_and_nothing_else(case: str) -> None:
+    position, torque = planted(case)
+    recording = Recording(TIME, position, NAMES, torque)
+    samples = prepare(recording, model(), options=Preprocessing(14.0, left_out="rests"))
+    gravities = {"": (0.0, 0.0, 0.0), "upside down": (0.0, 0.0, 9.81)}
+    mountings = {name: model(gravity) for name, gravity in gravities.items()}
+    found = find_readings(model(), samples, mountings=mountings)
+    steps = [step.change for step in found.steps]
+    expected = CASES[case]
+    assert [step._replace(size=0.0) for step in steps] == [
+        one._replace(size=0.0) for one in expected
+    ]
+    assert [step.size for step in steps] == pytest.approx([one.size for one in expected], abs=0.05)
+    assert all(step.sure for step in found.steps)
+    # The hand of the last joint is free: its zero turns with its bodies, which nothing else shows.
+    assert 2 in found.unseen_zeros
