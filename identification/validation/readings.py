@@ -1,12 +1,11 @@
 """Other readings of a recording: sign, order, unit and zero of its joints, gravity in its torque.
 
-The arm is fitted to the torque as read and with one reading after the other, with the corrections
-of :mod:`identification.validation.causes`. Parameters have the prior of
-:mod:`identification.estimators.prior`, in which ten rows count as one: geometry alone is enough,
-masses help where they are known, and a wrong reading is not explained by bodies that no arm has.
-All readings have as many parameters, so the errors of their fits are compared, block by block.
-Among readings that fit alike, those in which friction takes energy from every joint come first. The
-best reading is adopted if it is significant, and the search is repeated with it.
+All readings are fitted to few rows first. For those of least error the torque of every fifth block
+is predicted from the others, as in :mod:`identification.validation.causes`, whose corrections are
+used, and the errors are compared block by block. Parameters have the prior of
+:mod:`identification.estimators.prior`, so that geometry alone is enough and masses help where they
+are known. Among readings that predict alike, those in which friction takes energy from every joint
+come first. The best reading is adopted if it is significant, and the search is repeated with it.
 """
 
 from __future__ import annotations
@@ -49,6 +48,7 @@ SEPARATE: Final = 3.0
 """Standard errors by which the second best reading is worse."""
 EXPLAINED: Final = 0.15
 """Error of the torque above which no reading is sure: the arm does not explain the torque."""
+_LARGE: Final = 0.15  # relative reduction of the error that chance alone does not make
 _LEAST_GAIN: Final = 0.02  # relative reduction of the error of a reading that is adopted
 _ALIKE: Final = 0.05  # the same, of readings that fit alike
 _HARM: Final = 1.1  # error ratio of a joint beyond which a reading spoils it
@@ -58,9 +58,11 @@ _ROWS: Final = 700
 _FEWER_ROWS: Final = 250  # on which all readings are tried first
 _BLOCKS: Final = 20
 _FOLDS: Final = 5
-# Rows that count as one beside the prior, as many as a hundredth of a second has at 1 kHz: the
-# correlation of residuals is longer, so that the prior counts for more rather than less.
+# Rows that count as one beside the prior. Where other parts are predicted they are seven in all: a
+# wrong reading needs bodies that no arm has, which a weak prior would allow. Of few rows, all of
+# which are fitted, that would be too few to tell orders of a wrist apart.
 _ROWS_PER_FACT: Final = 10.0
+_ROWS_PER_FACT_LEFT_OUT: Final = 100.0
 _STARTS: Final = 3  # of the search for an order: as read, and two at random
 _IMPROVES: Final = 0.98  # error ratio of one exchange from which a whole order is searched for
 _ORDERS: Final = 2  # best orders of each kind that are compared
@@ -95,7 +97,7 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Errors of the blocks under one reading, fitted or predicted.
+    """Errors of predicted blocks under one reading.
 
     Attributes:
         squares: squared errors (B, n).
@@ -119,12 +121,6 @@ class Score:
     def overall(self) -> float:
         """Error over all joints as a share of the torque."""
         return float(np.sqrt(self.squares.sum() / max(self.torque.sum(), 1e-300)))
-
-    @property
-    def sum_of_logarithms(self) -> float:
-        """Sum over the joints of the logarithm of the squared error."""
-        squares = self.squares.sum(axis=0)
-        return float(np.log(np.where(squares > 0.0, squares, 1.0)).sum())
 
     @property
     def driven(self) -> NDArray[np.bool_]:
@@ -248,16 +244,15 @@ class _Search:
         self.model, self.samples = model, samples
         self._mountings = mountings
         self._unit_is_open = unit_is_open
-        self.score = fit_score(model, samples)
+        self.score = score_of(model, samples)
         self._trials: list[Trial] | None = None
 
     def by_friction(self) -> Step | None:
         """Adopt the sign of joints that friction would drive; None if it drives none."""
-        score = score_of(self.model, self.samples)  # deviations of the fit itself are too small
-        joints = tuple(np.flatnonzero(score.driven).tolist())
+        joints = tuple(np.flatnonzero(self.score.driven).tolist())
         if not joints:
             return None
-        moved = np.abs(score.friction) > _DISSIPATES
+        moved = np.abs(self.score.friction) > _DISSIPATES
         kinds: tuple[Meaning, ...] = ("torque sign", "position sign")
         if len(joints) >= max(2, int(moved.sum())):
             kinds = ("torque sign",)
@@ -272,11 +267,7 @@ class _Search:
         """Adopt the change that fits best; None if none is significant."""
         trials = self._tried()
         good = [
-            trial
-            for trial in trials
-            if trial.against.ratio < 1.0 - _LEAST_GAIN
-            and trial.against.sigmas < -SURE
-            and not self._is_spoilt(trial)
+            trial for trial in trials if _is_better(trial.against) and not self._is_spoilt(trial)
         ]
         if not good:
             return None
@@ -348,7 +339,7 @@ class _Search:
             if order not in errors:
                 change = _order_change(kind, order)
                 samples = _reordered(self.model, few, change) if change.joints else few
-                errors[order] = fit_score(self.model, samples).sum_of_logarithms
+                errors[order] = fitted_error(self.model, samples)
             return errors[order]
 
         n, rng = self.model.n_joints, np.random.default_rng(0)
@@ -396,7 +387,7 @@ class _Search:
             errors: dict[Change, float] = {}
             for change in self._changes():
                 model, samples = self._changed(change, few)
-                errors[change] = fit_score(model, samples).sum_of_logarithms
+                errors[change] = fitted_error(model, samples)
             ranked = sorted(errors, key=lambda change: errors[change])
             closer = ranked[:_CLOSER]
             meanings = {change.meaning for change in closer}
@@ -435,7 +426,7 @@ class _Search:
 
     def _try(self, change: Change) -> Trial:
         model, samples = self._changed(change, self.samples)
-        score = fit_score(model, samples)
+        score = score_of(model, samples)
         return Trial(change, model, samples, score, compare(score, self.score, self.model))
 
     def _changed(self, change: Change, samples: Samples) -> tuple[RobotModel, Samples]:
@@ -511,6 +502,13 @@ def _whole_order(change: Change, joints: int) -> tuple[int, ...]:
     return tuple(order)
 
 
+def _is_better(against: Comparison) -> bool:
+    """Whether a change reduces the error by more than chance, of all that are tried."""
+    if against.ratio < 1.0 - _LARGE and against.sigmas < -SEPARATE:
+        return True
+    return against.ratio < 1.0 - _LEAST_GAIN and against.sigmas < -SURE
+
+
 def _differs(change: Change, other: Change) -> bool:
     """Whether two changes are not angles of one zero."""
     is_zero = change.meaning == other.meaning == "zero" and change.joints == other.joints
@@ -526,19 +524,12 @@ def _factor(model: RobotModel, samples: Samples) -> Factor:
     return Factor.of(model, samples, index=index)
 
 
-def fit_score(model: RobotModel, samples: Samples) -> Score:
-    """Fit samples with the arm's prior; errors by `_BLOCKS` blocks."""
-    factor = _factor(model, samples)
+def fitted_error(model: RobotModel, samples: Samples) -> float:
+    """Return the sum over the joints of the logarithm of the squared error of a fit to all rows."""
+    factor = Factor.of(model, samples)
     prior = body_prior(model, factor).gaussian
-    values, weights = posterior_values(factor, prior, _ROWS_PER_FACT)
-    columns = _friction_columns(model, samples)
-    information = factor.weighted(weights).A + _ROWS_PER_FACT * prior.information
-    scale = np.sqrt(np.maximum(np.diag(information), np.finfo(np.float64).tiny))
-    inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)
-    spread = columns / scale
-    variance = _ROWS_PER_FACT * np.einsum("jp,pq,jq->j", spread, inverse, spread)
-    squares = _squares(factor, values, slice(None))
-    return _score(factor, squares, columns @ values, np.sqrt(np.maximum(variance, 0.0)))
+    squares = factor.squared_errors(posterior_values(factor, prior, _ROWS_PER_FACT)[0])
+    return float(np.log(np.where(squares > 0.0, squares, 1.0)).sum())
 
 
 def score_of(model: RobotModel, samples: Samples) -> Score:
@@ -550,7 +541,9 @@ def score_of(model: RobotModel, samples: Samples) -> Score:
     estimates: list[Array] = []
     for fold in range(_FOLDS):
         left_out = np.arange(len(factor)) % _FOLDS == fold
-        values, weights = posterior_values(factor.without(left_out), prior, _ROWS_PER_FACT, weights)
+        values, weights = posterior_values(
+            factor.without(left_out), prior, _ROWS_PER_FACT_LEFT_OUT, weights
+        )
         estimates.append(values)
         squares[left_out] = _squares(factor, values, left_out)
     friction = np.array(estimates) @ _friction_columns(model, samples).T
