@@ -63,7 +63,7 @@ _FOLDS: Final = 5
 # which are fitted, that would be too few to tell orders of a wrist apart.
 _ROWS_PER_FACT: Final = 10.0
 _ROWS_PER_FACT_LEFT_OUT: Final = 100.0
-_STARTS: Final = 3  # of the search for an order: as read, and two at random
+_STARTS: Final = 2  # of the search for an order: as read, and one at random
 _IMPROVES: Final = 0.98  # error ratio of one exchange from which a whole order is searched for
 _ORDERS: Final = 2  # best orders of each kind that are compared
 _CLOSER: Final = 12  # changes of least error on fewer rows, which are compared
@@ -212,6 +212,7 @@ def find_readings(
         return _Search(model, few, mountings or {}, unit_is_open=unit_is_open)
 
     search = started()
+    as_recorded = search.tried()
     steps: list[Step] = []
     while len(steps) < _MOST_STEPS:
         step = search.by_prediction() or search.by_friction()
@@ -220,7 +221,7 @@ def find_readings(
         steps.append(step)
     if len(steps) > 1:
         again = started()
-        single = again.single_as_good_as(search.score)
+        single = again.single_as_good_as(search.score, as_recorded)
         if single is not None:
             search, steps = again, [single]
     nearest = search.nearest()
@@ -265,7 +266,7 @@ class _Search:
 
     def by_prediction(self) -> Step | None:
         """Adopt the change that fits best; None if none is significant."""
-        trials = self._tried()
+        trials = self.tried()
         good = [
             trial for trial in trials if _is_better(trial.against) and not self._is_spoilt(trial)
         ]
@@ -278,11 +279,11 @@ class _Search:
             best = self._nearer(best)
         return self._adopt(best, good)
 
-    def single_as_good_as(self, score: Score) -> Step | None:
-        """Adopt the one change that fits as well as several do; None if none does."""
+    def single_as_good_as(self, score: Score, tried: Sequence[Trial]) -> Step | None:
+        """Adopt the one change of `tried` that fits as well as several do; None if none does."""
         trials = [
             trial
-            for trial in self._tried()
+            for trial in tried
             if compare(trial.score, score, self.model).sigmas < SEPARATE
             and trial.score.overall < (1.0 + _ALIKE) * score.overall
             and trial.score.driven.sum() <= score.driven.sum()
@@ -294,7 +295,7 @@ class _Search:
     def nearest(self) -> dict[Meaning, tuple[Change, Comparison]]:
         """Return by meaning the change that comes nearest to the reading found."""
         nearest: dict[Meaning, tuple[Change, Comparison]] = {}
-        for trial in self._tried():
+        for trial in self.tried():
             meaning = trial.change.meaning
             if meaning not in nearest or trial.against.ratio < nearest[meaning][1].ratio:
                 nearest[meaning] = trial.change, trial.against
@@ -380,7 +381,7 @@ class _Search:
         ranked = sorted(alike.items(), key=lambda pair: pair[1])
         return Step(best.change, best.score.overall, before, ratio, sigmas, tuple(ranked))
 
-    def _tried(self) -> list[Trial]:
+    def tried(self) -> list[Trial]:
         """Return the changes of least error, tried on all rows."""
         if self._trials is None:
             few = _thinned(self.samples, _FEWER_ROWS)
