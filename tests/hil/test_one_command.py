@@ -224,7 +224,7 @@ def test_files_without_quantities_get_the_lines_of_a_map(tmp_path: Path, urdf: P
         proposed_map(position, Robot.from_urdf(urdf))
     assert "Joint_1 .. Joint_3, which name no quantity" in refused.value.problem
     for line in ("sample_rate = HZ", '[position] file = "pos_data.csv"', "[drive] gear_ratio",
-                 '[torque] file = "curr_data.csv" if it has N.m'):  # fmt: skip
+                 '[torque] file = "curr_data.csv" if it has N·m'):  # fmt: skip
         assert line in refused.value.remedy
 
 
