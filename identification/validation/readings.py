@@ -558,7 +558,7 @@ def _squares(factor: Factor, values: Array, blocks: slice | NDArray[np.bool_]) -
     for gram, columns in zip(factor.matrices, factor.columns, strict=True):
         residual = np.append(-values[columns], 1.0)
         squares.append((gram[blocks] @ residual) @ residual)
-    return np.maximum(np.column_stack(squares), 0.0)
+    return np.asarray(np.maximum(np.column_stack(squares), 0.0))
 
 
 def _score(factor: Factor, squares: Array, friction: Array, deviation: Array) -> Score:
