@@ -74,8 +74,8 @@ def advice_on_branches(chain: Chain) -> str | None:
     if len(ends) < 2:
         return None
     branches = [_branch(chain, end) for end in ends]
-    kept = max(branches, key=len)
-    others = [name for k, name in enumerate(chain.joint_names) if k not in kept]
+    longest = max(branches, key=len)
+    others = [name for k, name in enumerate(chain.joint_names) if k not in longest]
     fixing = " ".join(f"--fix {name}" for name in others)
     last = ", ".join(chain.joint_names[end] for end in ends)
     return (
