@@ -163,7 +163,7 @@ def plan_around(
     # A design may be judged by some parameters only; the plan has the criteria over all of them.
     criteria = Objective(cell.model).criteria(excitation.trajectory, RESCORE_PERIOD)
     excitation = replace(excitation, criteria=criteria)
-    validation = _validation_motions(cell, checks)
+    validation = validation_motions(cell, checks)
     return CampaignPlan(
         excitation,
         tuple(PlannedMotion(motion.trajectory, moves_of(cell, motion)) for motion in validation),
@@ -171,7 +171,8 @@ def plan_around(
     )
 
 
-def _validation_motions(cell: Cell, checks: MotionChecks) -> tuple[ViaPointMotion, ...]:
+def validation_motions(cell: Cell, checks: MotionChecks) -> tuple[ViaPointMotion, ...]:
+    """Return the random validation motions of `[campaign]`; raise NoExcitationError for none."""
     settings = cell.campaign
     try:
         return random_validation_motions(

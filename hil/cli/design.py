@@ -4,27 +4,31 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from hil.campaign.campaign import campaign_of_design, require_replaceable
 from hil.campaign.operator import stop_on_interrupt
-from hil.campaign.plan import quick_settings
+from hil.campaign.plan import quick_settings, validation_motions
 from hil.campaign.trajectory_files import write_trajectories
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
 from hil.design import METHODS, Method, load_settings, preset
 from hil.design.advice import criteria_text
 from hil.design.given import given_of
+from hil.design.precision import PrecisionDesign, payload_search, short_search
+from hil.design.requirements import requirements_from
 from hil.design.run import Designed, DesignFolder, run_design
 from hil.design.settings import preset_text
 from hil.errors import HilError, InputError, OperatorStopError
+from hil.motion_checks import MotionChecks
 from hil.plots import save
+from hil.progress import Reporter, say
 from hil.progress import reporter as make_reporter
-from hil.progress import say
 from hil.terminal_text import printable, typed
 
 
@@ -40,6 +44,7 @@ def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
         "unchecked": list(done.result.settings.unchecked),
         **{k: v if v is not None and math.isfinite(v) else None for k, v in figures.items()},
         "duration": float(excitation.trajectory.duration),
+        "precision": list(done.result.data.get("precision", ())),
         "tried": excitation.tried,
         "infeasible": dict(excitation.rejected),
         "front": len(design.front),
@@ -69,6 +74,9 @@ def design(
     show_settings: Annotated[Method | None, typer.Option(metavar="NAME")] = None,
     quick: bool = False,
     given: Annotated[list[Path] | None, typer.Option(metavar="ARCHIVE|FOLDER")] = None,
+    precision: Annotated[list[str] | None, typer.Option(metavar="REQUIREMENTS")] = None,
+    purpose: Annotated[Literal["payload"] | None, typer.Option("--for", metavar="payload")] = None,
+    payload_mass: Annotated[float, typer.Option(min=0.001, max=10000.0, metavar="KG")] = 5.0,
     repetitions: Annotated[int | None, typer.Option(min=1, max=1000)] = None,
     seed: Annotated[int | None, typer.Option(min=0)] = None,
     workers: Annotated[int | None, typer.Option(min=1, max=256)] = None,
@@ -110,6 +118,11 @@ def design(
             [campaign].
         given: Archive or campaign folder of earlier recordings of this arm (repeatable): the motion
             adds what they do not determine, and the criteria are those of all together.
+        precision: Halves of 95 % intervals, such as "parameters 5%, torque 2": the motion minimises
+            the largest ratio of predicted to required interval. Method: gradient.
+        purpose: payload: a motion of at most ten seconds that weighs a payload (`hil payload`), on
+            an arm that is known from --given, or else assumed to be known from a minute of motion.
+        payload_mass: With --for payload: expected mass. Default: 5 kg.
         repetitions: Number of repetitions of the motion. Default: that of [campaign].
         seed: Seed of the search; the result depends on nothing else. Default: that of the settings.
         workers: Number of processes; the result does not depend on it. Default: one per processor.
@@ -129,14 +142,21 @@ def design(
     loaded, folder = Cell.load(cell).with_campaign(repetitions=repetitions), DesignFolder(output)
     require_replaceable(output)
     there = folder.resumed_settings() if resume else None
-    if quick:
-        asked = quick_settings(loaded)
+    if purpose is not None:
+        precision = precision or ["mass of payload 1%"]
+        asked = there or (payload_search() if settings is None else load_settings(settings))
+    elif quick:
+        asked = short_search() if precision else quick_settings(loaded)
     elif settings is not None:
         asked = load_settings(settings)
     else:
-        asked = preset(method or "front") if method or there is None else there
+        usual: Method = "gradient" if precision else "front"
+        asked = preset(method or usual) if method or there is None else there
     if given:
         asked = asked.replaced(objective={"given": [str(path.resolve()) for path in given]})
+    if precision:
+        requirements = [str(requirement) for requirement in requirements_from(precision)]
+        asked = asked.replaced(objective={"precision": requirements})
     if seed is not None:
         asked = asked.replaced(seed=seed)
     if limits_only:
@@ -144,6 +164,9 @@ def design(
 
     recordings = [Path(name) for name in asked.objective.given]
     known = given_of(loaded, recordings) if recordings else None
+    mass = payload_mass if purpose is not None else None
+    promise = _promise(loaded, asked.objective.precision, recordings, reporter, mass)
+    planned = 1 if promise is None else 2 if purpose else loaded.campaign.repetitions
 
     def finish(done: Designed) -> None:
         """Report and draw the result, while the folder is locked."""
@@ -176,6 +199,9 @@ def design(
             figures = criteria_text(excitation.criteria.measures, p)
             duration = excitation.trajectory.duration
             typer.echo(printable(f"{figures}, {duration:.2f} s: {folder.result}"))
+        if promise is not None and not json:
+            for one in promise.forecasts(excitation, planned):
+                typer.echo(printable(one.message(planned, promise.scale)))
         _draw(folder, done, loaded)
 
     with stop_on_interrupt() as stop:
@@ -187,6 +213,10 @@ def design(
             workers=workers or len(os.sched_getaffinity(0)),
             stop=lambda: stop.requested,
             given=known,
+            precision=None if promise is None else promise.precision(planned),
+            promised=None
+            if promise is None
+            else lambda found: [one.to_dict() for one in promise.forecasts(found, planned)],
             resume=resume,
             force=force,
             then=finish,
@@ -196,6 +226,22 @@ def design(
             f"stopped before the end of the search; the best motion so far is in {folder.result}; "
             "continue with --resume"
         )
+
+
+def _promise(
+    cell: Cell,
+    requirements: Sequence[str],
+    recordings: Sequence[Path],
+    reporter: Reporter,
+    mass: float | None,
+) -> PrecisionDesign | None:
+    """Return the requirements about a cell, None without any, and report the torque error."""
+    if not requirements:
+        return None
+    motions = [motion.trajectory for motion in validation_motions(cell, MotionChecks.of(cell))]
+    promise = PrecisionDesign.of(cell, requirements_from(requirements), motions, recordings, mass)
+    reporter.say(f"torque error: {promise.source}")
+    return promise
 
 
 def _campaign(

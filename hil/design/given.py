@@ -15,11 +15,30 @@ from hil.cell import Cell
 from hil.errors import InputError
 from hil.identify.options import Options
 from hil.identify.prepared import executed_rows, samples_of, stated_settings
-from hil.identify.sources import archives_in, arm_differences, gather_sources
+from hil.identify.sources import Source, archives_in, arm_differences, gather_sources
 from identification.excitation import Given, Objective
 from identification.excitation.constraints import SAMPLE_PERIOD
 
 from .settings import SettingsError
+
+
+def given_sources(cell: Cell, paths: Sequence[Path]) -> tuple[Source, ...]:
+    """Return the recordings of archives or folders; of a campaign its excitations.
+
+    Raises:
+        InputError: the archives cannot be read, or are of another arm.
+    """
+    every = list(archives_in(paths))
+    fitted = [path for path in every if open_archive(path).header.purpose != "validation"]
+    sources = gather_sources(fitted or every, Options().split, in_sample=True)
+    if differing := arm_differences(cell, sources.cell):
+        raise SettingsError(
+            paths[0],
+            f"is of another arm than {cell.path}: {' and '.join(differing)} differ",
+            field="--given",
+            remedy="give recordings of this arm",
+        )
+    return sources.training
 
 
 def given_of(cell: Cell, paths: Sequence[Path]) -> Given:
@@ -30,20 +49,11 @@ def given_of(cell: Cell, paths: Sequence[Path]) -> Given:
     Raises:
         InputError: the archives cannot be read, have no motion, or are of another arm.
     """
-    options, every = Options(), list(archives_in(paths))
-    fitted = [path for path in every if open_archive(path).header.purpose != "validation"]
-    sources = gather_sources(fitted or every, options.split, in_sample=True)
-    if differing := arm_differences(cell, sources.cell):
-        raise SettingsError(
-            paths[0],
-            f"is of another arm than {cell.path}: {' and '.join(differing)} differ",
-            field="--given",
-            remedy="give recordings of this arm",
-        )
+    options = Options()
     objective, settings = Objective(cell.model), stated_settings(cell, options)
     total = np.zeros((cell.model.n_parameters, cell.model.n_parameters))
     count, duration = 0, 0.0
-    for source in sources.training:
+    for source in given_sources(cell, paths):
         samples = samples_of(source, cell, settings)
         motion = samples.motion.rows(executed_rows(source, samples))
         if motion.n_samples < 2:

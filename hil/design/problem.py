@@ -15,6 +15,7 @@ from identification.excitation import (
     CurrentModel,
     Given,
     Objective,
+    Precision,
     Problem,
     SearchSettings,
     SineGenome,
@@ -29,8 +30,16 @@ from .settings import DesignSettings, SettingsError
 Array = NDArray[np.float64]
 
 
-def problem_of(cell: Cell, settings: DesignSettings, given: Given | None = None) -> Problem:
-    """Return genome, objective and constraints of a search; `given` is of earlier recordings.
+def problem_of(
+    cell: Cell,
+    settings: DesignSettings,
+    given: Given | None = None,
+    precision: Precision | None = None,
+) -> Problem:
+    """Return genome, objective and constraints of a search.
+
+    `given` is the information of earlier recordings, `precision` what the requirements of the
+    settings stand for.
 
     Raises:
         SettingsError: settings that do not fit the cell.
@@ -45,6 +54,13 @@ def problem_of(cell: Cell, settings: DesignSettings, given: Given | None = None)
             field="objective.given",
             remedy="pass given = hil.design.given.given_of(cell, paths)",
         )
+    if settings.objective.precision and precision is None:
+        raise SettingsError(
+            None,
+            "names requirements, and what they stand for was not computed",
+            field="objective.precision",
+            remedy="pass precision = hil.design.precision.PrecisionDesign.of(...).precision(30)",
+        )
     checker = collision_checker(cell) if constraints.collision else None
     currents = planned(current_model(cell)) if constraints.current else None
     genome = _genome(cell, settings, checker)
@@ -55,6 +71,7 @@ def problem_of(cell: Cell, settings: DesignSettings, given: Given | None = None)
             cell.model,
             parameters=_judged(cell, settings),
             given=given,
+            precision=precision,
         ),
         constraints=Constraints(
             limits=cell.joint_limits,

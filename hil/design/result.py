@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -59,6 +59,9 @@ _COMMENTS: Final = {
     "its criteria,\nsampled every millisecond.",
     "settings": "Settings of the search; `hil design --settings` can read them from this file.",
     "cell": "Name of the cell, and digests of its parts.",
+    "precision": "Requirements: the worst quantity, half of its 95 % interval as promised for the\n"
+    "planned repetitions and as required (shares, N m), what the torque's scale alone leaves, and\n"
+    "how many repetitions, or different motions of this kind, meet it.",
     "plan": "The motion: it is planned from these moves.",
     "sines": "The motion: offset + ramp x sum of amplitude x sin(frequency x t), rad/s.",
     "seal": "Digest of the tables above, and positions of the motion at equal intervals.",
@@ -133,6 +136,10 @@ class DesignResult:
         data["cell"] = {"name": cell.name, **fingerprint(cell)}
         data["software"] = software()
         return cls(data | _motion_data(excitation, cell), settings, excitation)
+
+    def with_precision(self, promised: Sequence[Mapping[str, Any]]) -> Self:
+        """Return the result with what the motion promises for each requirement."""
+        return replace(self, data={**self.data, "precision": [*promised]})
 
     def save(self, path: Path) -> None:
         """Write the file.

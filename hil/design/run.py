@@ -123,6 +123,8 @@ def run_design(
     workers: int = 2,
     stop: Callable[[], bool] = lambda: False,
     given: excitation.Given | None = None,
+    precision: excitation.Precision | None = None,
+    promised: Callable[[excitation.Excitation], list[dict[str, Any]]] | None = None,
     resume: bool = False,
     force: bool = False,
     then: Callable[[Designed], None] = lambda _: None,
@@ -133,14 +135,15 @@ def run_design(
     `resume` continues it; `force` replaces an existing design. The folder is locked until `then`,
     called with the result, has returned.
 
-    `given` is the information of the earlier recordings in the settings.
+    `given` is the information of the earlier recordings in the settings, `precision` what their
+    requirements stand for, and `promised` returns what a motion promises for each, for the file.
 
     Raises:
         InputError: the folder has a design already, is locked, or cannot be written to.
         UnsafeError: the motion does not pass the final check.
         HilError: see :func:`run_search`.
     """
-    problem = problem_of(cell, settings, given)  # before anything is replaced
+    problem = problem_of(cell, settings, given, precision)  # before anything is replaced
     if problem.objective.given is not None:
         seconds = problem.objective.given.duration
         reporter.say(f"the criteria count {seconds:.3g} s of motion in the given recordings")
@@ -161,6 +164,8 @@ def run_design(
             reason = violation_text(broken[0], AngleFrame.of(cell))
             raise UnsafeError(f"the motion does not pass the final check: {reason}")
         result = DesignResult.of(cell, settings, design, problem.objective)
+        if promised is not None:
+            result = result.with_precision(promised(design.excitation))
         result.save(folder.result)
         done = Designed(problem, design, result)
         then(done)
@@ -188,6 +193,9 @@ def _searched(
             "duration": given.duration,
             "information": json_digest(given.mean.tolist()),
         }
+    if (wanted := problem.objective.precision) is not None:
+        arrays = (wanted.quantities.directions, wanted.quantities.allowed, wanted.density)
+        identity["precision"] = {"digest": json_digest([one.tolist() for one in arrays])}
     with folder.opened_journal() as file:
         journal = _journal(file, identity, reporter)
         design = run_search(

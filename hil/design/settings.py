@@ -163,6 +163,11 @@ class ObjectiveTable(Table):
         "a list of archives or folders of earlier recordings, whose information the motion adds to",
         [],
     )
+    precision: list[str] = field(
+        'a list of requirements for the precision of the estimates, such as "parameters 5%", '
+        "which replace the criteria",
+        [],
+    )
 
     @property
     def named(self) -> list[str] | None:
@@ -190,6 +195,11 @@ class DesignSettings(Table):
             raise ValueError(
                 f"[search] gradient = {self.search.gradient} improves [via_points], not [sines]; "
                 "make it 0"
+            )
+        if self.objective.precision and self.search.gradient == 0:
+            raise ValueError(
+                "[objective] precision is reached by steps along the gradient, and [search] "
+                "gradient is 0; choose the method gradient, or make it 100 with [via_points]"
             )
         asked, length = self.constraints, None if self.sines is None else self.sines.length
         if length is not None and not asked.min_duration <= length <= asked.max_duration:

@@ -120,8 +120,8 @@ def cluster_covariance(
 ) -> Clustered:
     """Return the cluster-robust covariance by information (B, p, p) and scores (B, p) of blocks.
 
-    The solution is that of the summed information, with the prior's (p,). Blocks of `block` seconds
-    are merged, by a further factor `stretch` if enough remain.
+    The solution is that of the summed information, with the prior's (p, p). Blocks of `block`
+    seconds are merged, by a further factor `stretch` if enough remain.
     """
     used = scores.any(axis=1)
     information, scores = information[used], scores[used]
@@ -130,7 +130,7 @@ def cluster_covariance(
     shares = _shares(merged(information, length), solution.root, solution.root)
     result = _sandwich(shares, merged(scores, length), solution, length * block)
     if prior is not None:
-        added = max(1.0, result.design_effect) * (solution.inverse * prior) @ solution.inverse
+        added = max(1.0, result.design_effect) * solution.inverse @ prior @ solution.inverse
         covariance = result.covariance + added
         mark_undetermined(covariance, solution.determined)
         result = replace(result, covariance=covariance)

@@ -275,7 +275,9 @@ def _with_covariance(
             information[: len(run)] += own[0]
             scores[: len(run)] += own[1]
         duration = length * FINE_BLOCK  # for the description only
-        clustered = cluster_covariance(information, scores, solution, prior, duration, STRETCH)
+        clustered = cluster_covariance(
+            information, scores, solution, np.diag(prior), duration, STRETCH
+        )
         effect *= max(1.0, clustered.design_effect)
     return unknowns, solution, clustered
 

@@ -23,13 +23,15 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.covariance import Clustered, cluster_covariance
-from identification.estimators.torque_scale import scale_covariance
+from identification.estimators.torque_scale import scale_covariance, scale_sensitivity
 from identification.factor.factor import (
     FINE_BLOCK,
+    Estimate,
     Factor,
     NormalEquations,
     count_by_block,
     fine_blocks,
+    inverse_variance,
     no_rows_message,
     solve,
 )
@@ -145,30 +147,49 @@ class PayloadEstimate:
     method: str  # description of the covariance
 
 
+@dataclass(frozen=True, eq=False)
+class KnownArm:
+    """Parameters of an arm without payload, as an earlier identification left them.
+
+    It stands for bare recordings: friction of the loaded ones may have drifted from it.
+    """
+
+    values: Array  #: (p,)
+    information: Array  #: inverse of their covariance (p, p)
+    sensitivity: Array  #: change per relative change of each joint's torques (p, n)
+
+    @classmethod
+    def of(cls, factor: Factor, estimate: Estimate, prior: Array, design_effect: float) -> KnownArm:
+        """Return the posterior of a factor and the information of a prior (p, p).
+
+        Its information is that of the rows that count, one of `design_effect`, and of the prior:
+        the covariance from few blocks cannot be inverted.
+        """
+        weights = inverse_variance(estimate.noise_std**2) / design_effect
+        information = factor.weighted(weights).A + prior
+        scale = 1.0 / np.sqrt(np.diag(information))
+        unit = np.linalg.inv(information * scale[:, None] * scale)
+        sensitivity = scale_sensitivity(factor, weights, unit * scale[:, None] * scale)
+        return cls(estimate.values, information, sensitivity)
+
+
 def identify_payload(
-    model: RobotModel, runs: Sequence[Run], scale_std: Array | None = None
+    model: RobotModel,
+    runs: Sequence[Run],
+    scale_std: Array | None = None,
+    known: KnownArm | None = None,
 ) -> PayloadEstimate:
     """Estimate the body that the loaded recordings carry and the bare ones do not.
 
     `scale_std` is the relative standard deviation of each joint's torque scale (n,), by default
-    zero: it is common to all recordings.
+    zero: it is common to all recordings. A `known` arm replaces or adds to bare recordings.
 
     Raises:
         PayloadError: undetermined mass, or negative mass.
         IdentificationError: no usable row.
     """
-    found = _body_estimate(model, runs, scale_std)
-    mass, low, high = found.mass
-    if not np.isfinite(high):
-        raise PayloadError(
-            "the motion does not separate the mass from other parameters; record one that moves"
-            " more axes, with the wrist in many poses"
-        )
-    if high < 0.0:
-        raise PayloadError(
-            f"the bare recordings carry {-mass:.3g} kg more than the loaded ones; check whether"
-            " they are interchanged, and the sign of the torques"
-        )
+    found = _body_estimate(model, runs, scale_std, known)
+    mass, low, high = _determined_mass(found)
     intervals = np.tile([-np.inf, np.inf], (_BODY, 1))
     intervals[0] = max(0.0, low), high
     if low <= 0.0:
@@ -206,6 +227,22 @@ def identify_payload(
     )
 
 
+def _determined_mass(found: _BodyEstimate) -> tuple[float, float, float]:
+    """Return mass and interval [kg] of a body; PayloadError if undetermined, or negative."""
+    mass, low, high = found.mass
+    if not np.isfinite(high):
+        raise PayloadError(
+            "the motion does not separate the mass from other parameters; record one that moves"
+            " more axes, with the wrist in many poses"
+        )
+    if high < 0.0:
+        raise PayloadError(
+            f"the bare recordings carry {-mass:.3g} kg more than the loaded ones; check whether"
+            " they are interchanged, and the sign of the torques"
+        )
+    return mass, low, high
+
+
 def _impossible(intervals: Array, rounding: float) -> NDArray[np.bool_]:
     """Return which figures (10,) are moments of inertia that are negative beyond rounding."""
     negative = np.zeros(_BODY, dtype=np.bool_)
@@ -223,7 +260,10 @@ class Weighing:
 
 
 def contradiction(
-    model: RobotModel, runs: Sequence[Run], estimate: PayloadEstimate
+    model: RobotModel,
+    runs: Sequence[Run],
+    estimate: PayloadEstimate,
+    known: KnownArm | None = None,
 ) -> tuple[Weighing, Weighing] | None:
     """Return two loaded, or two bare recordings that carry different bodies; None if all agree.
 
@@ -238,7 +278,7 @@ def contradiction(
     size = max(estimate.moment[0], mass * ball_radius(mass))
     limits = np.array([SAME_CENTRE * size] * 3 + [SAME_MASS * mass])
     if len(loaded) > 1:
-        single = [_body_estimate(model, [*bare, run]) for run in loaded]
+        single = [_body_estimate(model, [*bare, run], known=known) for run in loaded]
         for one, run in zip(single[1:], loaded[1:], strict=True):
             if _differs(single[0], one, limits):
                 return _weighing(loaded[0].name, single[0]), _weighing(run.name, one)
@@ -338,7 +378,9 @@ class _Fit(NamedTuple):
         return np.asarray(axes[:, lost < _PARTICIPATION**2].T * scale)
 
 
-def _fit(model: RobotModel, runs: Sequence[Run], shape: Array) -> _Fit:
+def _fit(
+    model: RobotModel, runs: Sequence[Run], shape: Array, known: KnownArm | None = None
+) -> _Fit:
     """Solve the joint problem for the r unknowns of the body, ten parameters by shape (10, r)."""
     rows = np.sum([run.factor.samples for run in runs], axis=0)
     if not rows.any():
@@ -372,8 +414,12 @@ def _fit(model: RobotModel, runs: Sequence[Run], shape: Array) -> _Fit:
                 found.append((joint, small.T @ gram @ small, used))
         return found
 
+    expected, information = np.zeros(width), np.zeros((width, width))
+    if known is not None:
+        expected[:p], information[:p, :p] = known.values, known.information
+
     def prior_of(problem: Sequence[_Rows], weights: Array) -> Array:
-        """Return the information on each unknown (width,), of offsets and friction scales."""
+        """Return the information on the unknowns, of known arm, offsets and friction scales."""
         squares = np.zeros(n)
         for joint, gram, places in problem:
             at = np.flatnonzero(np.isin(places, drifts[:, 1, joint]))
@@ -383,7 +429,7 @@ def _fit(model: RobotModel, runs: Sequence[Run], shape: Array) -> _Fit:
         prior = np.zeros(width)
         prior[drifts[:, 0]] = np.divide(1.0, level, out=np.zeros(n), where=level > 0.0)
         prior[drifts[:, 1]] = 1.0 / DRIFT**2
-        return prior
+        return np.asarray(information + np.diag(prior))
 
     def blocks_of(problem: Sequence[_Rows], weights: Array) -> Array:
         """Return weighted Gram matrices of all joints and runs (B, width + 1, width + 1)."""
@@ -393,7 +439,7 @@ def _fit(model: RobotModel, runs: Sequence[Run], shape: Array) -> _Fit:
         return whole
 
     def equations_of(total: Array, prior: Array) -> NormalEquations:
-        return NormalEquations(total[:-1, :-1] + np.diag(prior), total[:-1, -1])
+        return NormalEquations(total[:-1, :-1] + prior, total[:-1, -1] + information @ expected)
 
     for _ in range(_ROUNDS):
         problem = problem_of()
@@ -421,6 +467,8 @@ def _fit(model: RobotModel, runs: Sequence[Run], shape: Array) -> _Fit:
     pulls = np.zeros((width, n))
     for joint, gram, places in problem:
         pulls[places[:-1], joint] += scaled[joint] * gram.sum(axis=0)[:-1, -1]
+    if known is not None:
+        pulls[:p] += known.information @ known.sensitivity
     return _Fit(
         values=solution.values[part],
         root=basis[part] / np.linalg.norm(basis, axis=0),
@@ -496,14 +544,17 @@ class _BodyEstimate(NamedTuple):
 
 
 def _body_estimate(
-    model: RobotModel, runs: Sequence[Run], scale_std: Array | None = None
+    model: RobotModel,
+    runs: Sequence[Run],
+    scale_std: Array | None = None,
+    known: KnownArm | None = None,
 ) -> _BodyEstimate:
     """Estimate the body of the loaded runs, of least norm where undetermined."""
-    fit, determined = _fit(model, runs, np.eye(_BODY)), np.eye(_BODY)
+    fit, determined = _fit(model, runs, np.eye(_BODY), known), np.eye(_BODY)
     found = fit.determined
     if len(found) < _BODY:
         determined = found
-        fit = _fit(model, runs, np.asarray(np.linalg.pinv(determined)))
+        fit = _fit(model, runs, np.asarray(np.linalg.pinv(determined)), known)
     std, factor = np.zeros(model.n_joints), fit.clustered.interval_factor
     if scale_std is not None:
         std = scale_std
@@ -514,6 +565,19 @@ def _body_estimate(
         factor=factor,
         words=fit.clustered.words,
     )
+
+
+def parameter_change(model: RobotModel, frame: str | None) -> Array:
+    """Return the change of an arm's parameters by a body at a frame (p, 10).
+
+    Raises:
+        ModelError: the description has no such frame, or it is fixed to the base.
+    """
+    joint, rotation, translation = model.chain.frame(frame)
+    change = np.zeros((model.n_parameters, _BODY))
+    links = model.base.grouping[:, model.layout.links[joint]]
+    change[: model.base.rank] = links @ _moved(rotation, translation)
+    return change
 
 
 def _moved(rotation: Array, translation: Array) -> Array:

@@ -16,6 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.excitation.constraints import midpoints
+from identification.excitation.precision import Precision
 from identification.factor.factor import Factor
 from identification.model.motion import Motion
 from identification.model.regressor import joint_arrays
@@ -287,6 +288,7 @@ class Objective:
     parameters: NDArray[np.intp] | None = None  #: indices (e,) of those in the criteria; None: all
     #: of earlier recordings: the criteria are those of all recordings and the motion together
     given: Given | None = None
+    precision: Precision | None = None  #: that is wanted; its criterion is beside the `CRITERIA`
 
     @property
     def n_parameters(self) -> int:
@@ -299,14 +301,46 @@ class Objective:
         Raises:
             ShapeError: an array of the motion has the wrong shape.
         """
-        total = self._gram(motion)
+        return self._judged(motion, self._gram(self._joint_grams(motion)))
+
+    def _judged(self, motion: Motion, total: Array) -> Array:
+        """Return the Gram matrix (e, e) of what is judged, with what is given."""
         if self.given is not None:
-            total += self.n_given(motion) * self.given.mean
+            total = total + self.n_given(motion) * self.given.mean
         return total if self.parameters is None else total[np.ix_(self.parameters, self.parameters)]
 
     def measures(self, motion: Motion) -> dict[str, float]:
         """Return the `CRITERIA` of a sampled motion by name (see :meth:`information`)."""
         return measures(self.information(motion), motion.n_samples + self.n_given(motion))
+
+    def scores(self, motion: Motion) -> tuple[dict[str, float], float]:
+        """Return the `CRITERIA` of a sampled motion, and the criterion of the precision, else 0."""
+        grams = self._joint_grams(motion)
+        found = measures(
+            self._judged(motion, self._gram(grams)), motion.n_samples + self.n_given(motion)
+        )
+        if self.precision is None:
+            return found, 0.0
+        return found, self.precision.criterion(self._gram(grams, self._joint_weights(motion)))
+
+    def grams_by_joint(self, motion: Motion) -> Array:
+        """Return the Gram matrix of the rows of each joint (n, p, p)."""
+        p = self.model.n_parameters
+        grams = np.zeros((self.model.n_joints, p, p))
+        for joint, (index, gram) in enumerate(
+            zip(self._block_indices, self._joint_grams(motion), strict=True)
+        ):
+            grams[joint][index] = gram
+        return grams
+
+    def precise_information(self, motion: Motion) -> Array:
+        """Return the information (p, p) of a sampled motion by the stated torque error."""
+        return self._gram(self._joint_grams(motion), self._joint_weights(motion))
+
+    def _joint_weights(self, motion: Motion) -> Array:
+        """Return the weight of a sample of each joint (n,) by the stated torque error."""
+        assert self.precision is not None
+        return np.asarray((motion.time[1] - motion.time[0]) / self.precision.density)
 
     def n_given(self, motion: Motion) -> float:
         """Return the samples that the given recordings have at the period of a motion."""
@@ -332,18 +366,23 @@ class Objective:
                     total += weight * one.slope(root)
         return total
 
-    def along(self, motion: Motion, matrix: Array) -> Array:
-        r"""Return :math:`\mathrm{tr}(\Phi_t M \Phi_t^T)` of each sample (m,), M (e, e)."""
+    def along(self, motion: Motion, matrix: Array, weights: Array | None = None) -> Array:
+        r"""Return :math:`\mathrm{tr}(\Phi_t M \Phi_t^T)` of each sample (m,), M (e, e).
+
+        With `weights` (n,) of the rows of the joints it is that of all parameters, M (p, p).
+        """
         model = self.model
-        if self.parameters is not None:
+        if self.parameters is not None and weights is None:
             whole = np.zeros((model.n_parameters, model.n_parameters))
             whole[np.ix_(self.parameters, self.parameters)] = matrix
             matrix = whole
         blocks = [matrix[index] for index in self._block_indices]
+        if weights is not None:
+            blocks = [weight * block for weight, block in zip(weights, blocks, strict=True)]
         total = np.zeros(motion.n_samples)
         for part, rows in model.chunks(*self._states(motion)):
-            for block, weights in zip(rows, blocks, strict=True):
-                total[part] += np.einsum("pm,pm->m", block, weights @ block)
+            for columns, block in zip(rows, blocks, strict=True):
+                total[part] += np.einsum("pm,pm->m", columns, block @ columns)
         return total
 
     def _states(self, motion: Motion) -> tuple[Array, ...]:
@@ -355,16 +394,19 @@ class Objective:
             acceleration=motion.acceleration,
         )
 
-    def _gram(self, motion: Motion) -> Array:
-        """Return the Gram matrix (p, p) of the motion."""
-        model = self.model
-        sums = [np.zeros((len(used), len(used))) for used in model.plan.columns]
-        for _, rows in model.chunks(*self._states(motion)):
+    def _joint_grams(self, motion: Motion) -> list[Array]:
+        """Return the Gram matrix of the columns of each joint."""
+        sums = [np.zeros((len(used), len(used))) for used in self.model.plan.columns]
+        for _, rows in self.model.chunks(*self._states(motion)):
             for joint, block in enumerate(rows):
                 sums[joint] += block @ block.T
-        total = np.zeros((model.n_parameters, model.n_parameters))
-        for block_index, gram in zip(self._block_indices, sums, strict=True):
-            total[block_index] += gram
+        return sums
+
+    def _gram(self, grams: Sequence[Array], weights: Array | None = None) -> Array:
+        """Return the Gram matrix (p, p) of all joints, of weights (n,) or equal ones."""
+        total = np.zeros((self.model.n_parameters, self.model.n_parameters))
+        for joint, (index, gram) in enumerate(zip(self._block_indices, grams, strict=True)):
+            total[index] += gram if weights is None else weights[joint] * gram
         return total
 
     @cached_property

@@ -63,7 +63,7 @@ def design_of(cell: Cell, trajectory: Trajectory, chosen: int | None = 1) -> Des
     return Design(
         genes=np.zeros(1),
         excitation=found,
-        front=Front(np.zeros((3, 1)), measures, np.ones(3)),
+        front=Front(np.zeros((3, 1)), measures, np.zeros(3), np.ones(3)),
         chosen=chosen,
         origin=1,
         origin_criteria=found.criteria,
@@ -116,7 +116,7 @@ class TestPage:
         monkeypatch.setitem(CRITERIA, "condition", OTHER)
         measures = np.column_stack((design.front.measures, [9.0, 8.0, 7.0]))
         names = ("condition", "coupling_index")
-        front = Front(np.zeros((3, 1)), measures, np.ones(3), names)
+        front = Front(np.zeros((3, 1)), measures, np.zeros(3), np.ones(3), names)
         words = texts(draw_design(replace(design, front=front), two_link))
         assert {"Spread of Φ (lower is better)", "chosen (8.000, 80.0)"} <= set(words)
         assert any(f", κ {design.excitation.criteria.condition:.3f}" in text for text in words)
@@ -145,7 +145,7 @@ class TestPage:
         urdf = two_link.urdf.replace('"shoulder"', '"shoulder_pan_joint"')
         cell = Cell.from_texts(two_link.text, urdf, two_link.path)
         design = design_of(cell, wandering(cell))
-        front = Front(np.zeros((1, 1)), design.front.measures[:1], np.ones(1))
+        front = Front(np.zeros((1, 1)), design.front.measures[:1], np.zeros(1), np.ones(1))
         figure = draw_design(replace(design, front=front, origin=0), cell)
         assert {"front, 1 motion", "shoulder_\npan_joint"} <= set(texts(figure))
         figure.draw_without_rendering()

@@ -573,7 +573,8 @@ def scores_of(log10_det, coupling_index, *, duration=5.0, excess=0.0):
     measures = np.array([log10_det, coupling_index], dtype=float).T.reshape(-1, 2)
     broken = np.zeros((len(measures), len(KINDS)))
     broken[:, KINDS.index("collision")] = excess
-    return Scores(measures, np.full(len(measures), duration, dtype=float), broken)
+    lasting = np.full(len(measures), duration, dtype=float)
+    return Scores(measures, np.zeros(len(measures)), lasting, broken)
 
 
 def front_of(log10_det, coupling_index):

@@ -283,7 +283,7 @@ class TestScores:
             assert refusing.violations(rows[0]) == ()
         np.testing.assert_array_equal(scores.feasible, [True, False, True])
         np.testing.assert_array_equal(scores.rows[1], unplanned())
-        np.testing.assert_array_equal(unplanned()[:3], [-np.inf, np.inf, np.nan])
+        np.testing.assert_array_equal(unplanned()[:4], [-np.inf, np.inf, np.inf, np.nan])
         assert violation.kind == "planning" and "planning failed" in str(violation)
         with Population(problem(faulty(crash=(0.0, 1.0)))) as crashing:
             (violation,) = crashing.violations(rows[0])
@@ -407,7 +407,7 @@ def scores_of(log10_det, coupling_index, excess=0.0):
     measures = np.column_stack(np.broadcast_arrays(log10_det, coupling_index))
     broken = np.zeros((len(measures), len(KINDS)))
     broken[:, 3] = excess
-    return Scores(measures, np.full(len(measures), 5.0), broken)
+    return Scores(measures, np.zeros(len(measures)), np.full(len(measures), 5.0), broken)
 
 
 class Bowl:

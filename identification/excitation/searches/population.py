@@ -36,14 +36,17 @@ Array = NDArray[np.float64]
 
 _MEASURES: Final = len(CRITERIA)
 
-ROW: Final = _MEASURES + 1 + len(KINDS)
-"""Length of a row of scores: `CRITERIA`, duration, one excess for each of `KINDS`."""
+ROW: Final = _MEASURES + 2 + len(KINDS)
+"""Length of a row of scores: `CRITERIA`, precision, duration, one excess for each of `KINDS`."""
 
 
 class Scores(NamedTuple):
     """Scores of m motions."""
 
     measures: Array  #: (m, d) `CRITERIA`; the worst values if unplannable or not exciting
+    #: (m,) criterion of the wanted precision, to be minimised; 0 if none is wanted, inf if
+    #: unplannable
+    precision: Array
     duration: Array  #: (m,) [s]; nan if unplannable
     #: (m, n_kinds) largest excess of each of `KINDS`, 0 if satisfied; inf for "planning" if
     #: unplannable
@@ -76,7 +79,8 @@ class Scores(NamedTuple):
     @classmethod
     def of_rows(cls, rows: Array) -> Self:
         """Return the scores in an array (m, ROW)."""
-        return cls(rows[:, :_MEASURES], rows[:, _MEASURES], rows[:, _MEASURES + 1 :])
+        measures, (precision, duration) = rows[:, :_MEASURES], rows[:, _MEASURES : _MEASURES + 2].T
+        return cls(measures, precision, duration, rows[:, _MEASURES + 2 :])
 
 
 def finite(measures: Array) -> NDArray[np.bool_]:
@@ -87,7 +91,7 @@ def finite(measures: Array) -> NDArray[np.bool_]:
 def unplanned() -> Array:
     """Return the row (ROW,) of an unplannable motion."""
     excess = np.where(np.array(KINDS) == "planning", np.inf, 0.0)
-    return np.concatenate((-SENSE * np.inf, [np.nan], excess))
+    return np.concatenate((-SENSE * np.inf, [np.inf, np.nan], excess))
 
 
 SAMPLE_COUNT: Final = 200
@@ -145,24 +149,28 @@ _EQUAL: Final = 1e-12
 class Front:
     """Pareto front: the k motions not dominated in some criteria, the best in the last first.
 
+    A wanted precision counts as one more criterion.
+
     Of motions with equal measures it has one: the shortest, then the one whose genes come first.
     So it does not depend on the order in which motions are added.
     """
 
     genes: Array  #: (k, n_genes), within [0, 1]
     measures: Array  #: (k, d)
+    precision: Array  #: (k,) criterion of the wanted precision, 0 if none is wanted
     duration: Array  #: (k,) [s]
     criteria: tuple[str, ...] = OF_PAPER  #: in which motions compare
 
     @classmethod
     def empty(cls, n_genes: int, criteria: tuple[str, ...] = OF_PAPER) -> Self:
         """Return the front of no motions."""
-        return cls(np.empty((0, n_genes)), np.empty((0, _MEASURES)), np.empty(0), criteria)
+        none = np.empty(0)
+        return cls(np.empty((0, n_genes)), np.empty((0, _MEASURES)), none, none, criteria)
 
     @classmethod
     def of(cls, genes: Array, scores: Scores, criteria: tuple[str, ...] = OF_PAPER) -> Self:
         """Return the front of the usable motions among genes (m, n_genes)."""
-        every = cls(genes, scores.measures, scores.duration, criteria)
+        every = cls(genes, scores.measures, scores.precision, scores.duration, criteria)
         return every._part(scores.usable)._nondominated()
 
     def __len__(self) -> int:
@@ -175,7 +183,8 @@ class Front:
     def scores(self, index: int) -> Scores:
         """Return the scores of one motion, m = 1."""
         one = slice(index, index + 1)
-        return Scores(self.measures[one], self.duration[one], np.zeros((1, len(KINDS))))
+        met = np.zeros((1, len(KINDS)))
+        return Scores(self.measures[one], self.precision[one], self.duration[one], met)
 
     def merge(self, other: Self) -> Self:
         """Return the front of the motions of both."""
@@ -183,6 +192,7 @@ class Front:
             self,
             genes=np.concatenate((self.genes, other.genes)),
             measures=np.concatenate((self.measures, other.measures)),
+            precision=np.concatenate((self.precision, other.precision)),
             duration=np.concatenate((self.duration, other.duration)),
         )._nondominated()
 
@@ -207,11 +217,16 @@ class Front:
         return int(highest[np.argmax(scale.gains(self.measures[highest]).sum(axis=1))])
 
     def _part(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Self:
-        arrays = self.genes[rows], self.measures[rows], self.duration[rows]
-        return type(self)(*arrays, self.criteria)
+        return replace(
+            self,
+            genes=self.genes[rows],
+            measures=self.measures[rows],
+            precision=self.precision[rows],
+            duration=self.duration[rows],
+        )
 
     def _nondominated(self) -> Self:
-        cost = columns(-SENSE * self.measures, self.criteria)
+        cost = np.column_stack((columns(-SENSE * self.measures, self.criteria), self.precision))
         left = np.lexsort((*self.genes.T[::-1], self.duration, *cost.T))
         found = []
         while len(left):  # no other one dominates the first in this order
@@ -259,9 +274,10 @@ class Problem:
             if isinstance(motion, PlannerError):
                 rows.append(unplanned())
             else:
-                measures = self.objective.measures(midpoints(motion, self.period))
+                measures, precision = self.objective.scores(midpoints(motion, self.period))
                 excess = excess_by_kind(self._violations(motion))
-                rows.append(np.array((*measures.values(), motion.duration, *excess)))
+                row = (*measures.values(), precision, motion.duration, *excess)
+                rows.append(np.array(row))
         return Scores.of_rows(np.array(rows))
 
     def violations(self, genes: Array) -> tuple[Violation, ...]:
@@ -282,8 +298,10 @@ class Problem:
             raise motion
         return motion, self.objective.criteria(motion, period)
 
-    def tangent(self, genes: Array, weights: Array) -> Tangent:
+    def tangent(self, genes: Array, weights: Array | None) -> Tangent:
         """Return the slopes of `weights` (d,) times the criteria along the motion of genes.
+
+        Without weights they are those of minus the logarithm of the precision's criterion.
 
         Raises:
             PlannerError: the motion cannot be planned.
@@ -362,10 +380,10 @@ class Population:
         found: tuple[Motion, Criteria] = self._call("evaluate", genes, period)
         return found
 
-    def linearise(self, genes: Array, weights: Array) -> Linearisation | None:
+    def linearise(self, genes: Array, weights: Array | None) -> Linearisation | None:
         """Return `weights` (d,) times the criteria, and the margins, to first order in the genes.
 
-        None if the motion cannot be planned.
+        Without weights: see `Problem.tangent`. None if the motion cannot be planned.
         """
         try:
             tangent: Tangent = self._call("tangent", genes, weights)

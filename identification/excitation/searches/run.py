@@ -266,11 +266,24 @@ class Goal:
     settings: SearchSettings  # of the search
     p: int  # number of parameters in the criteria
     scale: Scale | None  # units of the measures; None if not used
+    precise: bool = False  # whether motions compare by the wanted precision
 
     @property
     def method(self) -> SearchMethod:
         """The method."""
         return METHODS[self.settings.method]
+
+    @property
+    def two_objectives(self) -> bool:
+        """Whether motions compare by two criteria."""
+        return self.method.fitness is None and not self.precise
+
+    def costs(self, scores: Scores) -> Array:
+        """Return the objectives to minimise, (m, 1) or (m, 2), for scores of m motions."""
+        if self.precise:
+            with np.errstate(divide="ignore"):
+                return np.log(scores.precision)[:, None]
+        return self.objectives(scores.measures)
 
     def objectives(self, measures: Array) -> Array:
         """Return the objectives to minimise, (m, 1) or (m, 2), for measures (m, d)."""
@@ -288,6 +301,8 @@ class Goal:
 
     def choice(self, front: Front) -> int:
         """Return the index of the best motion of a non-empty front."""
+        if self.precise:
+            return int(np.argmin(front.precision))
         if self.method.fitness is None:
             return front.knee(self.scale)
         return int(np.argmin(self.objectives(front.measures)[:, 0]))
@@ -299,9 +314,9 @@ class Goal:
 
     def polish_fitness(self, start: Scores) -> Fitness:
         """Return the fitness that a polish from a motion (scores, m = 1) maximises."""
-        if self.method.fitness is None:
+        if self.method.fitness is None and not self.precise:
             return dominating(start, self.scale, self.method.criteria)
-        return lambda scores: -self.objectives(scores.measures)[:, 0]
+        return lambda scores: -self.costs(scores)[:, 0]
 
 
 def search(
@@ -367,7 +382,7 @@ class _Search:
         first = self._genome.sample(random, settings.population)
         if isinstance(self._genome, ViaPointGenome) and len(goal.method.reach) > 1:
             first = self._genome.contracted(first, goal.method.reach)
-        evolution = Evolution(settings, first, 2 if goal.method.fitness is None else 1)
+        evolution = Evolution(settings, first, 2 if goal.two_objectives else 1)
         while self._generations < settings.generations and not self._should_stop():
             children = evolution.ask()
             if children is None:
@@ -376,7 +391,7 @@ class _Search:
             scores = self._score(children)
             if self._first is None:
                 self._first = children, scores
-            evolution.tell(scores, goal.objectives(scores.measures))
+            evolution.tell(scores, goal.costs(scores))
         front = self._front
         if len(front) == 0:
             raise self._failure()
@@ -387,7 +402,8 @@ class _Search:
         if genes.tobytes() != start.tobytes():
             trajectory, criteria = self._population.evaluate(genes, RESCORE_PERIOD)
             # better only at the search's sample period, or other genes of the same motion
-            if criteria == origin[1] or goal.is_worse(criteria, origin[1]):
+            worse = not goal.precise and goal.is_worse(criteria, origin[1])
+            if criteria == origin[1] or worse:
                 genes, (trajectory, criteria) = start, origin
         return Design(
             genes=genes.copy(),
@@ -414,7 +430,7 @@ class _Search:
         settings = self._settings
         if settings.gradient > 0 and not self._should_stop():
             self._phase = "gradient"
-            genes, scores = self._climbed(goal.polish_fitness(scores), genes, scores)
+            genes, scores = self._climbed(goal, genes, scores)
         if settings.polish > 0 and not self._should_stop():
             self._phase = "polish"
             genes, _ = polish(
@@ -428,16 +444,18 @@ class _Search:
             )
         return genes
 
-    def _climbed(self, fitness: Fitness, genes: Array, scores: Scores) -> tuple[Array, Scores]:
+    def _climbed(self, goal: Goal, genes: Array, scores: Scores) -> tuple[Array, Scores]:
         """Return genes and scores of the best motion, improved by the gradient.
 
         With several starts half of the steps are shared by this motion and the best ones of the
         first generation; the other half improve what is best then.
         """
-        settings = self._settings
+        settings, fitness = self._settings, goal.polish_fitness(scores)
         ascent = Ascent(
             self._score,
-            lambda genes, scores: self._population.linearise(genes, partials(fitness, scores)),
+            lambda genes, scores: self._population.linearise(
+                genes, None if goal.precise else partials(fitness, scores)
+            ),
             fitness,
             self._should_stop,
         )
@@ -471,7 +489,8 @@ class _Search:
             except DesignError:  # a front can do without a scale
                 if method.fitness is not None:
                     raise self._failure() from None
-        return Goal(settings, self._population.problem.objective.n_parameters, scale)
+        objective = self._population.problem.objective
+        return Goal(settings, objective.n_parameters, scale, objective.precision is not None)
 
     def _score(self, genes: Array) -> Scores:
         """Return the scores of genes (m, n_genes), from the journal if it has them."""

@@ -102,8 +102,10 @@ def states_of(motion: PiecewiseCubic | FourierSeries) -> Array:
     return np.array(motion.sample(time))
 
 
-def tangent_of(problem: Problem, genes: Array, weights: Array) -> Tangent:
+def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent:
     """Return the slopes of `weights` (d,) times the criteria, and of the margins, by the states.
+
+    Without weights the criterion is minus the logarithm of that of the wanted precision.
 
     Raises:
         PlannerError: the motion cannot be planned.
@@ -161,23 +163,30 @@ def _neighbours(states: Array, steps: Array) -> Iterator[tuple[int, int, Array, 
 
 
 def _excitation(
-    objective: Objective, states: Array, steps: Array, weights: Array, period: float
+    objective: Objective, states: Array, steps: Array, weights: Array | None, period: float
 ) -> tuple[Array, float]:
     """Return the slopes of the weighted criteria by the states (3, N, n), and by the duration."""
-    gram = objective.information(_motion(states, period))
-    by_duration = 0.0
-    if objective.given is not None:
-        longer, shorter = (
-            np.array([*objective.measures(_motion(states, factor * period)).values()]) @ weights
-            for factor in (1.0 + _DURATION_STEP, 1.0 - _DURATION_STEP)
-        )
-        change = 2.0 * _DURATION_STEP * N_SAMPLES * period
-        by_duration = float((longer - shorter) / change)
-    matrix = objective.slope(gram, weights)
+    by_duration, of_joints = 0.0, None
+    if weights is None:
+        precision = objective.precision
+        assert precision is not None
+        whole = objective.precise_information(_motion(states, period))
+        matrix = precision.slope(whole)
+        of_joints = period / precision.density
+        by_duration = float(np.sum(matrix * whole) / (N_SAMPLES * period))
+    else:
+        matrix = objective.slope(objective.information(_motion(states, period)), weights)
+        if objective.given is not None:
+            longer, shorter = (
+                np.array([*objective.measures(_motion(states, factor * period)).values()]) @ weights
+                for factor in (1.0 + _DURATION_STEP, 1.0 - _DURATION_STEP)
+            )
+            change = 2.0 * _DURATION_STEP * N_SAMPLES * period
+            by_duration = float((longer - shorter) / change)
     slope = np.zeros_like(states)
     for kind, joint, above, below, gap in _neighbours(states, steps):
-        difference = objective.along(_motion(above), matrix)
-        difference -= objective.along(_motion(below), matrix)
+        difference = objective.along(_motion(above), matrix, of_joints)
+        difference -= objective.along(_motion(below), matrix, of_joints)
         slope[kind, :, joint] = difference / gap
     return slope, by_duration
 

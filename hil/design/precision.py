@@ -1,0 +1,320 @@
+"""Precision that a design promises: before the search, and of the motion that was found.
+
+Not imported by the package: what reads archives also reads designs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.cell import Cell
+from hil.errors import InputError
+from hil.identify.estimating import Posterior
+from hil.identify.options import FIXED
+from hil.identify.payload_run import flange_of
+from hil.identify.prepared import samples_of, stated_settings
+from hil.identify.torque_scale import TorqueScale, torque_scale
+from hil.terminal_text import plural
+from identification.estimators.payload import DRIFT, parameter_change
+from identification.excitation import Excitation, LoadQuantities, Objective, midpoints
+from identification.excitation.precision import Precision
+from identification.factor.factor import Factor, inverse_variance
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.selection.inner_prediction import Strength
+from planner import Trajectory
+
+from .given import given_sources
+from .requirements import Requirement, require_known
+from .settings import DesignSettings, preset
+from .wanted import ReferenceMotions, Wanted
+
+Array = NDArray[np.float64]
+
+ERROR_SHARE: Final = 0.03
+"""Torque error of a fitted model, as a share of each joint's torque, where nothing was recorded.
+On the real arms of the board (`docs/board.md`) it is 2 to 17 %, on the simulated NS 16 2 %."""
+ERROR_TIME: Final = 0.015
+"""Its correlation [s]: the simulated NS 16 with unmodelled effects has 14 ms."""
+NOISE_SHARE: Final = 0.01
+"""White noise of the torque in one cycle, which repetitions average, as a share of the torque."""
+_CYCLE: Final = 0.001  # s, of a cell without controller
+_REFERENCE_PERIOD: Final = 0.04  # s
+_ARM_TIME: Final = 60.0  # s of motion, from which an arm is assumed to be known
+_YEAR: Final = 3.156e7  # s
+_MEASURED: Final = 3  # recordings whose torque error is measured
+_MOST: Final = 1000  # repetitions that are counted
+_NORMAL: Final = 1.96  # standard deviations in half a 95 % interval of a stated variance
+_ENDLESS: Final = 1e9  # factor of the information of motions without end
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What is promised for one requirement.
+
+    Attributes:
+        requirement: what was wanted.
+        worst: the quantity that is worst.
+        half: half of its 95 % interval after the planned repetitions, in units of the requirement.
+        repetitions: of this motion that meet the requirement; None if none do.
+        motions: different motions of this kind that meet it, once each; None if none do.
+        limit: half of the interval that the scale of the torque alone leaves.
+    """
+
+    requirement: Requirement
+    worst: str
+    half: float
+    repetitions: int | None
+    motions: int | None
+    limit: float
+
+    def message(self, planned: int, scale: TorqueScale) -> str:
+        """Return the forecast as a sentence without full stop."""
+        shown = self.requirement.shown
+        after = plural(planned, "repetition")
+        text = f"{self.requirement}: {self.worst} {shown(self.half)} after {after}"
+        if self.limit > self.requirement.value:
+            return (
+                f"{text}; no motion of this arm can meet it: {shown(self.limit)} remain, "
+                f"{scale.message} (weigh a known load with `hil torque-constants`, or state "
+                "torque_uncertainty)"
+            )
+        if self.repetitions is not None:
+            return f"{text}; met by {plural(self.repetitions, 'repetition')}"
+        text += "; repetitions of one motion do not meet it, as the error of the model repeats"
+        if self.motions is None:
+            return f"{text}, and no number of such motions does"
+        return f"{text}: {plural(self.motions, 'different motion')} of this kind would"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the forecast for JSON and TOML; what does not exist is left out."""
+        table = {
+            "requirement": str(self.requirement),
+            "worst": self.worst,
+            "half": self.half,
+            "wanted": self.requirement.value,
+            "limit": self.limit,
+            "repetitions": self.repetitions,
+            "motions": self.motions,
+        }
+        return {name: value for name, value in table.items() if value is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class PrecisionDesign:
+    """Requirements about an arm, and what is known of its parameters and its torque error."""
+
+    cell: Cell
+    wanted: Wanted
+    subject: Array  #: parameters (p,) that the torque's scale multiplies: the arm's, or a load's
+    prior: Array  #: information of prior and recordings (p, p)
+    error: Array  #: density (n,) of the torque error that every repetition has [(N m)² s]
+    noise: Array  #: density (n,) of the noise that repetitions average [(N m)² s]
+    reference: ReferenceMotions
+    scale: TorqueScale
+    source: str  #: where the torque error is from
+
+    @classmethod
+    def of(
+        cls,
+        cell: Cell,
+        requirements: Sequence[Requirement],
+        motions: Sequence[Trajectory],
+        given: Sequence[Path],
+        payload: float | None = None,
+    ) -> PrecisionDesign:
+        """Return the requirements about a cell, on its validation motions; `given` are recordings.
+
+        With a `payload` of this mass [kg] they are about that, recorded on an arm that is known.
+
+        Raises:
+            InputError: a requirement names no joint or parameter, or is beyond what can be had.
+            CellError: the cell lacks `[nominal]`.
+        """
+        require_known(requirements, cell.model)
+        if any((one.kind == "mass") == (payload is None) for one in requirements):
+            raise InputError(
+                None,
+                "the mass of a payload and the arm itself need different motions",
+                field="--precision",
+                remedy="for a payload add --for payload, with no other requirement",
+            )
+        sampled = [midpoints(motion, _REFERENCE_PERIOD) for motion in motions]
+        reference, nominal = ReferenceMotions(cell.model, sampled), cell.nominal_values()
+        scatter = reference.scatter(nominal)
+        error = (ERROR_SHARE * scatter) ** 2 * ERROR_TIME
+        noise = (NOISE_SHARE * scatter) ** 2 * _cycle(cell)
+        whole = Motion(
+            *(np.concatenate(parts) for parts in zip(*(m[:4] for m in sampled), strict=True))
+        )
+        factor = Factor.from_samples(cell.model, whole, reference.torque(nominal))
+        prior = Posterior.of(cell, factor, "auto", Strength()).prior.gaussian.information
+        values, scale = nominal, torque_scale(cell, (), simulated=cell.only_simulated)
+        if cell.file.drive_train is not None:
+            scale = replace(scale, of="torque constants")
+        source = (
+            f"assumed, {100 * ERROR_SHARE:g} % of each joint's torque; recordings measure it "
+            "(--given)"
+        )
+        if given:
+            values, prior, error = _posterior(cell, given)
+            source = "of the given recordings"
+        known = prior + reference.information(error)
+        subject = values
+        if payload is None:
+            wanted = reference.wanted(requirements, values, known)
+        else:
+            known = prior if given else prior + _ARM_TIME * reference.information(error)
+            wanted, subject = _load(cell.model, requirements[0], payload, values, known)
+        made = cls(cell, wanted, subject, prior, error, noise, reference, scale, source)
+        made._require_possible()
+        return made
+
+    def precision(self, repetitions: float) -> Precision:
+        """Return the criterion of a search for so many repetitions of a motion."""
+        density = self.error + self.noise / repetitions
+        return Precision(self.wanted.quantities, density, self.prior)
+
+    def forecasts(self, excitation: Excitation, repetitions: int) -> list[Forecast]:
+        """Return what a motion promises for each requirement after so many repetitions."""
+        motion = midpoints(excitation.trajectory)
+        step = float(motion.time[1] - motion.time[0])
+        grams = step * Objective(self.cell.model).grams_by_joint(motion)
+
+        limits = np.zeros(len(self.wanted.labels))
+        if self.scale.std.any():
+            limits = self._ratios(grams, repetitions, _ENDLESS)
+        found = []
+        worst = self.wanted.worst(self._ratios(grams, repetitions, 1.0))
+        for k, (requirement, label, ratio) in enumerate(worst):
+            mine = self.wanted.owners == k
+            repeated = partial(self._meets, grams, mine, motions=1.0)
+            various = partial(self._meets, grams, mine, repetitions)
+            found.append(
+                Forecast(
+                    requirement=requirement,
+                    worst=label,
+                    half=ratio * requirement.value,
+                    repetitions=_least(repeated),
+                    motions=_least(various),
+                    limit=float(limits[mine].max()) * requirement.value,
+                )
+            )
+        return found
+
+    def _meets(
+        self, grams: Array, which: NDArray[np.bool_], repetitions: float, motions: float
+    ) -> bool:
+        """Return whether the ratios of some quantities (k,) are all at most one."""
+        return bool(self._ratios(grams, repetitions, motions)[which].max() <= 1.0)
+
+    def _ratios(self, grams: Array, repetitions: float, motions: float) -> Array:
+        """Return the ratios (k,) for the grams (n, p, p) of a motion, times its sample period.
+
+        `motions` is the number of different motions of its kind.
+        """
+        precision = self.precision(repetitions)
+        by_joint = motions * grams / precision.density[:, None, None]
+        information = by_joint.sum(axis=0)
+        ratios = precision.ratios(information)
+        if not self.scale.std.any():
+            return ratios
+        pulls = (by_joint @ self.subject).T
+        moved = precision.spread(information).slope @ pulls * self.scale.std
+        by_scale = _NORMAL * np.linalg.norm(moved, axis=1) / self.wanted.quantities.allowed
+        return np.asarray(np.hypot(ratios, by_scale))
+
+    def _require_possible(self) -> None:
+        """Raise InputError for a requirement beyond what a year of different motions gives."""
+        rate = self.reference.information(self.error + self.noise)
+        precision = self.precision(1.0)
+        for requirement, worst, ratio in self.wanted.worst(precision.ratios(_YEAR * rate)):
+            if ratio > 1.0:
+                year = ratio * requirement.value
+                raise InputError(
+                    None,
+                    f"{requirement} cannot be had: a year of motion leaves "
+                    f"{requirement.shown(year)} ({worst})",
+                    field="--precision",
+                    remedy=f"a day leaves {requirement.shown(year * math.sqrt(365.0))}, an hour "
+                    f"{requirement.shown(year * math.sqrt(365.0 * 24.0))}",
+                )
+
+
+def _load(
+    model: RobotModel, requirement: Requirement, mass: float, values: Array, known: Array
+) -> tuple[Wanted, Array]:
+    """Return a mass at the flange as what is wanted, and the change of parameters (p,) by it.
+
+    The arm is known with the information `known` (p, p); its friction may drift.
+    """
+    change = parameter_change(model, flange_of(model))
+    drift = np.where(model.friction_columns, DRIFT * values, 0.0)
+    scale = 1.0 / np.sqrt(np.diag(known))
+    unit = np.linalg.inv(known * scale[:, None] * scale)
+    covariance = unit * scale[:, None] * scale + np.diag(drift**2)
+    size = np.sqrt(np.diag(covariance))
+    root = size[:, None] * np.linalg.cholesky(covariance / size[:, None] / size)
+    direction = np.zeros((1, change.shape[1]))
+    direction[0, -1] = 1.0
+    allowed = np.array([requirement.value * (mass if requirement.relative else 1.0)])
+    quantities = LoadQuantities(direction, allowed, change, root)
+    owners = np.zeros(1, dtype=np.intp)
+    return Wanted((requirement,), quantities, ("mass",), owners), mass * change[:, -1]
+
+
+def payload_search() -> DesignSettings:
+    """Return settings of a search for a motion that weighs a payload: at most ten seconds."""
+    return short_search().replaced(constraints={"max_duration": 10.0}, via_points={"n_via": 4})
+
+
+def short_search() -> DesignSettings:
+    """Return settings of a search of some seconds for a wanted precision."""
+    return preset("gradient").replaced(
+        search={"population": 24, "generations": 2, "gradient": 30, "starts": 1},
+        via_points={"n_via": 8},
+    )
+
+
+def _least(meets: Callable[[int], bool]) -> int | None:
+    """Return the least count, up to `_MOST`, at which a condition holds that stays true."""
+    if not meets(_MOST):
+        return None
+    low, high = 0, _MOST
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if meets(middle) else (middle, high)
+    return high
+
+
+def _posterior(cell: Cell, paths: Sequence[Path]) -> tuple[Array, Array, Array]:
+    """Return parameters (p,), information (p, p) and torque error (n,) by recordings of an arm."""
+    settings = stated_settings(cell, FIXED)
+    factors, errors = list[Factor](), list[Array]()
+    for source in given_sources(cell, paths):
+        samples = samples_of(source, cell, settings)
+        factors.append(Factor.by_time(cell.model, samples))
+        if len(errors) < _MEASURED:
+            step = float(np.median(np.diff(samples.motion.time)))
+            alone = Posterior.of(cell, factors[-1], "auto", Strength())
+            noise = alone.free(factors[-1]).estimate.noise_std
+            errors.append(noise**2 * step * alone.design_effect)
+    total = sum(factors[1:], factors[0])
+    posterior = Posterior.of(cell, total, "auto", Strength())
+    estimate = posterior.free(total).estimate
+    weights = inverse_variance(estimate.noise_std**2)
+    data = total.weighted(weights).A / posterior.design_effect
+    information = data + posterior.prior.gaussian.information
+    return estimate.values, information, np.median(errors, axis=0)
+
+
+def _cycle(cell: Cell) -> float:
+    return _CYCLE if cell.file.controller is None else cell.period
