@@ -13,6 +13,7 @@ from hil.cli.arguments import JsonOption, QuietOption, figures
 from hil.cli.identify_options import DelayOption, delay_from
 from hil.cli.verdict import NOT_GOOD
 from hil.identify.options import Options
+from hil.identify.payload_by_model import weigh_by_model
 from hil.identify.payload_run import PayloadFound, find_payload
 from hil.progress import reporter as make_reporter
 
@@ -20,6 +21,7 @@ from hil.progress import reporter as make_reporter
 def payload(
     bare: Annotated[list[Path], typer.Argument(metavar="BARE")],
     loaded: list[Path] | None = None,
+    model: Annotated[list[Path] | None, typer.Option(metavar="FOLDER")] = None,
     frame: str | None = None,
     check: Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE")] = None,
     delay: DelayOption = None,
@@ -33,11 +35,17 @@ def payload(
     Exit status 5 if a value of --check lies outside its interval, or if another mounting of the arm
     explains the bare recordings much better.
 
-    **Example:** `hil payload empty.mcap --loaded full.mcap`
+    **Examples:**
+
+    - `hil payload empty.mcap --loaded full.mcap`
+    - `hil payload --model runs/mine full.mcap`: without a bare recording of the motion
 
     Options:
-        bare: Archives (*.mcap) recorded without the payload, or campaign folders.
+        bare: Archives (*.mcap) recorded without the payload, or campaign folders; with --model
+            those recorded with it.
         loaded: Archive recorded with it, or campaign folder (repeatable).
+        model: Campaign folder, or archive, of the bare arm in any motion (repeatable): the payload
+            is the difference to its model, and friction is free to scale.
         frame: URDF link in whose frame the values are given. Default: tool0 or flange if fixed to
             the last joint, else the link of that joint.
         check: Known value, such as mass=4.0 (kg): exit status 5 if it lies outside its 95 %
@@ -45,8 +53,13 @@ def payload(
     """
     wanted = figures(check or [], "--check", "mass=4.0", bare=False)
     reporter = make_reporter(quiet=quiet or json)
-    options = Options(estimator="wls", delay=delay_from(delay))
-    found = find_payload(bare, loaded or [], reporter, frame=frame, options=options)
+    if model:
+        automatic = Options(delay=delay_from(delay))
+        weighed = [*bare, *(loaded or [])]
+        found = weigh_by_model(model, weighed, reporter, frame=frame, options=automatic)
+    else:
+        options = Options(estimator="wls", delay=delay_from(delay))
+        found = find_payload(bare, loaded or [], reporter, frame=frame, options=options)
     outside = found.outside(wanted)
     remedies = found.remedy(wanted) if outside else []
     fields = found.as_json() | {"checked": wanted, "outside": outside, "next_steps": remedies}

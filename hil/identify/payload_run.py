@@ -15,6 +15,7 @@ from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification.estimators.payload import (
     NAMES,
+    KnownArm,
     PayloadEstimate,
     Run,
     contradiction,
@@ -118,6 +119,12 @@ class PayloadFound:
             lines.append(
                 "the archives hold torques without motor currents: check unit and scale of"
                 f" [torque] in the column map (scale = {ratio:.4f} times the present one)"
+            )
+            return lines
+        if not self.bare:
+            lines.append(
+                "estimate the torque constants from the known load: record the same motion without"
+                " it, then hil torque-constants BARE --loaded LOADED"
             )
             return lines
         lines.append(f"estimate the torque constants from the known load: {self._gains(expected)}")
@@ -265,22 +272,15 @@ def find_payload(
     simulated = all(side.header.only_simulated for side in found.values())
     recordings = [source.recording for source in training]
     scale = torque_scale(cell, recordings, simulated=simulated)
-    with reporter.task("weighing", 3) as task:
-        estimate = identify_payload(cell.model, runs, scale.std)
-        task.advance(1)
-        if estimate.body is not None:
-            _require_agreement(cell.model, runs, estimate, frame, sides, training)
-            travel = np.max([np.abs(one.position).max(axis=0) for one in recordings], axis=0)
-            _require_within_reach(estimate, reach(cell.model, frame, travel), frame)
-        task.advance(1)
+    with reporter.task("weighing", 2) as task:
         mounting = doubtful_mounting(cell.model, prepared.fitted)
         task.advance(1)
+        estimate, body = weighed(cell.model, runs, scale, frame, sides, training, mounting)
+        task.advance(1)
     warnings = (*prepared.sources.warnings, *found[True].warnings)
-    if estimate.body is None:
-        raise _no_payload(estimate, mounting)
     return PayloadFound(
         estimate=estimate,
-        body=estimate.body,
+        body=body,
         frame=frame,
         gravity=float(np.linalg.norm(cell.model.gravity)),
         bare=tuple(source.name for source in first),
@@ -351,6 +351,35 @@ def _runs(
     return runs
 
 
+def weighed(
+    model: RobotModel,
+    runs: Sequence[Run],
+    scale: TorqueScale,
+    frame: str,
+    sides: Mapping[bool, Sequence[Path]],
+    training: Sequence[Source],
+    mounting: str | None,
+    known: KnownArm | None = None,
+) -> tuple[PayloadEstimate, Body]:
+    """Return the payload of reduced recordings; `sides` are the bare and the loaded archives.
+
+    `mounting` says why another mounting of the arm is likely.
+
+    Raises:
+        InputError: there is no payload, the recordings contradict each other, or no arm can carry
+            what was found.
+        IdentificationError: the recordings do not determine the mass.
+    """
+    estimate = identify_payload(model, runs, scale.std, known)
+    if estimate.body is None:
+        raise _no_payload(estimate, mounting)
+    _require_agreement(model, runs, estimate, frame, sides, training, known)
+    positions = [np.abs(source.recording.position).max(axis=0) for source in training]
+    travel = np.max(positions, axis=0)
+    _require_within_reach(estimate, reach(model, frame, travel), frame)
+    return estimate, estimate.body
+
+
 def doubtful_mounting(model: RobotModel, bare: Sequence[Samples]) -> str | None:
     """Return why another direction of gravity is likely, from the bare recordings; else None.
 
@@ -385,9 +414,10 @@ def _require_agreement(
     frame: str,
     sides: Mapping[bool, Sequence[Path]],
     training: Sequence[Source],
+    known: KnownArm | None,
 ) -> None:
     """Raise InputError if two recordings carried different bodies."""
-    found = contradiction(model, runs, estimate)
+    found = contradiction(model, runs, estimate, known)
     if found is None:
         return
     first, second = found

@@ -70,7 +70,7 @@ def printed(folder: Path) -> dict[str, object]:
     return found
 
 
-SHORTER = {"design": ("--settings", "quick.toml")}
+SHORTER = {"design": ("--seed", "1")}
 """Words that a test adds to a command."""
 
 
@@ -116,6 +116,55 @@ class TestFigures:
         assert six[:2] == [f"{figures[name]['value']:.5f}" for name in ("Ixx", "Iyy")]
         nine = typed["Franka"].split("{")[2].strip("});").split(", ")
         assert (len(nine), nine[1], nine[4]) == (9, nine[3], six[1])
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bare arm in two other motions."""
+    folder = tmp_path_factory.mktemp("arm")
+    for seed in (11, 12):
+        made = simulate("ur5_robot.urdf", np.arange(0.0, 20.0, 8e-3), seed=seed)
+        archived(folder / f"{seed}.mcap", made)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(folder: Path, arm: Path) -> dict[str, Any]:
+    """The payload against the model of the arm."""
+    status, text = run(folder, "--model", str(arm), "full.mcap", "--json")
+    assert status == 0
+    weighed: dict[str, Any] = json.loads(text)
+    return weighed
+
+
+class TestByModel:
+    """`hil payload --model`: loaded recordings alone, against the model of the arm."""
+
+    def test_the_mass_is_within_two_percent(self, found: dict[str, Any]) -> None:
+        mass = found["figures"]["mass"]
+        assert mass["value"] == pytest.approx(MASS, rel=0.02)
+        assert mass["interval"][0] < MASS < mass["interval"][1]
+        assert found["bare"] == [] and found["loaded"] == ["full.mcap"]
+        assert "against the model of the arm" in found["method"]
+
+    def test_it_agrees_with_a_bare_recording_and_is_not_surer(
+        self, found: dict[str, Any], printed: dict[str, Any]
+    ) -> None:
+        for name in ("mass", "cx", "cy", "cz"):
+            alone, both = found["figures"][name], printed["figures"][name]
+            low, high = alone["interval"]
+            assert low <= both["interval"][1] and both["interval"][0] <= high
+        widths = [np.diff(result["figures"]["mass"]["interval"])[0] for result in (found, printed)]
+        assert widths[0] > 0.5 * widths[1]
+
+    def test_another_arm_and_nothing_carried_are_refused(self, folder: Path, arm: Path) -> None:
+        with pytest.raises(InputError, match=r"show no payload|does not separate"):
+            run(folder, "--model", str(arm), "empty.mcap")
+        other = archived(
+            arm.parent / "ur10.mcap", simulate("ur10_robot.urdf", np.arange(0.0, 6.0, 8e-3), seed=1)
+        )
+        with pytest.raises(ArchiveError, match=r"another arm .* robot\.urdf"):
+            run(folder, "--model", str(arm), str(other))
 
 
 def test_the_same_recording_and_another_arm_are_named(folder: Path, tmp_path: Path) -> None:
