@@ -75,10 +75,21 @@ class StepResult(Frozen):
     details: list[str]
 
 
+class PrecisionResult(Frozen):
+    """One required precision over the repetitions."""
+
+    requirement: str
+    repetitions: list[int]
+    ratio: list[float]  #: 95 % interval over the required one, after each of them
+    worst: str  #: Quantity that was worst at the end
+    promised: float | None = None  #: Ratio that the design promised for the planned repetitions
+
+
 class ConductResult(Frozen):
     """Execution of a campaign."""
 
     steps: list[StepResult]
+    precision: list[PrecisionResult] = []  #: Empty if none was required
 
 
 class JointJudgement(Frozen):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from hil.archive.live import LiveView
 from hil.cell import Cell
+from hil.design.requirements import Requirement
 from hil.errors import HilError, InputError
 from hil.identify.options import Options
 from hil.progress import Reporter, Silent
@@ -113,6 +114,7 @@ class Campaign(CampaignState):
         accept_dry_run: bool = False,
         accept_torque: Sequence[str] = (),
         live: LiveView | None = None,
+        until_precise: Sequence[Requirement] = (),
     ) -> RunResult:
         """Run the motions that are missing, in order, and return the arm to its first position.
 
@@ -135,6 +137,7 @@ class Campaign(CampaignState):
             accept_torque: joints to accept whose torque had the opposite sign of gravity in the
                 dry run of an earlier run (`DryRunRecord.against_gravity`).
             live: where viewers may connect, on the cell's own link.
+            until_precise: end the repetitions when these are met, or more of them do not help.
 
         Raises:
             NotRehearsedError: the plan did not pass its rehearsal.
@@ -160,6 +163,7 @@ class Campaign(CampaignState):
             accept_dry_run=accept_dry_run,
             accept_torque=tuple(accept_torque),
             live=live,
+            until_precise=tuple(until_precise),
         )
         return run_motions(self, link, watch, reporter or Silent(), options)
 

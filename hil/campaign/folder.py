@@ -191,6 +191,7 @@ class CampaignFolder:
     rehearsed = _Below("rehearsal")
     dry_run = _Below("dry_run.json")
     warmup = _Below("warmup.json")
+    precision = _Below("precision.json")
     _path = _Below("manifest.json")
 
     @property

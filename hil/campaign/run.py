@@ -20,6 +20,7 @@ from .gates import require_as_rehearsed, require_dry_run, require_gates
 from .intervals import Interval, StraightMoves, require_allowed
 from .link import MotionLink
 from .operator import RunWatch
+from .precision import PrecisionStage
 from .quality import Rejected
 from .runner import RunArchives, Runner, RunOptions
 from .stages import DryRunStage, WarmUpStage
@@ -41,6 +42,7 @@ class RunResult:
         repetitions, validations: how many are complete now, and how many there are to be.
         complete: whether no motion is missing.
         cycles: archived by this run.
+        precision: what the repetitions reached of a required precision; "" if none was required.
         notes: what a reader must know.
     """
 
@@ -57,6 +59,7 @@ class RunResult:
     validations: tuple[int, int]
     complete: bool
     cycles: int
+    precision: str
     notes: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -107,11 +110,18 @@ class _CampaignRun:
                 can_answer=watch.operator.can_answer,
             )
         self._warm_up = WarmUpStage(campaign, self._archives, watch, reporter)
+        self._precision = (
+            PrecisionStage(campaign, options.until_precise, plan_hash, reporter)
+            if options.until_precise
+            else None
+        )
 
     def execute(self) -> RunResult:
         """Run the missing motions; a controller is connected only where some are missing."""
         options, dry_run = self._options, self._dry_run
         self._archives.adopt(dry_run.intervals)
+        if self._precision is not None:
+            self._precision.begin()
         slow, full = dry_run.missing(), [] if options.dry_run_only else self._campaign.missing()
         if not slow:
             dry_run.accept()
@@ -181,12 +191,18 @@ class _CampaignRun:
         """Run the missing motions of a kind; repetitions only while the joints are warm."""
         _, total = self._campaign.progress(kind)
         for interval in self._campaign.missing(kind):
+            precision = self._precision if kind == "excitation" else None
+            if precision is not None and precision.ended:
+                return
             runner.run_until_accepted(interval, interval.index + 1, total)
+            if precision is not None:
+                precision.repeated()
             if kind == "validation":
                 self._warm_up.motion_ended()
 
     def _result(self) -> RunResult:
         campaign, archives, found = self._campaign, self._archives, self._dry_run.found()
+        precision = campaign.precision
         return RunResult(
             campaign=str(campaign.folder.root),
             plan_hash=archives.plan_hash,
@@ -201,6 +217,7 @@ class _CampaignRun:
             validations=campaign.progress("validation"),
             complete=not campaign.missing(),
             cycles=archives.cycles,
+            precision="" if precision is None else precision.message,
             notes=(
                 *archives.notes,
                 *(f"dry run: {text}" for text in (() if found is None else found.warnings)),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hil.archive import ArchiveHeader, ArchiveSpec, open_archive
 from hil.archive.live import LiveView
+from hil.design.requirements import Requirement
 from hil.errors import ArchiveError
 from hil.progress import Reporter, Task
 from hil.reading import parse_json
@@ -48,6 +49,7 @@ class RunOptions:
     accept_dry_run: bool = False
     accept_torque: tuple[str, ...] = ()
     live: LiveView | None = None
+    until_precise: tuple[Requirement, ...] = ()
 
 
 class RunArchives:

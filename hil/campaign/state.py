@@ -15,12 +15,14 @@ from hil.design.run import DESIGN_FILES
 from hil.errors import OutputError
 from hil.files import make_folder, write_atomically
 from hil.motion_checks import MotionChecks
+from hil.reading import path_exists
 from identification.excitation import Excitation
 
 from .errors import CampaignFolderError
 from .folder import CampaignFolder
 from .intervals import Interval, planned_intervals, require_runnable
 from .plan import CampaignPlan, plan_around
+from .precision_record import PrecisionRecord
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -121,14 +123,32 @@ class CampaignState:
         """All motions of its plan in order, without the moves between them."""
         return planned_intervals(self.cell, self.plan)
 
+    @property
+    def precision(self) -> PrecisionRecord | None:
+        """Precision of its repetitions, as far as a run measured it."""
+        if not path_exists(self.folder.precision):
+            return None
+        return PrecisionRecord.load(self.folder.precision, self.folder.plan_hash)
+
     def missing(self, *kinds: str) -> list[Interval]:
-        """Return what is still to be run at full speed, of these kinds or of all."""
+        """Return what is still to be run at full speed, of these kinds or of all.
+
+        Repetitions that a required precision has ended are not missing.
+        """
+        precision = self.precision
+        ended = ("excitation",) if precision is not None and precision.ended else ()
         return [
             one
             for one in self.motions
-            if one.kind in (kinds or (one.kind,)) and self.folder.whole(one.kind, one.index) is None
+            if one.kind in (kinds or (one.kind,))
+            and one.kind not in ended
+            and self.folder.whole(one.kind, one.index) is None
         ]
 
     def progress(self, kind: str) -> tuple[int, int]:
         """Return how many motions of a kind are complete, and how many there are to be."""
-        return len(self.folder.completed(kind)), sum(one.kind == kind for one in self.motions)
+        done = len(self.folder.completed(kind))
+        precision = self.precision if kind == "excitation" else None
+        if precision is not None and precision.ended:
+            return done, done
+        return done, sum(one.kind == kind for one in self.motions)

@@ -9,14 +9,16 @@ from typing import Any, Final, Literal
 
 from hil.archive import ArchiveName
 from hil.cell import Cell
+from hil.design.result import RESULT, DesignResult
 from hil.errors import HilError
 from hil.reading import path_exists
-from hil.results import ConductResult, Results, StepResult
+from hil.results import ConductResult, PrecisionResult, Results, StepResult
 from hil.terminal_text import plural, typed
 from identification.text import percentage
 
 from .dry_run import DryRunRecord
 from .folder import CampaignFolder
+from .precision_record import PrecisionRecord
 from .rehearsal import Rehearsal
 from .state import CampaignState
 from .warmup import WarmUpRecord, drift_wanted
@@ -214,7 +216,9 @@ def _conducted_warm_up(folder: CampaignFolder) -> Step:
 def _motions(campaign: CampaignState, kind: str, words: str) -> Step:
     whole, total = campaign.progress(kind)
     state: State = "done" if whole >= total else "next"
-    return Step(state, f"{whole} of {total} {words} complete", "run {}")
+    precision = campaign.precision if kind == "excitation" else None
+    details = () if precision is None else (precision.message,)
+    return Step(state, f"{whole} of {total} {words} complete", "run {}", details)
 
 
 def _identified(folder: CampaignFolder) -> Step:
@@ -252,12 +256,43 @@ def conduct_of(folder: CampaignFolder) -> ConductResult:
         "repetitions": _recorded(folder, "excitation"),
         "validation": _recorded(folder, "validation"),
     }
+    record = _precision(folder)
+    if record is not None:
+        repeated = steps["repetitions"]
+        details = (*repeated.details, record.message)
+        steps["repetitions"] = replace(repeated, details=details)
     return ConductResult(
         steps=[
             StepResult(step=name, done=found.done, words=found.sentence, details=[*found.details])
             for name, found in steps.items()
-        ]
+        ],
+        precision=[] if record is None else _over_repetitions(folder, record),
     )
+
+
+def _precision(folder: CampaignFolder) -> PrecisionRecord | None:
+    if not path_exists(folder.precision):
+        return None
+    found = PrecisionRecord.load(folder.precision, folder.plan_hash)
+    return found if found is not None and found.looks else None
+
+
+def _over_repetitions(folder: CampaignFolder, record: PrecisionRecord) -> list[PrecisionResult]:
+    """Return each requirement over the repetitions, with what the design in the folder promised."""
+    promised: dict[str, float] = {}
+    if path_exists(folder.root / RESULT):
+        for one in DesignResult.load(folder.root).data.get("precision", ()):
+            promised[one["requirement"]] = one["half"] / one["wanted"]
+    return [
+        PrecisionResult(
+            requirement=text,
+            repetitions=[look.repetitions for look in record.looks],
+            ratio=[look.reached[k].ratio for look in record.looks],
+            worst=record.looks[-1].reached[k].worst,
+            promised=promised.get(text),
+        )
+        for k, text in enumerate(record.requirements)
+    ]
 
 
 def _recorded(folder: CampaignFolder, kind: str) -> Step:

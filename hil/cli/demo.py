@@ -129,7 +129,7 @@ def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
 
 
 _OURS = {"archives", "cell.toml", "robot.urdf", "plan.json", "manifest.json", "paper"}
-_OURS |= {"rehearsal", "rehearsal.json", "dry_run.json", "warmup.json"}
+_OURS |= {"rehearsal", "rehearsal.json", "dry_run.json", "warmup.json", "precision.json"}
 _OURS |= {"campaign.lock", RESULTS, REPORT, SERIES, *FILES}
 
 

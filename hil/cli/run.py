@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json as json_format
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -11,10 +11,12 @@ import typer
 from hil.archive import ArchiveName
 from hil.archive.live import LiveView
 from hil.campaign import Campaign, MotionFailedError, stop_on_interrupt
+from hil.campaign.precision import requirements_of
 from hil.campaign.run import RunResult
 from hil.cell_link import require_real_time
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, print_json
 from hil.cli.verdict import NOT_GOOD, as_json, finish
+from hil.design.requirements import Requirement
 from hil.errors import ExecutionError, InputError, OperatorStopError
 from hil.progress import reporter as make_reporter
 from hil.progress import say
@@ -29,6 +31,8 @@ def run(
     accept_dry_run: bool = False,
     accept_torque: Annotated[list[str] | None, typer.Option(metavar="JOINT")] = None,
     no_identify: bool = False,
+    until_precise: bool = False,
+    precision: Annotated[list[str] | None, typer.Option(metavar="REQUIREMENTS")] = None,
     live: Annotated[str | None, typer.Option(metavar="[HOST:]PORT")] = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -56,12 +60,17 @@ def run(
         accept_torque: With --accept-dry-run: confirm that the torque of this joint had a known
             reason to oppose the modelled gravity in the dry run (repeatable).
         no_identify: Only run; no parameters and no report.
+        until_precise: End the repetitions when the required precision is reached, or when more of
+            them do not help. Their number in [campaign] is the limit.
+        precision: With --until-precise: halves of 95 % intervals, such as "parameters 5%, torque
+            10". Default: those of the design, or of an earlier run.
         live: Stream the run to Foxglove; on 127.0.0.1 unless HOST is given.
     """
     if dry_run and accept_dry_run:
         remedy = "run --dry-run first, watch the arm, then --accept-dry-run"
         raise InputError(None, "--dry-run and --accept-dry-run together", remedy=remedy)
     opened = Campaign.open(campaign)
+    required = _required(opened, until_precise, precision or [])
     if rehearse:
         with stop_on_interrupt() as stop:
             opened.rehearse(reporter=make_reporter(quiet=quiet or json), stop=stop)
@@ -69,12 +78,25 @@ def run(
         "dry_run_only": dry_run,
         "accept_dry_run": accept_dry_run,
         "accept_torque": accept_torque or (),
+        "until_precise": required,
     }
     result = _run(opened, choices, quiet=quiet or json, live=live)
     if dry_run or no_identify:
         _print(result, json=json)
         return
     _identify(opened, result, quiet=quiet, json=json)
+
+
+def _required(
+    campaign: Campaign, until_precise: bool, texts: Sequence[str]
+) -> tuple[Requirement, ...]:
+    """Return the precision that ends the repetitions, none without --until-precise."""
+    if until_precise:
+        return requirements_of(campaign, texts)
+    if texts:
+        remedy = "add --until-precise"
+        raise InputError(None, "--precision without --until-precise", remedy=remedy)
+    return ()
 
 
 def _run(
@@ -123,6 +145,8 @@ def _print(result: RunResult, *, json: bool) -> None:
         f"{result.campaign}: dry run {result.dry_run}, repetitions {done} of {wanted}, validation "
         f"{tested} of {tests}, {len(result.rejected)} rejected"
     )
+    if result.precision:
+        say(result.precision)
     for note in result.notes:
         say(note)
     for one in result.rejected:

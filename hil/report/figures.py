@@ -281,6 +281,27 @@ def residual_panels(results: Results) -> dict[str, list[Panel]]:
     return found
 
 
+def precision_panels(results: Results) -> list[Panel]:
+    """Draw each required precision over the repetitions, with what the design promised."""
+    panels = []
+    required = results.conduct.precision if results.conduct is not None else []
+    for k, one in enumerate(required):
+        count, ratio = np.array(one.repetitions, np.float64), np.array(one.ratio)
+        note = f"{one.worst} is worst"
+        what = "95 % interval over the required one, over repetitions"
+        axes = single(170.0, "interval / required", "repetitions", x_ticks=6)
+        axes.x_limits = 0.5, float(count.max()) + 0.5
+        promised = np.full(2, np.nan if one.promised is None else one.promised)
+        shown = np.concatenate([ratio, promised, [0.0, 1.1]])
+        axes.y_limits = padded(shown[np.isfinite(shown)])
+        axes.segments(np.array([[-np.inf, np.inf]]), np.ones((1, 2)), MUTED, 0.9)
+        axes.line(np.array(axes.x_limits), promised, MUTED, 1.4, dashed=True)
+        axes.line(count, ratio, FIRST, 1.2)
+        axes.dots(count, ratio, FIRST, 4.5)
+        panels.append(panel([axes], Caption(f"q{k}", one.requirement, note, what)))
+    return panels
+
+
 def correlation_matrix(results: Results) -> Panel | None:
     """Draw |Ψ_ij| / sqrt(Ψ_ii Ψ_jj) of the base parameters, 0 white, 1 black (paper, Fig. 2)."""
     n = results.n_base

@@ -81,6 +81,7 @@ def report_bytes(
         "correlation": figures.correlation_matrix(results),
         "legend": figures.LEGENDS,
         "part_legends": figures.known_parts(series),
+        "precision": figures.precision_panels(results),
         **figures.residual_panels(results),
         **{name: [chart_panel(chart, bins) for chart in group] for name, group in charts.items()},
         "chart_data": chart_data(charts, results.joint_names),

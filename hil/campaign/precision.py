@@ -1,0 +1,191 @@
+"""Precision of a running campaign: measured after each repetition, and when it is enough.
+
+The estimate is the posterior that `hil identify` computes, with the friction law and delay of the
+cell file. Its intervals are cluster-robust: what the model cannot explain in the same place of
+every repetition counts as one error, however often it is repeated. Only the rest falls with them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.design.requirements import Requirement, require_known, requirements_from
+from hil.design.result import RESULT
+from hil.design.settings import load_settings
+from hil.design.wanted import ReferenceMotions
+from hil.errors import InputError
+from hil.identify.estimating import Posterior, with_uncertain_scale
+from hil.identify.options import FIXED
+from hil.identify.prepared import samples_of, stated_settings
+from hil.identify.sources import gather_sources
+from hil.identify.torque_scale import torque_scale
+from hil.progress import Reporter
+from identification.excitation import midpoints
+from identification.factor.factor import Factor, inverse_variance
+from identification.selection.inner_prediction import Strength
+
+from .precision_record import IN_A_ROW, Look, PrecisionRecord, Reached
+from .state import CampaignState
+
+Array = NDArray[np.float64]
+
+_REFERENCE_PERIOD: Final = 0.04  # s
+
+
+class PrecisionMeter:
+    """Measures the precision of the archived repetitions of a campaign."""
+
+    def __init__(self, campaign: CampaignState, requirements: Sequence[Requirement]) -> None:
+        require_known(requirements, campaign.cell.model)
+        if any(one.kind == "mass" for one in requirements):
+            raise InputError(
+                None,
+                "the mass of a payload needs motions with the payload",
+                field="--precision",
+                remedy="weigh it with `hil payload`",
+            )
+        self._cell, self._requirements = campaign.cell, tuple(requirements)
+        self._settings = stated_settings(campaign.cell, FIXED)
+        motions = [
+            midpoints(motion.trajectory, _REFERENCE_PERIOD) for motion in campaign.plan.validation
+        ]
+        self._reference = ReferenceMotions(campaign.cell.model, motions)
+        self._factors: dict[Path, Factor] = {}
+
+    def measure(self, paths: Sequence[Path]) -> Look:
+        """Return the precision that some repetitions give together; archives are read once."""
+        for path in paths:
+            if path not in self._factors:
+                (source,) = gather_sources([path], FIXED.split, in_sample=True).training
+                samples = samples_of(source, self._cell, self._settings)
+                self._factors[path] = Factor.by_time(self._cell.model, samples)
+        factors = [self._factors[path] for path in paths]
+        total = sum(factors[1:], factors[0])
+        posterior = Posterior.of(self._cell, total, "auto", Strength())
+        estimate = posterior.free(total).estimate
+        scale = torque_scale(self._cell, (), simulated=self._cell.only_simulated)
+        stated = with_uncertain_scale(estimate, total, posterior.precision, scale)
+        weights = inverse_variance(estimate.noise_std**2)
+        information = total.weighted(weights).A + posterior.precision
+        wanted = self._reference.wanted(
+            self._requirements, estimate.values, information / posterior.design_effect
+        )
+        directions = wanted.quantities.directions
+        variance = np.einsum("kp,pq,kq->k", directions, stated.covariance, directions)
+        ratios = stated.interval_factor * np.sqrt(variance) / wanted.quantities.allowed
+        moved = np.asarray(np.linalg.solve(information, directions.T))
+        shares = noise_shares(factors, weights, estimate.values, moved)
+        reached = []
+        for k, requirement in enumerate(self._requirements):
+            mine = np.flatnonzero(wanted.owners == k)
+            worst = int(mine[np.argmax(ratios[mine])])
+            more = [further(len(paths), ratios[one], shares[one]) for one in mine.tolist()]
+            known = [one for one in more if one is not None]
+            most = max(known) if len(known) == len(more) else None
+            half = float(ratios[worst]) * requirement.value
+            reached.append(Reached(str(requirement), wanted.labels[worst], half, most))
+        return Look(len(paths), tuple(reached))
+
+
+def noise_shares(factors: Sequence[Factor], weights: Array, values: Array, moved: Array) -> Array:
+    """Return the share of the variances (k,) that differs between repetitions of a motion.
+
+    The rest is the same in all of them. `moved` (p, k) are the inverse information times the
+    directions. NaN for one repetition.
+    """
+    count = len(factors)
+    if count < 2:
+        return np.full(moved.shape[1], np.nan)
+    blocks = min(len(factor) for factor in factors)
+    pulls = np.array([factor.scores(weights, values)[:blocks] @ moved for factor in factors])
+    whole = np.sum(pulls.sum(axis=0) ** 2, axis=0)
+    scatter = np.sum((pulls - pulls.mean(axis=0)) ** 2, axis=(0, 1)) * count / (count - 1)
+    return np.asarray(np.clip(scatter / np.where(whole > 0.0, whole, 1.0), 0.0, 1.0))
+
+
+def further(repetitions: int, ratio: float, share: float) -> int | None:
+    """Return how many more repetitions bring a ratio to one, None if none do.
+
+    `share` of its square falls with the number of repetitions, the rest does not.
+    """
+    if ratio <= 1.0:
+        return 0
+    left = 1.0 / ratio**2 - (1.0 - share)
+    if not left > 0.0:  # NaN as well
+        return None
+    return max(1, math.ceil(repetitions * share / left) - repetitions)
+
+
+class PrecisionStage:
+    """Measures each repetition of a run, and ends the repetitions when they are enough."""
+
+    def __init__(
+        self,
+        campaign: CampaignState,
+        requirements: Sequence[Requirement],
+        plan_hash: str,
+        reporter: Reporter,
+    ) -> None:
+        self._campaign, self._reporter = campaign, reporter
+        self._path, self._limit = campaign.folder.precision, campaign.cell.campaign.repetitions
+        self._meter = PrecisionMeter(campaign, requirements)
+        texts = tuple(str(one) for one in requirements)
+        self._record = PrecisionRecord(plan_hash, texts)
+        found = PrecisionRecord.load(self._path, plan_hash)
+        if found is not None and found.requirements == texts:
+            self._record = found
+
+    def begin(self) -> None:
+        """Measure the repetitions of earlier runs; a new requirement may need more of them."""
+        done = len(self._campaign.folder.completed("excitation"))
+        if done == 0 or not self._record.looks or self._record.looks[-1].repetitions != done:
+            self._record = replace(self._record, looks=(), outcome="going on")
+            for count in range(max(1, done - IN_A_ROW + 1), done + 1):
+                self._look(count)
+        self._record.save(self._path)
+
+    @property
+    def ended(self) -> bool:
+        """Whether no more repetitions are run."""
+        return self._record.ended
+
+    def repeated(self) -> None:
+        """Measure the precision after another repetition, and report it."""
+        self._look(len(self._campaign.folder.completed("excitation")))
+        self._record.save(self._path)
+        self._reporter.say(self._record.message)
+
+    def _look(self, count: int) -> None:
+        paths = self._campaign.folder.completed("excitation")[:count]
+        self._record = self._record.with_look(self._meter.measure(paths), self._limit)
+
+
+def requirements_of(campaign: CampaignState, texts: Sequence[str]) -> tuple[Requirement, ...]:
+    """Return the requirements of texts, else of an earlier run, else of the design in the folder.
+
+    Raises:
+        InputError: there are none, or one is invalid.
+    """
+    folder = campaign.folder
+    if texts:
+        return requirements_from(texts)
+    found = PrecisionRecord.load(folder.precision, folder.plan_hash)
+    if found is not None:
+        return requirements_from(found.requirements)
+    if (folder.root / RESULT).exists():
+        stated = load_settings(folder.root / RESULT).objective.precision
+        if stated:
+            return requirements_from(stated)
+    raise InputError(
+        folder.root,
+        "neither its design nor an earlier run states a precision",
+        field="--until-precise",
+        remedy='state it, for example --precision "parameters 5%, torque 10"',
+    )

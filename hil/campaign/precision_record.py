@@ -1,0 +1,143 @@
+"""Precision of a campaign over its repetitions, as `precision.json` records it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Literal, Self
+
+from hil.design.requirements import Requirement, requirements_from
+from hil.terminal_text import plural
+
+from .folder import load_record, save_record
+
+IN_A_ROW: Final = 2
+"""Repetitions after which a requirement must be met one after the other: one interval alone can be
+narrow by chance, the more often one looks (Simons 1968 adds observations after the first look)."""
+FEWEST: Final = 3
+"""Repetitions before a campaign ends because more of them do not help."""
+_VERSION: Final = 1
+
+
+@dataclass(frozen=True)
+class Reached:
+    """One requirement after some repetitions.
+
+    Attributes:
+        requirement: as typed.
+        worst: quantity that is worst.
+        half: half of its 95 % interval, in units of the requirement.
+        more: further repetitions that would meet it; None if none do, or after one repetition.
+    """
+
+    requirement: str
+    worst: str
+    half: float
+    more: int | None
+
+    @property
+    def wanted(self) -> Requirement:
+        """The requirement."""
+        return requirements_from([self.requirement])[0]
+
+    @property
+    def ratio(self) -> float:
+        """Interval over the required one."""
+        return self.half / self.wanted.value
+
+    def message(self, repetitions: int) -> str:
+        """Return its state after so many, such as "I5yy 7.1 % of 5 %, about 6 more"."""
+        wanted = self.wanted
+        text = f"{self.worst} {wanted.shown(self.half)} of {wanted.shown(wanted.value)}"
+        if self.ratio <= 1.0:
+            return f"{text}, met"
+        if repetitions == 1:  # what differs between repetitions is not known
+            return text
+        if self.more is None:
+            return f"{text}, which repetitions of this motion do not improve enough"
+        return f"{text}, about {self.more} more"
+
+
+@dataclass(frozen=True)
+class Look:
+    """Precision after some repetitions."""
+
+    repetitions: int
+    reached: tuple[Reached, ...]
+
+    @property
+    def worst(self) -> Reached:
+        """The requirement that is missed most."""
+        return max(self.reached, key=lambda one: one.ratio)
+
+    @property
+    def met(self) -> bool:
+        """Whether all requirements are met."""
+        return self.worst.ratio <= 1.0
+
+
+@dataclass(frozen=True)
+class PrecisionRecord:
+    """Precision of a campaign over its repetitions; `precision.json`.
+
+    Attributes:
+        plan_hash: of the plan.
+        requirements: as typed.
+        looks: one for each repetition, in order.
+        outcome: "going on"; "met"; "out of reach", if more repetitions do not help; or "limit".
+    """
+
+    plan_hash: str
+    requirements: tuple[str, ...]
+    looks: tuple[Look, ...] = ()
+    outcome: Literal["going on", "met", "out of reach", "limit"] = "going on"
+
+    @classmethod
+    def load(cls, path: Path, plan_hash: str) -> Self | None:
+        """Read the file; None without one for this plan (CampaignFolderError if damaged)."""
+        found = load_record(cls, path, "remove that file")
+        return found if found is not None and found.plan_hash == plan_hash else None
+
+    def save(self, path: Path) -> None:
+        """Write the file (OutputError if the disk refuses)."""
+        save_record(path, self, _VERSION)
+
+    def with_look(self, look: Look, limit: int) -> PrecisionRecord:
+        """Return the record after another repetition, of at most `limit`."""
+        looks = (*(one for one in self.looks if one.repetitions < look.repetitions), look)
+        longer = replace(self, looks=looks)
+        last = looks[-IN_A_ROW:]
+        if len(last) == IN_A_ROW and all(one.met for one in last):
+            return replace(longer, outcome="met")
+        if look.repetitions >= limit:
+            return replace(longer, outcome="limit")
+        unreachable = [
+            one.ratio > 1.0 and (one.more is None or look.repetitions + one.more > limit)
+            for one in look.reached
+        ]
+        promising = [one.ratio > 1.0 for one in look.reached]
+        if look.repetitions >= FEWEST and any(unreachable) and unreachable == promising:
+            return replace(longer, outcome="out of reach")
+        return replace(longer, outcome="going on")
+
+    @property
+    def ended(self) -> bool:
+        """Whether no more repetitions are run."""
+        return self.outcome != "going on"
+
+    @property
+    def message(self) -> str:
+        """Its last look as a sentence without full stop."""
+        if not self.looks:
+            return "no repetition was measured yet"
+        look = self.looks[-1]
+        worst = look.worst.message(look.repetitions)
+        text = f"precision after {plural(look.repetitions, 'repetition')}: {worst}"
+        if self.outcome == "met":
+            return f"{text}: all requirements are met, no more repetitions"
+        if self.outcome == "out of reach":
+            return (
+                f"{text}: no more repetitions; another motion adds what this one does not show "
+                "(hil design --given, with the same --precision)"
+            )
+        return text

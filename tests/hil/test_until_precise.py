@@ -1,0 +1,189 @@
+"""Campaigns that end when the required precision is reached, or when repetitions do not help."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hil.campaign import Campaign
+from hil.campaign.operator import Stop
+from hil.campaign.plan import design
+from hil.campaign.precision import further, requirements_of
+from hil.campaign.precision_record import Look, PrecisionRecord, Reached
+from hil.cli import app
+from hil.errors import ExecutionError, InputError
+from hil.progress import Silent
+from tests.hil.fast_cell import fast_cell, pass_rehearsal
+
+LOOSE = ("parameters 20%", "torque 5")
+
+
+class Heard(Silent):
+    """Keeps what is said."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.lines.append(text)
+
+
+def campaign_of(folder, **changes) -> Campaign:
+    cell = fast_cell(folder, repetitions=6).with_values(
+        {"simulation.friction_drift": 0.0} | changes
+    )
+    return Campaign.create(folder / "it", cell, design(cell, Silent()))
+
+
+def run(campaign, *texts: str, stop: Stop | None = None, **choices) -> Heard:
+    heard, required = Heard(), requirements_of(campaign, texts)
+    campaign.run(stop=stop, reporter=heard, unrehearsed=True, until_precise=required, **choices)
+    return heard
+
+
+@pytest.fixture(scope="module")
+def met(tmp_path_factory):
+    campaign = campaign_of(tmp_path_factory.mktemp("met"))
+    return campaign, run(campaign, *LOOSE)
+
+
+class TestEnd:
+    def test_a_campaign_ends_after_two_repetitions_that_meet(self, met) -> None:
+        """A single interval may be narrow by chance, so that two in a row must meet."""
+        campaign, heard = met
+        assert len(campaign.folder.completed("excitation")) == 2
+        assert len(campaign.folder.completed("validation")) == 1
+        assert campaign.precision.outcome == "met"
+        assert [look.met for look in campaign.precision.looks] == [True, True]
+        assert any("all requirements are met, no more" in line for line in heard.lines)
+
+    def test_nothing_is_missing_then(self, met) -> None:
+        campaign, _ = met
+        assert campaign.missing() == []
+        assert campaign.progress("excitation") == (2, 2)
+        steps = {step.name: step for step in campaign.status().steps}
+        assert steps["repetitions"].done
+        assert "requirements are met" in steps["repetitions"].details[0]
+
+    def test_a_stricter_requirement_continues(self, met) -> None:
+        campaign, _ = met
+        run(campaign, "parameters 0.001%")
+        assert campaign.precision.outcome in ("out of reach", "limit")
+        assert len(campaign.folder.completed("excitation")) > 2
+
+    def test_without_one_all_repetitions_are_run(self, tmp_path) -> None:
+        campaign = campaign_of(tmp_path)
+        campaign.run(unrehearsed=True)
+        assert campaign.progress("excitation") == (6, 6)
+        assert campaign.precision is None
+
+    def test_a_stopped_run_is_resumed(self, tmp_path) -> None:
+        campaign, stop = campaign_of(tmp_path), Stop()
+
+        class Stopping(Heard):
+            def say(self, text: str) -> None:
+                super().say(text)
+                stop.requested |= text.startswith("precision after 1 repetition:")
+
+        required = requirements_of(campaign, LOOSE)
+        with pytest.raises(ExecutionError):
+            campaign.run(stop=stop, reporter=Stopping(), unrehearsed=True, until_precise=required)
+        assert len(campaign.folder.completed("excitation")) == 1
+        assert campaign.precision.outcome == "going on"
+        again = Campaign.open(campaign.folder.root)
+        run(again)  # with the requirements of the stopped run
+        assert len(again.folder.completed("excitation")) == 2
+        assert again.precision.outcome == "met"
+
+
+def reached(half: float, more: int | None, text: str = "parameters 5 %") -> Reached:
+    return Reached(text, "I2m", half, more)
+
+
+class TestRecord:
+    @pytest.mark.parametrize(
+        ("halves", "more", "outcome"),
+        [
+            ((0.04,), (0,), "going on"),
+            ((0.04, 0.06), (0, 1), "going on"),
+            ((0.06, 0.04, 0.04), (1, 0, 0), "met"),
+            ((0.07, 0.07, 0.07), (None, None, None), "out of reach"),
+            ((0.07, 0.07, 0.07), (None, 30, 30), "out of reach"),
+            ((0.07, 0.07), (None, None), "going on"),
+            ((0.07, 0.06, 0.055, 0.052), (3, 3, 2, 1), "going on"),
+        ],
+    )
+    def test_outcomes(self, halves, more, outcome) -> None:
+        record = PrecisionRecord("hash", ("parameters 5 %",))
+        for count, (half, further_) in enumerate(zip(halves, more, strict=True), 1):
+            record = record.with_look(Look(count, (reached(half, further_),)), limit=10)
+        assert record.outcome == outcome
+
+    def test_the_limit_ends_it(self) -> None:
+        record = PrecisionRecord("hash", ("parameters 5 %",))
+        for count in range(1, 5):
+            record = record.with_look(Look(count, (reached(0.06, 1),)), limit=4)
+        assert record.outcome == "limit"
+
+    def test_one_requirement_in_reach_continues(self) -> None:
+        """The one that repetitions do not meet is no reason to leave the other unmet."""
+        look = Look(3, (reached(0.07, None), reached(3.0, 2, "torque 2 N·m")))
+        assert PrecisionRecord("hash", ()).with_look(look, limit=10).outcome == "going on"
+
+    def test_the_message_names_the_worst(self) -> None:
+        look = Look(4, (reached(0.071, 6), reached(1.0, 0, "torque 2 N·m")))
+        record = PrecisionRecord("hash", ()).with_look(look, limit=30)
+        assert record.message == "precision after 4 repetitions: I2m 7.1 % of 5 %, about 6 more"
+
+    def test_it_survives_its_file(self, tmp_path) -> None:
+        record = PrecisionRecord("hash", ("parameters 5 %",), (Look(1, (reached(0.07, None),)),))
+        record.save(tmp_path / "precision.json")
+        assert PrecisionRecord.load(tmp_path / "precision.json", "hash") == record
+        assert PrecisionRecord.load(tmp_path / "precision.json", "other") is None
+
+
+class TestForecast:
+    def test_noise_alone_falls_with_the_number_of_repetitions(self) -> None:
+        assert further(4, 2.0, 1.0) == 12
+        assert further(4, 0.9, 1.0) == 0
+
+    def test_what_repeats_does_not(self) -> None:
+        assert further(4, 2.0, 0.5) is None
+        assert further(4, 1.1, 0.5) == 3  # (0.5 * 4 / 7 + 0.5) * 1.1**2 is below one
+        assert further(1, 2.0, np.nan) is None
+
+
+class TestRefusals:
+    def test_without_requirements_the_command_says_what_to_add(self, tmp_path) -> None:
+        campaign = campaign_of(tmp_path)
+        with pytest.raises(InputError, match=r"states a precision.*--precision"):
+            requirements_of(campaign, ())
+
+    def test_unknown_joints_are_refused_before_anything_moves(self, tmp_path) -> None:
+        campaign = campaign_of(tmp_path)
+        with pytest.raises(InputError, match="names no joint"):
+            run(campaign, "torque of wrist 2")
+        assert campaign.folder.manifest() == []
+
+    def test_precision_alone_is_refused(self, tmp_path) -> None:
+        campaign = campaign_of(tmp_path)
+        words = ["run", str(campaign.folder.root), "--precision", "parameters 5%"]
+        with pytest.raises(InputError, match="add --until-precise"):
+            CliRunner().invoke(app, words, catch_exceptions=False)
+
+
+def test_the_command_prints_what_was_reached(tmp_path) -> None:
+    campaign = campaign_of(tmp_path)
+    pass_rehearsal(campaign.folder)
+    words = ["run", str(campaign.folder.root), "--accept-dry-run", "--no-identify"]
+    words += ["--until-precise", "--precision", ", ".join(LOOSE), "--json"]
+    result = CliRunner().invoke(app, words, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    found = json.loads(
+        result.stdout.splitlines()[-1] if "\n}" not in result.stdout else result.stdout
+    )
+    assert "all requirements are met" in found["precision"]
+    assert found["repetitions"] == [2, 2]
