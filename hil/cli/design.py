@@ -74,9 +74,9 @@ def design(
     show_settings: Annotated[Method | None, typer.Option(metavar="NAME")] = None,
     quick: bool = False,
     given: Annotated[list[Path] | None, typer.Option(metavar="ARCHIVE|FOLDER")] = None,
-    precision: Annotated[list[str] | None, typer.Option(metavar="REQUIREMENTS")] = None,
+    precision: Annotated[list[str] | None, typer.Option(metavar="TEXT")] = None,
     purpose: Annotated[Literal["payload"] | None, typer.Option("--for", metavar="payload")] = None,
-    payload_mass: Annotated[float, typer.Option(min=0.001, max=10000.0, metavar="KG")] = 5.0,
+    payload_mass: Annotated[float, typer.Option(min=0.001, metavar="KG")] = 5.0,
     repetitions: Annotated[int | None, typer.Option(min=1, max=1000)] = None,
     seed: Annotated[int | None, typer.Option(min=0)] = None,
     workers: Annotated[int | None, typer.Option(min=1, max=256)] = None,
@@ -118,10 +118,10 @@ def design(
             [campaign].
         given: Archive or campaign folder of earlier recordings of this arm (repeatable): the motion
             adds what they do not determine, and the criteria are those of all together.
-        precision: Halves of 95 % intervals, such as "parameters 5%, torque 2": the motion minimises
-            the largest ratio of predicted to required interval. Method: gradient.
+        precision: Required halves of 95 % intervals, such as "parameters 5%, torque 2": the motion
+            minimises the largest ratio of predicted to required interval.
         purpose: payload: a motion of at most ten seconds that weighs a payload (`hil payload`), on
-            an arm that is known from --given, or else assumed to be known from a minute of motion.
+            an arm that is known, if possible from --given.
         payload_mass: With --for payload: expected mass. Default: 5 kg.
         repetitions: Number of repetitions of the motion. Default: that of [campaign].
         seed: Seed of the search; the result depends on nothing else. Default: that of the settings.

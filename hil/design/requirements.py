@@ -99,6 +99,8 @@ def _requirement(text: str) -> Requirement:
     if (matched["unit"] or unit) not in units:
         given = f"the unit {matched['unit']}" if matched["unit"] else "no per cent"
         remedy = f"write {name} 2, in N·m" if kind == "torque" else f"write {name} 5%"
+        if kind == "parameter":  # which may be no parameter at all
+            remedy += f"; {_known()}"
         raise InputError(None, f"{text!r} has {given}", field=_FIELD, remedy=remedy)
     return Requirement(kind, subject, value, relative)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -70,6 +71,20 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+class TestPrecision:
+    def test_every_block_runs(self, workplace: Path) -> None:
+        """In the order in which a user has what a block needs: the campaign before `--given`."""
+        for name in ("cell.toml", "robot.urdf"):
+            shutil.copy(ROOT / "examples" / "two_joints" / name, workplace)
+        text = page("precision.md")
+        first, given, campaign = (block for _, block in blocks(text))
+        assert typed(first) == ["design"]
+        assert typed(campaign, (0, 5)) == ["rehearse", "run"]
+        assert typed(given) == ["design"]
+        record = json.loads((workplace / "runs" / "precise" / "precision.json").read_text())
+        assert record["outcome"] in ("met", "out of reach")
 
 
 class TestBringYourOwnRobot:

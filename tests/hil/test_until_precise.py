@@ -18,6 +18,8 @@ from hil.errors import ExecutionError, InputError
 from hil.progress import Silent
 from tests.hil.fast_cell import fast_cell, pass_rehearsal
 
+pytestmark = pytest.mark.safety
+
 LOOSE = ("parameters 20%", "torque 5")
 
 

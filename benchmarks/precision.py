@@ -1,0 +1,227 @@
+"""Whether precision to order keeps what it promises: `python -m benchmarks.precision --stops 200`.
+
+Three independent parts, each with its number of seeds:
+
+- ``--campaigns N``: campaigns of the NS 16 with effects in virtual time, by one quick design for
+  ``--require``, each of its own simulated arm, run with ``--until-precise``. Figures: outcomes,
+  repetitions, robot time over that of thirty repetitions, promised and reached intervals of the
+  requirements, and the share of parameters whose true value is in its 95 % interval at the end.
+- ``--stops N``: the same rule on simulated torques of the NS 16 with coloured noise and an error
+  that every repetition has: coverage of all intervals when the rule has stopped, and after six
+  repetitions without looking. Required are 1.1 times the intervals after six repetitions.
+- ``--payloads N``: loads of `benchmarks.payload` weighed without a bare recording, against the
+  model of three bare recordings of other motions. Friction differs by 4 % between recordings.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from benchmarks import parser_of, show
+from benchmarks.payload import arm_model, load_of, recordings_of, samples_of
+from hil.campaign import Campaign, Stop
+from hil.campaign.plan import plan_around, validation_motions
+from hil.campaign.precision_record import IN_A_ROW
+from hil.cell import Cell
+from hil.design.precision import PrecisionDesign, short_search
+from hil.design.problem import problem_of
+from hil.design.requirements import requirements_from
+from hil.design.run import run_search
+from hil.motion_checks import MotionChecks
+from hil.progress import Silent
+from hil.simulation import simulated_link, simulated_provenance
+from identification.estimators.payload import NAMES, KnownArm, Run, figures_of, identify_payload
+from identification.estimators.prior import body_prior, design_effect_of, fit_posterior
+from identification.factor.factor import Estimate, Factor
+from identification.model.robot import RobotModel
+from sim_fixtures.ns16 import CELL_PATH
+
+Array = NDArray[np.float64]
+
+_THIRTY: Final = 30
+_RATE: Final = 250.0  # Hz
+_MEMORY: Final = 0.02  # s, of the noise
+_NOISE: Final = 0.02  # of the torque's scatter
+_REPEATED: Final = 0.003  # likewise, of the error that every repetition has
+_MOST: Final = 12  # repetitions of a simulated rule
+
+
+def campaigns(count: int, required: str) -> dict[str, Any]:
+    """Run campaigns of the NS 16 with effects until they are precise."""
+    requirements = requirements_from([required])
+    cell = Cell.load(CELL_PATH).with_campaign(validation_runs=2, repetitions=_THIRTY)
+    motions = [one.trajectory for one in validation_motions(cell, MotionChecks.of(cell))]
+    promise = PrecisionDesign.of(cell, requirements, motions, ())
+    settings = short_search()
+    problem = problem_of(cell, settings, None, promise.precision(2.0))
+    excitation = run_search(cell, settings, Silent(), problem=problem).excitation
+    forecasts = promise.forecasts(excitation, 2)
+    outcomes, repetitions, reached = Counter[str](), [], []
+    inside = []
+    for seed in range(1, count + 1):
+        own = cell.with_campaign(simulation_seed=seed)
+        with tempfile.TemporaryDirectory() as scratch:
+            campaign = Campaign.create(Path(scratch) / "it", own, plan_around(own, excitation))
+            campaign.run(
+                simulated_link(own, effects=True),
+                Stop(),
+                Silent(),
+                provenance=simulated_provenance(own, effects=True),
+                durable=False,
+                unrehearsed=True,
+                until_precise=requirements,
+            )
+            record = campaign.precision
+            assert record is not None
+            outcomes[record.outcome] += 1
+            repetitions.append(record.looks[-1].repetitions)
+            reached.append([one.half for one in record.looks[-1].reached])
+            inside.append(_inside(campaign))
+    return {
+        "campaigns": count,
+        "outcomes": dict(outcomes),
+        "repetitions": float(np.mean(repetitions)),
+        "robot_time_of_thirty": float(np.mean(repetitions)) / _THIRTY,
+        "required": [one.requirement.value for one in forecasts],
+        "promised": [one.half for one in forecasts],
+        "reached": np.median(reached, axis=0).tolist(),
+        "promise_kept": float(np.mean(np.array(reached) <= [one.half for one in forecasts])),
+        "true_values_inside": float(np.mean(inside)),
+    }
+
+
+def _inside(campaign: Campaign) -> float:
+    """Return the share of inertial parameters whose true value is in its interval."""
+    found = campaign.identify().results
+    simulation = campaign.cell.simulation
+    truth = campaign.cell.parameter_values(
+        rotor_inertia=np.array(simulation.rotor_inertia),
+        coulomb=np.array(simulation.coulomb),
+        viscous=np.array(simulation.viscous),
+        third=np.array(simulation.third),
+        inertia_scale=np.array(simulation.inertia_scale),
+    )
+    half = found.uncertainty.interval_factor * np.array([one.std for one in found.parameters])
+    error = np.array([one.estimate for one in found.parameters]) - truth
+    return float(np.mean((np.abs(error) <= half)[: found.n_base]))
+
+
+def stops(count: int) -> dict[str, Any]:
+    """Stop simulated campaigns by the rule, and count the intervals that hold the truth."""
+    model = arm_model()
+    stopped: list[float] = []
+    planned: list[float] = []
+    numbers: list[int] = []
+    for seed in range(count):
+        random = np.random.default_rng([seed, 52])
+        recording = next(iter(recordings_of(seed, model.joint_names, (None,))))
+        samples = samples_of(recording, model)
+        truth = _posterior(model, Factor.by_time(model, samples))[0].values
+        clean = model.torque(truth, *samples.motion[1:4])
+        scatter = clean.std(axis=0)
+        repeated = clean + _REPEATED * scatter * _coloured(random, clean.shape)
+        factors = []
+        for _ in range(_MOST):
+            torque = repeated + _NOISE * scatter * _coloured(random, clean.shape)
+            factors.append(Factor.by_time(model, replace(samples, torque=torque)))
+        half = _interval(model, factors[: _MOST // 2])[1]
+        number, met = _MOST, 0
+        for repetition in range(1, _MOST + 1):
+            met = met + 1 if np.all(_interval(model, factors[:repetition])[1] <= 1.1 * half) else 0
+            if met == IN_A_ROW:
+                number = repetition
+                break
+        numbers.append(number)
+        for share, some in ((stopped, factors[:number]), (planned, factors[: _MOST // 2])):
+            values, half = _interval(model, some)
+            share.append(float(np.mean(np.abs(values - truth) <= half)))
+    return {
+        "stops": count,
+        "repetitions": float(np.mean(numbers)),
+        "covered_at_the_stop": float(np.mean(stopped)),
+        "covered_without_looking": float(np.mean(planned)),
+    }
+
+
+def payloads(count: int) -> dict[str, Any]:
+    """Weigh loads against the model of the arm, without bare recordings of the motion."""
+    model = arm_model()
+    errors: list[float] = []
+    inside: list[NDArray[np.bool_]] = []
+    widths: list[float] = []
+    for seed in range(count):
+        load = load_of(seed)
+        bare = (None, None, None)
+        recordings = recordings_of(seed + 10_000, model.joint_names, bare, other_motions=True)
+        factors = [Factor.by_time(model, samples_of(one, model)) for one in recordings]
+        total = sum(factors[1:], factors[0])
+        estimate, prior, effect = _posterior(model, total)
+        known = KnownArm.of(total, estimate, prior, effect)
+        loaded = next(iter(recordings_of(seed, model.joint_names, (load,))))
+        run = Run.of("loaded", model, samples_of(loaded, model), None, loaded=True)
+        found = identify_payload(model, [run], known=known)
+        truth = figures_of(load)
+        inside.append((found.intervals[:, 0] <= truth) & (truth <= found.intervals[:, 1]))
+        errors.append(float(found.parameters[9]) / load.mass - 1.0)
+        widths.append(float(np.diff(found.intervals[0])[0]) / 2.0 / load.mass)
+    error = np.array(errors)
+    return {
+        "payloads": count,
+        "mass_error": float(np.sqrt(np.mean(error**2))),
+        "worst": float(np.abs(error).max()),
+        "within_one_percent": float(np.mean(np.abs(error) < 0.01)),
+        "within_two_percent": float(np.mean(np.abs(error) < 0.02)),
+        "half_width": float(np.median(widths)),
+        "covered": dict(zip(NAMES, np.mean(inside, axis=0).tolist(), strict=True)),
+    }
+
+
+def _posterior(model: RobotModel, factor: Factor) -> tuple[Estimate, Array, float]:
+    """Return the posterior of a factor, and information (p, p) and effect of its prior."""
+    prior = body_prior(model, factor).gaussian
+    effect = design_effect_of(factor, prior)
+    return fit_posterior(model, factor, prior, effect).estimate, prior.information, effect
+
+
+def _interval(model: RobotModel, factors: Sequence[Factor]) -> tuple[Array, Array]:
+    """Return parameters (p,) and halves of their intervals by repetitions together."""
+    estimate = _posterior(model, sum(factors[1:], factors[0]))[0]
+    return estimate.values, estimate.interval_factor * estimate.std
+
+
+def _coloured(random: np.random.Generator, shape: tuple[int, ...]) -> Array:
+    """Return noise of unit variance with a memory (m, n)."""
+    keep = np.exp(-1.0 / (_MEMORY * _RATE))
+    drive = np.sqrt(1.0 - keep**2) * random.standard_normal(shape)
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -keep], drive, axis=0))
+
+
+def main() -> None:
+    """Print the figures of the parts that were asked for."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--campaigns", type=int, default=0)
+    parser.add_argument("--require", default="torque 30, friction 10%")
+    parser.add_argument("--stops", type=int, default=0)
+    parser.add_argument("--payloads", type=int, default=0)
+    options = parser.parse_args()
+    found: dict[str, Any] = {}
+    if options.campaigns:
+        found["campaigns"] = campaigns(options.campaigns, options.require)
+    if options.stops:
+        found["stops"] = stops(options.stops)
+    if options.payloads:
+        found["payloads"] = payloads(options.payloads)
+    show(found, only_json=options.json)
+
+
+if __name__ == "__main__":
+    main()
