@@ -17,7 +17,7 @@ def polish(
 ) -> tuple[PolishResult, Arm]:
     """Polish an arm on fitted windows, and judge it on held-out ones by the `identified` errors.
 
-    It is kept if the geometric mean of the held-out errors is lower and no more windows are
+    It is used if the geometric mean of the held-out errors is lower and no more windows are
     unstable; never without held-out windows (`in_sample`).
 
     Raises:
@@ -44,9 +44,9 @@ def polish(
 def _reason(
     change: float, errors: Errors, identified: Errors, *, accepted: bool, in_sample: bool
 ) -> str:
-    """Return why a polish was kept or not."""
+    """Return why a polished arm is used or not."""
     if in_sample:
-        return "The polished arm was not kept: nothing was held out to judge it on."
+        return "The polished arm is not used: nothing was held out to judge it on."
     factor = percentage(float(abs(np.expm1(change))), 1)
     direction = "lowers" if change < 0.0 else "raises"
     result = (
@@ -55,7 +55,7 @@ def _reason(
     )
     if not accepted and change < 0.0:
         result += f", but makes {errors.unstable} windows unstable instead of {identified.unstable}"
-    return f"{result}: {'kept' if accepted else 'not kept'}."
+    return f"{result}: {'used' if accepted else 'not used'}."
 
 
 def _parameters(start: Driven, best: Driven) -> list[PolishedParameter]:

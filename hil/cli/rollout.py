@@ -67,8 +67,8 @@ def rollout(
             motion; 0 for none.
         servo: A servo in place of the recorded torque: gains in N·m/rad and N·m·s/rad and delay
             in s, or identified from commanded and measured positions.
-        polish: Fit friction, rotor inertia, servo gains and delay to simulated windows of the
-            fitted motion, and write polished.xml if the held-out windows are predicted better.
+        polish: Fit friction, rotors, servo and delay to windows of the fitted motion, and write
+            polished.xml if the held-out windows are predicted better.
         split: Fraction of the recording that is fitted if there is no validation run; the rest is
             simulated.
         again: Identify again even if results.json and parameters.json are there.

@@ -78,7 +78,7 @@ def test_the_reference_of_the_drivers_has_every_name() -> None:
     assert sorted(documented) == sorted(drivers.__all__)
 
 
-FINDINGS = ROOT / "identification" / "validation" / "verdict.py"
+FINDINGS = sorted((ROOT / "identification" / "validation").rglob("*.py"))
 COMMAND = re.compile(r"`hil ([^`]+)`")
 
 
@@ -94,7 +94,7 @@ def sentences(module: Path) -> Iterator[str]:
 def test_commands_that_findings_recommend_exist() -> None:
     """With their options."""
     named = []
-    for text in sentences(FINDINGS):
+    for text in (text for module in FINDINGS for text in sentences(module)):
         assert {*re.findall(r"--[a-z][a-z-]+", COMMAND.sub("", text))} <= options()
         named += COMMAND.findall(text)
     assert named

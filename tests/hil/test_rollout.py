@@ -135,7 +135,7 @@ def test_a_polish_is_judged_on_held_out_windows(folder: Path) -> None:
     assert found.polish is not None
     assert found.polish.accepted == (found.polish.change < 0.0)
     assert (folder / POLISHED).exists() == found.polish.accepted
-    verdict = "kept." if found.polish.accepted else "not kept."
+    verdict = "used." if found.polish.accepted else "not used."
     assert verdict in found.message
     assert f"held-out position error by {percentage(abs(np.expm1(found.polish.change)), 1)}" in (
         found.message
