@@ -202,7 +202,8 @@ class GuardError(RefusalError):
             f"allowed is {bound:.9g} {unit}"
         )
         if not math.isfinite(value):
-            check, message = Check.FINITE, f"joint {joint + 1} has {value} where a number must be"
+            check = Check.FINITE
+            message = f"joint {joint + 1} has {value} where a number must be"
         super().__init__(message, cycle)
         self.check = check
         self.remedy = check.remedy

@@ -151,7 +151,8 @@ class Execution:
                 self._source.resume()
         except BaseException as error:
             return f"the motion source refused it: {error_text(error)}"
-        self._rest_by, self.held = None, False
+        self._rest_by = None
+        self.held = False
         return None
 
     def advance(self, cycle: int) -> tuple[Array, Array, BoundsName]:

@@ -52,7 +52,8 @@ def raise_first(
     not_finite = ~np.isfinite(found)
     bad = not_finite if not_finite.any() else ~(np.abs(found) <= allowed)
     row, joint = (int(index) for index in np.argwhere(bad)[0])
-    value, bound = float(found[row, joint]), float(allowed[row, joint])
+    value = float(found[row, joint])
+    bound = float(allowed[row, joint])
     if checks[row] is Check.POSITION and middle is not None:
         bound = float(middle[joint]) + math.copysign(bound / (1.0 + RELATIVE_TOLERANCE), value)
         value += float(middle[joint])
@@ -158,13 +159,15 @@ class ActiveBounds:
 
     def reset(self, rank: int = 0, cycles: int = 0) -> None:
         """Activate a set for `cycles` more than `MEMORY`."""
-        self.rank, self._age = rank, -cycles
+        self.rank = rank
+        self._age = -cycles
 
     def update(self, bounds: BoundsName) -> int:
         """Return the rank of the active set for a next set-point within `bounds`."""
         rank = RANK[bounds]
         if rank >= self.rank:
-            self.rank, self._age = rank, 0
+            self.rank = rank
+            self._age = 0
         elif self._age < MEMORY:
             self._age += 1
         else:

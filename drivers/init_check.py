@@ -77,7 +77,8 @@ def _axes(
 
 
 def _values(drive_train: DriveTrain, init: InitPacket, arm: int) -> tuple[str, ...]:
-    n, row = drive_train.n_joints, arm - 1
+    n = drive_train.n_joints
+    row = arm - 1
     pairs = [
         (f"gear ratio of axis {axis + 1}", init.gear_ratio[row, axis], ratio, 0.0)
         for axis, ratio in enumerate(drive_train.gear_ratio)

@@ -182,7 +182,9 @@ class SentSetPoints:
         self._sent[(self._newest - self._back) % len(self._sent)] = (
             target - self._back[:, None] * step
         )
-        self._resent, self._resent_before, self.resend_needed = 0, False, False
+        self._resent = 0
+        self._resent_before = False
+        self.resend_needed = False
 
     def resend(self) -> None:
         """Record that the last set-point was sent once more."""
@@ -190,7 +192,8 @@ class SentSetPoints:
 
     def add(self, target: Array) -> None:
         """Record that the next set-point (n,) was sent."""
-        self._resent_before, self._resent = self._resent > 0, 0
+        self._resent_before = self._resent > 0
+        self._resent = 0
         self._newest = newest = (self._newest + 1) % len(self._sent)
         self._sent[newest] = target
 
@@ -222,7 +225,8 @@ class SentSetPoints:
                 from all of them, or than `MAX_TARGET_JUMP` from the last, or not the last one after
                 `REPETITIONS` of it.
         """
-        sent, standstill = self._sent, self._guard.limits.standstill
+        sent = self._sent
+        standstill = self._guard.limits.standstill
         newest = sent[self._newest]
         self.resend_needed = False
         # Usual case: the set-point sent last.
@@ -234,7 +238,8 @@ class SentSetPoints:
             return 0
         rows = sent[(self._newest - self._back) % len(sent)]
         extrapolated = newest + self._ahead[:missed] * (newest - rows[1])
-        late, ahead = np.abs(rows - target), np.abs(extrapolated - target)
+        late = np.abs(rows - target)
+        ahead = np.abs(extrapolated - target)
         where = self._every if where is None else where
         nearest = np.minimum(late[: self._depth].min(axis=0), ahead.min(axis=0, initial=np.inf))
         threshold = self._guard.following_error
@@ -304,8 +309,11 @@ class SetPointGenerator:
     def reply(self, now: OpenCycle) -> OpenReply:
         """Fill in the reply to the packet of a cycle in open mode."""
         try:
-            self._now, self._packet, self._cycle = now, now.packet, now.cycle
-            self._measured, self._commanded = now.measured, now.commanded
+            self._now = now
+            self._packet = now.packet
+            self._cycle = now.cycle
+            self._measured = now.measured
+            self._commanded = now.commanded
             self._check_losses(now)
             self._builder.require_targets(now.packet.other_slots, now.cycle)
             if now.state is State.OPEN:
@@ -331,7 +339,8 @@ class SetPointGenerator:
 
     def _reply_open(self, now: OpenCycle) -> OpenReply:
         """Fill in the next set-point; it is the last one where the motion has settled."""
-        motion, rejected = now.motion, 0
+        motion = now.motion
+        rejected = 0
         moving = motion is not None and motion.started
         if now.entering:
             self.enter()
@@ -409,7 +418,8 @@ class SetPointGenerator:
     def enter(self) -> None:
         """Send the target received as the first set-point, at rest."""
         self._require_at_rest()
-        target, position = self._raw[TARGET].copy(), self._measured[0].copy()
+        target = self._raw[TARGET].copy()
+        position = self._measured[0].copy()
         self._guard.begin(position, self._cycle)
         self._check_feedback(target)
         self.set_point = position
@@ -426,7 +436,8 @@ class SetPointGenerator:
 
     def next(self, execution: Execution | None) -> None:
         """Send the motion's next set-point, or the last one without a motion."""
-        cycle, commanded = self._cycle, self._commanded
+        cycle = self._cycle
+        commanded = self._commanded
         self._check_feedback(self._sent)
         self._check_accepted(stopping=execution is not None and execution.outcome == "stopped")
         if execution is None:
@@ -461,7 +472,8 @@ class SetPointGenerator:
             return
         off = np.abs(motor - self._raw[TARGET]) > self._guard.limits.standstill
         if (off & ~opened).any():
-            joint, wanted = int(np.argmax(off & ~opened)) + 1, int(self._mode)
+            joint = int(np.argmax(off & ~opened)) + 1
+            wanted = int(self._mode)
             message = f"joint {joint} is in mode {int(Mode.CLOSED)}; the motion needs {wanted}"
             raise AxisNotInMode(message, self._cycle)
 
@@ -477,9 +489,12 @@ class SetPointGenerator:
         A motion continues from the target, some steps further on its path, or at rest. Axes that
         have closed since the first set-point are left out.
         """
-        cycle, where = self._cycle, self._continuing & self._packet.ready
-        raw, step = self._raw, self._step
-        target, velocity = np.where(where, raw[TARGET], self._sent), np.where(where, raw[1:4:2], 0)
+        cycle = self._cycle
+        where = self._continuing & self._packet.ready
+        raw = self._raw
+        step = self._step
+        target = np.where(where, raw[TARGET], self._sent)
+        velocity = np.where(where, raw[1:4:2], 0)
         if not (execution is not None and execution.is_resumable and step.any()):
             self._guard.check_after_gap(target, velocity, self._sent, step, cycle, where)
             return
@@ -498,7 +513,8 @@ class SetPointGenerator:
         execution.resume_from(position, speed, spread, cycle)
         self._guard.resume_from(position, speed, spread)
         self._history.resume_from(target, step)
-        self.set_point, self._sent = position, target
+        self.set_point = position
+        self._sent = target
 
     def check_after_pause(self) -> None:
         """Require after a late packet that the arm moves as the set-points sent last."""
@@ -508,7 +524,9 @@ class SetPointGenerator:
 
     def leaving(self) -> None:
         """Hold axes that were always open at the last set-point, reopened ones at their target."""
-        ready, continuing, held = self._packet.ready, self._continuing, self._packet.held_joints
+        ready = self._packet.ready
+        continuing = self._continuing
+        held = self._packet.held_joints
         continuing &= ready
         self.require_holdable(held | ready)
         self._record_held(held)

@@ -72,7 +72,11 @@ def attach_memory(fd: int) -> mmap.mmap:
 _TAG: Final = 0x31474E4952434948
 _HEADER_BYTES: Final = 256
 # Indices of 8-byte words, those of different writers on different cache lines.
-_KIND, _JOINTS, _CAPACITY, _WRITTEN, _READ = 0, 1, 2, 8, 16
+_KIND = 0
+_JOINTS = 1
+_CAPACITY = 2
+_WRITTEN = 8
+_READ = 16
 
 
 class RingReader:
@@ -141,7 +145,9 @@ class CycleRing(RingReader):
             own = memoryview(bytearray(_HEADER_BYTES + capacity * cycle_dtype(n_joints).itemsize))
             _describe(own, n_joints, capacity)
             self._map(own, n_joints)
-            self._readable, self._acknowledge, self._read = capacity, True, 0
+            self._readable = capacity
+            self._acknowledge = True
+            self._read = 0
         else:
             super().__init__(fd, n_joints)
         self.fd = -1 if fd is None else fd
@@ -171,7 +177,8 @@ class CycleRing(RingReader):
 
     def commit(self) -> None:
         """Add the row filled last to the ring."""
-        words, written = self._words, self.written
+        words = self._words
+        written = self.written
         if words[_READ] <= written - self.capacity:
             self.overflow += 1
         self.written = words[_WRITTEN] = written + 1

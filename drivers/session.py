@@ -258,7 +258,8 @@ class Session:
 
     def events(self) -> list[Event]:
         """Return the events since the last call, in order; rejected packets last, by kind."""
-        events, self._events = self._events, []
+        events = self._events
+        self._events = []
         events.extend(PacketRejected(kind, *found) for kind, found in self._unreported.items())
         self._unreported.clear()
         return events
@@ -269,7 +270,8 @@ class Session:
         Raises:
             RequestError: the state does not allow one, or it is no source of a motion.
         """
-        n, stop_cycles = self._drive_train.n_joints, round(STOP_TIMEOUT / self._guard.period)
+        n = self._drive_train.n_joints
+        stop_cycles = round(STOP_TIMEOUT / self._guard.period)
         execution = execution_of(source, n, self._settle_cycles, stop_cycles)
         if isinstance(execution, str):
             raise self._request_error(execution)
@@ -327,7 +329,8 @@ class Session:
             raise self._request_error(_NO_MOTION, "hold")
         if self.stop_reason is not None:
             return
-        before, reason = execution.held, execution.hold(self.cycle)
+        before = execution.held
+        reason = execution.hold(self.cycle)
         if reason is not None:
             self.stop(reason)
         elif execution.held is not before:
@@ -448,7 +451,8 @@ class Session:
 
     def _cyclic(self, packet: bytes, number: int, now: float) -> bytes | None:
         """Run one cycle: decode, record, change state, reply; an error becomes drive-off or 508."""
-        controller, ring = self._controller, self._ring
+        controller = self._controller
+        ring = self._ring
         assert controller is not None
         decoded = CyclicPacket.decode(packet, controller.init.n_axes)
         if self._sequence.is_duplicate(number) and packet == self._last_packet:
@@ -527,7 +531,8 @@ class Session:
 
         Commanded values are NaN.
         """
-        ring, wire = self._ring, controller.wire
+        ring = self._ring
+        wire = controller.wire
         ring.status[row] = status.status
         ring.commanded[row] = math.nan
         if wire is None:
@@ -544,7 +549,8 @@ class Session:
 
         Returns what open mode did, None outside it. Raises RefusalError if nothing may be sent.
         """
-        builder, state = controller.builder, self.state
+        builder = controller.builder
+        state = self.state
         if state is State.FAULTED and status.powered:
             self._fill_refusal(controller, self._offending, status, words)
             return None
@@ -603,7 +609,8 @@ class Session:
         controller.builder.fill_refusal(status.reply, words, slot)
 
     def _axis_error(self, joint: int, status: PacketStatus) -> AxisNotInMode:
-        mode, expected = int(status.modes[joint]), self._mode
+        mode = int(status.modes[joint])
+        expected = self._mode
         wanted = int(Mode.CLOSED if mode == expected else expected)
         message = f"joint {joint + 1} is in mode {mode}; the motion needs {wanted}"
         return AxisNotInMode(message, self.cycle)
@@ -651,7 +658,8 @@ class Session:
         return decision
 
     def _enter(self, after: State) -> None:
-        before, self.state = self.state, after
+        before = self.state
+        self.state = after
         self.entered_at = self._exit_requested_at = self.cycle
         self._events.append(StateChanged(before, after, self.cycle))
         if after is State.OPEN:

@@ -218,7 +218,8 @@ class LossTracker:
         self.missed = missed
         self.late = elapsed / self._period - max(missed, self.max_gap)
         # After a corrupted number the controller's own numbers are stale for a while.
-        self.gap, self.stale = missed + self.stale, 0
+        self.gap = missed + self.stale
+        self.stale = 0
 
     def reject(self, count: int, cycle: int) -> None:
         """Count replies that the controller, according to the packet of `cycle`, did not use."""

@@ -33,8 +33,10 @@ def annotate(found: Identification, output: Path) -> list[Path]:
     Raises:
         ArchiveError: an archive cannot be read again.
     """
-    prepared, values = found.prepared, found.estimate.pooled.values
-    sources, model = prepared.sources, found.cell.model
+    prepared = found.prepared
+    values = found.estimate.pooled.values
+    sources = prepared.sources
+    model = found.cell.model
     held_out = () if sources.in_sample else zip(sources.held_out, prepared.held_out, strict=True)
     pairs = [*zip(sources.training, prepared.training, strict=True), *held_out]
     parts: dict[Path, list[tuple[NDArray[np.int64], Array, Array]]] = {}

@@ -194,7 +194,8 @@ def compare_campaigns(
     arm: Arm, campaigns: Sequence[BatchEstimate], repetitions: Sequence[Sequence[BatchEstimate]]
 ) -> Comparison:
     """Compare the parameters of campaigns of one arm, with their repetitions, with the first."""
-    names, compared = _names(campaigns), quantities(arm.cell.model, campaigns[0])
+    names = _names(campaigns)
+    compared = quantities(arm.cell.model, campaigns[0])
     pairs = zip(campaigns, repetitions, strict=True)
     figures = np.array([_figures(compared, *pair) for pair in pairs])
     value, variance, _ = np.moveaxis(figures, 2, 0)
@@ -239,12 +240,16 @@ def quantities(model: RobotModel, first: BatchEstimate) -> list[Quantity]:
     That is the mean of both directions at the speed at which the first campaign determines it best:
     single coefficients are correlated, and their changes much less certain.
     """
-    layout, joints, terms = model.layout, model.joint_names, model.friction.terms
+    layout = model.layout
+    joints = model.joint_names
+    terms = model.friction.terms
     own = [(*links, *layout.rotors[j : j + 1]) for j, links in enumerate(layout.links)]
     axes = {layout.names[k]: joints[j] for j, places in enumerate(own) for k in places}
-    rank, single = model.base.rank, np.eye(model.n_parameters)
+    rank = model.base.rank
+    single = np.eye(model.n_parameters)
     rows = [*range(rank), *range(rank + len(terms), model.n_parameters)]
-    names, units = model.parameter_names, model.units
+    names = model.parameter_names
+    units = model.units
     found = [
         Quantity(names[k], axes.get(names[k], ""), "inertia", units[k], single[k]) for k in rows
     ]
@@ -332,7 +337,8 @@ def _figures(
     compared: Sequence[Quantity], one: BatchEstimate, repetitions: Sequence[BatchEstimate]
 ) -> list[Figure]:
     """Return the figure of each quantity of a campaign."""
-    weights, freedom = np.array([each.weights for each in compared]), freedom_of(one)
+    weights = np.array([each.weights for each in compared])
+    freedom = freedom_of(one)
     singles = np.array([_projected(each, weights)[0] for each in repetitions])
     columns = singles.reshape(len(repetitions), len(compared)).T
     rows = zip(*_projected(one, weights), columns, strict=True)
@@ -375,7 +381,8 @@ def against_first(figures: Array) -> tuple[Array, Array, Array]:
     the first campaign, and where unknown.
     """
     value, variance, freedom = np.moveaxis(figures, 2, 0)
-    change, total = value - value[0], variance + variance[0]
+    change = value - value[0]
+    total = variance + variance[0]
     change[0] = np.nan
     change[~(total > 0.0)] = np.nan
     squares = variance**2 / freedom

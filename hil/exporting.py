@@ -100,7 +100,8 @@ def export_model(found: Identification | IdentifiedModel, output: Path, to: Form
         IdentificationError: the arm cannot be written, or reads back with other parameters.
     """
     model = found if isinstance(found, IdentifiedModel) else model_of(found)
-    form, arm = FORMATS[to], model.arm
+    form = FORMATS[to]
+    arm = model.arm
     make_folder(output.parent)
     text = form.write(arm, model.name, remarks_of(model))
     try:
@@ -197,7 +198,9 @@ def _ensemble_texts(
     model: IdentifiedModel, ensemble: Ensemble, form: Format, seed: int
 ) -> tuple[dict[str, str], float | str]:
     """Return the files of the arms, and their largest difference when read back."""
-    texts, difference, missing = dict[str, str](), 0.0, ""
+    texts = dict[str, str]()
+    difference = 0.0
+    missing = ""
     digits = len(str(len(ensemble)))
     for k, (standard, values) in enumerate(
         zip(ensemble.standard, ensemble.values, strict=True), start=1

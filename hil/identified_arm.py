@@ -85,7 +85,8 @@ class IdentifiedArm:
         """
         import pandas  # only for this table
 
-        found, factor = self.results.parameters, self.results.uncertainty.interval_factor
+        found = self.results.parameters
+        factor = self.results.uncertainty.interval_factor
         return pandas.DataFrame(
             {
                 "estimate": [one.estimate for one in found],
@@ -218,7 +219,8 @@ def identify(
     """
     if urdf is not None:
         if robot is not None:
-            problem, remedy = "exclude each other", "give one of them"
+            problem = "exclude each other"
+            remedy = "give one of them"
             raise InputError(None, problem, field="urdf and robot", remedy=remedy)
         robot = Robot.from_urdf(urdf)
     robot_of = (lambda _: robot) if isinstance(robot, Robot) else robot
@@ -267,7 +269,9 @@ def write_arm(
     reporter: Reporter,
 ) -> tuple[Path, Results]:
     """Write an identified arm, see :meth:`IdentifiedArm.save`; return folder and `results.json`."""
-    first, staging, found = arm.recordings[0], arm.staging, arm.identification
+    first = arm.recordings[0]
+    staging = arm.staging
+    found = arm.identification
     is_folder = first.is_dir() and is_archive(first)
     sources = None if is_folder else sources_text(arm.recordings, arm.predicted)
     if folder is not None:

@@ -98,7 +98,9 @@ class IdentifiedModel:
         Raises:
             InputError: the estimator has no posterior.
         """
-        total, model, fitted = self.factor, self.cell.model, self.prepared.fitted
+        total = self.factor
+        model = self.cell.model
+        fitted = self.prepared.fitted
         rows = total.counts.sum(axis=1)
         before = np.cumsum(rows) - 0.5 * rows
         fold = np.minimum(np.floor(FOLDS * before / rows.sum()).astype(np.intp), FOLDS - 1)
@@ -130,7 +132,8 @@ def model_of(found: Identification) -> IdentifiedModel:
     Raises:
         InputError: there are no physically consistent parameters.
     """
-    consistent, fitted = consistent_of(found), found.prepared.fitted
+    consistent = consistent_of(found)
+    fitted = found.prepared.fitted
     return IdentifiedModel(
         found.cell,
         arm_with(found.cell, consistent.standard, consistent.estimate.values, fitted),
@@ -149,7 +152,8 @@ def arm_with(cell: Cell, standard: Array, values: Array, fitted: Sequence[Sample
 
     Friction that grows with the load is that of the fitted motion.
     """
-    described, efforts = urdf_limits(cell.urdf, cell.joint_names), cell.torque_limit
+    described = urdf_limits(cell.urdf, cell.joint_names)
+    efforts = cell.torque_limit
     if efforts is None:
         found = torque_limits(cell)
         efforts = described.effort if found is None else np.nan_to_num(found, nan=np.inf)
@@ -301,7 +305,9 @@ def _stored_values(cell: Cell, content: Mapping[str, Any]) -> tuple[Array, Array
     if stored is None:
         raise ValueError("it has no physically consistent parameters")
     model = cell.model
-    layout, links, motors = model.layout, stored["links"], stored["motor_friction"]
+    layout = model.layout
+    links = stored["links"]
+    motors = stored["motor_friction"]
     if [entry["name"] for entry in content["parameters"]] != list(model.parameter_names):
         raise ValueError("its parameters are others")
     standard = np.zeros(layout.size)

@@ -39,7 +39,9 @@ def violation_text(violation: Violation, frame: AngleFrame) -> str:
     limit = _JOINT_LIMIT.fullmatch(violation.subject) if violation.kind == "joint limit" else None
     if limit is None:
         return violation.sentence(joints)
-    quantity, joint, where = limit[1], int(limit[2]), limit[3]
+    quantity = limit[1]
+    joint = int(limit[2])
+    where = limit[3]
     # The magnitude of a rate is the same in any frame.
     sign, zero = (frame.sign[joint], frame.offset[joint]) if quantity == "position" else (1.0, 0.0)
     value, bound = (
@@ -143,7 +145,8 @@ class MotionChecks:
         return self._sentence(violations[0]) if violations else None
 
     def _sentence(self, violation: Violation) -> str:
-        text, remedy = violation_text(violation, self.frame), always_so(violation, self.checker)
+        text = violation_text(violation, self.frame)
+        remedy = always_so(violation, self.checker)
         if violation.kind == "current":
             text += self._whose_limit(violation.subject)
         return text if remedy is None else f"{text}; {remedy}"
@@ -153,7 +156,8 @@ class MotionChecks:
         joint = [f"motor of {name}" for name in self.currents.model.joint_names].index(motor)
         if self.cell_limit is None:
             return ""
-        ours, theirs = self.cell_limit[joint], self.currents.current_limit[joint]
+        ours = self.cell_limit[joint]
+        theirs = self.currents.current_limit[joint]
         if theirs == ours:
             return ""
         return (
@@ -164,7 +168,8 @@ class MotionChecks:
 
 def collision_checker(cell: Cell) -> CollisionChecker:
     """Return the check of contacts with floor, walls and the arm; CellError without shapes."""
-    folders, urdf = cell.mesh_folders, cell.file.cell.urdf
+    folders = cell.mesh_folders
+    urdf = cell.file.cell.urdf
     try:
         return CollisionChecker(
             cell.urdf, cell.workspace, limits=cell.joint_limits, mesh_folders=folders

@@ -32,14 +32,17 @@ from identification.export.urdf import write_urdf
 
 Array = NDArray[np.float64]
 
-RESULTS, REPORT, SERIES = "results.json", "report.html", "report_series.npz"
+RESULTS = "results.json"
+REPORT = "report.html"
+SERIES = "report_series.npz"
 _LARGEST: Final = 1 << 30
 """Maximum size of series in bytes, a hundred times that of a campaign of 30 repetitions."""
 
 
 def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Results:
     """Write exports, `results.json` and report together; OutputError if impossible."""
-    consistency, essential = found.consistency, found.essential
+    consistency = found.consistency
+    essential = found.essential
     occasion = occasion_of(found)
     origin = provenance_of(found.results, found.paths)
     exports = exports_of(
@@ -88,7 +91,8 @@ def occasion_of(found: Identification) -> OccasionResult:
 
 def settings_result(found: Identification) -> SettingsResult:
     """Return what the identification used, for exports and rollouts."""
-    sources, first = found.prepared.sources, found.prepared.sources.training[0]
+    sources = found.prepared.sources
+    first = found.prepared.sources.training[0]
     fitted = {source.path for source in sources.training}
     predicted = {source.path for source in sources.held_out} - fitted
     return SettingsResult(
@@ -164,7 +168,8 @@ def _load_series(path: Path, n_joints: int) -> ReportSeries:
 
 
 URDF = "identified.urdf"
-PARAMETERS_JSON, PARAMETERS_CSV = "parameters.json", "parameters.csv"
+PARAMETERS_JSON = "parameters.json"
+PARAMETERS_CSV = "parameters.csv"
 FILES = (PARAMETERS_JSON, PARAMETERS_CSV, URDF)
 """Exports of an identification."""
 

@@ -60,14 +60,17 @@ def _reason(
 
 def _parameters(start: Driven, best: Driven) -> list[PolishedParameter]:
     """Return the parameters that a polish changed, before and after."""
-    model, rows = start.arm.model, list[PolishedParameter]()
+    model = start.arm.model
+    rows = list[PolishedParameter]()
 
     def add(name: str, unit: str, before: float, after: float) -> None:
         if before != after:
             rows.append(PolishedParameter(name=name, unit=unit, before=before, after=after))
 
-    part, rotors = model.friction_part, model.layout.rotors
-    names, units = model.parameter_names[part], model.units[part]
+    part = model.friction_part
+    rotors = model.layout.rotors
+    names = model.parameter_names[part]
+    units = model.units[part]
     friction = start.arm.values[part].tolist(), best.arm.values[part].tolist()
     for row in zip(names, units, *friction, strict=True):
         add(*row)
@@ -76,7 +79,8 @@ def _parameters(start: Driven, best: Driven) -> list[PolishedParameter]:
         for joint, (before, after) in enumerate(zip(*inertia, strict=True)):
             unit = "kg·m²" if model.chain.revolute[joint] else "kg"
             add(f"I{joint + 1}m", unit, before, after)
-    old, new = start.motion.servo, best.motion.servo
+    old = start.motion.servo
+    new = best.motion.servo
     if old is None or new is None:
         add("delay of the torque", "s", start.motion.delay, best.motion.delay)
         return rows

@@ -41,7 +41,8 @@ class Task:
     """Progress of a task: shows how much is done, and what is being done."""
 
     def __init__(self, show: Callable[[float, str], None]) -> None:
-        self._show, self._done = show, 0.0
+        self._show = show
+        self._done = 0.0
 
     def advance(self, units: float, note: str = "") -> None:
         """Add `units` that are done; `note` is what is being done."""

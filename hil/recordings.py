@@ -69,7 +69,8 @@ def recording_of(archive: Archive) -> Recording:
         problem = f"has no sample{f' ({archive.damage})' if archive.damage else ''}"
         remedy = "record it again, or name a time within the recording"
         raise ArchiveError(archive.path, problem, remedy=remedy)
-    imported, own = archive.kind == "imported", archive.header.by_controller_program
+    imported = archive.kind == "imported"
+    own = archive.header.by_controller_program
     provenance = {"archive": archive.path.name, **archive.header.entries}
     for key, value in (archive.outcome.entries if archive.outcome else {}).items():
         provenance[key if key == "outcome" else f"outcome.{key}"] = value
@@ -94,7 +95,8 @@ def recording_of(archive: Archive) -> Recording:
 
 def _time(archive: Archive) -> Array:
     """Return seconds since the first sample."""
-    columns, period = archive.columns, archive.period
+    columns = archive.columns
+    period = archive.period
     if "cycle" in columns:
         if period is None:
             problem = "has cycles but no period, so their times are unknown"

@@ -54,7 +54,8 @@ from identification.rollout.windows import STEP, windows_of
 
 Array = NDArray[np.float64]
 
-PICTURE, POLISHED = "rollout.png", "polished.xml"
+PICTURE = "rollout.png"
+POLISHED = "polished.xml"
 MOST_WINDOWS: Final = 1000
 """Windows that are simulated at most."""
 _FEW_WINDOWS: Final = 200  # of which the error of each sample is computed
@@ -89,9 +90,11 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
         InputError: there are no consistent parameters, no window, or no servo where one is asked.
         NotSimulatedError: MuJoCo does not accept the identified arm.
     """
-    arm, prepared = model.arm, model.prepared
+    arm = model.arm
+    prepared = model.prepared
     motion, feedback, drive = _motion_of(model, options)
-    windows, tool = motion.windows, ToolFrame(arm)
+    windows = motion.windows
+    tool = ToolFrame(arm)
     measured = windows.reached[:, horizon_rows(windows)]
     positions = simulate(arm, motion, feedback)
     nominal, reason, notes = _nominal(model.cell, arm, motion, feedback, measured, tool)
@@ -140,7 +143,9 @@ def _motion_of(
     model: IdentifiedModel, options: RolloutOptions
 ) -> tuple[RecordedMotion, Feedback, str]:
     """Return the windows of the held-out motion, the feedback, and what drives the arm."""
-    arm, prepared, sources = model.arm, model.prepared, model.prepared.sources
+    arm = model.arm
+    prepared = model.prepared
+    sources = model.prepared.sources
     recordings = _with_commands(sources.held_out, prepared.held_out)
     stretches, owners = recorded_stretches(arm.model, recordings, STEP)
     try:
@@ -163,11 +168,13 @@ def _motion_of(
 
 
 def _servo_of(model: IdentifiedModel, options: RolloutOptions) -> tuple[Servo | None, str]:
-    arm, prepared = model.arm, model.prepared
+    arm = model.arm
+    prepared = model.prepared
     if options.servo is None:
         return None, ""
     if isinstance(options.servo, Servo):
-        n, stated = arm.model.n_joints, options.servo
+        n = arm.model.n_joints
+        stated = options.servo
         servo = Servo(np.broadcast_to(stated.kp, n), np.broadcast_to(stated.kd, n), stated.delay)
         return servo, f"a servo as stated, delay {1e3 * servo.delay:.3g} ms"
     fitted = _with_commands(prepared.sources.training, prepared.fitted)
@@ -197,7 +204,8 @@ def _nominal(
     tool: ToolFrame,
 ) -> tuple[ArmErrors | None, str, list[str]]:
     """Return the errors of the nominal arm, why there is none, and notes."""
-    nominal, model = nominal_of(cell), cell.model
+    nominal = nominal_of(cell)
+    model = cell.model
     if nominal is None:
         return None, "the URDF has no masses", []
     standard = model.nominal
@@ -236,7 +244,8 @@ def _simulated_ensemble(
     few = replace(motion, windows=motion.windows.some(_FEW_WINDOWS))
     fitted = model.prepared.fitted
     residual = ResidualTorque.of(model.predicted_residuals(), fitted, motion.windows)
-    alone, disturbed = [], []
+    alone = []
+    disturbed = []
     with reporter.task("simulating", len(ensemble)) as task:
         for standard, parameters in zip(ensemble.standard, ensemble.values, strict=True):
             sample = replace(model.arm, standard=standard, values=parameters)
@@ -276,12 +285,14 @@ def _leading_effect(
         error = np.where(np.isfinite(at), at - measured[:, JUDGED, joint], LARGEST_ERROR)
         return float(np.mean(error**2))
 
-    before, effect = square(positions), ""
+    before = square(positions)
+    effect = ""
     least = (1.0 - _LEADS) * before
     for name, change in variants(joint):
         after = square(simulate(*change(arm, motion), feedback))
         if after < least:
-            least, effect = after, name
+            least = after
+            effect = name
     return effect
 
 
@@ -304,7 +315,8 @@ def write_rollout(folder: Path, rollout: Rollout) -> str:
     Raises:
         WriteBackError: MuJoCo reads the polished arm otherwise.
     """
-    result, text = rollout.result, None
+    result = rollout.result
+    text = None
     if rollout.polished is not None:
         form = FORMATS["mjcf"]
         remarks = ("Polished on simulated windows by hil rollout.", *rollout.remarks)

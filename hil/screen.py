@@ -57,7 +57,9 @@ _UNFINISHED: Final = re.compile(rb"\x1b(?:\[[0-?]*[ -/]*|O)?\Z")
 _SEQUENCE_WAIT: Final = 0.05
 """s to wait for the rest of a sequence; without it, it is the key Esc."""
 _CHUNK: Final = 256
-_LOCAL, _CONTROL, _INPUT = 3, 6, 0
+_LOCAL = 3
+_CONTROL = 6
+_INPUT = 0
 
 
 def typed(chunk: str) -> str:
@@ -146,7 +148,8 @@ class Keyboard:
                     for key in typed(_chunk(fd).decode(errors="replace")):
                         self._take(key)
         except Exception as error:  # the operator is informed that keys have no effect
-            self.failure, self.attached = error, False
+            self.failure = error
+            self.attached = False
 
 
 def _chunk(fd: int) -> bytes:
@@ -173,7 +176,8 @@ WARNING: Final = 0.8
 
 def status_line(status: RunStatus) -> str:
     """Return the progress of a run in one line."""
-    parts, motion = [f"{status.phase} {status.number} of {status.total}"], status.motion
+    parts = [f"{status.phase} {status.number} of {status.total}"]
+    motion = status.motion
     if motion is not None:
         held = "held" if motion.held else f"override {percentage(motion.override)}"
         parts += [_times(motion), held, _packets(motion)]
@@ -201,7 +205,8 @@ def _motion_rows(names: Sequence[str], motion: MotionProgress) -> list[Renderabl
     progress = Table.grid(padding=(0, 1), expand=True)
     progress.add_column(ratio=1)
     progress.add_column(no_wrap=True)
-    done, total = motion.motion_time or 0.0, motion.duration or math.inf
+    done = motion.motion_time or 0.0
+    total = motion.duration or math.inf
     progress.add_row(ProgressBar(total, done), _times(motion))
     lost = motion.missed or motion.late or motion.not_accepted
     packets = Text(f"cycles {motion.cycles}, {_packets(motion)}", "bold yellow" if lost else "")
@@ -218,8 +223,10 @@ def _motion_rows(names: Sequence[str], motion: MotionProgress) -> list[Renderabl
 
 def _joint_cells(motion: MotionProgress, joint: int) -> tuple[str | Text, ...]:
     """Return following error and current of a joint, "-" while its drive is off."""
-    error, error_share = motion.following_error, motion.following_share
-    current, current_share = motion.current, motion.current_share
+    error = motion.following_error
+    error_share = motion.following_share
+    current = motion.current
+    current_share = motion.current_share
     if error is None or error_share is None or current is None or current_share is None:
         return ("-",) * 4
     return (
@@ -294,7 +301,8 @@ def confirmed(console: Console, question: str, word: str, stop: Stop) -> bool:
 REFRESH_PERIOD: Final = 0.1  # s between two pictures
 LINE_EVERY: Final = 5.0  # s between two lines where there is no terminal
 FAREWELL: Final = 0.5  # s that a terminal may take for the last picture
-NEWEST, REMEMBERED = 5, 200
+NEWEST = 5
+REMEMBERED = 200
 """Messages that are shown, and that are printed at the end."""
 
 
@@ -329,7 +337,8 @@ class Screen:
         self._quiet = quiet
         self._stop = stop
         self._request = OperatorRequest()
-        self._title, self._controller = title, controller
+        self._title = title
+        self._controller = controller
         self._names = tuple(joint_names)
         self._status: RunStatus | None = None
         self._came = time.monotonic()
@@ -426,7 +435,8 @@ class Screen:
 
     def picture(self) -> Layout:
         """Return the present picture, made for 80 columns and 24 lines."""
-        status, request = self._status, self._request
+        status = self._status
+        request = self._request
         motion = None if status is None else status.motion
         top = Table.grid(padding=(0, 2), expand=True)
         top.add_column(no_wrap=True, ratio=1)
@@ -487,14 +497,16 @@ class Screen:
         self._undrawn = self._keyboard = None
         if self._quiet:
             return
-        display, end = self._print_line, self._print_messages
+        display = self._print_line
+        end = self._print_messages
         if self._full:
             self._keyboard = Keyboard(self.press)
             self._undo.enter_context(self._keyboard.reading())
             # The alternate page of the terminal: the shell's lines reappear at the end.
             live = Live(console=self._console, screen=True, auto_refresh=False)
             live.start()
-            display, end = partial(self._draw_page, live), live.stop
+            display = partial(self._draw_page, live)
+            end = live.stop
 
         def draw() -> None:
             try:

@@ -38,7 +38,8 @@ def open_controller_link(
         remedy = "give one of --udp, --can and --link"
         raise InputError(None, "one link is needed", remedy=remedy)
     option, text = given[0]
-    name, address = option.removeprefix("--"), text
+    name = option.removeprefix("--")
+    address = text
     if option == "--link":
         name, _, address = text.partition(":")
     kind = LINKS.get(name)
@@ -86,7 +87,8 @@ class Buttons:
         if signum in (signal.SIGUSR1, signal.SIGUSR2):
             self._pressed.add(signum)
         else:
-            self._at_once, self.interrupted = self.interrupted, True
+            self._at_once = self.interrupted
+            self.interrupted = True
 
     def apply(self, controller: SimulatedController) -> None:
         """Apply pressed buttons to the controller: drive on, or the emergency stop."""
@@ -190,7 +192,8 @@ def serve_session(
             raise ControllerFault(str(error)) from error
         begun = Phase.DRIVE_OFF in phases[1:]
         if begun or not summary.ended or pressed.request() is not serve.Request.CONTINUE:
-            opened, foreign = phases[1:].count(Phase.OPEN), getattr(link, "foreign", 0)
+            opened = phases[1:].count(Phase.OPEN)
+            foreign = getattr(link, "foreign", 0)
             return Served(controller, summary, opened, starts, foreign)
         until = time.monotonic() + serve.KNOCK_INTERVAL
         while time.monotonic() < until and pressed.request() is serve.Request.CONTINUE:

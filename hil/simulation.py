@@ -123,7 +123,8 @@ def own_postures(cell: Cell) -> tuple[tuple[float, ...], ...]:
     straight motions in between; there may be fewer than 13.
     """
     rng = np.random.default_rng(cell.simulation.seed)
-    limits, home = cell.joint_limits, cell.home
+    limits = cell.joint_limits
+    home = cell.home
     reach = np.minimum(0.25 * (limits.upper - limits.lower), np.pi)
     checker = collision_checker(cell)
 
@@ -209,7 +210,8 @@ def simulated_provenance(cell: Cell, effects: bool) -> dict[str, str]:
     """Return the metadata of a simulated archive."""
     sizes = unmodelled_effects(cell) if effects else UnmodelledEffects()
     elasticity = ", ".join(f"{compliance:g}" for compliance in sizes.elasticity)
-    ripple, drift = percentage(sizes.torque_ripple), percentage(sizes.friction_drift)
+    ripple = percentage(sizes.torque_ripple)
+    drift = percentage(sizes.friction_drift)
     described = {
         f"torque ripple of {ripple} of the Coulomb torque": sizes.torque_ripple,
         f"friction drift of {drift} from cold to hot": sizes.friction_drift,

@@ -94,7 +94,8 @@ class StraightMoves(NamedTuple):
 
         Pieces outside have zero length and the state at the cut.
         """
-        begin, end = begin[:, None], end[:, None]
+        begin = begin[:, None]
+        end = end[:, None]
         knots = np.clip(self.knots, begin, end)
         pieces = self.pieces.copy()
         moved = knots[:, :-1] - self.knots[:, :-1]
@@ -197,8 +198,10 @@ def _ramp(rise: Array, flat: Array, jerk: Array) -> tuple[Array, ...]:
     a1 = jerk * rise
     v1 = a1 * rise / 2.0
     p1 = v1 * rise / 3.0
-    v2, p2 = v1 + a1 * flat, p1 + flat * (v1 + a1 * flat / 2.0)
-    v3, p3 = v2 + v1, p2 + rise * (v2 + a1 * rise / 3.0)
+    v2 = v1 + a1 * flat
+    p2 = p1 + flat * (v1 + a1 * flat / 2.0)
+    v3 = v2 + v1
+    p3 = p2 + rise * (v2 + a1 * rise / 3.0)
     return p1, v1, a1, p2, v2, p3, v3
 
 
@@ -268,16 +271,20 @@ def passing(motion: PiecewiseCubic, point: Array) -> Passing:
     apart = motion.sample(times)[0] - point
     square = np.einsum("ij,ij->i", apart, apart)
     index = int(square.argmin())
-    time, best = float(times[index]), float(square[index])
-    low, high = float(times[max(index - 1, 0)]), float(times[min(index + 1, _SAMPLES - 1)])
+    time = float(times[index])
+    best = float(square[index])
+    low = float(times[max(index - 1, 0)])
+    high = float(times[min(index + 1, _SAMPLES - 1)])
     # At its ends a motion may rest, where the slope is zero.
     t = time if low < time < high else 0.5 * (low + high)
     for _ in range(_STEPS):
         q, qd, qdd = motion.sample_one(t)
         gap = q - point
-        apart_here, slope = float(gap @ gap), float(gap @ qd)
+        apart_here = float(gap @ gap)
+        slope = float(gap @ qd)
         if apart_here < best:
-            time, best = t, apart_here
+            time = t
+            best = apart_here
         low, high = (t, high) if slope < 0.0 else (low, t)
         bend = float(qd @ qd + gap @ qdd)
         closer = t - slope / bend if bend > 0.0 else high
@@ -322,7 +329,8 @@ def round_corners(
         UnsupportedSolver: a corner is to be rounded with an untested version of ruckig.
     """
     corners = [STOP] * len(before)
-    slowing, speeding = moves.slowing_down[before], moves.speeding_up[after]
+    slowing = moves.slowing_down[before]
+    speeding = moves.speeding_up[after]
     asked = np.flatnonzero((slowing > 0.0) & (speeding > 0.0) & (fly >= LEAST_SHARE))
     if len(asked) == 0:  # stops need no solver, of whatever version
         return corners
@@ -332,8 +340,10 @@ def round_corners(
 
     def solved(rows: Rows, shares: Array) -> Solutions:
         leave, enter = cuts(rows, shares)
-        first, second = moves.take(before[rows]), moves.take(after[rows])
-        starts, ends = first.states(first.durations - leave), second.states(enter)
+        first = moves.take(before[rows])
+        second = moves.take(after[rows])
+        starts = first.states(first.durations - leave)
+        ends = second.states(enter)
         full = fly[rows] * (slowing[rows] + speeding[rows])
         return solve_many(starts, ends, full, bounds.take(rows))
 
@@ -458,7 +468,8 @@ def _in_units(starts: Array, ends: Array, times: Array, bounds: Allowance) -> Se
     square, cube = np.array([(time**2, time**3) for time in times.tolist()]).reshape(-1, 2).T
     way = bounds.jerk / SOLVER_JERK * cube[:, None]
     units = np.stack((way, way / times[:, None], way / square[:, None]), axis=2)
-    here, there = starts / units, ends / units
+    here = starts / units
+    there = ends / units
     there[..., 0] = (ends[..., 0] - starts[..., 0]) / way
     here[..., 0] = 0.0
     largest = FULL * (np.stack((bounds.velocity, bounds.acceleration), axis=2) / units[..., 1:])
@@ -475,7 +486,8 @@ def finish_many(solutions: Solutions, bounds: Allowance) -> list[PiecewiseCubic 
     groups = [(np.flatnonzero(met), tables.take(met))]
     if not np.all(met):
         missed = np.flatnonzero(~met)
-        starts, ends = solutions.starts[missed], solutions.ends[missed]
+        starts = solutions.starts[missed]
+        ends = solutions.ends[missed]
         groups.append((missed, _closed(tables.take(missed), starts, ends)))
     for rows, block in groups:
         own = bounds.take(rows)

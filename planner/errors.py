@@ -21,7 +21,9 @@ class InvalidSetting(PlannerError, ValueError):
     """Setting of a plan or a player (speed, fly, period, bound) outside its range."""
 
     def __init__(self, name: str, value: object, valid: str) -> None:
-        self.name, self.value, self.valid = name, value, valid
+        self.name = name
+        self.value = value
+        self.valid = valid
         super().__init__(f"{name} = {value} is not allowed; valid is {valid}")
 
 
@@ -45,7 +47,10 @@ class LimitExceeded(PlanningError):
     """The planned motion would break a limit of one joint (SI units)."""
 
     def __init__(self, quantity: str, joint: int, value: float, bound: float) -> None:
-        self.quantity, self.joint, self.value, self.bound = quantity, joint, value, bound
+        self.quantity = quantity
+        self.joint = joint
+        self.value = value
+        self.bound = bound
         super().__init__(
             f"planned {quantity} of joint {joint} reaches {value:.9g}, its limit is {bound:.9g}"
         )
@@ -55,7 +60,10 @@ class NotSmooth(PlanningError):
     """The planned motion would jump between two of its pieces (SI units)."""
 
     def __init__(self, quantity: str, joint: int, time: float, jump: float) -> None:
-        self.quantity, self.joint, self.time, self.jump = quantity, joint, time, jump
+        self.quantity = quantity
+        self.joint = joint
+        self.time = time
+        self.jump = jump
         super().__init__(
             f"planned {quantity} of joint {joint} jumps by {jump:.3g} at {time:.6g} s; "
             "it must be continuous"
@@ -70,7 +78,10 @@ class StartMismatch(PlannerError):
     """A joint is farther from the start or resume point of a motion than the tolerance [rad]."""
 
     def __init__(self, joint: int, value: float, expected: float, tolerance: float) -> None:
-        self.joint, self.value, self.expected, self.tolerance = joint, value, expected, tolerance
+        self.joint = joint
+        self.value = value
+        self.expected = expected
+        self.tolerance = tolerance
         super().__init__(
             f"joint {joint} is at {value:.6g} rad, the motion at {expected:.6g} rad; "
             f"the tolerance is {tolerance:.3g} rad"

@@ -220,7 +220,8 @@ class FourierSeries:
 
     def _bounds(self, order: int, ramped: bool) -> Array:
         """Return a bound of a derivative's magnitude, less offset, from the amplitudes, (n,)."""
-        size, rate = np.abs(self.amplitude), np.abs(self.frequency)
+        size = np.abs(self.amplitude)
+        rate = np.abs(self.frequency)
         with np.errstate(all="ignore"):  # an overflow is inf, which exceeds every limit
             sums = [
                 np.sum(np.where(size > 0.0, size * rate**k, 0.0), axis=1) for k in range(order + 1)
@@ -239,7 +240,8 @@ class FourierSeries:
 
     def _stage(self, t: Array) -> NDArray[np.int_]:
         """Return the stage at times (m,): 1 in the first ramp, 0 between, -1 in the last ramp."""
-        first, last = t < self.ramp, t > self.length - self.ramp
+        first = t < self.ramp
+        last = t > self.length - self.ramp
         return first.astype(np.int_) - (last & ~first).astype(np.int_)
 
     def _window(self, t: Array, order: int, stage: NDArray[np.int_]) -> list[Array]:
@@ -257,7 +259,8 @@ class FourierSeries:
     def _sines(self, t: Array, order: int) -> list[Array]:
         """Return the sum of sines and its derivatives up to `order`, (m, n) each."""
         phase = t[:, None, None] * self.frequency
-        sine, cosine = np.sin(phase), np.cos(phase)
+        sine = np.sin(phase)
+        cosine = np.cos(phase)
         turned = (sine, cosine, -sine, -cosine)
         return [
             np.sum(self.amplitude * self.frequency**k * turned[k % 4], axis=2)

@@ -186,7 +186,8 @@ class MotionQueue:
     def __init__(
         self, start: Array, limits: JointLimits, corner: Callable[[Legs, float], Corner]
     ) -> None:
-        self._limits, self._corner = limits, corner
+        self._limits = limits
+        self._corner = corner
         self._stretches: list[_Stretch] = []
         self._reading = 0
         self._point = start
@@ -220,12 +221,15 @@ class MotionQueue:
             PlannerError: no motion to it was found; the motion planned before is unchanged.
         """
         new = legs = self.leg_to(move, overrides)
-        turn, turns = STOP, list[Corner]()
+        turn = STOP
+        turns = list[Corner]()
         if self._last is not None:
             both = self._last[0].followed_by(new)
             found = self._corner(both, self._last[1])
             if found.join is not None and self.end - found.leave >= now:
-                turn, turns, legs = found, [found], both
+                turn = found
+                turns = [found]
+                legs = both
         legs.motions(turns, 1)  # checked from rest to rest, with the leg before the corner
         del self._stretches[: self._reading]
         self._reading = 0
@@ -238,7 +242,8 @@ class MotionQueue:
         enter = np.array([turn.enter])
         (part,) = new.moves.tables(enter, np.maximum(enter, new.moves.durations))
         self._extend(part)
-        self._point, self._last = move.target, (new, move.fly_percent / 100.0)
+        self._point = move.target
+        self._last = (new, move.fly_percent / 100.0)
         self.ahead.append(_Passage(target_id, self.end))
 
     def _extend(self, part: PiecewiseCubic) -> None:
@@ -297,11 +302,14 @@ def _service(
             self._require(self._initialized, "the interpolator is not initialized")
             return method(self, *args, **kwargs) or Status.OK
         except _RefusedError as refused:
-            status, self.refusal = refused.status, str(refused)
+            status = refused.status
+            self.refusal = str(refused)
         except (InvalidSetting, TypeError, ValueError, OverflowError) as error:
-            status, self.refusal = Status.INCONSISTENT, str(error)
+            status = Status.INCONSISTENT
+            self.refusal = str(error)
         except PlannerError as error:
-            status, self.refusal = Status.FATAL, str(error)
+            status = Status.FATAL
+            self.refusal = str(error)
         return status
 
     return service
@@ -370,7 +378,8 @@ class Interpolator:
         Refused while the arm moves, as `reset` and `terminate` are: call `stop_motion` or
         `cancel_motion` first. FATAL if the process that plans corners does not start.
         """
-        before, self._initialized = self._initialized, True
+        before = self._initialized
+        self._initialized = True
         status = self.reset()
         if status < 0:
             self._initialized = before
@@ -409,7 +418,8 @@ class Interpolator:
         self._require_rest()
         self._require(0.0 < period < inf, f"interpolation time of {period} s")
         self._period = float(period)
-        time, rate = self._law.motion_time, self._law.rate
+        time = self._law.motion_time
+        rate = self._law.rate
         self._law = TimeLaw(self._period)
         self._law.restart(time, rate)
 
@@ -452,7 +462,8 @@ class Interpolator:
 
         The path at fly-by corners can change.
         """
-        share, overrides = percent / 100.0, self._settings.overrides
+        share = percent / 100.0
+        overrides = self._settings.overrides
         scaled = AccelerationKind(kind)
         if scaled is not AccelerationKind.DECELERATION:
             overrides = replace(overrides, acceleration=share)
@@ -529,7 +540,8 @@ class Interpolator:
         the motion and while it is stopped; NO_TARGET without targets; OUTPUT_FORMAT for another
         format.
         """
-        queue, law = self._queue, self._law
+        queue = self._queue
+        law = self._law
         if output_format != OutputFormat.JOINT:
             return self._no_step(Status.OUTPUT_FORMAT, "only joint positions are available")
         if queue is None:
@@ -589,7 +601,8 @@ class Interpolator:
         if self.get_current_target_id() is None:
             self._held = False
         elif self._moving:
-            self._cancelling, self._stop_reported = True, False
+            self._cancelling = True
+            self._stop_reported = False
             self._run(self._stopping)
         else:
             self._drop()
@@ -666,7 +679,9 @@ class Interpolator:
 
     def _position_of(self, position: ArrayLike) -> Array:
         """Return a position (n,) checked to be inside the limits."""
-        point, lower, upper = read_only(position), self._limits.lower, self._limits.upper
+        point = read_only(position)
+        lower = self._limits.lower
+        upper = self._limits.upper
         inside = point.shape == lower.shape and np.all((point >= lower) & (point <= upper))
         self._require(bool(inside), f"position {position!r:.200} is not in the limits")
         return point

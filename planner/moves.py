@@ -147,7 +147,8 @@ class Legs(NamedTuple):
         Limits within a corner are the larger ones of the two moves; those of acceleration are the
         deceleration before and the acceleration after it.
         """
-        first, second = self.bounds.take(before), self.bounds.take(after)
+        first = self.bounds.take(before)
+        second = self.bounds.take(after)
         bounds = first._replace(
             velocity=np.maximum(first.velocity, second.velocity),
             acceleration=np.maximum(self.deceleration[before], second.acceleration),
@@ -195,12 +196,14 @@ def _checked(motion: PiecewiseCubic, bounds: Allowance) -> PiecewiseCubic | Plan
 
 def _assembled(moves: StraightMoves, corners: Sequence[Corner], count: int) -> Block:
     """Return `count` motions of equal numbers of legs, with corners between them."""
-    legs, n = len(moves.start) // count, moves.start.shape[1]
+    legs = len(moves.start) // count
+    n = moves.start.shape[1]
     leave, enter = np.zeros((2, count, legs))
     leave[:, :-1] = np.array([corner.leave for corner in corners]).reshape(count, -1)
     enter[:, 1:] = np.array([corner.enter for corner in corners]).reshape(count, -1)
     # Two full fly-bys may use up a move without cruise: then `end` is `begin` within rounding.
-    begin, end = enter.ravel(), moves.durations - leave.ravel()
+    begin = enter.ravel()
+    end = moves.durations - leave.ravel()
     times, pieces = moves.cut(begin, np.maximum(begin, end))
     times = times.reshape(count, legs, 1, -1)
     pieces = pieces.reshape(count, legs, n, -1, 4)
@@ -213,7 +216,8 @@ def _assembled(moves: StraightMoves, corners: Sequence[Corner], count: int) -> B
     knots = np.zeros((count, legs - 1, n, width + 1))
     for index, (_, _, join, *_) in enumerate(corners):
         if join is not None:
-            where, own = divmod(index, legs - 1), len(join.knots[0])
+            where = divmod(index, legs - 1)
+            own = len(join.knots[0])
             rounds[where][:, : own - 1] = join.coefficients
             knots[where][:, :own] = join.knots
             knots[where][:, own:] = join.duration
@@ -221,7 +225,8 @@ def _assembled(moves: StraightMoves, corners: Sequence[Corner], count: int) -> B
     spans = np.zeros((count, 2 * legs))
     spans[:, 1::2], spans[:, 2::2] = times[:, :, 0, -1], knots[:, :, 0, -1]
     offset = np.cumsum(spans, axis=1)[..., None, None]
-    row_knots, row_pieces = [np.zeros((count, n, 1))], []
+    row_knots = [np.zeros((count, n, 1))]
+    row_pieces = []
     for part in range(2 * legs - 1):
         leg = part // 2
         local, table = (knots, rounds) if part % 2 else (times, pieces)
@@ -324,7 +329,9 @@ class MotionPlan:
     @cached_property
     def targets(self) -> tuple[TargetPassage, ...]:
         """Passage of the target of each move."""
-        time, entered, passages = 0.0, 0.0, []
+        time = 0.0
+        entered = 0.0
+        passages = []
         for index, (move, duration, corner) in enumerate(
             zip(self.moves, self.durations, (*self.corners, STOP), strict=True)
         ):
@@ -360,7 +367,9 @@ def checked_via_points(via_points: ArrayLike, limits: JointLimits) -> Array:
         raise InvalidViaPoints(f"{len(points)} via point(s) given; a motion needs at least 2")
     inside = (points >= limits.lower) & (points <= limits.upper)
     for index, joint in np.argwhere(~inside).tolist():  # the first; NaN is never inside
-        value, lower, upper = points[index, joint], limits.lower[joint], limits.upper[joint]
+        value = points[index, joint]
+        lower = limits.lower[joint]
+        upper = limits.upper[joint]
         raise InvalidViaPoints(
             f"via point {index}, joint {joint}: {value:.6g} rad is outside "
             f"[{lower:.6g}, {upper:.6g}] rad"
@@ -468,7 +477,8 @@ def plan_chunk(
             acceleration,
         )
         each = np.arange(len(velocity)).reshape(count, -1)
-        before, after = each[:, :-1].ravel(), each[:, 1:].ravel()
+        before = each[:, :-1].ravel()
+        after = each[:, 1:].ravel()
         corners = legs.corners(before, after, np.full(len(before), 100.0 * fly / 100.0))
         planned |= dict(zip(rows, legs.checked_motions(corners, count), strict=True))
     return [planned[index] for index in range(len(individuals))]

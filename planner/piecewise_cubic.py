@@ -278,10 +278,14 @@ class Block(NamedTuple):
         real = np.diff(self.knots, axis=-1) > 0.0
         real[..., 0] |= ~real.any(axis=-1)
         ends = np.cumsum(real.sum(axis=-1), axis=None).tolist()
-        times, pieces = self.knots[..., 1:][real], self.coefficients[real]
-        tables, begin, n_joints = [], 0, real.shape[1]
+        times = self.knots[..., 1:][real]
+        pieces = self.coefficients[real]
+        tables = []
+        begin = 0
+        n_joints = real.shape[1]
         for row in range(0, len(ends), n_joints):
-            knots, coefficients = [], []
+            knots = []
+            coefficients = []
             for end in ends[row : row + n_joints]:
                 knots.append(np.concatenate(([0.0], times[begin:end])))
                 coefficients.append(pieces[begin:end].copy())
@@ -341,7 +345,8 @@ def check_limits(trajectory: WithExtrema, limits: Bounds) -> None:
         ("position", "upper", 1.0),
         *((rate, rate, 1.0) for rate in ("velocity", "acceleration", "jerk")),
     ):
-        value, bound = getattr(extrema, end), getattr(limits, end)
+        value = getattr(extrema, end)
+        bound = getattr(limits, end)
         excess = sign * (value - bound) - (slack if quantity == "position" else 0.0)
         if not np.all(excess <= 0.0):  # written so that NaN is refused too
             joint = int(np.argmax(excess))

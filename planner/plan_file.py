@@ -179,7 +179,8 @@ class PlanFile:
 
 
 def _check_motion(stored: PiecewiseCubic, planned: MotionPlan) -> None:
-    other, limits = planned.trajectory, planned.limits
+    other = planned.trajectory
+    limits = planned.limits
     try:
         check_limits(stored, limits)
         check_smooth(stored, limits)

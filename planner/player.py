@@ -45,7 +45,8 @@ class PathReader:
             return position[0], velocity[0]
         piece = bisect_right(self._knots, s) - 1
         x = s - self._knots[piece]
-        basis, square = self._basis, x * x
+        basis = self._basis
+        square = x * x
         basis[0, 1] = x
         basis[0, 2] = square
         basis[0, 3] = square * x
@@ -59,9 +60,12 @@ class _Sines:
     """Evaluates a `FourierSeries`, equal to its `sample` within rounding."""
 
     def __init__(self, series: FourierSeries) -> None:
-        self._offset, self._frequency = series.offset, series.frequency
-        self._amplitude, self._rate = series.amplitude, series.amplitude * series.frequency
-        self._length, self._ramp = series.length, series.ramp
+        self._offset = series.offset
+        self._frequency = series.frequency
+        self._amplitude = series.amplitude
+        self._rate = series.amplitude * series.frequency
+        self._length = series.length
+        self._ramp = series.ramp
         self._sum: Array = np.ones(series.frequency.shape[1])
 
     def read(self, s: float) -> tuple[Array, Array]:
@@ -234,7 +238,8 @@ class TrajectoryPlayer:
         return offset
 
     def _check_range(self, offset: Array) -> None:
-        limits, rounding = self._limits, position_rounding(self._limits)
+        limits = self._limits
+        rounding = position_rounding(self._limits)
         slack = np.maximum(rounding, 0.5 * _RANGE_ROUNDING * (limits.upper - limits.lower))
         for reach, bound, sign in (
             (self._lower + offset, limits.lower, -1.0),
@@ -258,18 +263,22 @@ class TrajectoryPlayer:
         """
         offset = self._offset + (position - self._last)
         if velocity.any() and np.max(np.abs(offset)) <= self._tolerance:
-            self._offset, self._last = offset, position
+            self._offset = offset
+            self._last = position
             return
-        s, here = self.motion_time, position - self._offset
+        s = self.motion_time
+        here = position - self._offset
         # Below this squared speed the path has no usable direction.
         slowest = float(velocity @ velocity) * _ROUNDING
-        least, most = max(s - _FARTHEST, 0.0), min(s + _FARTHEST, self.duration)
+        least = max(s - _FARTHEST, 0.0)
+        most = min(s + _FARTHEST, self.duration)
         point, speed = self._path.read(s)
         for _ in range(_NEWTON_STEPS):
             square = float(speed @ speed)
             if square <= slowest:
                 break
-            before, s = s, min(max(s + float((here - point) @ speed) / square, least), most)
+            before = s
+            s = min(max(s + float((here - point) @ speed) / square, least), most)
             point, speed = self._path.read(s)
             if abs(s - before) <= _ROUNDING * self._period:
                 break
@@ -367,7 +376,8 @@ class TrajectoryPlayer:
         """Stop on the path and end the motion; without effect if stopping or finished."""
         if self.finished or self._stopping:
             return
-        self._held, self._stopping = False, True
+        self._held = False
+        self._stopping = True
         self._aim(0.0, "stop")
         self.bounds = "stop"
         self.finished = self._settled

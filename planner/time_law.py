@@ -82,14 +82,17 @@ def ramp(rate: float, slope: float, target: float, bounds: RateBounds) -> Ramp:
 
     A slope beyond its bound, which came from wider bounds, does not grow further.
     """
-    way, change = target - rate, bounds.change
+    way = target - rate
+    change = bounds.change
     up = 1.0 if target >= stopping_rate(rate, slope, change) else -1.0
-    way, slope_up = up * way, up * slope
+    way = up * way
+    slope_up = up * slope
     peak = sqrt(max(change * way + 0.5 * slope_up * slope_up, 0.0))
     peak = max(min(peak, bounds.slope), slope_up)
     # Change of rate while the slope rises and falls; the rest is made at the peak slope.
     covered = (peak * peak - 0.5 * slope_up * slope_up) / change
-    rising, falling = (peak - slope_up) / change, peak / change
+    rising = (peak - slope_up) / change
+    falling = peak / change
     staying = max((way - covered) / peak, 0.0) if peak > 0.0 else 0.0
 
     jerk = copysign(change, up)
@@ -114,7 +117,9 @@ class TimeLaw:
 
     def restart(self, motion_time: float, rate: float, slope: float = 0.0) -> None:
         """Set motion time [s], a constant rate, and the slope [1/s] for the next `aim`."""
-        self.motion_time, self.rate, self.slope = motion_time, rate, slope
+        self.motion_time = motion_time
+        self.rate = rate
+        self.slope = slope
         self._follow(ramp(rate, 0.0, rate, RateBounds(1.0, 1.0)))
 
     def aim(self, target: float, bounds: RateBounds) -> None:
@@ -160,8 +165,11 @@ def slowing_bounds(
     in r' and r'' such that a change from full rate to rest takes the least time. Without `extrema`
     of the path the limits are assumed.
     """
-    v, a, j = limits.velocity, limits.acceleration, limits.jerk
-    spare_acceleration, spare_jerk = (acceleration - 1.0) * a, (jerk - 1.0) * j
+    v = limits.velocity
+    a = limits.acceleration
+    j = limits.jerk
+    spare_acceleration = (acceleration - 1.0) * a
+    spare_jerk = (jerk - 1.0) * j
     if extrema is not None:
         spare_acceleration = acceleration * a - np.minimum(extrema.acceleration, a)
         spare_jerk = jerk * j - np.minimum(extrema.jerk, j)

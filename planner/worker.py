@@ -325,8 +325,10 @@ def stream_in_children(
     Yields each index with its result or its own error, in any order; raises PlannerNotStarted if a
     child died before its first call several times, and what the function raises.
     """
-    fresh, again = iter(chunks), deque[Chunk]()
-    crashed, not_started = set[int](), 0
+    fresh = iter(chunks)
+    again = deque[Chunk]()
+    crashed = set[int]()
+    not_started = 0
     idle = list(children)
     busy: dict[Any, tuple[WorkerProcess, Chunk]] = {}
     found: list[tuple[int, Outcome[T]]] = []

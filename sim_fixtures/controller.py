@@ -192,7 +192,8 @@ class LoopProgram:
     def pause(self, mode: int, cycles: int) -> None:
         """Report a pause, mode 500 or 502, for some cycles if the drive is on."""
         if self.powered and self.phase is not Phase.DRIVING_ON:
-            self.pause_mode, self._pause_cycles = mode, cycles
+            self.pause_mode = mode
+            self._pause_cycles = cycles
             self._enter(Phase.PAUSED)
 
     def restarted(self, settings: ControllerSettings) -> LoopProgram:
@@ -235,7 +236,8 @@ class LoopProgram:
 
     def _open_due_axes(self) -> None:
         """Open one axis after the other."""
-        stagger, wanted = self._settings.opening_stagger, self.wanted_axes
+        stagger = self._settings.opening_stagger
+        wanted = self.wanted_axes
         self.open_axes = [
             wanted[axis] and axis not in self._gone and self._age >= sum(wanted[:axis]) * stagger
             for axis in range(self._n_axes)
@@ -243,7 +245,8 @@ class LoopProgram:
 
     def _close_due_axes(self) -> None:
         """Close one axis after the other."""
-        settings, age = self._settings, self._age
+        settings = self._settings
+        age = self._age
         self.open_axes = [
             is_open and age < settings.closing_cycles + i * settings.closing_stagger
             for i, is_open in enumerate(self.open_axes)
@@ -318,7 +321,8 @@ class LoopProgram:
     def _advance_timed(self, at_rest: bool) -> None:
         """Leave the phases that last a number of cycles."""
         settings = self._settings
-        phase, age = self.phase, self._age
+        phase = self.phase
+        age = self._age
         if phase is Phase.DRIVE_OFF and age >= settings.drive_off_cycles:
             if self._finishing or self.gave_up:
                 self._enter(Phase.ENDING)
@@ -533,7 +537,8 @@ class OwnMotion:
         return self.position, self.velocity
 
     def _start_move(self) -> None:
-        self._from, self._to = self.position, self._postures[self._next]
+        self._from = self.position
+        self._to = self._postures[self._next]
         self._next += self._stride
         at_an_end = not 0 <= self._next < len(self._postures)
         if self._repeats and len(self._postures) > 1 and at_an_end:
@@ -602,7 +607,8 @@ class Targets:
         else:
             if not self._settings.corrected:
                 self._follow(demand, wanted)
-            self.own, self.own_delta = demand.target, demand.delta
+            self.own = demand.target
+            self.own_delta = demand.delta
             self._offset = [0.0] * len(self.own)
         return demand
 
@@ -619,7 +625,8 @@ class Targets:
         if corrected:
             return CycleDemand(list(self.own), list(zero), zero, list(zero))
         continues = self._settings.while_silent == "continue"
-        target, delta = list(servo.target), [0.0] * n
+        target = list(servo.target)
+        delta = [0.0] * n
         for i, before in enumerate(servo.delta):
             if before == 0.0 or not continues:
                 self._ramp[i] = 0.0
@@ -739,7 +746,8 @@ class SimulatedController:
             effects=effects, gravity=gravity, position=initial_position, rng=noise_rng,
         )  # fmt: skip
         self.plant = self._arm.plant
-        gains, resolution = settings.servo, settings.current_resolution
+        gains = settings.servo
+        resolution = settings.current_resolution
         model = NominalModel(urdf, truth, gravity=gravity, error=gains.model_error, rng=model_rng)
         self.servo = CycleServo(
             drive, model, gains, period=settings.period, current_resolution=resolution
@@ -858,7 +866,8 @@ class SimulatedController:
 
     def _run(self, demand: CycleDemand) -> None:
         """Simulate the arm for one period and read its encoders."""
-        servo, program = self.servo, self.program
+        servo = self.servo
+        program = self.program
         if program.powered:
             self._arm.begin_cycle(braked=program.braked)
             servo.run_cycle(demand, self._arm.run)
@@ -885,7 +894,8 @@ class SimulatedController:
 
     def _read(self, reply: bytes) -> tuple[Requests, Wanted]:
         """Decode a reply: its requests, and the fields of each open axis."""
-        program, layout = self.program, self._layout
+        program = self.program
+        layout = self._layout
         try:
             if packet_number(reply) != next_number(self._number):
                 raise PacketError("number", packet_number(reply), "that of this cycle")
@@ -914,7 +924,9 @@ class SimulatedController:
 
     def _cyclic_packet(self, phase: Phase) -> bytes:
         """Return the cyclic packet of the present cycle."""
-        servo, program, layout = self.servo, self.program, self._layout
+        servo = self.servo
+        program = self.program
+        layout = self._layout
         common = program.pause_mode if phase is Phase.PAUSED else _COMMON_MODE.get(phase)
         layout.set_modes(common, program.open_axes)
         zero = [0.0] * self._drive.n_axes

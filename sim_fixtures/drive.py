@@ -91,8 +91,10 @@ class SimulatedDrive:
         speeds = [ratio * v for ratio, v in zip(self._signed_ratio, qd, strict=True)]
         if self._coupled:
             # the coupling is defined for controller angles
-            kr, sign = self.gear_ratio, self.joint_sign
-            a4, a5 = sign[3] * qd[3], sign[4] * qd[4]
+            kr = self.gear_ratio
+            sign = self.joint_sign
+            a4 = sign[3] * qd[3]
+            a5 = sign[4] * qd[4]
             speeds[4] -= kr[4] * self.k54 * a4 / (2.0 * pi)
             speeds[5] += kr[5] * (self._k46 * a4 - self.k65 * a5) / (2.0 * pi)
         return speeds
@@ -111,7 +113,8 @@ class SimulatedDrive:
         ]
         if self._coupled:
             sign = self.joint_sign
-            a4, own5 = sign[3] * speeds[3], sign[4] * speeds[4]
+            a4 = sign[3] * speeds[3]
+            own5 = sign[4] * speeds[4]
             speeds[4] += sign[4] * self.k54 * a4
             speeds[5] += sign[5] * (self.k65 * own5 + self.k64 * a4)
         return speeds
@@ -122,7 +125,8 @@ class SimulatedDrive:
         torque = [2.0 * pi * ratio * m for ratio, m in zip(self._signed_ratio, motor, strict=True)]
         if self._coupled:
             # motors 5 and 6 also act on joint 4, motor 6 on joint 5
-            kr, sign = self.gear_ratio, self.joint_sign
+            kr = self.gear_ratio
+            sign = self.joint_sign
             torque[3] += sign[3] * (kr[5] * self._k46 * motor[5] - kr[4] * self.k54 * motor[4])
             torque[4] -= sign[4] * kr[5] * self.k65 * motor[5]
         return torque

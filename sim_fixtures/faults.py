@@ -168,7 +168,9 @@ def _parsed(text: str) -> Fault:
     match = _HEAD.fullmatch(head)
     if match is None:
         raise ValueError(f"{head!r:.80} is not KIND@CYCLE or KIND@CYCLExCOUNT")
-    name, cycle, times = match[1], int(match[2]), match[3]
+    name = match[1]
+    cycle = int(match[2])
+    times = match[3]
     kind = _KINDS.get(name)
     if kind is None:
         raise ValueError(f"{name!r} is none of {', '.join(_KINDS)}")
@@ -183,7 +185,8 @@ def _parsed(text: str) -> Fault:
         case "lose":
             return link.Lose(cycle, to, count)
         case "delay":
-            value, unit = float(found["time"][1]), found["time"][2]
+            value = float(found["time"][1])
+            unit = found["time"][2]
             if unit.startswith("cycle"):
                 return link.Delay(cycle, cycles=value, direction=to, count=count)
             return link.Delay(cycle, seconds=value * _SECONDS[unit], direction=to, count=count)

@@ -302,7 +302,8 @@ class Plant:
             return False
         friction = torque - self._holding
         if (np.abs(friction) <= self._coulomb).all():
-            self._dry, self._smooth = friction, self._no_friction
+            self._dry = friction
+            self._smooth = self._no_friction
             return True
         self._holding = None
         return False

@@ -210,9 +210,13 @@ class Servo:
 
     def _close_loops(self, gains: Sequence[float]) -> list[float]:
         """Return the target currents [A]; `gains` in A per motor rev/s."""
-        settings, rate = self._settings, 1.0 / self._period
-        resolution, integral, deadband = self._resolution, self._integral, self._deadband
-        position_gain, growth = settings.position_gain, settings.integral_rate * self._period
+        settings = self._settings
+        rate = 1.0 / self._period
+        resolution = self._resolution
+        integral = self._integral
+        deadband = self._deadband
+        position_gain = settings.position_gain
+        growth = settings.integral_rate * self._period
         currents = []
         rows = zip(
             self.target,
@@ -331,9 +335,11 @@ class CycleServo:
         `drive_arm` applies target currents (n,) [A] for one period of the loops and returns the
         encoder positions (n,) [motor rev] after it.
         """
-        loops, n = self._loops, self._n_loops
+        loops = self._loops
+        n = self._n_loops
         loops.feed([speed / n for speed in demand.speed], demand.current)
-        currents, model_currents = [], []
+        currents = []
+        model_currents = []
         for target, delta in self._set_points(demand):
             currents.append(loops.advance(target, delta))
             model_currents.append(loops.model_current)
@@ -359,7 +365,8 @@ class CycleServo:
         points = []
         for loop in range(1, n):
             s = loop / n
-            position, speed = [], []
+            position = []
+            speed = []
             for start, end, v, w in zip(self.target, demand.target, self._speed, ends, strict=True):
                 # Linear for the part of the step that is not in the speeds, as after a lost reply.
                 position.append(start + s * (end - start - 0.5 * (1.0 - s) * (w - v)))
@@ -410,7 +417,8 @@ class CurrentLoop:
         if self._queue:
             self._queue.append(target)
             target = self._queue.pop(0)
-        decay, mean = self._decay, self._mean
+        decay = self._decay
+        mean = self._mean
         lag = [s - t for s, t in zip(self._state, target, strict=True)]
         self._state = [t + decay * x for t, x in zip(target, lag, strict=True)]
         return [t + mean * x + e for t, x, e in zip(target, lag, noise, strict=True)]

@@ -86,7 +86,8 @@ def warm_up(
     }
     session.reply(InitPacket.build(n, round(1000.0 * period), values).encode(), 0.0)
     session.request(_Rest(position))
-    status, number = bytes((DRIVE_ON, 0, 0, 0)), INIT_NUMBER
+    status = bytes((DRIVE_ON, 0, 0, 0))
+    number = INIT_NUMBER
     reply: bytes | None = None
     for cycle in range(cycles):
         number = next_number(number)

@@ -198,15 +198,18 @@ class HeartbeatMonitor:
     def __init__(
         self, heartbeat: Callable[[], float], *, max_interval: float = MAX_INTERVAL
     ) -> None:
-        self._read, self._max_interval = heartbeat, max_interval
+        self._read = heartbeat
+        self._max_interval = max_interval
         self._last, self._read_at = heartbeat(), time.monotonic()
         self._silence = 0.0
 
     def silence(self) -> float:
         """Return the seconds since the last change, 0 before the first; to be called often."""
-        now, heartbeat = time.monotonic(), self._read()
+        now = time.monotonic()
+        heartbeat = self._read()
         if heartbeat != self._last or heartbeat == 0.0:
-            self._last, self._silence = heartbeat, 0.0
+            self._last = heartbeat
+            self._silence = 0.0
         else:
             self._silence += min(now - self._read_at, self._max_interval)
         self._read_at = now

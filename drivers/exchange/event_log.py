@@ -74,7 +74,8 @@ CAPACITY: Final = 4 << 20
 """Bytes, for some hundred refusals with their flight recorders, or 50 000 small events."""
 _HEADER_BYTES: Final = 256
 _FRAME: Final = struct.Struct("<IIQ")
-_HEAD, _TAIL = 8, 16
+_HEAD = 8
+_TAIL = 16
 
 
 def create(capacity: int = CAPACITY) -> int:

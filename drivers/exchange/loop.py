@@ -78,7 +78,8 @@ class _PeerSelection:
             self._transport.forget_peer()
 
     def after_silence(self) -> None:
-        session, transport = self._session, self._transport
+        session = self._session
+        transport = self._transport
         if _accepts_any_peer(session) and (
             session.state is not State.SYNC or transport.now - self._replied_at >= PEER_TIMEOUT
         ):
@@ -119,7 +120,8 @@ class ReceiveQueue:
         Raises:
             TransportClosed: the link is closed.
         """
-        transport, session = self._transport, self._session
+        transport = self._transport
+        session = self._session
         before = transport.now
         packet = transport.receive(min(POLL, max(0.0, session.deadline - before)))
         if packet is None:
@@ -128,8 +130,10 @@ class ReceiveQueue:
         period = session.period
         stamp = self._stamp()
         arrived = now if stamp is None else stamp
-        read_at, self._read_at = self._read_at, now
-        earliest, self._earliest_next = self._earliest_next, arrived + _BUNCHED * period
+        read_at = self._read_at
+        self._read_at = now
+        earliest = self._earliest_next
+        self._earliest_next = arrived + _BUNCHED * period
         if stamp is None:
             queued = now - before <= _IMMEDIATE * period
         else:
@@ -159,9 +163,11 @@ class ReceiveQueue:
             if packet is None:
                 break
             backlog.add(self._arrival(packet, self._stamp(), transport.now))
-        arrivals, dropped = tuple(arrival for _, arrival in backlog.newest), backlog.dropped
+        arrivals = tuple(arrival for _, arrival in backlog.newest)
+        dropped = backlog.dropped
         if dropped and self._too_old(arrivals, period):
-            arrivals, dropped = (), dropped + 1
+            arrivals = ()
+            dropped = dropped + 1
         self._session.discarded("late", dropped)
         return arrivals
 
@@ -285,7 +291,8 @@ def exchange(
     peers = _PeerSelection(transport, session)
     lateness = _LatenessMonitor(session, max_late)
     handled = 0
-    send, reply_to = transport.send, session.reply
+    send = transport.send
+    reply_to = session.reply
     while session.state is not State.ENDED and not ends_when():
         try:
             arrivals = queue.receive()

@@ -61,7 +61,8 @@ def pack(source: MotionSource) -> int:
 def _write(fd: int, block: memoryview, begin: int) -> None:
     while block.nbytes:
         written = os.pwrite(fd, block, begin)
-        block, begin = block[written:], begin + written
+        block = block[written:]
+        begin = begin + written
 
 
 def unpack(fd: int) -> MotionSource:

@@ -252,7 +252,8 @@ class ExchangeProcess:
     def _close_memory(self) -> None:
         self._channel.close()
         for name in ("ring_fd", "event_fd", "control_fd"):
-            fd, closed = getattr(self, name), -1
+            fd = getattr(self, name)
+            closed = -1
             if fd != closed:
                 os.close(fd)
                 setattr(self, name, closed)

@@ -14,8 +14,10 @@ from typing import Final
 CPU_LATENCY: Final = Path("/dev/cpu_dma_latency")
 """Open with value 0 it excludes the slow idle states of the processors."""
 LIMITS_FILE: Final = "/etc/security/limits.d/90-hil.conf"
-_MCL_CURRENT, _MCL_FUTURE = 1, 2
-_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
+_MCL_CURRENT = 1
+_MCL_FUTURE = 2
+_M_TRIM_THRESHOLD = -1
+_M_MMAP_MAX = -4
 _HEAP: Final = 32 << 20
 """Bytes of heap allocated, and so locked, before the first cycle."""
 _open_files: list[int] = []

@@ -191,7 +191,8 @@ class CommandHandler:
         self._control.latencies[bin_of(latency)] += 1
 
     def _run_commands(self, now: float) -> None:
-        control, session = self._control, self._session
+        control = self._control
+        session = self._session
         self._calls += 1
         self._archive_silence = self._archive.silence()
         if self._calls % _SLOW_EVERY == 0 and self._inbox.closed():
@@ -240,7 +241,8 @@ class CommandHandler:
 
     def _leave(self, reason: str, linger: float) -> None:
         if not self.reason:
-            self.reason, self._linger = reason, linger
+            self.reason = reason
+            self._linger = linger
             self.log(Leaving(reason))
 
     def _archive_fault(self) -> str:
@@ -279,7 +281,8 @@ class CommandHandler:
 
     def _request(self, source: MotionSource) -> None:
         """Request the motion that was read, once it may begin, and report the outcome."""
-        control, identity = self._control, self._inbox.identity
+        control = self._control
+        identity = self._inbox.identity
         try:
             if self._withdrawn(identity):
                 raise RequestError(self._state, WITHDRAWN)
@@ -322,7 +325,8 @@ class CommandHandler:
         self._inbox.answer(refusal)
 
     def _publish(self, now: float) -> None:
-        control, session = self._control, self._session
+        control = self._control
+        session = self._session
         control.exchange_heartbeat = now
         for event in self._limiter.filter(session.events(), now):
             self._log_event(event)
@@ -359,7 +363,8 @@ class CommandHandler:
             self._control.ended_count += 1
 
     def _publish_counters(self) -> None:
-        control, counters = self._control, self._session.counters
+        control = self._control
+        counters = self._session.counters
         discarded = counters.discarded
         for name in _COUNTERS:
             setattr(control, name, getattr(counters, name))

@@ -97,7 +97,8 @@ class FaultyLink:
         """
         if not packet:
             return []
-        delay, copies = 0.0, 1
+        delay = 0.0
+        copies = 1
         for cycles, fault in self._planned[direction]:
             if cycle not in cycles:
                 continue

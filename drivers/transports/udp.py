@@ -164,7 +164,8 @@ class UdpTransport:
 
     def rejected(self) -> dict[str, int]:
         """Return the datagrams discarded since the last call, by kind."""
-        counts, self._rejected = self._rejected, {}
+        counts = self._rejected
+        self._rejected = {}
         dropped = 0 if self._closed else _dropped(self._socket)
         if dropped > self._dropped:
             counts["overrun"] = dropped - self._dropped
@@ -215,7 +216,8 @@ class UdpTransport:
         seconds, nanoseconds = _TIMESPEC.unpack(control[0][2])
         wall = time.time()
         now = time.monotonic()
-        offset, self._offset = self._offset, wall - now
+        offset = self._offset
+        self._offset = wall - now
         if abs(self._offset - offset) > _CLOCK_SET:
             arrived = now
         else:

@@ -164,7 +164,8 @@ def fixed_layout(definition: str) -> MessageLayout:
         match = _FIELD.match(" ".join(line.split()[:2]))  # a default value may follow the name
         if match is None:
             raise LayoutError(f"its definition has the line {line!r}")
-        kind, count = match["type"], match["count"]
+        kind = match["type"]
+        count = match["count"]
         if kind in _HEADERS and count is None:
             builder.variable("sec", "int32")
             builder.variable("nanosec", "uint32")

@@ -160,10 +160,12 @@ class Overview:
 def read_overview(path: str | PathLike[str]) -> Overview:
     """Return the overview of an archive; ArchiveError if it cannot be read."""
     archive, found = scan_archive(path, all_channels=True)
-    header, stamp = archive.header, archive.columns["stamp"]
+    header = archive.header
+    stamp = archive.columns["stamp"]
     outcome = archive.outcome or ArchiveOutcome(outcome="missing")
     entries = {**header.entries, **{f"outcome.{k}": text for k, text in outcome.entries.items()}}
-    title, duration = KIND_NAMES.get(header.kind, header.kind), 0.0
+    title = KIND_NAMES.get(header.kind, header.kind)
+    duration = 0.0
     if header.index is not None:
         title = f"{motion_name(header.kind, header.index)}, attempt {header.attempt or 1}"
     if len(stamp):
@@ -207,7 +209,8 @@ def recording_date(archive: Archive) -> str | None:
 
     Clocks of imported recordings that count from 1970 have it.
     """
-    header, stamp = archive.header, archive.columns["stamp"]
+    header = archive.header
+    stamp = archive.columns["stamp"]
     if header.recorded_at is not None or header.kind != "imported":
         return header.recorded_at
     try:

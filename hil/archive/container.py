@@ -41,7 +41,8 @@ LARGEST_RECORD = 1 << 28  # bytes; attachments and summaries are far smaller
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX = range(9, 14)
-SUMMARY_OFFSET, DATA_END = 14, 15
+SUMMARY_OFFSET = 14
+DATA_END = 15
 
 RECORD = struct.Struct("<BQ")  # opcode, length of the body
 FOOTER_SIZE = RECORD.size + 20
@@ -154,8 +155,10 @@ def heads(stream: BinaryIO, size: int, only: Collection[int] = range(256)) -> It
     stream.seek(0)
     if stream.read(len(MAGIC)) != MAGIC:
         raise Damage(0, "is not the beginning of an MCAP file")
-    offset, opcode = len(MAGIC), -1
-    seek, read = stream.seek, stream.read
+    offset = len(MAGIC)
+    opcode = -1
+    seek = stream.seek
+    read = stream.read
     while opcode != DATA_END:
         seek(offset)
         head = read(RECORD.size)
@@ -236,7 +239,8 @@ def indexed(stream: BinaryIO, size: int) -> list[Head]:
     heads = []
     for index in read_summary(stream, size, CHUNK_INDEX, ATTACHMENT_INDEX, METADATA_INDEX):
         if isinstance(index, ChunkIndex):
-            begin, end = index.chunk_start_offset, index.chunk_start_offset + index.chunk_length
+            begin = index.chunk_start_offset
+            end = index.chunk_start_offset + index.chunk_length
             head = Head(CHUNK, begin, end)
         else:
             opcode = ATTACHMENT if isinstance(index, AttachmentIndex) else METADATA
@@ -303,7 +307,8 @@ def decompress(head: Chunk, offset: int, *, largest: int = LARGEST_CHUNK) -> byt
     At most one byte more than declared is decompressed: a corrupt frame fills no memory. `Damage`
     if the size is above `largest` or `MOST_INFLATION`, not as declared, or the data are corrupt.
     """
-    size, data = head.uncompressed_size, head.data
+    size = head.uncompressed_size
+    data = head.data
     if size > min(largest, MOST_INFLATION * len(data)):
         raise Damage(offset, f"(chunk) claims {size} bytes of content")
     try:

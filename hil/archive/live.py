@@ -117,7 +117,8 @@ class LivePublisher:
         self._events = _channel(EVENT_CHANNEL, self._context)
         self._offset: int | None = None
         self._waiting = deque[tuple[Records, tuple[ExchangeEvent, ...], DriveTrain]](maxlen=QUEUE)
-        self._more, self._closed = threading.Event(), False
+        self._more = threading.Event()
+        self._closed = False
         self._thread = threading.Thread(target=self._work, name="live view", daemon=True)
         self._thread.start()
 

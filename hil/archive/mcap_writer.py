@@ -98,11 +98,13 @@ class McapWriter:
 
     def put(self, record: McapRecord) -> None:
         """Add a record other than a chunk in front of the chunk in progress, and index it."""
-        data, place = encode(record), self.position
+        data = encode(record)
+        place = self.position
         if isinstance(record, Metadata):
             self._metadata.append(MetadataIndex(place, len(data), record.name))
         elif isinstance(record, Attachment):
-            times, size = (record.log_time, record.create_time), len(record.data)
+            times = (record.log_time, record.create_time)
+            size = len(record.data)
             self._attachments.append(
                 AttachmentIndex(place, len(data), *times, size, record.name, record.media_type)
             )
@@ -172,14 +174,17 @@ class McapWriter:
             return
         data = b"".join(self._parts)
         entries = {number: np.concatenate(parts) for number, parts in self._entries.items()}
-        self._parts, self._size, self._entries = [], 0, {}
+        self._parts = []
+        self._size = 0
+        self._entries = {}
         first, last = span(entries)
         packed = zstandard.compress(data, _LEVEL)
         self.add_chunk(Chunk("zstd", packed, last, first, crc32(data), len(data)), entries)
 
     def add_chunk(self, chunk: Chunk, entries: Entries) -> None:
         """Add a complete chunk and its message indexes, in front of the chunk in progress."""
-        start, record = self.position, encode(chunk)
+        start = self.position
+        record = encode(chunk)
         self._put(record)
         end = self.position
         offsets: dict[int, int] = {}
@@ -229,7 +234,8 @@ class McapWriter:
             (container.ATTACHMENT_INDEX, self._attachments),
             (container.METADATA_INDEX, self._metadata),
         ]
-        summary, offsets = b"", b""
+        summary = b""
+        offsets = b""
         for opcode, records in groups:
             data = b"".join(map(encode, records))
             offsets += encode(SummaryOffset(opcode, start + len(summary), len(data)))

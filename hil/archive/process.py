@@ -63,8 +63,10 @@ class PreTriggerBuffer:
 
     def pop_session(self) -> tuple[Records, list[ExchangeEvent]]:
         """Remove and return what is of the last session, behind its init packet."""
-        events, parts = self._events, self._records
-        self._records, self._events = [], []
+        events = self._events
+        parts = self._records
+        self._records = []
+        self._events = []
         inits = [index for index, event in enumerate(events) if isinstance(event, InitReceived)]
         own = events[inits[-1] + 1 :] if inits else events
         if not parts:
@@ -126,7 +128,9 @@ class ArchiveProcess:
         commands: Channel,
         exchange: int,
     ) -> None:
-        self._ring, self._events, self._control = ring, events, control
+        self._ring = ring
+        self._events = events
+        self._control = control
         self._commands: Channel | None = commands
         self._job: Job | None = None
         self._leaving = False
@@ -207,8 +211,10 @@ class ArchiveProcess:
             self._close("interrupted", "another archive was opened")
         self._fill_buffer()
         records, events = self._buffer.pop_session()
-        overflow, control = self._ring.missed, self._control
-        accepted, ended_count = control.program_accepted, control.ended_count
+        overflow = self._ring.missed
+        control = self._control
+        accepted = control.program_accepted
+        ended_count = control.ended_count
         try:
             recorder = Recorder(command.spec.open(), command.drive_train)
             if not command.from_now:
@@ -237,9 +243,12 @@ class ArchiveProcess:
             self._fill_buffer()
             return
         # Read before the ring, so that nothing the exchange wrote is missed.
-        exchange_ended, ended_count = self._exchange_ended(), self._control.ended_count
-        events, records = self._events.drain(), self._ring.drain()
-        lost, job.overflow = self._ring.missed - job.overflow, self._ring.missed
+        exchange_ended = self._exchange_ended()
+        ended_count = self._control.ended_count
+        events = self._events.drain()
+        records = self._ring.drain()
+        lost = self._ring.missed - job.overflow
+        job.overflow = self._ring.missed
         if self._live is not None:
             self._live.publish(records, events)
         now = time.monotonic()
@@ -248,7 +257,8 @@ class ArchiveProcess:
             if ended_count != job.ended_count and job.recorder.ended is None:
                 job.recorder.motion_ended(self._control.outcome, self._control.ended_interval)
             if len(records):
-                job.last_record, job.flushed = now, False
+                job.last_record = now
+                job.flushed = False
             elif not job.flushed and now - job.last_record > FLUSH_DELAY:
                 job.recorder.writer.flush()
                 job.flushed = True
@@ -280,7 +290,8 @@ class ArchiveProcess:
 
     def _watch_exchange(self) -> None:
         """Record in the archive that the exchange sends no heartbeats, or sends them again."""
-        silence, job = self._monitor.silence(), self._job
+        silence = self._monitor.silence()
+        job = self._job
         if job is None:
             return
         if (silence > EXCHANGE_SILENCE) is not job.exchange_silent:
@@ -304,7 +315,8 @@ class ArchiveProcess:
         self._buffer.add(records, events)
 
     def _close(self, outcome: str, reason: str) -> None:
-        job, self._job = self._job, None
+        job = self._job
+        self._job = None
         if job is None:
             return
         self._control.archive_state = ArchiveState.NONE
@@ -319,9 +331,13 @@ class ArchiveProcess:
         """Report a failure; first by the field that makes the exchange stop the arm."""
         self._control.archive_state = ArchiveState.FAILED
         self._job = None
-        path, problem, remedy = "", f"{type(error).__name__}: {error}", ""
+        path = ""
+        problem = f"{type(error).__name__}: {error}"
+        remedy = ""
         if isinstance(error, ArchiveError):
-            path, problem, remedy = str(error.path), error.problem, error.remedy
+            path = str(error.path)
+            problem = error.problem
+            remedy = error.remedy
         cause = error if isinstance(error, OSError) else error.__cause__
         code = cause.errno if isinstance(cause, OSError) else None
         self._reply(Failed(number, path, problem, remedy, code))

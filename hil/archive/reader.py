@@ -102,7 +102,9 @@ class Scan:
         self.lost = False
         self._stream = stream
         self._data_end: int | None = None  # None where a length does not lead to it
-        self._fields, self._times, self._all_channels = fields, times, all_channels
+        self._fields = fields
+        self._times = times
+        self._all_channels = all_channels
         self._left_out: set[int] = set()
         self._gap = False  # whether something was left out behind the last chunk
         self._skipped = False  # whether chunks were left out: channels continue at any number
@@ -152,7 +154,8 @@ class Scan:
     @property
     def faults(self) -> list[str]:
         """What is wrong, a sentence each: damages in the order of the file, then shortfalls."""
-        sentences, used = [], [*(head.offset for head in self.heads), self.size]
+        sentences = []
+        used = [*(head.offset for head in self.heads), self.size]
         for offset, reason in sorted(self.damages.items()):
             end = used[bisect_left(used, offset)]
             left_out = f" (bytes {offset} to {end} are left out)" if end > offset else ""
@@ -184,7 +187,8 @@ class Scan:
 
     def _find_heads(self) -> None:
         """Find the records with content, behind damage by the index of the summary."""
-        stream, heads = self._stream, self.heads
+        stream = self._stream
+        heads = self.heads
         try:
             heads += container.heads(stream, self.size, _CONTENT)
             self._data_end = heads.pop().end
@@ -305,7 +309,8 @@ class Scan:
 
     def _flush(self) -> None:
         """Decode the buffered chunks: all at once, or one by one where that fails."""
-        pending, self._pending = self._pending, []
+        pending = self._pending
+        self._pending = []
         if len(pending) > 1:
             try:
                 self._decode(self._buffer[: pending[-1][1].stop], pending[0][0], several=True)
@@ -369,9 +374,11 @@ class Scan:
         assert self.header is not None
         layouts = {}
         for topic in found.keys() & set(NUMBERS):
-            messages, layout = found[topic], self._layouts.get(topic)
+            messages = found[topic]
+            layout = self._layouts.get(topic)
             if layout is None:
-                record, first = self.parser.schema(topic), bytes(messages.data[0][0])
+                record = self.parser.schema(topic)
+                first = bytes(messages.data[0][0])
                 try:
                     layout = schema.message_layout(topic, self.header.joint_names, record, first)
                 except LayoutError as error:
@@ -395,11 +402,13 @@ class Scan:
         """Copy verified messages of the wanted channels and times into the columns."""
         if not found:
             return
-        stamps, chosen = next(iter(found.values())).stamps, None
+        stamps = next(iter(found.values())).stamps
+        chosen = None
         if self._times != ALWAYS:
             chosen = (stamps >= self._times[0]) & (stamps < self._times[1])
             stamps = stamps[chosen]
-        begin, self._count = self._count, self._count + len(stamps)
+        begin = self._count
+        self._count = self._count + len(stamps)
         room = max(self._room, len(self._stamps))
         if self._count > room:
             room = 2 * self._count
@@ -416,7 +425,8 @@ class Scan:
                     if (topic, name) not in self._raw:
                         self._raw[topic, name] = np.empty(room, f"V{dtype.itemsize}")
                     columns.append((self._raw[topic, name], start))
-            first, at = 0, begin
+            first = 0
+            at = begin
             for data in messages.data:
                 part = slice(first, first + len(data))
                 first = part.stop

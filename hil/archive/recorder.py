@@ -254,7 +254,8 @@ class Recorder:
         if isinstance(event, Refused) and isinstance(event.error, GuardError):
             data = {name: getattr(event.error, name) for name in _REFUSAL_DATA}
             data["check"] = event.error.check.quantity
-        cycle, name = getattr(event, "cycle", None), type(event).__name__
+        cycle = getattr(event, "cycle", None)
+        name = type(event).__name__
         name = REPLIES_LOST if isinstance(event, RepliesLost) else name
         self.writer.event(cycle, name, describe(event), level=level_of(event), data=data)
 
@@ -272,7 +273,8 @@ class Recorder:
         cycles = records["cycle"]
         beyond = (np.diff(cycles, prepend=self.writer.newest) < 1) | (cycles > self._last_cycle)
         if beyond.any():
-            records, self._cut = records[: int(np.argmax(beyond))], True
+            records = records[: int(np.argmax(beyond))]
+            self._cut = True
         if len(records):
             self.writer.write(records, self._drive_train.joint_torque(records["target_current"]))
             self.records += len(records)

@@ -153,7 +153,8 @@ def _copy(
     outcome: Mapping[str, str] | None = None,
 ) -> None:
     """Write the valid content of an archive as a new one."""
-    writer, parser = McapWriter(write, schema.PROFILE, schema.LIBRARY), ChunkParser()
+    writer = McapWriter(write, schema.PROFILE, schema.LIBRARY)
+    parser = ChunkParser()
     described = _description(found)
     writer.put(Metadata(METADATA, header.with_checksum(described)))
     for head in found.heads:
@@ -203,7 +204,8 @@ def _description(found: Scan) -> dict[str, str]:
 def _outcome(found: Scan, described: Mapping[str, str]) -> dict[str, str]:
     """Return the ``hil.outcome`` record, unchanged without loss."""
     unknown = ArchiveOutcome.of({"outcome": "unknown", "reason": "the outcome is lost"})
-    before, lost = found.outcome or unknown, _samples_lost(found)
+    before = found.outcome or unknown
+    lost = _samples_lost(found)
     if not found.lost:
         return dict(before.record)
     earlier = before.samples_lost

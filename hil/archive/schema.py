@@ -338,7 +338,8 @@ class ArchivedEvent:
             raise LayoutError("the message is not little-endian CDR")
         try:
             seconds, nanoseconds, level = _LOG_HEAD.unpack_from(message, len(ENCAPSULATION))
-            end, texts = len(ENCAPSULATION) + _LOG_HEAD.size, []
+            end = len(ENCAPSULATION) + _LOG_HEAD.size
+            texts = []
             for _ in ("name", "text"):
                 start = end + -end % 4 + 4
                 end = start + int(struct.unpack_from("<I", message, start - 4)[0])
@@ -355,7 +356,8 @@ class ArchivedEvent:
         with suppress(ValueError):
             data = parse_json(second)
         if not isinstance(data, dict):
-            text, data = whole, {}
+            text = whole
+            data = {}
         known = max((one for one in Level if one <= level), default=Level.DEBUG)
         return cls((seconds * 10**9 + nanoseconds) * 1e-9, name, text, known, data)
 

@@ -192,7 +192,8 @@ class ArchiveProcessHandle:
 
     def kill(self, reason: str) -> None:
         """Kill the process; `reason` continues "the archive process" in messages."""
-        self._ended_for, self._gone = reason, True
+        self._ended_for = reason
+        self._gone = True
         self.process.kill(EXIT_TIMEOUT)
 
     def send(self, command: Command) -> None:

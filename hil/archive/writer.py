@@ -131,7 +131,8 @@ class ArchiveFile:
         channels = [self._numbers[topic] for topic in topics]
         with self._guarded():
             if len(batch.stamp) and self._description_message is not None:
-                number, stamp = self._numbers[DESCRIPTION_TOPIC], int(batch.stamp[0])
+                number = self._numbers[DESCRIPTION_TOPIC]
+                stamp = int(batch.stamp[0])
                 self._writer.add_message(number, stamp, 0, self._description_message)
                 self.counts[DESCRIPTION_TOPIC] = 1
                 self._description_message = None
@@ -450,7 +451,8 @@ def write_samples(
         ArchiveWriteError: the file exists or cannot be written, or a stamp cannot be stored.
     """
     path = Path(path)
-    stamp, current = samples.stamp, samples.motor_current
+    stamp = samples.stamp
+    current = samples.motor_current
     if stamp.size and not 0 <= stamp.min() <= stamp.max() < 2**31 * 10**9:
         raise ArchiveWriteError(
             path, "a stamp is outside 0 .. 2^31 s", remedy="shift the recording's clock"

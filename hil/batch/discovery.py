@@ -336,7 +336,8 @@ def describe_setup(cell: Cell) -> str:
     def row(figures: Iterable[float]) -> str:
         return f"({', '.join(f'{figure:.12g}' for figure in figures)})"
 
-    delay, payload = stated_delay(cell), cell.file.robot.payload
+    delay = stated_delay(cell)
+    payload = cell.file.robot.payload
     words = [f"torque lags by {1e3 * delay:.12g} ms"] if delay else []
     if payload is not None and (payload.mass or any(payload.inertia)):
         frame = f" in {payload.frame}" if payload.frame else ""
@@ -371,14 +372,17 @@ def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
     """
     if (cached := _cached_ref(place, cache)) is not None:
         return cached
-    begun, stamp = time.time_ns(), stamp_of(place)
+    begun = time.time_ns()
+    stamp = stamp_of(place)
     with as_file(place) as path:
         sha256 = digest_of(path)
         # Of an intact file this reads summary, metadata, attachments and one chunk.
         archive = open_archive(path, fields=(), stop=-1.0)
     require_complete(archive, place)
-    header, plan = archive.header, archive.attachments.get("plan.json")
-    index, attempt = header.index, header.attempt
+    header = archive.header
+    plan = archive.attachments.get("plan.json")
+    index = header.index
+    attempt = header.attempt
     if index is None or attempt is None:  # else as stated in the archive, even if renamed
         name = ArchiveName.parse(name_of(place))
         index, attempt = (0, 0) if name is None else (name.index, name.attempt)
@@ -400,7 +404,8 @@ def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
         simulated=header.only_simulated,
     )
     if ref.use in USES:
-        cell, drives = cell_in(archive), archive.attachments.get("drive_train.json")
+        cell = cell_in(archive)
+        drives = archive.attachments.get("drive_train.json")
         key = json_digest([cell.text, cell.urdf])
         if not cache.has(place, key):
             cache.put(place, key, CellTexts(cell.text, cell.urdf))
@@ -440,7 +445,9 @@ _Attempts = dict[tuple[str, str, int], int]
 def _select(found: dict[str, ArchiveRef | Unused]) -> Discovery:
     """Separate archives to be fitted from copies, failures and earlier attempts."""
     manifests, broken = _manifests(found)
-    read, unusable, skipped = list[ArchiveRef](), list[Unused](), list[Unused]()
+    read = list[ArchiveRef]()
+    unusable = list[Unused]()
+    skipped = list[Unused]()
     for place, one in found.items():
         entries = manifests.get(folder_of(place))
         entry = None if entries is None else entries.get(name_of(place))

@@ -234,7 +234,8 @@ class Estimator:
         That of the consistent estimator is unconstrained, as in `hil identify`. The scatter of the
         scores is that of the archive by itself.
         """
-        fit, scatter = summary.fit, summary.scatter
+        fit = summary.fit
+        scatter = summary.scatter
         assert fit is not None and scatter is not None, "it was fitted"
         if posterior is None:
             return fit
@@ -311,7 +312,8 @@ class Estimator:
             IdentificationError: there is no estimate.
         """
         assert group.total is not None
-        refs, estimate = group.refs, self.of_group(group, posterior)
+        refs = group.refs
+        estimate = self.of_group(group, posterior)
         unseen = Factor.zero(self.model) if group.unseen is None else group.unseen
         is_poor = not estimate.undetermined and estimate.condition > QR_CONDITION
         if posterior is None and is_poor:

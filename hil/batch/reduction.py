@@ -101,7 +101,8 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, Factor
     if settings.loading is not None:
         samples = samples.with_load(model, np.array(settings.loading))
     factor = Factor.by_time(model, samples)
-    fit, scatter = None, None
+    fit = None
+    scatter = None
     if is_fitted:
         fit = fit_least_squares(model, [samples], factor=factor)
         prior = body_prior(model, factor, known=known_parameters(cell))
@@ -164,7 +165,8 @@ def ensure_reduced(ref: ArchiveRef, settings: Settings, cache: CacheLocation) ->
 def added(parts: Iterable[Reduction]) -> Reduction:
     """Add reductions in their order."""
     result = Reduction()
-    summaries, broken = list[Summary](), list[Unused]()
+    summaries = list[Summary]()
+    broken = list[Unused]()
     for part in parts:
         summaries += part.summaries
         broken += part.broken
@@ -239,7 +241,8 @@ def _packed(reduction: Reduction) -> tuple[dict[str, Any], Arrays]:
 
 def _entry(summary: Summary) -> dict[str, Any]:
     """Return what is no array of an archive, as JSON data."""
-    fit, scatter = summary.fit, summary.scatter
+    fit = summary.fit
+    scatter = summary.scatter
     entry: dict[str, Any] = {
         "warnings": summary.warnings,
         "products": summary.products is not None,
@@ -278,7 +281,9 @@ def _unpacked(
     k, begin, measured = 0, 0, 0  # fits, rows of scatter and products so far
     for number, (ref, entry) in enumerate(zip(refs, content["archives"], strict=True)):
         rows = slice(number, number + 1)
-        fit, scatter, products = None, None, None
+        fit = None
+        scatter = None
+        products = None
         if "fit" in entry:
             stated = entry["fit"]
             fit = Estimate(
@@ -295,7 +300,8 @@ def _unpacked(
             )
             end = begin + entry["scatter"].pop("rows")
             scatter = ScoreScatter(arrays["scatter"][begin:end], **entry["scatter"])
-            k, begin = k + 1, end
+            k = k + 1
+            begin = end
         if entry["products"]:
             products = arrays["products"][measured]
             measured += 1

@@ -178,7 +178,8 @@ def reidentify(
         CacheError: the cache cannot be written.
     """
     if options.estimator not in (estimators := get_args(BatchEstimator)):
-        problem, remedy = f"{options.estimator!r} reads samples", f"use {', '.join(estimators)}"
+        problem = f"{options.estimator!r} reads samples"
+        remedy = f"use {', '.join(estimators)}"
         raise InputError(None, problem, field="estimator", remedy=remedy)
     discovery = discover(roots, cache, cluster, reporter)
     check(discovery.refs)
@@ -276,7 +277,8 @@ class _Batch:
             if isinstance(found, Unused):  # perhaps an archive ends its process
                 alone = [Task(ref.location, open_only, (ref,)) for ref in refs]
                 opened = self._results(alone, "opening archives one by one", len(alone))
-                broken, reason = [other for other in opened if other is not None], found.reason
+                broken = [other for other in opened if other is not None]
+                reason = found.reason
             else:
                 one.settings, broken = found
                 some = any(ref.use == "excitation" for ref in refs)

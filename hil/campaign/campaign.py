@@ -63,7 +63,8 @@ class Campaign(CampaignState):
             OperatorStopError: it was stopped.
             CampaignFolderError: the folder was changed, or is in use by a run.
         """
-        reporter, stop = reporter or Silent(), stop or Stop()
+        reporter = reporter or Silent()
+        stop = stop or Stop()
         seed = SEED if seed is None else seed
         return rehearse(self, reporter, seed=seed, stop=stop, again=again)
 

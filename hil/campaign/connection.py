@@ -72,7 +72,8 @@ class Connection:
         """Update the state with an event."""
         match event:
             case InitReceived():
-                self.init, self.unusable = event.init, event.unusable
+                self.init = event.init
+                self.unusable = event.unusable
                 self.differences = event.differences
                 self.inits += 1
             case Refused():
@@ -91,7 +92,9 @@ class Connection:
 
     def reset_motion(self) -> None:
         """Forget the last motion: another one is about to be requested."""
-        self.ended, self.refused, self.started = None, None, False
+        self.ended = None
+        self.refused = None
+        self.started = False
 
     def require_usable(self) -> None:
         """Raise ControllerFault if the controller is not the cell's."""
@@ -124,7 +127,8 @@ class StartTimeout:
 
 def not_ready(state: State, waited: float) -> ControllerFault:
     """Return the error of a controller that was not ready for a motion after `waited` s."""
-    after, restart = f"within {waited:.3g} s", "restart the program on the controller"
+    after = f"within {waited:.3g} s"
+    restart = "restart the program on the controller"
     match state:
         case State.SYNC:
             problem = (
@@ -179,7 +183,8 @@ def narrower_limits(cell: Cell, connection: Connection, limit: Limit) -> tuple[s
     """
     if connection.init is None:
         return ()
-    stated, own = _stated(cell, connection.init, limit), getattr(cell.drive_table, limit)
+    stated = _stated(cell, connection.init, limit)
+    own = getattr(cell.drive_table, limit)
     unit = "A" if limit == "current_limit" else "motor revolutions"
     return tuple(
         f"{cell.joint_names[joint]}: {float32_text(stated[joint])} {unit} in the controller, "

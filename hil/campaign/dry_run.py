@@ -161,9 +161,12 @@ class DryRunRecord:
         cls, campaign: CampaignState, names: Sequence[str], *, plan_hash: str, simulated: bool
     ) -> Self:
         """Return the dry run from its archives."""
-        folder, cell = campaign.folder, campaign.cell
-        limit, step = cell.drive_train.current_limit, max(1, round(_STEP / cell.period))
-        current, following = np.zeros(len(limit)), np.zeros(len(limit))
+        folder = campaign.folder
+        cell = campaign.cell
+        limit = cell.drive_train.current_limit
+        step = max(1, round(_STEP / cell.period))
+        current = np.zeros(len(limit))
+        following = np.zeros(len(limit))
         missed = late = cycles = 0
         slow: list[tuple[Array, Array, Array]] = []
         for name in names:
@@ -184,7 +187,8 @@ class DryRunRecord:
         correlation = np.full(len(limit), np.nan)
         if slow:
             q, qd, torque = (np.concatenate(parts) for parts in zip(*slow, strict=True))
-            still, model = np.zeros_like(q), cell.model
+            still = np.zeros_like(q)
+            model = cell.model
             rigid = np.where(model.friction_columns, 0.0, cell.nominal_values())
             gravity = model.torque(rigid, q, still, still) + model.load_torque(q, still, still)
             correlation = agreement(gravity, torque, qd, model.moving(qd))

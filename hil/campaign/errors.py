@@ -45,7 +45,9 @@ class MotionFailedError(ExecutionError):
         archive: str | None = None,
         refused: Refused | None = None,
     ) -> None:
-        self.outcome, self.reason, self.refused = outcome, reason, refused
+        self.outcome = outcome
+        self.reason = reason
+        self.refused = refused
         which = motion if archive is None else f"{motion} ({archive})"
         how = reason if reason.startswith(outcome) else f"{outcome}: {reason}"
         self.sentence = f"{which} was {how}"
@@ -69,17 +71,25 @@ def refusal_text(cell: Cell, error: RefusalError) -> str:
     """Return a refusal with the joint's name, degrees, and what in the cell file sets the bound."""
     if not isinstance(error, GuardError):
         return str(error)
-    joint, check, unit = error.joint, error.check, error.unit
-    name, cycle = cell.joint_names[joint], f"(cycle {error.cycle})"
+    joint = error.joint
+    check = error.check
+    unit = error.unit
+    name = cell.joint_names[joint]
+    cycle = f"(cycle {error.cycle})"
     if check is Check.FINITE:
         return f"{name} has {error.value} where a number must be {cycle}"
-    value, bound = error.value, error.bound
+    value = error.value
+    bound = error.bound
     if unit.startswith("rad"):
-        value, bound, unit = math.degrees(value), math.degrees(bound), unit.replace("rad", "°")
+        value = math.degrees(value)
+        bound = math.degrees(bound)
+        unit = unit.replace("rad", "°")
     if check is Check.POSITION:
         frame = AngleFrame.of(cell)
-        sign, offset = frame.sign[joint], math.degrees(frame.offset[joint])
-        value, bound = sign * value + offset, sign * bound + offset
+        sign = frame.sign[joint]
+        offset = math.degrees(frame.offset[joint])
+        value = sign * value + offset
+        bound = sign * bound + offset
     source = f", set by {_SET_BY[check]}" if check in _SET_BY else ""
     # The guard allows a millionth more than the cell file, for rounding.
     allowed = f"allowed is {bound:.6g} {unit}{source}"

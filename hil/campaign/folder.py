@@ -290,7 +290,8 @@ class CampaignFolder:
 
     def next_name(self, kind: str, index: int) -> ArchiveName:
         """Return the name of the next attempt at an interval; no name is used twice."""
-        used, attempt = {entry.name for entry in self.manifest()}, 1
+        used = {entry.name for entry in self.manifest()}
+        attempt = 1
         while (name := str(ArchiveName(kind, index, attempt))) in used or (
             self.archives / name
         ).exists():
@@ -314,7 +315,8 @@ class CampaignFolder:
 
     def _changed(self) -> str | None:
         """Return the first file that differs from the manifest."""
-        sealed, now = self._manifest().inputs, self._inputs()
+        sealed = self._manifest().inputs
+        now = self._inputs()
         for name in sorted(sealed.keys() | now.keys()):
             if sealed.get(name) != now.get(name):
                 return name

@@ -107,7 +107,8 @@ def _require_one_kind_of_arm(folder: CampaignFolder, simulated: bool) -> None:
     """
     own = yes_or_no(simulated)
     for entry in folder.manifest():
-        path, made_by = folder.archives / entry.name, own
+        path = folder.archives / entry.name
+        made_by = own
         with suppress(ArchiveError):
             if path.is_file():
                 made_by = open_archive(path, fields=()).header.simulated or ""
@@ -127,7 +128,8 @@ def _require_own_link(campaign: CampaignState, link: MotionLink | None) -> None:
     other = getattr(link, "cell", None)
     if not isinstance(other, Cell) or other is campaign.cell:
         return
-    wanted, found = _sent_by(campaign.cell), _sent_by(other)
+    wanted = _sent_by(campaign.cell)
+    found = _sent_by(other)
     if differ := [name for name in wanted if wanted[name] != found[name]]:
         raise CampaignFolderError(
             campaign.folder.root,

@@ -83,7 +83,8 @@ def at_limit(posture: Array, limits: JointLimits) -> Array:
 
 def beyond(cell: Cell, posture: Array, verb: str = "stands at") -> str | None:
     """Return which joint of a posture (n,) [rad] is outside its limits, in degrees, or None."""
-    limits, frame = cell.joint_limits, AngleFrame.of(cell)
+    limits = cell.joint_limits
+    frame = AngleFrame.of(cell)
     posture = at_limit(posture, limits)
     outside = np.flatnonzero((posture < limits.lower) | (posture > limits.upper))
     if not len(outside):
@@ -98,7 +99,8 @@ def beyond(cell: Cell, posture: Array, verb: str = "stands at") -> str | None:
 
 def planned_intervals(cell: Cell, plan: CampaignPlan) -> list[Interval]:
     """Return all motions of a plan, without the moves between them."""
-    repetitions, excitation = cell.campaign.repetitions, plan.excitation.trajectory
+    repetitions = cell.campaign.repetitions
+    excitation = plan.excitation.trajectory
     return [
         Interval("standstill", 0, rest(cell.home, cell.campaign.standstill_s)),
         *(Interval("excitation", k, excitation, plan.moves) for k in range(repetitions)),
@@ -110,7 +112,8 @@ class StraightMoves:
     """Straight moves between postures, each planned and checked once."""
 
     def __init__(self, cell: Cell, checks: MotionChecks) -> None:
-        self._cell, self._checks = cell, checks
+        self._cell = cell
+        self._checks = checks
         self._known: list[Interval] = []
 
     def between(
@@ -132,7 +135,9 @@ class StraightMoves:
         Raises:
             MotionRefusedError: a move failed its check, or a motion does not begin where one ends.
         """
-        at, home, joined = where, self._cell.home, list[Interval]()
+        at = where
+        home = self._cell.home
+        joined = list[Interval]()
 
         def go(target: Array) -> None:
             nonlocal at
@@ -228,7 +233,8 @@ def _require(interval: Interval, problem: str | None) -> None:
 
 def _jump(before: Interval, after: Interval) -> str | None:
     """Return why `after` cannot follow `before`, None if it begins where that ends."""
-    end, start = before.ends[1], after.ends[0]
+    end = before.ends[1]
+    start = after.ends[0]
     distance = np.abs(start - end)
     if np.max(distance) <= START_TOLERANCE:
         return None

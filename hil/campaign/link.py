@@ -86,7 +86,9 @@ class MotionLink:
     """
 
     def __init__(self, cell: Cell, port: ControllerPort) -> None:
-        self.cell, self.port, self.cycles = cell, port, 0
+        self.cell = cell
+        self.port = port
+        self.cycles = 0
         self.connection = Connection(cell=cell)
         self._inits = 0  # until the controller was connected
         self._ended_before = 0
@@ -268,9 +270,11 @@ class MotionLink:
 
     def come_to_rest(self) -> bool:
         """Stop a motion that is not archived any more; return whether its end was seen."""
-        port, state = self.port, self.port.status
+        port = self.port
+        state = self.port.status
         port.stop("the archive cannot be written")
-        deadline, closed_by = port.now + REST_TIMEOUT, math.inf
+        deadline = port.now + REST_TIMEOUT
+        closed_by = math.inf
 
         def finished() -> bool:
             nonlocal closed_by
@@ -314,7 +318,8 @@ class MotionLink:
 
     def _await_session(self, stop: Stop, wait: float, watch: Watch) -> None:
         """Exchange packets until the controller's init packet came."""
-        port, connection = self.port, self.connection
+        port = self.port
+        connection = self.connection
         deadline = port.now + wait
 
         def finished() -> bool:
@@ -336,7 +341,9 @@ class MotionLink:
         self, spec: ArchiveSpec, stop: Stop, duration: float | None, watch: Watch
     ) -> Recorded:
         """Record until an end is found, and complete the archive."""
-        port, connection, inits = self.port, self.connection, self.connection.inits
+        port = self.port
+        connection = self.connection
+        inits = self.connection.inits
         limit = math.inf if duration is None else round(duration / self.cell.period)
         ending: tuple[str, str] | None = None
 
@@ -349,7 +356,8 @@ class MotionLink:
             # First the process: its last message and the last state of the session are known then.
             failure = port.failure()
             self._poll()
-            status, lost = port.status(), connection.lost
+            status = port.status()
+            lost = connection.lost
             ending = recording_end(
                 restarted=connection.inits > inits,
                 complete=status.cycle + 1 >= limit,
@@ -380,8 +388,10 @@ class MotionLink:
         port = self.port
         if port.is_virtual:
             return
-        stopped, still = stop.requested, Standstill(self.cell.period)
-        drive_on, received = port.now, 1
+        stopped = stop.requested
+        still = Standstill(self.cell.period)
+        drive_on = port.now
+        received = 1
         monitor = HeartbeatMonitor(lambda: received, max_interval=MAX_INTERVAL)
         port.prepare(stop)
         port.new_records()
@@ -390,7 +400,8 @@ class MotionLink:
             nonlocal drive_on, received
             if stop.insisted or (stop.requested and not stopped):
                 return True
-            state, now = port.status().state, port.now
+            state = port.status().state
+            now = port.now
             if state is not State.DRIVE_OFF:
                 drive_on = now
             if state in NO_SESSION or now - drive_on > OFF:
@@ -427,7 +438,8 @@ class MotionLink:
 
     def _waiting(self) -> str:
         """Return what was received from a controller without a session."""
-        spec, problem = self.cell.link_spec, self.connection.not_understood
+        spec = self.cell.link_spec
+        problem = self.connection.not_understood
         who = "the controller" if spec is None else spec.description
         what = f"{who}: {problem}" if problem else f"no packet from {who}"
         return f"{what} ({self.port.status().foreign} packets from other addresses)"
@@ -452,8 +464,12 @@ class _Supervision:
     """Waits for the end of a motion that was requested, and of its archive; passes on requests."""
 
     def __init__(self, link: MotionLink, spec: ArchiveSpec, steering: Steering, stop: Stop) -> None:
-        self._link, self._port, self._connection = link, link.port, link.connection
-        self._spec, self._steering, self._stop = spec, steering, stop
+        self._link = link
+        self._port = link.port
+        self._connection = link.connection
+        self._spec = spec
+        self._steering = steering
+        self._stop = stop
         self._start = StartTimeout(link.port.now)
         self._guard = active_guard(link.cell, link.connection.init)
         self._no_start: str | None = None
@@ -474,7 +490,8 @@ class _Supervision:
         return self._ended(self._recorded)
 
     def _finished(self) -> bool:
-        port, connection = self._port, self._connection
+        port = self._port
+        connection = self._connection
         due = port.due()
         if self._stop.requested:
             port.stop(STOPPED)
@@ -491,7 +508,8 @@ class _Supervision:
 
         A simulated controller in virtual time waits for its reply: a hold takes no simulated time.
         """
-        port, steering = self._port, self._steering
+        port = self._port
+        steering = self._steering
         while True:
             if steering.due:
                 steering.show(self._link.cell.drive_train, self._guard, port.status())
@@ -544,7 +562,8 @@ class _Supervision:
 
     def _give_up(self) -> MotionEnded:
         """Drop a motion that has not started; without an archive it cannot start any more."""
-        refused, reason = self._connection.refused, self._no_start or NOT_STARTED
+        refused = self._connection.refused
+        reason = self._no_start or NOT_STARTED
         reason = reason if refused is None else str(refused.error)
         self._link.complete("void" if refused is None else "refused", reason)
         self._port.stop(reason)

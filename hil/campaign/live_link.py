@@ -77,7 +77,8 @@ class Heartbeat:
     def __init__(
         self, beat: Callable[[], None], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._beat, self._clock = beat, clock
+        self._beat = beat
+        self._clock = clock
         self._turned: float | None = None
         self._ended = False
 
@@ -110,7 +111,8 @@ class Heartbeat:
 
     def update(self) -> None:
         """Beat, unless the supervising loop stalls."""
-        now, turned = self._clock(), self._turned
+        now = self._clock()
+        turned = self._turned
         if turned is None or now - turned <= STALL:
             self._beat()
 
@@ -123,7 +125,8 @@ class ExchangeMonitor:
     """
 
     def __init__(self, exchange: ExchangeProcess) -> None:
-        self.exchange, self.ended_for = exchange, ""
+        self.exchange = exchange
+        self.ended_for = ""
         self._last_message = ""
         control = SharedState(exchange.control_fd)
         self._monitor = HeartbeatMonitor(lambda: control.exchange_heartbeat)
@@ -132,7 +135,8 @@ class ExchangeMonitor:
     def poll(self) -> list[ExchangeEvent]:
         """Return the events of the exchange since the last call."""
         self._read()
-        events, self._events = self._events, []
+        events = self._events
+        self._events = []
         return events
 
     def failure(self) -> str | None:
@@ -179,10 +183,15 @@ class LivePort:
         *,
         only_simulated: bool = False,
     ) -> None:
-        self.cell, self.exchange, self.archive, self.heart = cell, exchange, archive, heart
-        self.finish, self.only_simulated = finish, only_simulated
+        self.cell = cell
+        self.exchange = exchange
+        self.archive = archive
+        self.heart = heart
+        self.finish = finish
+        self.only_simulated = only_simulated
         self.live: LiveView | None = None
-        self.job, self.open_path = 0, ""
+        self.job = 0
+        self.open_path = ""
         self._monitor = ExchangeMonitor(exchange)
         self._answer: Answer | None = None
         self._late_path = ""
@@ -412,7 +421,8 @@ class LivePort:
         """See `ControllerPort.open_archive`; one still open at an error is closed with the link."""
         drives = self.cell.drive_train
         self.job += 1
-        self.open_path, self._answer = str(spec.path), None
+        self.open_path = str(spec.path)
+        self._answer = None
         command = Open(self.job, spec, drives, not own_motion, not own_motion)
         unsent = f"nothing was sent, and {spec.path} is not recorded"
         if self._request(command, Opened, unsent) is None:
@@ -427,7 +437,8 @@ class LivePort:
 
     def archived(self) -> Recorded | None:
         """See `ControllerPort.archived`."""
-        answer, self._answer = self._answer, None
+        answer = self._answer
+        self._answer = None
         answer = answer or self.archive.answer(0.0, self.job)
         if isinstance(answer, Failed):
             self.open_path = ""
@@ -463,7 +474,8 @@ class LivePort:
         self.archive.send(command)
         deadline = time.monotonic() + OPEN_TIMEOUT
         while time.monotonic() < deadline:
-            found, self._answer = self._answer or self.archive.answer(POLL, self.job), None
+            found = self._answer or self.archive.answer(POLL, self.job)
+            self._answer = None
             if isinstance(found, answer):
                 return found
             if isinstance(found, Failed):

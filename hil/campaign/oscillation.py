@@ -44,7 +44,8 @@ def growing_oscillation(error: Array, period: float) -> Oscillation | None:
         error: commanded minus measured position (m, n) [rad], one row per cycle.
         period: cycle [s].
     """
-    smoothed, length = max(1, round(SMOOTHED / period)), max(2, round(WINDOW / period))
+    smoothed = max(1, round(SMOOTHED / period))
+    length = max(2, round(WINDOW / period))
     windows = len(error) // length
     if windows < SHORTEST:
         return None
@@ -66,7 +67,8 @@ def growing_oscillation(error: Array, period: float) -> Oscillation | None:
 
 def _longest_growth(rms: Array) -> tuple[int, int]:
     """Return first and last window of the longest uninterrupted growth."""
-    best, start = (0, 0), 0
+    best = (0, 0)
+    start = 0
     for end in range(1, len(rms)):
         if rms[end] < rms[end - 1]:
             start = end

@@ -192,7 +192,8 @@ def validation_motions(cell: Cell, checks: MotionChecks) -> tuple[ViaPointMotion
 
 def moves_of(cell: Cell, motion: Excitation | ViaPointMotion) -> PlanFile | None:
     """Return the moves of a motion through via points; None for Fourier series."""
-    moves, via_points = motion.moves, motion.via_points
+    moves = motion.moves
+    via_points = motion.via_points
     if moves is None or via_points is None:
         return None
     return PlanFile(cell.joint_names, via_points[0], moves, limits=cell.joint_limits)

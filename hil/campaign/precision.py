@@ -133,8 +133,10 @@ class PrecisionStage:
         plan_hash: str,
         reporter: Reporter,
     ) -> None:
-        self._campaign, self._reporter = campaign, reporter
-        self._path, self._limit = campaign.folder.precision, campaign.cell.campaign.repetitions
+        self._campaign = campaign
+        self._reporter = reporter
+        self._path = campaign.folder.precision
+        self._limit = campaign.cell.campaign.repetitions
         self._meter = PrecisionMeter(campaign, requirements)
         texts = tuple(str(one) for one in requirements)
         self._record = PrecisionRecord(plan_hash, texts)
@@ -187,5 +189,5 @@ def requirements_of(campaign: CampaignState, texts: Sequence[str]) -> tuple[Requ
         folder.root,
         "neither its design nor an earlier run states a precision",
         field="--until-precise",
-        remedy='state it, for example --precision "parameters 5%, torque 10"',
+        remedy='state it, for example --precision "parameters 5 %, torque 10"',
     )

@@ -141,7 +141,8 @@ def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> Problem | 
 
 def incomplete_or_slowed(executed: Executed, trajectory: Motion, cell: Cell) -> Problem | None:
     """Return the problem of a motion that is incomplete, or was held or slowed; None for none."""
-    wanted, rows = int(np.ceil(trajectory.duration / cell.period - 1e-6)), len(executed.commanded)
+    wanted = int(np.ceil(trajectory.duration / cell.period - 1e-6))
+    rows = len(executed.commanded)
     if rows < wanted - 1:
         return Problem(f"{rows} of its {wanted} cycles are archived")
     times = np.minimum(np.arange(rows) * cell.period, trajectory.duration)
@@ -184,7 +185,8 @@ class RepetitionCheck:
     """Compares repetitions of one motion with the last accepted ones."""
 
     def __init__(self, cell: Cell, trajectory: Motion) -> None:
-        self._cell, self._trajectory = cell, trajectory
+        self._cell = cell
+        self._trajectory = trajectory
         self._earlier: deque[Executed] = deque(maxlen=COMPARED)
         self._differences: deque[Array] = deque(maxlen=2 * COMPARED)
 
@@ -204,7 +206,8 @@ class RepetitionCheck:
         found = problem_of(executed, self._trajectory, self._cell)
         if found is not None or not self._earlier:
             return found
-        new, past = self._difference(executed), np.array(self._differences)
+        new = self._difference(executed)
+        past = np.array(self._differences)
         for row, (what, scale, first, least) in enumerate(_CHANNELS):
             bound = np.full(len(new[row]), first)
             if len(past) >= FEWEST - 1:
@@ -265,7 +268,9 @@ class ArchiveReview:
     """
 
     def __init__(self, folder: CampaignFolder, cell: Cell, motion: Motion) -> None:
-        self._folder, self._cell, self._motion = folder, cell, motion
+        self._folder = folder
+        self._cell = cell
+        self._motion = motion
         self._check = RepetitionCheck(cell, self._motion)
         self._check.learn(folder.completed("excitation"))
         self.rejected: list[Rejected] = []
@@ -274,7 +279,8 @@ class ArchiveReview:
 
     def enter(self, interval: Interval, name: str, known: Problem | None = None) -> Problem | None:
         """Judge the complete archive of an interval and enter it; return its problem or None."""
-        problem, executed = known, None
+        problem = known
+        executed = None
         if problem is None and interval.kind == "excitation":
             executed = self._executed(name)
             problem = self._judged(executed)
@@ -313,7 +319,8 @@ class ArchiveReview:
         Where enough later attempts agree with each other and not with the only accepted one, that
         one is rejected instead: once in a run, since a second time shows that they scatter.
         """
-        problem, good = self._check.problem(executed), self._folder.completed("excitation")
+        problem = self._check.problem(executed)
+        good = self._folder.completed("excitation")
         if problem is None or not problem.differs or len(good) != 1 or self.notes:
             return problem
         alike, with_accepted = self._alike(executed)
@@ -346,7 +353,9 @@ class ArchiveReview:
         for entry in self._folder.manifest():
             if entry.kind == "excitation":
                 rejected = [*rejected, entry.name] if entry.outcome == REJECTED else []
-        check, alike, with_accepted = RepetitionCheck(self._cell, self._motion), list[str](), 0
+        check = RepetitionCheck(self._cell, self._motion)
+        alike = list[str]()
+        with_accepted = 0
         check.accept(executed)
         for one in rejected:
             with suppress(ArchiveError):

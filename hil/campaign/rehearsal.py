@@ -314,7 +314,8 @@ def _ordinary_effects(cell: Cell, rotors: Array) -> UnmodelledEffects:
     No resonance exceeds `FASTEST` in any of `POSTURES` random postures. Where axes are almost
     parallel, the effective inertia beyond a spring is much below that of its link.
     """
-    n, limits = len(rotors), cell.joint_limits
+    n = len(rotors)
+    limits = cell.joint_limits
     model = pinocchio.buildModelFromXML(cell.urdf)
     data = model.createData()
 
@@ -327,7 +328,8 @@ def _ordinary_effects(cell: Cell, rotors: Array) -> UnmodelledEffects:
     soft = (np.arange(n) < MAIN_AXES) & (reduced > 0.0)
     compliance = np.zeros(n)
     compliance[soft] = 1.0 / (reduced[soft] * RESONANCE**2)
-    root, fastest = 1.0 / np.sqrt(compliance[soft]), 0.0
+    root = 1.0 / np.sqrt(compliance[soft])
+    fastest = 0.0
     shares = np.random.default_rng(0).random((POSTURES, n))
     for posture in [cell.home, *(limits.lower + shares * (limits.upper - limits.lower))]:
         if soft.any():
@@ -360,13 +362,17 @@ def criterion(
 
 def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> Criterion:
     """Judge the largest current of any motor, as a share of its limit."""
-    worst, motor, where = 0.0, 0, ""
+    worst = 0.0
+    motor = 0
+    where = ""
     limit = cell.drive_train.current_limit
     for entry in folder.manifest():
         current = np.abs(open_archive(folder.archives / entry.name).columns["target_current"])
         share = np.nan_to_num(current).max(axis=0, initial=0.0) / limit
         if share.max() > worst:
-            worst, motor, where = float(share.max()), int(share.argmax()), entry.name
+            worst = float(share.max())
+            motor = int(share.argmax())
+            where = entry.name
     return criterion(
         f"current ({name})",
         worst,
@@ -393,7 +399,8 @@ def of_motions(cell: Cell, folder: CampaignFolder, name: str, failure: str) -> C
     shares = [_speed_shares(cell, folder.archives / entry.name) for entry in entries]
     fastest = int(np.argmax([share.max() for share in shares]))
     joint = int(np.argmax(shares[fastest]))
-    share, where = float(shares[fastest][joint]), entries[fastest].name
+    share = float(shares[fastest][joint])
+    where = entries[fastest].name
     if share <= MOST_SPEED:
         text = f"{name}: every motion was completed, at up to {percentage(share)} of a speed limit"
         return criterion(f"motions ({name})", 0.0, 0.0, text)
@@ -475,7 +482,8 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
         return [
             criterion(name, None, bound, f"{name}: {problem}") for name, bound in bounds.items()
         ]
-    model, found = twin.cell.model, estimation.result.pooled
+    model = twin.cell.model
+    found = estimation.result.pooled
     undetermined = found.undetermined
     deviation = found.interval_factor / normal_limit(0.025) * found.std
     apart = np.abs(found.values - twin.truth) / deviation

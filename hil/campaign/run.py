@@ -91,8 +91,11 @@ class _CampaignRun:
         reporter: Reporter,
         options: RunOptions,
     ) -> None:
-        self._campaign, self._link, self._options = campaign, link, options
-        self._watch, self._reporter = watch, reporter
+        self._campaign = campaign
+        self._link = link
+        self._options = options
+        self._watch = watch
+        self._reporter = reporter
         plan_hash = campaign.folder.hash_of(campaign.cell, campaign.plan)
         simulated = (campaign.cell if link is None else link).only_simulated
         require_gates(
@@ -118,11 +121,13 @@ class _CampaignRun:
 
     def execute(self) -> RunResult:
         """Run the missing motions; a controller is connected only where some are missing."""
-        options, dry_run = self._options, self._dry_run
+        options = self._options
+        dry_run = self._dry_run
         self._archives.adopt(dry_run.intervals)
         if self._precision is not None:
             self._precision.begin()
-        slow, full = dry_run.missing(), [] if options.dry_run_only else self._campaign.missing()
+        slow = dry_run.missing()
+        full = [] if options.dry_run_only else self._campaign.missing()
         if not slow:
             dry_run.accept()
         if slow or full:
@@ -139,7 +144,8 @@ class _CampaignRun:
     @contextmanager
     def _connected(self, slow: Sequence[Interval], full: Sequence[Interval]) -> Iterator[Runner]:
         """Connect the controller, check all motions with its limits, and close the link after."""
-        cell, reporter = self._campaign.cell, self._reporter
+        cell = self._campaign.cell
+        reporter = self._reporter
         checks = MotionChecks.of(cell)
         if checks.not_checked is not None:
             reporter.say(checks.not_checked)
@@ -201,7 +207,9 @@ class _CampaignRun:
                 self._warm_up.motion_ended()
 
     def _result(self) -> RunResult:
-        campaign, archives, found = self._campaign, self._archives, self._dry_run.found()
+        campaign = self._campaign
+        archives = self._archives
+        found = self._dry_run.found()
         precision = campaign.precision
         return RunResult(
             campaign=str(campaign.folder.root),

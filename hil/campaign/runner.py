@@ -69,7 +69,8 @@ class RunArchives:
         self, campaign: CampaignState, link: MotionLink | None, options: RunOptions, plan_hash: str
     ) -> None:
         given = options.provenance
-        self._campaign, self.plan_hash = campaign, plan_hash
+        self._campaign = campaign
+        self.plan_hash = plan_hash
         self.simulated = (campaign.cell if link is None else link).only_simulated
         self.names, self.notes, self.cycles = list[str](), list[str](), 0
         in_file = link is None and campaign.cell.controller.transport == "simulated"
@@ -87,7 +88,8 @@ class RunArchives:
 
     def adopt(self, slow: Sequence[Interval]) -> None:
         """Enter archives of an earlier run of the plan, and of its `slow` motions, see `review`."""
-        arm, plan_hash = self.provenance.get(SIMULATED), self.plan_hash
+        arm = self.provenance.get(SIMULATED)
+        plan_hash = self.plan_hash
 
         def made(header: ArchiveHeader) -> bool:
             return header.plan_hash == plan_hash and header.simulated == arm
@@ -164,15 +166,22 @@ class Runner:
         start: Array,
         unrehearsed: bool,
     ) -> None:
-        self.campaign, self._link, self._straight, self._start = campaign, link, straight, start
-        self._archives, self._watch, self._reporter = archives, watch, reporter
+        self.campaign = campaign
+        self._link = link
+        self._straight = straight
+        self._start = start
+        self._archives = archives
+        self._watch = watch
+        self._reporter = reporter
         self._warmth = warmth
-        self._position, self._moves = start, 0
+        self._position = start
+        self._moves = 0
         self._seen = None if unrehearsed else seen_in_dry_run(campaign.folder)
 
     def times(self, joined: Sequence[Interval], slow: int) -> list[float]:
         """Return the seconds of each motion and way; the first `slow` motions are run slowly."""
-        times, watched = [], slow > 0
+        times = []
+        watched = slow > 0
         for one in joined:
             share = OVERRIDE if slow else 1.0
             if one.kind == "move":
@@ -256,7 +265,8 @@ class Runner:
     def _execute(self, interval: Interval, number: int, total: int, most: float) -> str:
         if self._watch.stop.requested:
             raise MotionFailedError(str(interval), "stopped", NOT_STARTED)
-        spec, duration = self._archives.spec(interval), interval.trajectory.duration
+        spec = self._archives.spec(interval)
+        duration = interval.trajectory.duration
         self._watch.begin(interval.kind, number, total, duration, most)
         player = player_of(self.campaign.cell, interval.trajectory)
         ended = self._link.run(player, spec, self._watch.stop, override=most, watch=self._watch)

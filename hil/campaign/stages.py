@@ -31,8 +31,11 @@ class DryRunStage:
         watch: RunWatch,
         options: RunOptions,
     ) -> None:
-        self._campaign, self._folder, self._options = campaign, campaign.folder, options
-        self._archives, self._watch = archives, watch
+        self._campaign = campaign
+        self._folder = campaign.folder
+        self._options = options
+        self._archives = archives
+        self._watch = watch
         self.state: DryRunState = "left out" if options.unrehearsed else "to be accepted"
         motions = [
             one for one in campaign.motions
@@ -76,7 +79,8 @@ class DryRunStage:
             DryRunError: it must be accepted now and is not.
             OperatorStopError: the operator stopped instead of answering.
         """
-        archives, found = self._archives, self.found()
+        archives = self._archives
+        found = self.found()
         if self._options.unrehearsed:
             return
         if found is None:
@@ -101,7 +105,8 @@ class DryRunStage:
 
     def _agreed(self, found: DryRunRecord, unknown: Sequence[str]) -> bool:
         """Return whether caller or operator accepts it; unknown joints only the operator can."""
-        operator, stop = self._watch.operator, self._watch.stop
+        operator = self._watch.operator
+        stop = self._watch.stop
         if self._options.accept_dry_run and not unknown:
             return True
         agreed = operator.can_answer and operator.accept_dry_run(found)
@@ -129,8 +134,12 @@ class WarmUpStage:
         watch: RunWatch,
         reporter: Reporter,
     ) -> None:
-        self._campaign, self._cell, self._path = campaign, campaign.cell, campaign.folder.warmup
-        self._archives, self._watch, self._reporter = archives, watch, reporter
+        self._campaign = campaign
+        self._cell = campaign.cell
+        self._path = campaign.folder.warmup
+        self._archives = archives
+        self._watch = watch
+        self._reporter = reporter
         self._pauses: list[str] = []
         self._threshold = drift_wanted(campaign.cell, only_simulated=archives.simulated)
 
@@ -155,7 +164,8 @@ class WarmUpStage:
 
     def expected(self) -> list[float]:
         """Return the durations [s] of the motions that it runs at least."""
-        state, motions = self._state(), self.next_motion()
+        state = self._state()
+        motions = self.next_motion()
         if state.outcome != "going on":
             return []
         missing = self._cell.campaign.warmup_least - len(state.motions)
@@ -165,10 +175,12 @@ class WarmUpStage:
         """Run motions until the arm is warm, if any are missing (RepetitionsRejectedError)."""
         if not self._threshold or not self._campaign.missing("excitation", "validation"):
             return
-        state, settings = self._present(), self._cell.campaign
+        state = self._present()
+        settings = self._cell.campaign
         meter = FrictionMeter(self._campaign.cell, self._campaign.plan.excitation.trajectory)
         while state.outcome == "going on":
-            interval, done = self._interval(state), len(state.motions)
+            interval = self._interval(state)
+            done = len(state.motions)
             if done >= settings.warmup_least:
                 self._watch.expect([interval.trajectory.duration])
             name = runner.run_until_accepted(interval, done + 1, settings.warmup_most)
@@ -210,7 +222,8 @@ class WarmUpStage:
         return found if found is not None and found.motions and found.cold(when) else None
 
     def _interval(self, state: WarmUpRecord) -> Interval:
-        plan, index = self._campaign.plan, len(state.earlier) + len(state.motions)
+        plan = self._campaign.plan
+        index = len(state.earlier) + len(state.motions)
         return Interval("warmup", index, plan.excitation.trajectory, plan.moves)
 
     def _present(self) -> WarmUpRecord:

@@ -59,7 +59,8 @@ class CampaignState:
             NoExcitationError: no validation motion satisfies the constraints of the cell.
             OutputError: the disk refuses; the folder is unchanged.
         """
-        root, plan = Path(folder), excitation
+        root = Path(folder)
+        plan = excitation
         if exist_ok and CampaignFolder(root).plan.exists():
             return cls.open(root)._require_same(cell, plan)
         if isinstance(plan, Excitation):

@@ -76,7 +76,8 @@ class CampaignStatus:
 
 def status_of(campaign: CampaignState) -> CampaignStatus:
     """Return the progress of a campaign from the files in its folder; nothing is changed."""
-    folder, again = replace(campaign.folder, digests={}), "rehearse {} --again"
+    folder = replace(campaign.folder, digests={})
+    again = "rehearse {} --again"
     campaign = replace(campaign, folder=folder)
     folder.manifest()  # one that cannot be read is an error of all steps
     at = typed(folder.root)
@@ -114,7 +115,8 @@ def _step(evaluate: Callable[[], Step], repair: str = "") -> Step:
 
 
 def _design(campaign: CampaignState) -> Step:
-    excitation, folder = campaign.plan.excitation, campaign.folder
+    excitation = campaign.plan.excitation
+    folder = campaign.folder
     if folder.manifest():  # before the first recording a rehearsal accepts changes
         folder.require_unchanged()
     motions = plural(len(campaign.plan.validation), "validation motion")

@@ -47,10 +47,14 @@ class Steering:
     ) -> None:
         if not 0.0 < most <= 1.0:
             raise ValueError(f"an override of {most!r} is not above 0 and at most 1")
-        self.source, self._watch, self._port, self._most = source, watch, port, most
+        self.source = source
+        self._watch = watch
+        self._port = port
+        self._most = most
         duration = getattr(source, "duration", None)
         self._duration = float(duration) if isinstance(duration, int | float) else None
-        self.fraction, self.held = most, False
+        self.fraction = most
+        self.held = False
         self._before = port.status().counts
         self._last: NDArray[np.void] | None = None
         self._due = -math.inf
@@ -87,7 +91,8 @@ class Steering:
 
     def follow(self) -> None:
         """Apply the present request. A motion held before it began begins at rest."""
-        request, motion = self._watch.request(), self._port
+        request = self._watch.request()
+        motion = self._port
         fraction = min(self._most, request.override)
         with suppress(RequestError):  # the motion has ended
             if fraction != self.fraction:

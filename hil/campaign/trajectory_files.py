@@ -82,7 +82,8 @@ def trajectory_files(cell: Cell, plan: CampaignPlan) -> dict[str, str]:
     motions = {"excitation": plan.excitation.trajectory}
     motions |= {f"validation_{k:03d}": one.trajectory for k, one in enumerate(plan.validation)}
     scripted = len(cell.joint_names) == UR_JOINTS and bool(cell.model.chain.revolute.all())
-    files, described = {}, []
+    files = {}
+    described = []
     for name, motion in motions.items():
         slowed = SlowedMotion(motion, SLOW)
         for variant, moves in ((name, motion), (f"{name}_slow", slowed)):
@@ -133,7 +134,8 @@ def urscript(motion: Trajectory, name: str, repetitions: int, header: Sequence[s
     It divides the way between two set-points by the stretching of time, so that a slow motion has
     as many set-points per second as a fast one.
     """
-    cycle, positions = 1.0 / SCRIPT_RATE, motion.sample(_times(motion, SCRIPT_RATE))[0]
+    cycle = 1.0 / SCRIPT_RATE
+    positions = motion.sample(_times(motion, SCRIPT_RATE))[0]
     rows = [f"[{', '.join(f'{value:.9f}' for value in q)}]" for q in positions]
     between = ", ".join(f"start[{j}] + share * (goal[{j}] - start[{j}])" for j in range(UR_JOINTS))
     seconds = f"{motion.duration:.1f} s at full speed"

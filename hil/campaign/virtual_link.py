@@ -54,7 +54,10 @@ class VirtualPort:
         ring: CycleRing,
         finish: Callable[[], None] = lambda: None,
     ) -> None:
-        self.transport, self.session, self.ring, self.finish = transport, session, ring, finish
+        self.transport = transport
+        self.session = session
+        self.ring = ring
+        self.finish = finish
         self._archiving: _Archiving | None = None
         self._source: object = None
         self._ended_count = 0
@@ -68,7 +71,8 @@ class VirtualPort:
 
     def status(self) -> PortStatus:
         """See `ControllerPort.status`."""
-        counters, ring = self.session.counters, self.ring
+        counters = self.session.counters
+        ring = self.ring
         discarded = counters.discarded
         motion_time, rate = progress_of(self._source)
         return PortStatus(
@@ -128,7 +132,8 @@ class VirtualPort:
     def due(self) -> bool:
         """See `ControllerPort.due`: every `DRAIN_CYCLES`, and at once at the end of a motion."""
         self._until_due -= 1
-        archiving, pending = self._archiving, False
+        archiving = self._archiving
+        pending = False
         if archiving is not None and archiving.until_ended:
             ended = archiving.recorder.ended is not None
             archiving.patience -= ended
@@ -248,7 +253,8 @@ class _Archiving:
     """
 
     def __init__(self, recorder: Recorder, overflow: int, *, until_ended: bool) -> None:
-        self.recorder, self.until_ended = recorder, until_ended
+        self.recorder = recorder
+        self.until_ended = until_ended
         self.patience = AFTERMATH_CYCLES
         self.failure: Exception | None = None
         self._overflow = overflow
@@ -256,7 +262,8 @@ class _Archiving:
 
     def update(self, events: Sequence[Event], ring: CycleRing) -> None:
         """Archive these events, and the records that came since the last call."""
-        records, earlier = ring.drain(), self._overflow
+        records = ring.drain()
+        earlier = self._overflow
         self._overflow = ring.overflow
         if len(records):
             self._newest = [records]
@@ -270,7 +277,8 @@ class _Archiving:
 
     def take_newest(self) -> NDArray[np.void]:
         """Return the records archived last, none if they were returned before."""
-        newest, self._newest = self._newest, []
+        newest = self._newest
+        self._newest = []
         return newest[0] if newest else np.zeros(0, np.dtype(np.void))
 
 

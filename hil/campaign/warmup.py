@@ -113,7 +113,8 @@ class WarmUpRecord:
         """Return this warm-up after another motion of friction (n,) [N·m], with its new outcome."""
         known = tuple(float(f) if np.isfinite(f) else None for f in friction)
         longer = replace(self, motions=(*self.motions, WarmMotion(archive, known)))
-        done, change = len(longer.motions), longer.changes[-1]
+        done = len(longer.motions)
+        change = longer.changes[-1]
         if done >= max(least, WINDOW) and change <= self.threshold:
             return replace(longer, outcome="warm")
         unknown = done >= least and np.isnan(change)  # and would be after more motions
@@ -127,7 +128,8 @@ class WarmUpRecord:
     @property
     def sentence(self) -> str:
         """Its state in a sentence; it has had a motion."""
-        done, change = len(self.motions), self.changes[-1]
+        done = len(self.motions)
+        change = self.changes[-1]
         return (
             f"warm-up: friction changes by {percentage(change, 2)} a motion after {done} motions, "
             f"below {percentage(self.threshold, 2)} the arm is warm: {self.outcome}"
@@ -160,8 +162,10 @@ class FrictionMeter:
     """Measures the friction of archived repetitions of one motion."""
 
     def __init__(self, cell: Cell, trajectory: PiecewiseCubic | FourierSeries) -> None:
-        self._period, self._trajectory = cell.period, trajectory
-        model, values = cell.model, cell.nominal_values()
+        self._period = cell.period
+        self._trajectory = trajectory
+        model = cell.model
+        values = cell.nominal_values()
         rigid = np.where(model.friction_columns, 0.0, values)
         times = np.arange(0.0, trajectory.duration, cell.period)
         q, qd, qdd = trajectory.sample(times)

@@ -203,7 +203,8 @@ class Cell:
     @property
     def guard_limits(self) -> GuardLimits:
         """Limits that the guard enforces on every set-point."""
-        limits, bounds = self.joint_limits, self.file.bounds
+        limits = self.joint_limits
+        bounds = self.file.bounds
         return GuardLimits(
             lower=limits.lower,
             upper=limits.upper,
@@ -232,7 +233,8 @@ class Cell:
         Raises:
             CellError: the cell is simulated, or its link cannot carry the session.
         """
-        table, spec = self.controller, self.link_spec
+        table = self.controller
+        spec = self.link_spec
         if spec is None:
             problem = "a simulated controller has no link"
             remedy = "write " + " or ".join(f'"{name}"' for name in LINKS)
@@ -253,7 +255,8 @@ class Cell:
 
     def session_settings(self, *, only_axis: int | None = None) -> dict[str, Any]:
         """Keyword arguments of `drivers.Session`."""
-        table, campaign = self.controller, self.file.campaign
+        table = self.controller
+        campaign = self.file.campaign
         settings: dict[str, Any] = {
             "mode": table.mode,
             "arm": table.arm,
@@ -475,7 +478,8 @@ def _check(cell: Cell) -> None:
     _check_assumed(cell)
     tables = [name for name in _TURNING_ONLY if getattr(file, name) is not None]
     if tables and file.robot.locked:  # motions are checked with all joints of the URDF
-        given, fixed = ", ".join(file.robot.locked), 'fix these joints in the URDF (type = "fixed")'
+        given = ", ".join(file.robot.locked)
+        fixed = 'fix these joints in the URDF (type = "fixed")'
         problem = f"is for arms identified from recordings, but there is a table [{tables[0]}]"
         raise cell.error("robot.locked", given, problem, fixed)
     if tables and not all(cell.model.chain.revolute):
@@ -521,7 +525,8 @@ def _check_assumed(cell: Cell) -> None:
 
 def _check_lengths(cell: Cell) -> None:
     """Check that lists with one entry per joint have the length of the URDF."""
-    n_joints, names = cell.model.n_joints, ", ".join(cell.joint_names)
+    n_joints = cell.model.n_joints
+    names = ", ".join(cell.joint_names)
     tables = {name: getattr(cell.file, name) for name in ("nominal", *_TURNING_ONLY)}
     if cell.file.simulation is not None:
         tables["simulation.drive_train"] = cell.file.simulation.drive_train
@@ -537,7 +542,8 @@ def _check_lengths(cell: Cell) -> None:
 
 def _check_uncertainty(cell: Cell) -> None:
     """Check that the uncertainty of torques is stated once, with an entry for each joint."""
-    stated, drives = cell.file.robot.torque_uncertainty, cell.file.drive_train
+    stated = cell.file.robot.torque_uncertainty
+    drives = cell.file.drive_train
     field = "robot.torque_uncertainty"
     if stated is not None and drives is not None and drives.torque_uncertainty is not None:
         problem = "is stated in [drive_train], too"
@@ -550,7 +556,8 @@ def _check_uncertainty(cell: Cell) -> None:
 
 def _check_postures(cell: Cell) -> None:
     """Check that the postures of the file lie inside its limits."""
-    limits, file = cell.joint_limits, cell.file
+    limits = cell.joint_limits
+    file = cell.file
     remedy = "choose a posture inside the limits, which are in degrees"
     postures = {} if file.campaign is None else {"campaign.home_deg": cell.home}
     postures |= {} if file.simulation is None else {"simulation.initial_deg": cell.initial}
@@ -562,7 +569,8 @@ def _check_postures(cell: Cell) -> None:
 
 def _check_limits(cell: Cell) -> None:
     """Check that limits are not wider than those of the URDF."""
-    limits, allowed = cell.joint_limits, urdf_limits(cell.urdf, cell.joint_names)
+    limits = cell.joint_limits
+    allowed = urdf_limits(cell.urdf, cell.joint_names)
     for field, values, bounds, beyond in (
         ("lower_deg", limits.lower, allowed.lower, -1.0),
         ("upper_deg", limits.upper, allowed.upper, 1.0),

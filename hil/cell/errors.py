@@ -30,7 +30,9 @@ def first_error(
 ) -> CellError:
     """Convert the first error of pydantic; `documentation` is named for undescribed fields."""
     detail = error.errors(include_url=False)[0]
-    place, value, kind = _place(schema, detail["loc"]), detail["input"], detail["type"]
+    place = _place(schema, detail["loc"])
+    value = detail["input"]
+    kind = detail["type"]
     if kind.startswith("union_tag"):
         given = value.get("kind") if isinstance(value, dict) else None
         problem = "is missing" if given is None else "is unknown"
@@ -59,8 +61,10 @@ class _Place(NamedTuple):
 
 def _place(schema: type[BaseModel], location: Sequence[str | int]) -> _Place:
     """Convert a location of pydantic, without its names of kinds and unions."""
-    name, description = "", ""
-    models, siblings = [schema], list[str]()
+    name = ""
+    description = ""
+    models = [schema]
+    siblings = list[str]()
     for part in location:
         of_kind = [model for model in models if part in _kinds(model)]
         if of_kind or (isinstance(part, str) and ("[" in part or part in _UNION_TAGS)):

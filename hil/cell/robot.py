@@ -105,7 +105,9 @@ def _coupling(
 ) -> Coupling | None:
     if table is None:
         return None
-    field, given, n = "robot.coupling.motor_from_joint", table.motor_from_joint, chain.n_joints
+    field = "robot.coupling.motor_from_joint"
+    given = table.motor_from_joint
+    n = chain.n_joints
     if given == "drive_train":
         matrix = drive_train()
     elif {len(row) for row in given} | {len(given)} == {n}:

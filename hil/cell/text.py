@@ -130,7 +130,8 @@ def urdf_limits(urdf: str, joint_names: Sequence[str]) -> UrdfLimits:
             float(stated.get(key, 0.0)) for key in ("lower", "upper", "velocity", "effort")
         )
         if turns or not lower < upper:
-            lower, upper = -math.inf, math.inf
+            lower = -math.inf
+            upper = math.inf
         rows.append((lower, upper, _stated(velocity), _stated(effort)))
     return UrdfLimits(*np.array(rows, dtype=np.float64).reshape(-1, 4).T)
 

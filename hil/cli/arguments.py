@@ -13,7 +13,9 @@ import typer
 
 from hil.errors import InputError
 
-ARM, CHANNELS, ESTIMATION = "Arm", "Channels of logs and bags", "Estimation"
+ARM = "Arm"
+CHANNELS = "Channels of logs and bags"
+ESTIMATION = "Estimation"
 """Panels of options in help texts."""
 
 CampaignArgument = Annotated[Path, typer.Argument(help="Campaign folder (`hil design -o`).")]

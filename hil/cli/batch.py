@@ -65,7 +65,8 @@ def batch(
     reporter = make_reporter(quiet=quiet or json)
     if output is not None:
         make_folder(output)
-    options, keep = how.options(estimator=estimator), cache != "none"
+    options = how.options(estimator=estimator)
+    keep = cache != "none"
     location = CacheLocation(str(Path(cache).resolve()) if keep and cache else None, keep)
     with Cluster(workers, scheduler=scheduler, reporter=reporter) as cluster:
         result = run.reidentify(places, options, cluster, reporter, cache=location)

@@ -105,7 +105,8 @@ def _require_same(
 
 def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
     """Run the missing motions on a simulated controller; Ctrl-C stops the arm, then the program."""
-    cell, started = campaign.cell, time.perf_counter()
+    cell = campaign.cell
+    started = time.perf_counter()
     link = simulated_link(cell, effects=effects)
     with stop_on_interrupt() as stop:
         try:

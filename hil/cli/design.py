@@ -34,7 +34,8 @@ from hil.terminal_text import printable, typed
 
 def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
     """Return the content of `--json`; None for values that are not finite."""
-    excitation, design = done.result.excitation, done.design
+    excitation = done.result.excitation
+    design = done.design
     figures = {k: v for k, v in asdict(excitation.criteria).items() if k != "n_samples"}
     return {
         "method": excitation.method,
@@ -139,11 +140,12 @@ def design(
     at_most_one(method=method, settings=settings, quick=quick)
     at_most_one(resume=resume, force=force)
     reporter = make_reporter(quiet=quiet or json)
-    loaded, folder = Cell.load(cell).with_campaign(repetitions=repetitions), DesignFolder(output)
+    loaded = Cell.load(cell).with_campaign(repetitions=repetitions)
+    folder = DesignFolder(output)
     require_replaceable(output)
     there = folder.resumed_settings() if resume else None
     if purpose is not None:
-        precision = precision or ["mass of payload 1%"]
+        precision = precision or ["mass of payload 1 %"]
         asked = there or (payload_search() if settings is None else load_settings(settings))
     elif quick:
         asked = short_search() if precision else quick_settings(loaded)
@@ -170,7 +172,8 @@ def design(
 
     def finish(done: Designed) -> None:
         """Report and draw the result, while the folder is locked."""
-        excitation, unchecked = done.result.excitation, done.result.settings.unchecked
+        excitation = done.result.excitation
+        unchecked = done.result.settings.unchecked
         broken = ", ".join(f"{kind} {count}" for kind, count in excitation.rejected.items())
         reporter.say(
             f"{excitation.tried} motions tried; broken constraints: {broken or 'none'}; "

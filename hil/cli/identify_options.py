@@ -86,7 +86,8 @@ class Identifying:
 
     def options(self, **more: Any) -> Options:
         """Return the options of an identification; `more` are those of one command."""
-        low_pass, friction = self.torque_bandwidth, self.friction
+        low_pass = self.torque_bandwidth
+        friction = self.friction
         return Options(
             friction=friction_from(friction) if friction != "auto" else "auto",
             delay=delay_from(self.delay),

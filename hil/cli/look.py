@@ -50,7 +50,8 @@ def look(
         print_json(found.as_json())
     else:
         _print(found)
-    text, is_open = found.map_text, False
+    text = found.map_text
+    is_open = False
     for choices in found.questions:
         chosen = _ask(choices) if asks else None
         if chosen is None:

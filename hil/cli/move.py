@@ -114,7 +114,8 @@ def move(
         else:
             make_folder(folder.archives)
             path = folder.archives / folder.next_name("move", 0)
-        bar, durable = make_reporter(quiet=json), cell.controller.transport != "simulated"
+        bar = make_reporter(quiet=json)
+        durable = cell.controller.transport != "simulated"
         with (
             stop_on_interrupt() as stop,
             bar.task("moving (s)", move.duration) as task,
@@ -152,7 +153,8 @@ class _Shown:
     """Progress bar of a motion, as its operator; only Ctrl-C stops the motion."""
 
     def __init__(self, task: Task) -> None:
-        self._task, self._done = task, 0.0
+        self._task = task
+        self._done = 0.0
 
     def show(self, progress: MotionProgress) -> None:
         """Update the bar."""
@@ -197,7 +199,8 @@ def _confirm(cell: Cell, link: MotionLink, *, yes: bool, json: bool) -> None:
 def _described(move: CheckedMove, cell: Cell, link: MotionLink) -> str:
     """Format the path, one line per joint."""
     frame = AngleFrame.of(cell)
-    start, end = frame.shown(move.start), frame.shown(move.target)
+    start = frame.shown(move.start)
+    end = frame.shown(move.target)
     peaks = np.degrees(move.interval.trajectory.extrema().velocity)
     width = max(len(name) for name in (*cell.joint_names, "joint"))
     lines = [f"{'joint':{width}}  {'from':>9}  {'to':>9}  {'by':>9}   peak speed"]

@@ -93,7 +93,8 @@ def new(
         design_only=design_only, from_controller=from_controller, from_archive=from_archive_file
     )
     if urdf is None and (base or tip):
-        problem, remedy = "are links of a URDF", "omit them with --dh"
+        problem = "are links of a URDF"
+        remedy = "omit them with --dh"
         raise InputError(None, problem, field="--base and --tip", remedy=remedy)
     _require_free(output, force=force)
     fixed = figures(fix or [], "--fix", "--fix finger=0.02 (rad or m)")

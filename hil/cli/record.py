@@ -128,8 +128,10 @@ class View:
     """Progress of a recording: a line every 5 s, and one when it is over."""
 
     def __init__(self, cell: Cell, *, quiet: bool) -> None:
-        self._cell, self._quiet = cell, quiet
-        self._over, self._next = "", 0.0
+        self._cell = cell
+        self._quiet = quiet
+        self._over = ""
+        self._next = 0.0
 
     def say(self, text: str) -> None:
         """Print a line, unless quiet."""

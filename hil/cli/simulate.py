@@ -44,7 +44,8 @@ class Status:
     """Prints a line for each change of a session's phase; nothing if `quiet`."""
 
     def __init__(self, settings: ControllerSettings, *, quiet: bool) -> None:
-        self._settings, self._quiet = settings, quiet
+        self._settings = settings
+        self._quiet = quiet
         self._began = time.monotonic()
         self._phase: Phase | None = None
         self._cycles = -1
@@ -279,7 +280,8 @@ def _figures(served: Served) -> dict[str, object]:
 
 def _sentences(served: Served) -> list[str]:
     """Format the summary."""
-    summary, reason = served.summary, served.controller.reason
+    summary = served.summary
+    reason = served.controller.reason
     if not summary.cycles:
         sent = plural(summary.knocks, "time")
         return [f"no reply of a PC program; the first packet was sent {sent}"]

@@ -70,7 +70,8 @@ _MOST: Final = 2  # examples of one error
 
 def with_present_names(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return arguments of the command line with present names, and a note for each former one."""
-    present, notes = list(arguments), list[str]()
+    present = list(arguments)
+    notes = list[str]()
     place = next((k for k, word in enumerate(present) if not word.startswith("-")), None)
     if place is None:
         return present, notes

@@ -50,7 +50,8 @@ def torque_constants(
         frame: URDF link of that frame. Default: the link of the last joint.
         delay: Delay of the current relative to the position, s. Default: that of the cell.
     """
-    bare, full = [*archives_in(archives)], [*archives_in(loaded or [])]
+    bare = [*archives_in(archives)]
+    full = [*archives_in(loaded or [])]
     twice = {path.resolve() for path in bare} & {path.resolve() for path in full}
     if twice:
         raise InputError(twice.pop(), "is listed twice", remedy="give it with or without load")

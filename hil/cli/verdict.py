@@ -63,7 +63,8 @@ def as_json(results: Results) -> str:
 
 def table(results: Results) -> list[str]:
     """Format one row per joint: errors on held-out motion, with references."""
-    joints, in_sample = results.judgement.joints, results.judgement.in_sample
+    joints = results.judgement.joints
+    in_sample = results.judgement.in_sample
     columns: list[tuple[str, Callable[[JointJudgement], str]]] = [
         ("joint", lambda joint: joint.joint),
         ("RMS error", lambda joint: f"{joint.rms:.3g} {joint.unit}"),

@@ -50,9 +50,11 @@ def given_of(cell: Cell, paths: Sequence[Path]) -> Given:
         InputError: the archives cannot be read, have no motion, or are of another arm.
     """
     options = Options()
-    objective, settings = Objective(cell.model), stated_settings(cell, options)
+    objective = Objective(cell.model)
+    settings = stated_settings(cell, options)
     total = np.zeros((cell.model.n_parameters, cell.model.n_parameters))
-    count, duration = 0, 0.0
+    count = 0
+    duration = 0.0
     for source in given_sources(cell, paths):
         samples = samples_of(source, cell, settings)
         motion = samples.motion.rows(executed_rows(source, samples))

@@ -148,7 +148,8 @@ class PrecisionDesign:
                 remedy="for a payload add --for payload, with no other requirement",
             )
         sampled = [midpoints(motion, _REFERENCE_PERIOD) for motion in motions]
-        reference, nominal = ReferenceMotions(cell.model, sampled), cell.nominal_values()
+        reference = ReferenceMotions(cell.model, sampled)
+        nominal = cell.nominal_values()
         scatter = reference.scatter(nominal)
         error = (ERROR_SHARE * scatter) ** 2 * ERROR_TIME
         noise = (NOISE_SHARE * scatter) ** 2 * _cycle(cell)
@@ -157,7 +158,8 @@ class PrecisionDesign:
         )
         factor = Factor.from_samples(cell.model, whole, reference.torque(nominal))
         prior = Posterior.of(cell, factor, "auto", Strength()).prior.gaussian.information
-        values, scale = nominal, torque_scale(cell, (), simulated=cell.only_simulated)
+        values = nominal
+        scale = torque_scale(cell, (), simulated=cell.only_simulated)
         if cell.file.drive_train is not None:
             scale = replace(scale, of="torque constants")
         source = (
@@ -288,7 +290,8 @@ def _least(meets: Callable[[int], bool]) -> int | None:
     """Return the least count, up to `_MOST`, at which a condition holds that stays true."""
     if not meets(_MOST):
         return None
-    low, high = 0, _MOST
+    low = 0
+    high = _MOST
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if meets(middle) else (middle, high)
@@ -298,7 +301,8 @@ def _least(meets: Callable[[int], bool]) -> int | None:
 def _posterior(cell: Cell, paths: Sequence[Path]) -> tuple[Array, Array, Array]:
     """Return parameters (p,), information (p, p) and torque error (n,) by recordings of an arm."""
     settings = stated_settings(cell, FIXED)
-    factors, errors = list[Factor](), list[Array]()
+    factors = list[Factor]()
+    errors = list[Array]()
     for source in given_sources(cell, paths):
         samples = samples_of(source, cell, settings)
         factors.append(Factor.by_time(cell.model, samples))

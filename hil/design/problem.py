@@ -92,16 +92,17 @@ def _require_start(
 ) -> None:
     """Check the initial posture of all motions."""
     if isinstance(genome, SineGenome):
-        where, posture, setting = (
-            "in the mean posture of the sines",
-            genome.centre,
-            "[sines] offset",
-        )
+        where = "in the mean posture of the sines"
+        posture = genome.centre
+        setting = "[sines] offset"
     elif genome.home is not None:
-        where, posture, setting = "at home", genome.home, "home_deg in [campaign]"
+        where = "at home"
+        posture = genome.home
+        setting = "home_deg in [campaign]"
     else:
         return
-    zero, frame = np.zeros_like(posture[None]), AngleFrame.of(cell)
+    zero = np.zeros_like(posture[None])
+    frame = AngleFrame.of(cell)
     contact = None if checker is None else clearance(checker, posture[None])
     exceeded = currents.check(Motion(np.zeros(1), posture[None], zero, zero)) if currents else []
     if checker is not None and contact is not None:
@@ -168,7 +169,8 @@ def _genome(
 
 def _inside(cell: Cell, asked: list[float], shown: Array) -> Array:
     """Return the URDF angles (n,) of a posture that must be within the limits."""
-    frame, limits = AngleFrame.of(cell), cell.joint_limits
+    frame = AngleFrame.of(cell)
+    limits = cell.joint_limits
     angles = frame.urdf(shown)
     for joint in np.flatnonzero(~((angles > limits.lower) & (angles < limits.upper))).tolist():
         ends = sorted(float(frame.shown(end)[joint]) for end in (limits.lower, limits.upper))
@@ -184,7 +186,8 @@ def _inside(cell: Cell, asked: list[float], shown: Array) -> Array:
 
 def _judged(cell: Cell, settings: DesignSettings) -> NDArray[np.intp] | None:
     """Return the indices of the parameters in the criteria, None for all."""
-    names, named = cell.model.parameter_names, settings.objective.named
+    names = cell.model.parameter_names
+    named = settings.objective.named
     if named is None:
         return None
     for name in named:

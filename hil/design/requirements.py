@@ -13,13 +13,13 @@ from identification.model.robot import RobotModel
 Kind = Literal["parameters", "parameter", "friction", "torque", "mass"]
 
 FORMS: Final = (
-    "parameters 5%",
-    "PARAMETER 5%",
-    "friction 5%",
-    "friction of JOINT 5%",
+    "parameters 5 %",
+    "PARAMETER 5 %",
+    "friction 5 %",
+    "friction of JOINT 5 %",
     "torque 2",
     "torque of JOINT 2",
-    "mass of payload 1%",
+    "mass of payload 1 %",
     "mass of payload 0.05",
 )
 """What can be required; torque in N·m (N of a prismatic joint), mass in kg."""
@@ -85,20 +85,21 @@ def _requirement(text: str) -> Requirement:
     if matched is None:
         problem = f"{text!r} is not a quantity with a number"
         raise InputError(None, problem, field=_FIELD, remedy=_known())
-    name, relative = matched["name"], matched["unit"] == "%"
+    name = matched["name"]
+    relative = matched["unit"] == "%"
     try:
         value = float(matched["value"]) / (100.0 if relative else 1.0)
     except ValueError:
         value = -1.0
     if not 0.0 < value < float("inf"):
         problem = f"{text!r} has no precision above zero"
-        raise InputError(None, problem, field=_FIELD, remedy="half of a 95 % interval, such as 5%")
+        raise InputError(None, problem, field=_FIELD, remedy="half of a 95 % interval, such as 5 %")
     kind, subject = _kind(" ".join(name.split()), text)
     units = ("%", *_ABSOLUTE.get(kind, ())) if kind != "torque" else _ABSOLUTE[kind]
     unit = units[-1] if kind in _ABSOLUTE else "none"  # a figure without unit is in N·m or kg
     if (matched["unit"] or unit) not in units:
         given = f"the unit {matched['unit']}" if matched["unit"] else "no per cent"
-        remedy = f"write {name} 2, in N·m" if kind == "torque" else f"write {name} 5%"
+        remedy = f"write {name} 2, in N·m" if kind == "torque" else f"write {name} 5 %"
         if kind == "parameter":  # which may be no parameter at all
             remedy += f"; {_known()}"
         raise InputError(None, f"{text!r} has {given}", field=_FIELD, remedy=remedy)

@@ -60,7 +60,7 @@ _COMMENTS: Final = {
     "settings": "Settings of the search; `hil design --settings` can read them from this file.",
     "cell": "Name of the cell, and digests of its parts.",
     "precision": "Requirements: the worst quantity, half of its 95 % interval as promised for the\n"
-    "planned repetitions and as required (shares, N m), what the torque's scale alone leaves, and\n"
+    "planned repetitions and as required (shares, N·m), what the torque's scale alone leaves, and\n"
     "how many repetitions, or different motions of this kind, meet it.",
     "plan": "The motion: it is planned from these moves.",
     "sines": "The motion: offset + ramp x sum of amplitude x sin(frequency x t), rad/s.",
@@ -73,7 +73,9 @@ def fingerprint(cell: Cell) -> dict[str, str]:
 
     Tables are compared by content, limits in URDF angles.
     """
-    file, limits, home = cell.file, cell.joint_limits, cell.file.campaign
+    file = cell.file
+    limits = cell.joint_limits
+    home = cell.file.campaign
     parts: dict[str, Any] = {
         "urdf": cell.urdf,
         "limits": {name: getattr(limits, name).tolist() for name in _LIMITS},
@@ -105,8 +107,11 @@ class DesignResult:
     @classmethod
     def of(cls, cell: Cell, settings: DesignSettings, design: Design, objective: Objective) -> Self:
         """Return the result of a design."""
-        names, chosen, front = objective.model.parameter_names, objective.parameters, design.front
-        excitation, origin = design.excitation, design.origin_criteria
+        names = objective.model.parameter_names
+        chosen = objective.parameters
+        front = design.front
+        excitation = design.excitation
+        origin = design.origin_criteria
         data: dict[str, Any] = {
             "format": RESULT_FORMAT,
             "version": VERSION,
@@ -204,7 +209,8 @@ class DesignResult:
         Raises:
             InputError: names the cells and the parts that differ.
         """
-        now, then = fingerprint(cell), self.data["cell"]
+        now = fingerprint(cell)
+        then = self.data["cell"]
         different = [part for part in DECISIVE if now[part] != then.get(part)]
         if different:
             raise InputError(
@@ -217,7 +223,8 @@ class DesignResult:
 
     @classmethod
     def _from_data(cls, data: Mapping[str, Any], path: Path) -> Self:
-        settings, search = settings_of(data["settings"], path), data["search"]
+        settings = settings_of(data["settings"], path)
+        search = data["search"]
         via = settings.via_points
         figures = {k: v for k, v in data["criteria"].items() if k in Criteria.__dataclass_fields__}
         excitation = Excitation(
@@ -239,7 +246,8 @@ def _motion_data(excitation: Excitation, cell: Cell) -> dict[str, Any]:
     if isinstance(trajectory, FourierSeries):
         data = {"joints": list(cell.joint_names)} | trajectory.to_dict()
         return {"sines": data | {name: Angles(data[name]) for name in ("offset", "amplitude")}}
-    moves, points = excitation.moves, excitation.via_points
+    moves = excitation.moves
+    points = excitation.via_points
     assert moves is not None and points is not None
     plan = PlanFile(cell.joint_names, points[0], moves, limits=cell.joint_limits).to_dict()
     plan["start"] = Angles(plan["start"])

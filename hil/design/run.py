@@ -23,7 +23,9 @@ from .problem import problem_of, search_settings
 from .result import RESULT, DesignResult, fingerprint
 from .settings import DesignSettings, SettingsError, load_settings
 
-PICTURE, SETTINGS, JOURNAL = "excitation.png", "settings.toml", "search.journal"
+PICTURE = "excitation.png"
+SETTINGS = "settings.toml"
+JOURNAL = "search.journal"
 DESIGN_FILES = frozenset((RESULT, PICTURE, SETTINGS, JOURNAL))
 """Files of a design; the folder may contain a campaign too."""
 
@@ -36,8 +38,10 @@ class DesignFolder:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.result, self.picture = root / RESULT, root / PICTURE
-        self.settings, self.journal = root / SETTINGS, root / JOURNAL
+        self.result = root / RESULT
+        self.picture = root / PICTURE
+        self.settings = root / SETTINGS
+        self.journal = root / JOURNAL
 
     def create(self, settings: DesignSettings, *, force: bool) -> None:
         """Write the settings of a new design; with `force` remove an earlier one.
@@ -233,11 +237,14 @@ def run_search(
         SettingsError, CellError: the settings do not fit the cell.
     """
     problem = problem or problem_of(cell, asked)
-    settings, checker = search_settings(asked), problem.constraints.checker
-    frame, total = AngleFrame.of(cell), excitation.most_evaluations(settings)
+    settings = search_settings(asked)
+    checker = problem.constraints.checker
+    frame = AngleFrame.of(cell)
+    total = excitation.most_evaluations(settings)
     if checker is not None and checker.exceptions is not None:
         reporter.say(checker.exceptions)
-    done, note = 0, "scoring the first motions"
+    done = 0
+    note = "scoring the first motions"
     with (
         reporter.task("designing (motions)", total) as task,
         excitation.Population(problem, workers) as population,

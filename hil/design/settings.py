@@ -164,7 +164,7 @@ class ObjectiveTable(Table):
         [],
     )
     precision: list[str] = field(
-        'a list of requirements for the precision of the estimates, such as "parameters 5%", '
+        'a list of requirements for the precision of the estimates, such as "parameters 5 %", '
         "which replace the criteria",
         [],
     )
@@ -201,7 +201,8 @@ class DesignSettings(Table):
                 "[objective] precision is reached by steps along the gradient, and [search] "
                 "gradient is 0; choose the method gradient, or make it 100 with [via_points]"
             )
-        asked, length = self.constraints, None if self.sines is None else self.sines.length
+        asked = self.constraints
+        length = None if self.sines is None else self.sines.length
         if length is not None and not asked.min_duration <= length <= asked.max_duration:
             raise ValueError(
                 f"[sines] length = {length:g} s is not between [constraints] min_duration = "

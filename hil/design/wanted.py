@@ -50,7 +50,8 @@ class ReferenceMotions:
         self.model = model
         states = [np.concatenate(parts) for parts in zip(*(m[1:4] for m in motions), strict=True)]
         self.position, self.velocity, self.acceleration = states
-        count, p = len(self.position), model.n_parameters
+        count = len(self.position)
+        p = model.n_parameters
         self.rows = np.zeros((model.n_joints, count, p))
         for part, blocks in model.chunks(*states):
             for joint, (block, used) in enumerate(zip(blocks, model.plan.columns, strict=True)):
@@ -76,7 +77,8 @@ class ReferenceMotions:
 
         `information` (p, p) decides at which instants the bands of torque are the widest.
         """
-        rows, owners = [], []
+        rows = []
+        owners = []
         for k, requirement in enumerate(requirements):
             found = list(self._quantities(requirement, values, information))
             rows += found
@@ -124,8 +126,10 @@ class ReferenceMotions:
         return np.asarray(np.maximum(np.abs(values), moved))
 
     def _friction(self, joint: int, label: str, share: float, values: Array) -> Iterator[_Row]:
-        model, speed = self.model, float(np.abs(self.velocity[:, joint]).max())
-        still, some = np.zeros((2 * len(_SPEEDS), model.n_joints)), model.friction_columns
+        model = self.model
+        speed = float(np.abs(self.velocity[:, joint]).max())
+        still = np.zeros((2 * len(_SPEEDS), model.n_joints))
+        some = model.friction_columns
         turning = still.copy()
         turning[:, joint] = np.concatenate((_SPEEDS, np.negative(_SPEEDS))) * speed
         least = MOVED * float(self.scatter(values)[joint])

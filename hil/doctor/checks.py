@@ -105,7 +105,8 @@ def _limit_lines(item: str, value: str) -> tuple[str, ...]:
 
 def scheduling(given: RealTimeReport, limit: int) -> Check:
     """Check the priority of a real-time process, and the limit RLIMIT_RTPRIO of this one."""
-    name, limited = "real-time priority", "no limit" if limit < 0 else f"rtprio limit {limit}"
+    name = "real-time priority"
+    limited = "no limit" if limit < 0 else f"rtprio limit {limit}"
     if "FIFO" in given.scheduling.upper():
         return Check(name, Status.OK, f"{given.scheduling} given ({limited})")
     found = f"refused, its scheduling is {given.scheduling or 'ordinary'}; {limited}"
@@ -118,7 +119,8 @@ def scheduling(given: RealTimeReport, limit: int) -> Check:
 def memory_lock(given: RealTimeReport, limit: int) -> Check:
     """Check whether memory can be locked, and the limit RLIMIT_MEMLOCK: page faults cost cycles."""
     limited = "no limit" if limit < 0 else f"memlock limit {limit // 1024} KiB"
-    name, remedy = "memory lock", _limit_lines("memlock", "unlimited")
+    name = "memory lock"
+    remedy = _limit_lines("memlock", "unlimited")
     if given.memory_locked:
         return Check(name, Status.OK, f"given ({limited})")
     if any(sentence.startswith("only memory") for sentence in given.refused):
@@ -170,7 +172,8 @@ def computer_checks(given: RealTimeReport | None, system: System) -> list[Check]
 
 BYTES_PER_CYCLE = 400
 """Upper bound of the archived bytes per cycle of six axes."""
-_SLOW, _TOO_SLOW = 0.1 * STALL_LIMIT, 0.5 * STALL_LIMIT
+_SLOW = 0.1 * STALL_LIMIT
+_TOO_SLOW = 0.5 * STALL_LIMIT
 """Limits of the time of one write, s; a motion is stopped if a write takes several seconds."""
 _MOVE = "# or put the campaign folder on another, local disk"
 
@@ -199,7 +202,8 @@ def disk_checks(place: Path, trial: DiskTrial | None) -> list[Check]:
         refused = f"cannot write to {trial.folder}: {trial.error or 'no result'}"
         look = (f"ls -ld {trial.folder}; id", _MOVE)
         return [space, Check("disk write", Status.BAD, refused, look)]
-    worst, middle = max(trial.seconds), sorted(trial.seconds)[len(trial.seconds) // 2]
+    worst = max(trial.seconds)
+    middle = sorted(trial.seconds)[len(trial.seconds) // 2]
     status = Status.OK if worst < _SLOW else Status.WARN if worst < _TOO_SLOW else Status.BAD
     found = f"64 KiB written in {1e3 * middle:.1f} ms, at most {1e3 * worst:.1f} ms"
     return [space, Check("disk write", status, found, () if worst < _SLOW else (_MOVE,))]
@@ -252,7 +256,8 @@ def try_port(wanted: FreePort) -> int:
 
 def port_check(wanted: FreePort, error: int) -> Check:
     """Judge the error number of `try_port`."""
-    bind, port = wanted.bind, wanted.port
+    bind = wanted.bind
+    port = wanted.port
     name = f"{wanted.protocol} port {port}"
     if error == 0:
         return Check(name, Status.OK, f"can be bound on {bind}")
@@ -287,7 +292,8 @@ def _address_of(host: str, system: System) -> str | None:
 
 def route_check(host: str, system: System) -> Check:
     """Check that the controller is reached directly: a router adds delay, or loses all packets."""
-    name, address = "route to the controller", _address_of(host, system)
+    name = "route to the controller"
+    address = _address_of(host, system)
     if address is None:
         found = f"{host!r} is neither an IPv4 address nor in /etc/hosts"
         remedy = (f"# write an address in the cell file: host = 10.2.12.150, not {host}",)

@@ -93,7 +93,8 @@ def judge(latencies: Sequence[Latency], cycle_ms: int) -> Fitness:
     period = cycle_ms / 1000
     worst = max(latencies, key=lambda each: (each.late_cycles(period), each.percentile(100)))
     slow = max(latencies, key=lambda each: each.percentile(99.9))
-    late, used = worst.late_cycles(period), (slow.percentile(99.9) + RESERVE) / period
+    late = worst.late_cycles(period)
+    used = (slow.percentile(99.9) + RESERVE) / period
     hours = worst.seconds / 3600.0
     # The mean at which a Poisson distribution gives `late` or fewer with 5 % probability.
     bound = float(gammaincinv(late + 1, _CONFIDENCE)) / hours
@@ -151,7 +152,9 @@ def run_probe(
         stderr=subprocess.DEVNULL,
         text=True,
     )
-    began, shown, output = time.monotonic(), 0.0, ""
+    began = time.monotonic()
+    shown = 0.0
+    output = ""
     try:
         while not output and (passed := time.monotonic() - began) < seconds + _GRACE:
             advance(min(passed, seconds) - shown)

@@ -33,7 +33,9 @@ _WRITES = 20
 def wake_ups(period: float, seconds: float) -> NDArray[np.float32]:
     """Return the delays of a timer, s, at absolute deadlines; missed ones are skipped."""
     late = np.empty(max(round(seconds / period), 1), dtype=np.float32)
-    count, clock, sleep = 0, time.perf_counter, time.sleep
+    count = 0
+    clock = time.perf_counter
+    sleep = time.sleep
     deadline = clock() + period
     end = deadline + seconds
     while deadline < end and count < len(late):
@@ -47,7 +49,9 @@ def wake_ups(period: float, seconds: float) -> NDArray[np.float32]:
 def round_trips(port: int, period: float, seconds: float) -> NDArray[np.float32]:
     """Return the times from packet to reply, s; `TIMEOUT` for a lost one, others waited for."""
     took = np.empty(max(round(seconds / period), 1), dtype=np.float32)
-    count, clock, sleep = 0, time.perf_counter, time.sleep
+    count = 0
+    clock = time.perf_counter
+    sleep = time.sleep
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.connect(("127.0.0.1", port))
         link.settimeout(TIMEOUT)

@@ -82,7 +82,8 @@ def _column_at(source: Source, field: str, time: Array) -> Array | None:
     if source.name != source.path.name:
         return None
     archive = open_archive(source.path, fields=("cycle", field))
-    column, cycle = archive.columns.get(field), archive.columns.get("cycle")
+    column = archive.columns.get(field)
+    cycle = archive.columns.get("cycle")
     if column is None or cycle is None or archive.period is None:
         return None
     if not np.isfinite(column).all() or not np.any(column):
@@ -104,10 +105,12 @@ _FAST: Final = 2.0  # a low-pass above this multiple of the motion's bandwidth h
 
 def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
     """Collect the facts about the cell and the recordings that a verdict needs."""
-    cell, sources = prepared.sources.cell, prepared.sources
+    cell = prepared.sources.cell
+    sources = prepared.sources
     recorded = sources.training if sources.in_sample else (*sources.training, *sources.held_out)
     driven = cell.file.drive_train is not None
-    saturated, nominal = prepared.masked.get(SATURATED), nominal_of(cell)
+    saturated = prepared.masked.get(SATURATED)
+    nominal = nominal_of(cell)
     steps = [position_steps(one.recording, one.name) for one in recorded]
     return CellContext(
         torque_limit=torque_limits(cell),
@@ -228,7 +231,8 @@ def _resolution(prepared: Prepared) -> Iterator[Finding]:
     Rounding to a step q is white noise of variance q²/12; after smoothing with a bandwidth B it
     contributes q²/12 (2 / rate) (2 pi)^4 B^5 / 5 to the variance of the acceleration.
     """
-    names, coarse = prepared.sources.cell.joint_names, dict[str, float]()
+    names = prepared.sources.cell.joint_names
+    coarse = dict[str, float]()
     for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
         recording = source.recording
         interval = float(np.median(np.diff(recording.time)))
@@ -273,7 +277,8 @@ class Nominal(NamedTuple):
 
 def nominal_of(cell: Cell) -> Nominal | None:
     """Return the model of `[nominal]`, else of the URDF's inertias; None without masses."""
-    table, model = cell.file.nominal, cell.model
+    table = cell.file.nominal
+    model = cell.model
     if table is not None:
         known = bool(np.any(table.rotor_inertia))
         return Nominal(cell.nominal_values(), "the nominal values", known, table.uncertainty)

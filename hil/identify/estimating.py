@@ -142,8 +142,10 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         InputError: the archives lack data that the estimator needs.
         ArchiveError: a recording has no usable row.
     """
-    cell, name = prepared.sources.cell, options.estimator
-    model, variance = cell.model, prepared.settings.delay_variance
+    cell = prepared.sources.cell
+    name = options.estimator
+    model = cell.model
+    variance = prepared.settings.delay_variance
     _require_usable_rows(prepared)
     with reporter.task("estimating", 4) as task:
         fitted = smoothed_for_instruments(model, prepared) if name == "iv" else prepared.fitted

@@ -30,10 +30,15 @@ _MARGIN: Final = 1.0  # time shown before and after the motion, s
 
 def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSeries:
     """Return the figure data of a report: the first fitted and the first held-out recording."""
-    sources, fitted, example = prepared.sources, prepared.fitted, prepared.held_out[0]
-    model, values = sources.cell.model, estimate.pooled.values
-    excitation, motion = fitted[0], fitted[0].motion
-    shown, nominal = _shown(prepared.training[0]), nominal_of(sources.cell)
+    sources = prepared.sources
+    fitted = prepared.fitted
+    example = prepared.held_out[0]
+    model = sources.cell.model
+    values = estimate.pooled.values
+    excitation = fitted[0]
+    motion = fitted[0].motion
+    shown = _shown(prepared.training[0])
+    nominal = nominal_of(sources.cell)
     speed, torque = _friction_data(model, values, fitted)
     slowest, fastest = (end(speed, axis=0, initial=0.0) for end in (np.nanmin, np.nanmax))
     load = median_load(model, values, fitted)
@@ -65,7 +70,8 @@ def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSerie
 
 def _shown(samples: Samples) -> slice:
     """Rows of a figure: the motion with a margin before and after it."""
-    moving, time = moving_rows(samples), samples.motion.time
+    moving = moving_rows(samples)
+    time = samples.motion.time
     if moving.start == moving.stop:
         return moving
     first = int(np.searchsorted(time, time[moving.start] - _MARGIN))

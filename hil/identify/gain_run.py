@@ -65,13 +65,16 @@ def find_gains(
             source = source_of(archive, cell)
             current = source.recording.motor_current
             if current is None:
-                problem, remedy = "holds no motor currents", "import them as motor_current"
+                problem = "holds no motor currents"
+                remedy = "import them as motor_current"
                 raise ArchiveError(path, problem, remedy=remedy)
             own = motor_from_joint(source.recording)
             if cell.file.drive_train is not None:
                 own = np.asarray(cell.drive_train.motor_from_joint)
             if first is None:
-                first, turns, model = cell, own, replace(cell.model, payload=None)
+                first = cell
+                turns = own
+                model = replace(cell.model, payload=None)
             # One robot with one drive train; only the payload may differ.
             same = cell.urdf == first.urdf and np.array_equal(turns, own)
             if not same or cell.model.parameter_names != model.parameter_names:
@@ -90,8 +93,7 @@ def find_gains(
     assert first is not None, "the command line asks for an archive"
     _require_load(loads.values())
     recorded = list(zip(sources, cells, lags, carried, strict=True))
-    factors = _reduced(recorded, model, turns, reporter)
-    gains = identify_gains(model, factors)
+    gains = identify_gains(model, _reduced(recorded, model, turns, reporter))
     return GainsFound(gains, loads, not np.array_equal(turns, np.eye(len(turns))))
 
 

@@ -101,7 +101,8 @@ def friction_from(text: str) -> Mapping[str, Any]:
                 remedy = f"for example {name}=1e-4"
                 raise InputError(None, problem, field="--friction", remedy=remedy)
         elif equals:
-            problem, remedy = f"{name!r} takes no value", f"write {name}"
+            problem = f"{name!r} takes no value"
+            remedy = f"write {name}"
             raise InputError(None, problem, field="--friction", remedy=remedy)
         elif option in ABSENT:
             value = kind.label

@@ -40,7 +40,8 @@ def weigh_by_model(
         IdentificationError: the recordings do not determine the mass.
     """
     options = options or Options()
-    of_arm, paths = list(archives_in(arm)), list(archives_in(loaded))
+    of_arm = list(archives_in(arm))
+    paths = list(archives_in(loaded))
     refuse_duplicates([*of_arm, *paths])
     fitted = [path for path in of_arm if open_archive(path).header.purpose != "validation"]
     sources = gather_sources(fitted or of_arm, options.split, in_sample=True)
@@ -54,12 +55,12 @@ def weigh_by_model(
     cell = prepared.sources.cell
     _require_usable(cell.model.friction.has_load, "has friction that grows with the load", arm[0])
     found = estimate_with(prepared, options, reporter)
-    prior, effect = found.posterior.prior.gaussian.information, found.posterior.design_effect
+    prior = found.posterior.prior.gaussian.information
+    effect = found.posterior.design_effect
     known = KnownArm.of(found.result.factor, found.result.pooled, prior, effect)
     frame = frame or flange_of(cell.model)
     runs = _reduced(others.training, prepared, frame, reporter)
-    every = (*prepared.sources.training, *others.training)
-    recordings = [source.recording for source in every]
+    recordings = [source.recording for source in (*prepared.sources.training, *others.training)]
     simulated = sources.header.only_simulated and others.header.only_simulated
     scale = torque_scale(cell, recordings, simulated=simulated)
     sides = {False: of_arm, True: paths}
@@ -86,7 +87,8 @@ def _reduced(
     loaded: Sequence[Source], prepared: Prepared, frame: str, reporter: Reporter
 ) -> list[Run]:
     """Return loaded recordings reduced with the settings of the arm's."""
-    cell, runs = prepared.sources.cell, []
+    cell = prepared.sources.cell
+    runs = []
     with reporter.task("reducing recordings", len(loaded)) as task:
         for source in loaded:
             if source.recording.torque is None:

@@ -158,7 +158,9 @@ class PayloadFound:
     @property
     def sentences(self) -> list[str]:
         """Summary for the operator."""
-        body, estimate, torque = self.body, self.estimate, self.wrist_torque
+        body = self.body
+        estimate = self.estimate
+        torque = self.wrist_torque
         low, high = estimate.intervals[0]
         centre = ", ".join(
             f"{1e3 * part:.1f}" if self.determines(name) else "?"
@@ -205,12 +207,14 @@ class PayloadFound:
         """
         if self.mounting is not None:
             return {}
-        with_centre, with_inertia = self.determines(*NAMES[1:4]), self.determines(*NAMES[4:])
+        with_centre = self.determines(*NAMES[1:4])
+        with_inertia = self.determines(*NAMES[4:])
         return controller_settings(Load(self.body, with_centre, with_inertia))
 
     def as_json(self) -> dict[str, Any]:
         """Return all values as JSON data; infinite ends and undetermined values are null."""
-        torque, estimate = self.wrist_torque, self.estimate
+        torque = self.wrist_torque
+        estimate = self.estimate
 
         def figure(value: float | None, low: float, high: float, unit: str) -> dict[str, Any]:
             interval = [end if np.isfinite(end) else None for end in (low, high)]
@@ -263,7 +267,8 @@ def find_payload(
     cell = found[False].cell.without_payload()
     if found[False].plan is None and found[True].plan is None:
         training, _ = aligned(training)
-    first, last = training[: len(found[False].training)], training[len(found[False].training) :]
+    first = training[: len(found[False].training)]
+    last = training[len(found[False].training) :]
     sources = replace(found[False], cell=cell, training=first, held_out=first)
     prepared = prepare_sources(sources, options, reporter)
     cell = prepared.sources.cell
@@ -321,7 +326,8 @@ def _sources_of(sides: Mapping[bool, Sequence[Path]]) -> dict[bool, Sources]:
         kind: gather_sources(paths, Options().split, in_sample=True)
         for kind, paths in sides.items()
     }
-    bare, loaded = sources[False].cell, sources[True].cell
+    bare = sources[False].cell
+    loaded = sources[True].cell
     if differing := arm_differences(bare, loaded):
         problem = f"is of another arm than {bare.path}: {' and '.join(differing)} differ"
         remedy = "give bare and loaded recordings of one arm"
@@ -338,7 +344,8 @@ def _runs(
     prepared: Prepared, loaded: Sequence[Source], frame: str, reporter: Reporter
 ) -> list[Run]:
     """Reduce the bare recordings, which are prepared, and the loaded ones."""
-    cell, bare = prepared.sources.cell, prepared.sources.training
+    cell = prepared.sources.cell
+    bare = prepared.sources.training
     runs = []
     with reporter.task("reducing recordings", len(bare) + len(loaded)) as task:
         for source, samples in zip(bare, prepared.fitted, strict=True):
@@ -386,14 +393,16 @@ def doubtful_mounting(model: RobotModel, bare: Sequence[Samples]) -> str | None:
     The check of :mod:`identification.validation`: fitted to the beginning of each recording, the
     best direction predicts the rest much better than the stated one.
     """
-    first, last = [], []
+    first = []
+    last = []
     for samples in bare[:_MOST_RECORDINGS]:
         count = len(samples.torque)
         cut = round(_FITTED * count)
         first.append(samples.between(0, cut))
         last.append(samples.between(cut, count))
     found = find_gravity(model, standard_factor(model, first), standard_factor(model, last))
-    limits, angle = Thresholds(), float(np.degrees(found.angle))
+    limits = Thresholds()
+    angle = float(np.degrees(found.angle))
     if not (found.ratio < limits.gravity and angle > limits.gravity_angle):
         return None
     declared, best = (

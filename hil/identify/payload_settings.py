@@ -51,14 +51,16 @@ def principal_axes(inertia: Array) -> tuple[Array, Rotation]:
     direct them it is the one that turns the frame least.
     """
     moments, axes = np.linalg.eigh(0.5 * (inertia + inertia.T))
-    best_moments, best_axes = moments, axes
+    best_moments = moments
+    best_axes = axes
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             turned = axes[:, order] * signs
             right_handed = np.linalg.det(turned) > 0.0
             better = np.linalg.det(best_axes) < 0.0 or np.trace(turned) > np.trace(best_axes)
             if right_handed and better:
-                best_moments, best_axes = moments[list(order)], turned
+                best_moments = moments[list(order)]
+                best_axes = turned
     return best_moments, Rotation.from_matrix(best_axes)
 
 

@@ -103,7 +103,8 @@ def stated_delay(cell: Cell) -> float:
 
 def stated_settings(cell: Cell, options: Options) -> Settings:
     """Return the settings that cell and options state, before any automatic choice."""
-    delay, bandwidth = options.delay, options.torque_bandwidth
+    delay = options.delay
+    bandwidth = options.torque_bandwidth
     delay = delay if isinstance(delay, float) else stated_delay(cell)
     return Settings(
         Preprocessing(
@@ -309,7 +310,8 @@ def averaged_source(source: Source, rate: float) -> Source:
     if source.context is None:
         return replace(source, recording=source.recording.averaged(rate))
     whole, start = source.context
-    mean, part = whole.averaged(rate), source.recording
+    mean = whole.averaged(rate)
+    part = source.recording
     first, last = np.searchsorted(mean.time, [whole.time[start], part.time[-1]])
     return replace(
         source, recording=mean.between(int(first), int(last)), context=(mean, int(first))
@@ -334,7 +336,8 @@ def known_parameters(cell: Cell) -> Known:
     table = cell.file.nominal
     if table is None:
         return {}
-    model, share = cell.model, table.uncertainty or FRICTION_SHARE
+    model = cell.model
+    share = table.uncertainty or FRICTION_SHARE
     known = {f"I{j}m": (value, share * value) for j, value in enumerate(table.rotor_inertia, 1)}
     for term in model.friction.terms:
         values = getattr(table, term.term.option, None)
@@ -353,7 +356,9 @@ def _chosen(
     reporter: Reporter,
 ) -> Settings:
     """Choose the automatic settings by inner prediction; `suggested` delays [s] are candidates."""
-    cell, questions, settings = sources.cell, _questions(sources, options, suggested), stated
+    cell = sources.cell
+    questions = _questions(sources, options, suggested)
+    settings = stated
     if not questions:
         return settings
     # One repetition of a motion is enough.
@@ -541,7 +546,8 @@ def prepared_with(sources: Sources, settings: Settings, reporter: Reporter) -> P
     # Parts of one recording share its arrays, and have its motion.
     motions: defaultdict[int, dict[Preprocessing, Smoothed]] = defaultdict(dict)
     with reporter.task("smoothing recordings", len(sources.training) + len(unseen)) as task:
-        fitted, held_out = [], []
+        fitted = []
+        held_out = []
         for source in sources.training:
             fitted.append(samples_of(source, cell, settings, motions=motions[source.motion_key]))
             task.advance(1, source.name)
@@ -624,7 +630,8 @@ def _require_slow_rows(stated: RobotModel, fitted: Sequence[Samples]) -> None:
 
 def executed_rows(source: Source, samples: Samples) -> slice:
     """Return the samples from the first to the last changing set-point, or moving joint."""
-    commanded, time = source.recording.commanded_position, source.recording.time
+    commanded = source.recording.commanded_position
+    time = source.recording.time
     if commanded is None:
         return moving_rows(samples)
     steps = np.flatnonzero((np.abs(np.diff(commanded, axis=0)) > 0.0).any(axis=1))

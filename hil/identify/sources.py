@@ -130,9 +130,11 @@ def gather_sources(
     refuse_duplicates([*paths, *predict])
     archives = [open_archive(path) for path in [*paths, *predict]]
     by_use = _by_use(archives, len(paths))
-    fitted, predicted = by_use["excitation"], by_use["validation"]
+    fitted = by_use["excitation"]
+    predicted = by_use["validation"]
     if in_sample:
-        fitted, predicted = [*fitted, *predicted], []
+        fitted = [*fitted, *predicted]
+        predicted = []
     if not fitted:
         raise InputError(
             paths[0] if paths else None,
@@ -184,7 +186,9 @@ def _import_warnings(archives: Sequence[Archive]) -> Iterator[str]:
 
 def _with_held_out(every: Sources, held_out: tuple[Source, ...], split: float) -> Sources:
     """Return sources with these held out; if there are none, a share or the last of the fitted."""
-    training, tested_on, warnings = every.training, "unseen motion", [*every.warnings]
+    training = every.training
+    tested_on = "unseen motion"
+    warnings = [*every.warnings]
     if not held_out and len(training) == 1:
         tested_on = "the rest of the same motion"
         training, held_out = _split(training[0], split)
@@ -217,7 +221,9 @@ def all_fitted(
         ArchiveError: the plan in the first archive is not valid.
     """
     archives, found = zip(*fitted, strict=True)
-    training, plan, same_motion = tuple(found), None, False
+    training = tuple(found)
+    plan = None
+    same_motion = False
     if "plan.json" in archives[0].attachments:
         plan = archives[0].table("plan.json")
         same_motion = len({archive.attachments.get("plan.json") for archive in archives}) == 1
@@ -289,7 +295,8 @@ def refuse_duplicates(paths: Sequence[Path]) -> None:
 
 def _incomplete(archive: Archive) -> str | None:
     """Return the warning about an archive that did not end as planned."""
-    name, outcome = archive.path.name, archive.outcome
+    name = archive.path.name
+    outcome = archive.outcome
     if archive.missing is not None or outcome is None or outcome.outcome == "completed":
         return archive.missing
     if outcome.outcome == REJECTED:
@@ -363,7 +370,8 @@ def _usable(archive: Archive, cell: Cell, recording: Recording) -> Source:
         single = without_repeats(recording).checked(cell.joint_names)
     except RecordingError as error:
         raise ArchiveError(archive.path, str(error), remedy="leave it out") from error
-    merged, timed = recording.n_samples - single.n_samples, single
+    merged = recording.n_samples - single.n_samples
+    timed = single
     averaged = f"{merged} samples had the time stamp of the one before and were averaged with it"
     clock: tuple[str, ...] = ()
     if archive.kind == "imported":  # other archives have the cycle counter of the controller
@@ -386,7 +394,8 @@ def useful_part(archive: Archive, recording: Recording) -> range | None:
     program, those with the drive on (otherwise the brakes carry the arm).
     """
     if archive.header.by_controller_program and "status" in archive.columns:
-        usable, problem = archive.columns["status"] == DRIVE_ON, "the drive is never on"
+        usable = archive.columns["status"] == DRIVE_ON
+        problem = "the drive is never on"
     elif recording.commanded_position is not None:
         usable = ~np.isnan(recording.commanded_position).any(axis=1)
         problem = "it has no commanded position"
@@ -434,7 +443,8 @@ def position_noise(cell: Cell, rest: Recording) -> Array:
         steps = [np.diff(np.unique(channel)).min(initial=np.inf) for channel in rest.position.T]
         least = np.where(np.isfinite(steps), steps, 0.0)
         return np.asarray(np.maximum(measured, least**2 / 12.0))
-    drives, count = cell.drive_train, 1.0 / cell.drive_table.encoder_counts_per_revolution
+    drives = cell.drive_train
+    count = 1.0 / cell.drive_table.encoder_counts_per_revolution
     rounding = 2.0 * FLOAT32_STEP * np.abs(drives.motor_revolutions(rest.position)).max(axis=0)
     joint_step = np.abs(drives.joint_from_motor) * (2.0 * np.pi * np.maximum(count, rounding))
     resolution = (joint_step**2).sum(axis=1) / 12.0

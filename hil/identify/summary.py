@@ -50,9 +50,13 @@ def summary(
     Raises:
         InputError: the plan in the archives cannot be read.
     """
-    sources, estimate = prepared.sources, estimation.result
-    cell, model, pooled = sources.cell, sources.cell.model, estimate.pooled
-    verdict, consistency = validation.verdict, validation.consistency
+    sources = prepared.sources
+    estimate = estimation.result
+    cell = sources.cell
+    model = sources.cell.model
+    pooled = estimate.pooled
+    verdict = validation.verdict
+    consistency = validation.consistency
     calibration = validation.calibration
     excitation, gram = _excitation(prepared)
     simulated = sources.header.only_simulated
@@ -89,7 +93,8 @@ def summary(
 
 
 def _estimator(estimation: Estimation) -> results.EstimatorResult:
-    name, pooled = estimation.estimator, estimation.result.pooled
+    name = estimation.estimator
+    pooled = estimation.result.pooled
     return results.EstimatorResult(
         name=name,
         words=pooled.method if name == "auto" else ESTIMATORS[name],
@@ -137,7 +142,8 @@ def _essential(choice: Elimination | str) -> results.EssentialResult | None:
 
 def true_values(cell: Cell, header: ArchiveHeader) -> Array | None:
     """Return the parameters (p,) of the simulated arm, NaN of a torque ripple; None if unknown."""
-    model, planted = cell.model, header.planted
+    model = cell.model
+    planted = header.planted
     if planted is not None:
         if not planted.keys() >= {*model.parameter_names[: model.element_part.start]}:
             return None
@@ -159,7 +165,8 @@ def _period(samples: Samples) -> float:
 
 def _excitation(prepared: Prepared) -> tuple[results.ExcitationResult, Array]:
     """Return the criteria of executed and planned motion, and the information (p, p); all rows."""
-    model, lengths = prepared.sources.cell.model, []
+    model = prepared.sources.cell.model
+    lengths = []
     factor = Factor.zero(model)
     for source, samples in zip(prepared.sources.training, prepared.training, strict=True):
         part = executed_rows(source, samples)
@@ -175,7 +182,8 @@ def _excitation(prepared: Prepared) -> tuple[results.ExcitationResult, Array]:
         return results.ExcitationResult(
             duration=duration, coupling_index_max=most, executed=executed
         ), gram
-    trajectory, via_points = planned.trajectory, planned.via_points
+    trajectory = planned.trajectory
+    via_points = planned.via_points
     n_via = None
     if via_points is not None:  # without start and end of a closed path
         n_via = len(via_points) - 2 * np.array_equal(via_points[0], via_points[-1])
@@ -205,8 +213,11 @@ def _planned(sources: Sources) -> Excitation | None:
 def _parameters(
     cell: Cell, estimation: Estimation, truth: Array | None
 ) -> list[results.ParameterResult]:
-    model, estimate, posterior = cell.model, estimation.result, estimation.with_prior
-    pooled, many = estimation.stated, len(estimate.repetitions) > 1
+    model = cell.model
+    estimate = estimation.result
+    posterior = estimation.with_prior
+    pooled = estimation.stated
+    many = len(estimate.repetitions) > 1
     # Rows 29 and 31 of the paper's Table 2 have the other sign.
     ids = {row.pivot or row.parameter: row.id for row in TABLE2}
     is_ns16 = cell.urdf == URDF_PATH.read_text(encoding="utf-8")
@@ -229,7 +240,8 @@ def _parameters(
 
 
 def _validation(prepared: Prepared, values: Array) -> list[results.ValidationResult]:
-    sources, model = prepared.sources, prepared.sources.cell.model
+    sources = prepared.sources
+    model = prepared.sources.cell.model
     errors = prediction_error(model, values, prepared.held_out)
     everywhere = prediction_error(model, values, prepared.held_out, all_rows=True)
     return [
@@ -270,15 +282,18 @@ def _fitted(prepared: Prepared, values: Array) -> results.FittedResult:
 
 
 def _delays(prepared: Prepared) -> results.DelaysResult | None:
-    found, applied = prepared.delays, prepared.assumed_delay
+    found = prepared.delays
+    applied = prepared.assumed_delay
     every = np.ones(len(prepared.sources.cell.joint_names))
     if found is not None:
         # A delay with a wide interval is applied, too, where it predicts better.
         known = 1.0 if found.determined or found.delay == applied else np.nan
-        delay, interval = known * found.delay, known * found.half_interval
+        delay = known * found.delay
+        interval = known * found.half_interval
     elif applied != prepared.settings.stated_delay:
         # The lag of a low-pass that predicts as well as the low-pass.
-        delay, interval = applied, np.nan
+        delay = applied
+        interval = np.nan
     else:
         return None
     return results.DelaysResult.of(
@@ -289,7 +304,8 @@ def _delays(prepared: Prepared) -> results.DelaysResult | None:
 def _coverage(values: Array, std: Array, truth: Array) -> results.CoverageResult:
     """Return the coverage of the determined parameters with known true values."""
     determined = np.isfinite(std) & np.isfinite(truth)
-    distance, std = np.abs(values - truth)[determined], std[determined]
+    distance = np.abs(values - truth)[determined]
+    std = std[determined]
     within_2, within_3 = (int((distance <= limit * std).sum()) for limit in (2.0, 3.0))
     return results.CoverageResult(within_2=within_2, within_3=within_3, total=len(std))
 
@@ -301,8 +317,12 @@ def _judgement(joint_names: Sequence[str], validation: Validation) -> results.Ju
         bins = one.bins
         return results.ProfileResult.rows(centre=one.centres, mean=bins.mean, std=bins.std)
 
-    evidence, verdict, nominal = validation.evidence, validation.verdict, validation.nominal
-    checks, context, error = evidence.residuals, evidence.context, evidence.held_out
+    evidence = validation.evidence
+    verdict = validation.verdict
+    nominal = validation.nominal
+    checks = evidence.residuals
+    context = evidence.context
+    error = evidence.held_out
     assert checks is not None
     inertia = context.controller_inertia
     limit = context.torque_limit

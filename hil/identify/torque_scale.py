@@ -42,19 +42,22 @@ def torque_scale(cell: Cell, recordings: Sequence[Recording], *, simulated: bool
     data sheet unless something else is stated, and joint torque sensors are no better
     (`identification.estimators.torque_scale.DATA_SHEET`).
     """
-    n, drives = len(cell.joint_names), cell.file.drive_train
+    n = len(cell.joint_names)
+    drives = cell.file.drive_train
     with_currents = any(one.motor_current is not None for one in recordings)
     of = "torque constants" if with_currents else "the scale of the recorded torques"
     mapped = [one.provenance.get("torque_uncertainty") for one in recordings]
     in_cell = cell.file.robot.torque_uncertainty
     table = "[robot]"
     if drives is not None and drives.torque_uncertainty is not None:
-        in_cell, table = drives.torque_uncertainty, "[drive_train]"
+        in_cell = drives.torque_uncertainty
+        table = "[drive_train]"
     if in_cell is not None:
         base = np.broadcast_to(np.asarray(in_cell, dtype=np.float64), n)
         source = f"torque_uncertainty of {table} in the cell file"
     elif simulated:
-        base, source = np.zeros(n), "a simulated arm"
+        base = np.zeros(n)
+        source = "a simulated arm"
     else:
         base = np.full(n, DATA_SHEET)
         source = "of a data sheet, as no torque_uncertainty is stated"

@@ -39,8 +39,10 @@ class Validation:
 
 def validate(prepared: Prepared, estimation: Estimation, reporter: Reporter) -> Validation:
     """Gather the evidence on an estimate, and judge it."""
-    sources, result = prepared.sources, estimation.result
-    model, nominal = sources.cell.model, nominal_of(sources.cell)
+    sources = prepared.sources
+    result = estimation.result
+    model = sources.cell.model
+    nominal = nominal_of(sources.cell)
     with reporter.task("validating", 3) as task:
         unseen = sum(estimation.held_out, Factor.zero(model))
         consistency = _consistency(estimation, unseen, in_sample=sources.in_sample)
@@ -79,7 +81,8 @@ def _consistency(
     estimation: Estimation, unseen: Factor, *, in_sample: bool
 ) -> ConsistencyCheck | str:
     """Compare the posteriors with and without possible bodies, or return why that failed."""
-    posterior, training = estimation.posterior, estimation.result.factor
+    posterior = estimation.posterior
+    training = estimation.result.factor
     try:
         return check_consistency(
             posterior.model,
@@ -110,7 +113,8 @@ def _calibration(prepared: Prepared, estimation: Estimation) -> Calibration | No
     """Check the intervals of held-out torque."""
     if prepared.sources.in_sample:
         return None
-    model, result = prepared.sources.cell.model, estimation.result
+    model = prepared.sources.cell.model
+    result = estimation.result
     try:
         calibration = calibrate(
             result.pooled,

@@ -170,7 +170,8 @@ class _Part(ABC):
 
 class _McapPart(_Part):
     def __init__(self, file: Path, path: Path) -> None:
-        self.file, self._path = file, path
+        self.file = file
+        self._path = path
         with _named(path, file):
             self.topics = mcap_messages.read(path, lambda *_: False)[0]
 
@@ -185,7 +186,8 @@ class _ReaderPart(_Part):
     """A file that `rosbags` reads: sqlite3 of ROS 2, or a bag of ROS 1."""
 
     def __init__(self, file: Path, reader: AnyReader) -> None:
-        self.file, self._reader = file, reader
+        self.file = file
+        self._reader = reader
         self.topics = {
             connection.topic: Topic(
                 connection.msgtype,

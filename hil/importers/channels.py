@@ -155,7 +155,8 @@ def _of_arrays(file: ArrayFile) -> Iterator[Channel]:
     }
     for name, (kind, number) in kinds.items():
         shape = file.shape(name)
-        samples, size = max(shape), math.prod(shape) // max(shape)
+        samples = max(shape)
+        size = math.prod(shape) // max(shape)
         rate = rates.get(samples)
         yield Channel(name, size, samples, None, file.dtype(name), rate, kind, number)
 

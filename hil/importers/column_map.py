@@ -217,7 +217,9 @@ class ColumnMap(_Table):
             return cls.model_validate(parse_toml(map_text(path)))
         except ValidationError as error:
             wrong = first_error(path, error, cls, documentation=_DOCUMENTATION)
-            problem, field, remedy = wrong.problem, wrong.field, wrong.remedy
+            problem = wrong.problem
+            field = wrong.field
+            remedy = wrong.remedy
             raise SourceError(path, problem, field=field, remedy=remedy) from error
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error

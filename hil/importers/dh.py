@@ -176,7 +176,8 @@ def _row(
             problem = f"line {line} has {repr(texts[field]) if texts[field] else 'nothing'}"
             raise InputError(path, problem, field=field, remedy=remedy)
 
-    kind, joint = _TYPES.get(texts["type"].lower(), ""), texts["joint"]
+    kind = _TYPES.get(texts["type"].lower(), "")
+    joint = texts["joint"]
     check(kind != "", "type", f"write {' or '.join(_TYPES)}")
     check(joint not in ("", *earlier), "joint", "give each joint a name of its own")
     values = {}

@@ -52,7 +52,8 @@ def examine(
     `locked` are positions [rad or m] of joints that are not in the model, by name; `nominal` is the
     torque of the nominal inertias, None if the URDF has none.
     """
-    time, position = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9), unwrap(samples.position)
+    time = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9)
+    position = unwrap(samples.position)
     limits = urdf_limits(urdf, joint_names)
     turning = _turning(urdf, joint_names)
     held = [f"{name} at {place:.4g}" for name, place in (locked or {}).items()]
@@ -81,7 +82,8 @@ def _turning(urdf: str, names: Sequence[str]) -> NDArray[np.bool_]:
 
 
 def _range(name: str, position: Array, turns: bool, lower: float, upper: float) -> str:
-    low, high = float(position.min()), float(position.max())
+    low = float(position.min())
+    high = float(position.max())
     text = f"{name}: {low:.3f} .. {high:.3f} {'rad' if turns else 'm'}"
     if turns:
         text += f" ({math.degrees(low):.0f} .. {math.degrees(high):.0f} deg)"
@@ -108,11 +110,13 @@ def _outside(
     position: Array, names: Sequence[str], limits: UrdfLimits, turning: NDArray[np.bool_]
 ) -> _Outside | None:
     """Return which positions leave the limits of the URDF, and which reading would not."""
-    fits, joints = _fits(position, limits), range(len(names))
+    fits = _fits(position, limits)
+    joints = range(len(names))
     beyond = [joint for joint in joints if not fits[joint, joint]]
     if not beyond:
         return None
-    low, high = position.min(axis=0), position.max(axis=0)
+    low = position.min(axis=0)
+    high = position.max(axis=0)
     ranges = ", ".join(f"{names[j]}: {low[j]:.3g} .. {high[j]:.3g}" for j in beyond)
     outside = (position < limits.lower - _TOLERANCE) | (position > limits.upper + _TOLERANCE)
     rows = np.asarray(outside.any(axis=1))
@@ -167,7 +171,8 @@ def are_degrees(position: Array, converted: Array, names: Sequence[str], urdf: s
 
     `converted` are the same numbers [rad], read as degrees.
     """
-    limits, turning = urdf_limits(urdf, names), _turning(urdf, names)
+    limits = urdf_limits(urdf, names)
+    turning = _turning(urdf, names)
     if not turning.all() or not len(position):
         return False
     finite = np.isfinite(position).all() and np.isfinite(converted).all()
@@ -200,7 +205,8 @@ def _positions(
     outside = _outside(position, names, limits, turning)
     if outside is not None:
         yield f"{outside.problem}; {outside.remedy}"
-    low, high = position.min(axis=0), position.max(axis=0)
+    low = position.min(axis=0)
+    high = position.max(axis=0)
     travel = float((high - low).max())
     if travel < _LEAST_TRAVEL:
         yield (
@@ -273,7 +279,8 @@ def against_position(time: Array, position: Array, velocity: Array) -> tuple[Arr
     known = steps <= 5.0 * usual  # the velocity in a gap is unknown
     moved = np.where(known, 0.5 * (velocity[1:] + velocity[:-1]) * steps, 0.0).cumsum(axis=0)
     gone = np.where(known, np.diff(position, axis=0), 0.0).cumsum(axis=0)
-    moved, gone = moved - moved.mean(axis=0), gone - gone.mean(axis=0)
+    moved = moved - moved.mean(axis=0)
+    gone = gone - gone.mean(axis=0)
     product = gone.T @ moved
     squares = np.sum(gone * gone, axis=0), np.sum(moved * moved, axis=0)
     sizes = np.sqrt(np.outer(*squares))
@@ -313,14 +320,16 @@ def _torque_size(
     if expected is not None and expected.any():
         compared = expected >= _SIGNIFICANT * expected.max()
         rms = np.sqrt(np.mean(np.square(samples.torque), axis=0))
-        ratio, reference = rms[compared] / expected[compared], "those of the URDF's masses"
+        ratio = rms[compared] / expected[compared]
+        reference = "those of the URDF's masses"
         lowest = _OTHER_UNIT
     else:
         compared = np.isfinite(limits)
         if not compared.any():
             return
         ratio = np.abs(samples.torque).max(axis=0)[compared] / limits[compared]
-        reference, lowest = "the effort limits of the URDF", _THOUSAND / _TOO_FAST
+        reference = "the effort limits of the URDF"
+        lowest = _THOUSAND / _TOO_FAST
     listing = ", ".join(
         f"{name}: {value:.2g}" for name, value in zip(_those(names, compared), ratio, strict=True)
     )
@@ -356,7 +365,8 @@ def _nominal_rms(samples: Samples, nominal: NominalTorque) -> Array | None:
     time = np.zeros(len(count))
     np.add.at(time, index, (samples.stamp - samples.stamp[0]) * 1e-9)
     time /= count
-    before, after = np.diff(time)[:-1, None], np.diff(time)[1:, None]
+    before = np.diff(time)[:-1, None]
+    after = np.diff(time)[1:, None]
     slopes = np.diff(mean, axis=0) / np.diff(time)[:, None]
     velocity = (slopes[:-1] * after + slopes[1:] * before) / (before + after)
     acceleration = 2.0 * np.diff(slopes, axis=0) / (before + after)

@@ -160,7 +160,9 @@ class _Log:
 
     def clock(self, count: int) -> _Clock:
         """Return the stamps of a log with this number of rows."""
-        time, rate, position = self._map.time, self._map.sample_rate, self._map.position
+        time = self._map.time
+        rate = self._map.sample_rate
+        position = self._map.position
         if time is None:
             assert rate is not None
             stamps = np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64)
@@ -212,7 +214,8 @@ class _Log:
         continued = without_wraps(stamp[valid])
         if continued.note is not None:
             self.notes.append(f"time: {continued.note}")
-        low, high = base + int(continued.stamp.min()), base + int(continued.stamp.max())
+        low = base + int(continued.stamp.min())
+        high = base + int(continued.stamp.max())
         origin = 0 if low >= 0 and high < _LATEST else low
         if high - origin >= _LATEST:
             self._raise_span(high - low, path)
@@ -257,12 +260,14 @@ class _Log:
         degrees none does; velocities, if they are 57.3 times the slope of the positions.
         """
         joint = _joint_side(values, self._map, self)
-        names, degree = robot.joint_names, UNITS["position"]["deg"]
+        names = robot.joint_names
+        degree = UNITS["position"]["deg"]
         if "position" in self._unstated:
             degrees = {**values, "position": values["position"] * degree}
             converted = _joint_side(degrees, self._map, self)
             if are_degrees(joint["position"], converted["position"], names, robot.urdf):
-                joint, values = converted, degrees
+                joint = converted
+                values = degrees
                 self.notes.append(
                     "position: no unit is stated; read as degrees, within the limits of the URDF, "
                     "which radians leave by far"
@@ -280,7 +285,9 @@ class _Log:
 
     def _numbers(self, name: str, quantity: Quantity) -> tuple[Array, list[str | None]]:
         """Return the numbers of a quantity as in the file, (m, k), and the units it states."""
-        field, columns, array = f"{name}.columns", quantity.columns, quantity.array
+        field = f"{name}.columns"
+        columns = quantity.columns
+        array = quantity.array
         if quantity.files is not None:
             return self._joint_by_joint(name, quantity, quantity.files)
         file = self._file(quantity.file, f"{name}.file")
@@ -303,8 +310,10 @@ class _Log:
         self, name: str, quantity: Quantity, names: str | Sequence[str]
     ) -> tuple[Array, list[str | None]]:
         """Return the numbers of a quantity that has a file per joint, (m, k), and their units."""
-        files, columns = self._file_per_joint(names, f"{name}.files"), quantity.columns
-        field, found = f"{name}.columns", []
+        files = self._file_per_joint(names, f"{name}.files")
+        columns = quantity.columns
+        field = f"{name}.columns"
+        found = []
         if isinstance(columns, str):
             columns = tuple(columns.replace("{}", str(k)) for k in range(1, len(files) + 1))
         elif columns is not None and len(columns) == 1:
@@ -377,7 +386,8 @@ class _Log:
 
     def _upright(self, matrix: Array, quantity: Quantity, path: Path, name: str) -> Array:
         """Return a whole matrix with time along its rows."""
-        count, along = len(self.joints), quantity.joints_along
+        count = len(self.joints)
+        along = quantity.joints_along
         if along is None:
             if matrix.shape == (count, count):
                 problem = f"{name} is a square matrix"
@@ -423,7 +433,8 @@ class _Log:
 
     def _motor_from_joint(self) -> Array:
         """Return motor angles per joint angle (k, k), in the log's order."""
-        drive, n = self._map.drive, len(self.joints)
+        drive = self._map.drive
+        n = len(self.joints)
         for name in ("gear_ratio", "joint_offset", "torque_constant", "motor_from_joint"):
             if (values := getattr(drive, name)) is not None:
                 self._check_count(values, f"drive.{name}")

@@ -72,7 +72,8 @@ class _Group:
     @property
     def label(self) -> str:
         """First and last name."""
-        first, last = self.names[0], self.names[-1]
+        first = self.names[0]
+        last = self.names[-1]
         return first if first == last else f"{first} .. {last}"
 
     def columns(self, joints: Sequence[str]) -> str | list[str]:
@@ -132,7 +133,10 @@ def _groups(channels: Iterable[Channel], joints: Sequence[str]) -> list[_Group]:
     members: dict[tuple[str, Kind | None, bool], list[tuple[int, str, Channel]]] = {}
     for channel, bare in zip(channels, bare_names, strict=True):
         end = channel.name.strip()[len(bare) :] if bare in repeated else ""
-        kind, pattern, place, by_joint = channel.kind, bare, 0, False
+        kind = channel.kind
+        pattern = bare
+        place = 0
+        by_joint = False
         match = _NUMBER.search(bare)
         if match is not None:
             pattern = f"{bare[: match.start()]}{{}}{bare[match.end() :]}"
@@ -143,7 +147,8 @@ def _groups(channels: Iterable[Channel], joints: Sequence[str]) -> list[_Group]:
             kind = kind_of(quantity, channel.unit)[0]
             if kind is not None:
                 by_joint = True
-                pattern, place = bare.replace(joint, "{}"), list(joints).index(joint)
+                pattern = bare.replace(joint, "{}")
+                place = list(joints).index(joint)
         entry = (place, bare + end, channel)
         members.setdefault((pattern + end, kind, by_joint), []).append(entry)
     groups = []
@@ -200,8 +205,11 @@ class _Search:
         chosen: Mapping[str, str],
         sample_rate: float | None,
     ) -> None:
-        self._log, self._joints, self._groups = log, joints, groups
-        self._chosen, self._rate = chosen, sample_rate
+        self._log = log
+        self._joints = joints
+        self._groups = groups
+        self._chosen = chosen
+        self._rate = sample_rate
         self._lines: list[str] = []
         self._used: set[str] = set()
 
@@ -309,7 +317,8 @@ class _Search:
         raise SourceError(self._log, problem, field=kind, remedy=f"choose one: {options}")
 
     def _refuse_count(self, kind: Kind, group: _Group) -> NoReturn:
-        count, joints = group.size, ", ".join(self._joints)
+        count = group.size
+        joints = ", ".join(self._joints)
         problem = (
             f"{count} {'channel is' if count == 1 else 'channels are'} named as {kind} "
             f"({group.label}), and the URDF has {len(self._joints)} joints: {joints}"

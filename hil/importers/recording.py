@@ -126,7 +126,8 @@ def import_recording(
     lines: tuple[str, ...] = ()
     if options.columns is not None:
         robot = robot_of(partial(_joints_of_map, options.columns))
-        columns, text = ColumnMap.load(options.columns), map_text(options.columns)
+        columns = ColumnMap.load(options.columns)
+        text = map_text(options.columns)
     else:
         robot = robot_of(partial(_no_joints, source))
         proposal = proposed_map(
@@ -136,7 +137,9 @@ def import_recording(
             sample_rate=options.sample_rate,
             drop_missing=options.drop_missing,
         )
-        columns, text, lines = proposal.columns, proposal.text, proposal.lines
+        columns = proposal.columns
+        text = proposal.text
+        lines = proposal.lines
     import_log(
         source,
         output,

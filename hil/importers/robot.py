@@ -201,7 +201,8 @@ def _writable_names(positions: Mapping[str, float]) -> dict[str, float]:
 def _require_writable(output: Path, source: Sequence[Path], *, force: bool) -> None:
     """Raise ArchiveWriteError for an output that is a recording, or exists without `force`."""
     if any(output.resolve() == path.resolve() for path in source):
-        problem, remedy = "is the recording itself", "choose another name (-o)"
+        problem = "is the recording itself"
+        remedy = "choose another name (-o)"
         raise ArchiveWriteError(output, problem, remedy=remedy)
     if not force and path_exists(output):
         remedy = "choose another name (-o), or replace it with --force"
@@ -267,9 +268,13 @@ def write_imported(
     }
 
     def write(path: Path) -> Path:
-        texts, names = robot.attachments(), robot.joint_names
         return write_samples(
-            path, samples, joint_names=names, metadata=entries, attachments=texts, period=period
+            path,
+            samples,
+            joint_names=robot.joint_names,
+            metadata=entries,
+            attachments=robot.attachments(),
+            period=period,
         )
 
     if not force:
@@ -304,7 +309,8 @@ def _check(samples: Samples, source: Path, joints: Sequence[str]) -> None:
             continue
         rows, columns = np.nonzero(~(np.abs(values) <= _MOST))
         if rows.size:
-            row, column = rows[0], columns[0]
+            row = rows[0]
+            column = columns[0]
             elapsed = (samples.stamp[row] - samples.stamp[0]) * 1e-9
             problem = (
                 f"{name} of joint {joints[column]} is {values[row, column]} in sample {row} "

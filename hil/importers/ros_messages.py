@@ -123,7 +123,8 @@ def _fields_of(value: Any, path: str, read: _Read) -> Iterator[tuple[str, _Read]
     elif is_dataclass(value):
         for field in fields(value):
             if field.default is MISSING and field.name != "__msgtype__":  # else a constant
-                inner, place = getattr(value, field.name), f"{path}/{field.name}".lstrip("/")
+                inner = getattr(value, field.name)
+                place = f"{path}/{field.name}".lstrip("/")
                 # C code where only names lead to a number, as in most messages.
                 dotted = place.replace("/", ".")
                 if not any(part.isdigit() for part in place.split("/")):

@@ -410,5 +410,6 @@ class _States:
 def _at(stamp: NDArray[np.int64], known: NDArray[np.int64], values: Array) -> Array:
     """Return values (k, n) known at stamps (k,), at other stamps: linear, exact where equal."""
     origin = known[0]
-    at, places = (stamp - origin).astype(np.float64), (known - origin).astype(np.float64)
+    at = (stamp - origin).astype(np.float64)
+    places = (known - origin).astype(np.float64)
     return np.column_stack([np.interp(at, places, column) for column in values.T])

@@ -124,9 +124,11 @@ def staged(
 def _free(folder: Path, recording: Path) -> Path:
     """Return a path for the archive of a recording; equal names get a number."""
     stem = recording.name if recording.is_dir() else recording.stem
-    path, number = folder / f"{stem}.mcap", 2
+    path = folder / f"{stem}.mcap"
+    number = 2
     while path.exists():
-        path, number = folder / f"{stem}-{number}.mcap", number + 1
+        path = folder / f"{stem}-{number}.mcap"
+        number = number + 1
     return path
 
 

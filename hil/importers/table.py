@@ -73,7 +73,8 @@ class Dialect(NamedTuple):
     def cells(self, line: str) -> list[str]:
         """Return the cells of a line without quotation marks."""
         if self.delimiter is None:
-            line, delimiter = " ".join(line.split()), " "
+            line = " ".join(line.split())
+            delimiter = " "
         else:
             delimiter = self.delimiter
         if '"' not in line:
@@ -136,7 +137,8 @@ class Table:
             commented = dialect.cells(comments[-1].lstrip().lstrip("#%/"))
             names = tuple(commented) if len(commented) == width > 1 else ()
         notes = (f"left out: lines that repeat the header ({repeated})",) if repeated else ()
-        numbers, lines = [number for number, _ in rows], [line for _, line in rows]
+        numbers = [number for number, _ in rows]
+        lines = [line for _, line in rows]
         gaps = form.missing == "drop"
         return cls(path, names, units, width, lines, numbers, dialect, gaps, notes)
 
@@ -193,7 +195,8 @@ class Table:
             texts = self.dialect.cells(self.lines[0])
             numbers = [self.numbered[0]] * len(texts)
         else:
-            texts, numbers = self._texts(index), list(self.numbered)
+            texts = self._texts(index)
+            numbers = list(self.numbered)
         numerals = _normalised(texts, self.dialect)
         times: list[int | None] = [_nanoseconds(text, decimals) for text in numerals]
         unread = [place for place, time in enumerate(times) if time is None]

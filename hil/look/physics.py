@@ -213,7 +213,8 @@ class Finding:
         if steps:
             text = "; ".join(self.described(step.change) for step in steps)
             return self._found("signs", steps, text, "push one joint by hand and see its torque")
-        friction, share = self.readings.score.friction, self.readings.score.share
+        friction = self.readings.score.friction
+        share = self.readings.score.share
         dissipates = (friction > SEPARATE) & (share > 0.0)
         if dissipates.all():
             return Row(
@@ -383,7 +384,8 @@ def _toml(value: Any) -> str:
 
 def _by_size(readings: Readings) -> float | None:
     """Return the weight that the torque shows over that of an arm of this reach; None if none."""
-    model, samples = readings.model, readings.samples
+    model = readings.model
+    samples = readings.samples
     if not np.any(model.gravity):
         return None
     factor = Factor.by_time(model, samples)
@@ -432,7 +434,8 @@ def determined(readings: Readings) -> tuple[Group, ...]:
 
     By the posterior over the prior standard deviation of each base parameter.
     """
-    model, samples = readings.model, readings.samples
+    model = readings.model
+    samples = readings.samples
     factor = Factor.by_time(model, samples)
     ratio = fit_posterior(model, factor, body_prior(model, factor).gaussian).ratio
     groups = []

@@ -73,7 +73,8 @@ def _without_robot(recording: Recording) -> Row:
 def _with_torque(
     source: Path, recorded: Source, imported: ImportedRecording, cell: Cell, rows: list[Row]
 ) -> Look:
-    recording, model = recorded.recording, cell.model
+    recording = recorded.recording
+    model = cell.model
     if recording.torque is None:
         rows.append(physics.current_only())
         return Look(source.name, tuple(rows), (), (), imported.map_text)

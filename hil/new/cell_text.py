@@ -82,7 +82,8 @@ def _fix(joint: ET.Element, position: float) -> None:
         origin = joint.find("origin")
         if origin is None:
             origin = ET.SubElement(joint, "origin")
-        place, turn = _three(origin.get("xyz"), "0 0 0"), _three(origin.get("rpy"), "0 0 0")
+        place = _three(origin.get("xyz"), "0 0 0")
+        turn = _three(origin.get("rpy"), "0 0 0")
         rotation = Rotation.from_euler("xyz", turn)  # URDF: roll, pitch, yaw about fixed axes
         if joint.get("type") == "prismatic":
             place = place + rotation.apply(along * position)
@@ -168,7 +169,8 @@ class NewCell:
             **({} if folders is None else {"cell.mesh_folders": folders}),
             **self.known.values,
         }
-        document, unknown = self._head(), list[str]()
+        document = self._head()
+        unknown = list[str]()
         without: Collection[str] = ("drive_train", "controller") if self.design_only else ()
         if self.lifting:
             without = {*CellFile.model_fields} - {*_OF_RECORDINGS}
@@ -199,7 +201,8 @@ class NewCell:
         """Return a commented table of the file, and its unknown fields."""
         fields = _fields_of(table)
         others = (name for name in values if name.startswith(f"{table}."))
-        written, unknown = tomlkit.table(), list[str]()
+        written = tomlkit.table()
+        unknown = list[str]()
         for name in dict.fromkeys([*fields, *others]):
             if name not in values and name not in _UNKNOWN:
                 continue
@@ -348,7 +351,8 @@ def _joints_between(path: Path, text: str, base: str | None, tip: str | None) ->
     ends = [tip] if tip is not None else list(to_link)
     found: dict[str, None] = {}
     for end in ends:
-        way, link = list[str](), end
+        way = list[str]()
+        link = end
         while link != base and link in to_link:
             name, link = to_link[link]
             way.append(name)
@@ -394,7 +398,8 @@ def _of_gripper(text: str, chain: Chain) -> list[str]:
 def _note_on_branches(text: str, chain: Chain) -> list[str]:
     """Return a note on a gripper or further arms among the joints that move."""
     notes = []
-    links, fingers = _links_of(text), _of_gripper(text, chain)
+    links = _links_of(text)
+    fingers = _of_gripper(text, chain)
     if fingers:
         fixing = " ".join(f"--fix {name}" for name in fingers[:_MOST_NAMES])
         notes.append(

@@ -168,7 +168,8 @@ def _turned(home: Array, limits: JointLimits) -> Iterator[Array]:
 
 def from_init(init: InitPacket, n_joints: int, arm: int) -> Known:
     """Return the values of an init packet for the first `n_joints` axes of an arm (from 1)."""
-    row, n = arm - 1, n_joints
+    row = arm - 1
+    n = n_joints
     wrist = dict(zip(("k54", "k64", "k65"), init.wrist_coupling(arm), strict=True))
     values: dict[str, Any] = {
         "drive_train.gear_ratio": _wire(init.gear_ratio[row, :n], zero=False),
@@ -178,7 +179,8 @@ def from_init(init: InitPacket, n_joints: int, arm: int) -> Known:
         **{f"drive_train.{k}": _wire([v])[0] for k, v in wrist.items() if n >= WRIST_AXES},
         "controller.arm": arm,
     }
-    notes, cycle = [], init.sample_time
+    notes = []
+    cycle = init.sample_time
     if cycle in _CYCLES:
         values["controller.cycle_ms"] = cycle
     else:
@@ -280,7 +282,8 @@ def read_init(
 
 def _waited_for(exchange: ExchangeProcess, wait: float, stop: Stop) -> InitPacket:
     deadline = time.monotonic() + wait
-    connection, monitor = Connection(), ExchangeMonitor(exchange)
+    connection = Connection()
+    monitor = ExchangeMonitor(exchange)
     while connection.init is None:
         exchange.send_heartbeat()
         for event in monitor.poll():
@@ -292,7 +295,8 @@ def _waited_for(exchange: ExchangeProcess, wait: float, stop: Stop) -> InitPacke
                 "stopped before a packet of the controller; no file was written."
             )
         if time.monotonic() > deadline:
-            status, text = exchange.status(), f"no init packet within {wait:g} s"
+            status = exchange.status()
+            text = f"no init packet within {wait:g} s"
             if status.replied or status.malformed or status.stale:
                 text += ", but other packets: a session was already running"
             text += f"; {connection.not_understood}" if connection.not_understood else ""
@@ -304,7 +308,8 @@ def _waited_for(exchange: ExchangeProcess, wait: float, stop: Stop) -> InitPacke
 
 
 def _nothing_moves(spec: TransportSpec, n_joints: int, arm: int) -> ExchangeSettings:
-    ones, zeros = np.ones(n_joints), np.zeros(n_joints)
+    ones = np.ones(n_joints)
+    zeros = np.zeros(n_joints)
     return ExchangeSettings(
         transport=spec,
         drive_train=DriveTrain(

@@ -110,7 +110,8 @@ def view_of(
     stamp = head.columns["stamp"]
     if not len(stamp):
         raise ArchiveError(path, "contains no sample", remedy="name another archive")
-    origin, last = float(stamp[0]) * 1e-9, float(stamp[-1] - stamp[0]) * 1e-9
+    origin = float(stamp[0]) * 1e-9
+    last = float(stamp[-1] - stamp[0]) * 1e-9
     begin = 0.0 if start is None else max(start, 0.0)
     end = last if stop is None else min(stop, last)
     if not begin <= end:
@@ -119,7 +120,8 @@ def view_of(
     shown = _wanted(head.joint_names, joints)
     scales = _Scales.of(head)
     archive = open_archive(path, fields=_FIELDS, start=origin + begin, stop=origin + end + 1e-6)
-    columns, time = archive.columns, archive.columns["stamp"] * 1e-9 - origin
+    columns = archive.columns
+    time = archive.columns["stamp"] * 1e-9 - origin
     quantities = []
     # Values that overflow in degrees are missing in the plot.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -165,12 +167,14 @@ class _Scales:
     @classmethod
     def of(cls, archive: Archive) -> _Scales:
         n = len(archive.joint_names)
-        cell, motors = _cell(archive), None
+        cell = _cell(archive)
+        motors = None
         frame = AngleFrame("urdf", np.ones(n), np.zeros(n))
         both = np.array([[-1.0], [1.0]])
         limits: dict[str, Array] = {}
         if cell is not None and cell.file.limits is not None:
-            frame, bounds = AngleFrame.of(cell), cell.joint_limits
+            frame = AngleFrame.of(cell)
+            bounds = cell.joint_limits
             limits["position"] = np.sort([frame.shown(bounds.lower), frame.shown(bounds.upper)], 0)
             limits["velocity"] = both * np.degrees(bounds.velocity)
             if cell.torque_limit is not None:
@@ -196,7 +200,8 @@ class _Scales:
         Torque signs follow the angles.
         Following errors are in motor revolutions if the drive train is known.
         """
-        limits, position = self.limits, columns.get("position")
+        limits = self.limits
+        position = columns.get("position")
         if position is not None:
             shown = np.where(self.slides, 1e3 * position, self.frame.shown(position))
             yield "position [deg]", shown, limits.get("position")
@@ -209,9 +214,11 @@ class _Scales:
             torque = columns["torque"] * np.where(self.slides, 1.0, self.frame.sign)
             yield "torque at the joint [N·m]", torque, limits.get("torque")
         if "target_position" in columns and position is not None:
-            error, unit = columns["target_position"] - position, "motor rev"
+            error = columns["target_position"] - position
+            unit = "motor rev"
             if self.motor_from_joint is None:
-                error, unit = self._rate(error), "deg"
+                error = self._rate(error)
+                unit = "deg"
             else:
                 error = error @ self.motor_from_joint.T / (2.0 * np.pi)
             # The controller reports no target with the drive off.
@@ -263,8 +270,11 @@ def _share(recorded: Trace) -> str:
 
 def draw_archive(view: ArchiveView) -> Figure:
     """Draw a picture with one row per joint and one column per quantity."""
-    rows, columns, facts = len(view.joint_names), max(1, len(view.quantities)), view.facts
-    width, height = 0.95 + 3.1 * columns, 1.6 + 1.15 * rows
+    rows = len(view.joint_names)
+    columns = max(1, len(view.quantities))
+    facts = view.facts
+    width = 0.95 + 3.1 * columns
+    height = 1.6 + 1.15 * rows
     marks = [(at, style.LIMIT if warns else style.MUTED) for at, _, _, warns in view.events]
     if view.gaps is not None:
         marks += [(float(gap), style.MUTED) for gap in view.gaps[:_MOST_GAPS]]

@@ -37,17 +37,26 @@ _PERIOD: Final = 0.001
 """Sampling period of the correlations, s."""
 _WHITE: Final[dict[str, Any]] = {"linestyle": "none", "markerfacecolor": "white"}
 # inch
-_WIDTH, _ROW, _FRONT, _LEGEND_LINE = 11.8, 1.05, 2.9, 0.22
-_CELL, _SMALLEST, _LARGEST = 0.1, 2.6, 4.0
-_TITLE_AT, _HEAD_LINE, _HEAD_FOOT = 0.36, 0.23, 0.3
+_WIDTH = 11.8
+_ROW = 1.05
+_FRONT = 2.9
+_LEGEND_LINE = 0.22
+_CELL = 0.1
+_SMALLEST = 2.6
+_LARGEST = 4.0
+_TITLE_AT = 0.36
+_HEAD_LINE = 0.23
+_HEAD_FOOT = 0.3
 _LINE_LENGTH: Final = 1300.0  # Characters of a line times its font size in points
 
 
 def draw_front(axes: Axes, design: Design) -> None:
     """Draw the front and the chosen motion, with a legend."""
-    front, chosen = design.front, design.chosen
+    front = design.front
+    chosen = design.chosen
     upward, rightward = front.criteria
-    over, beside = CRITERIA[upward], CRITERIA[rightward]
+    over = CRITERIA[upward]
+    beside = CRITERIA[rightward]
     origin = front.measure(upward)[design.origin], front.measure(rightward)[design.origin]
     axes.plot(
         front.measure(rightward), front.measure(upward), drawstyle="steps-post",
@@ -81,10 +90,13 @@ def draw_correlation(axes: Axes, trajectory: Trajectory, model: RobotModel) -> N
     motion = sampled(trajectory, _PERIOD)
     unknown = np.zeros_like(motion.position)  # the criteria do not depend on torque
     gram = information(Factor.from_samples(model, motion, unknown))
-    names, p = model.base.names, model.n_parameters
+    names = model.base.names
+    p = model.n_parameters
     matrix = np.abs(correlation(gram)[: len(names), : len(names)])
     axes.imshow(matrix, cmap="gray_r", vmin=0.0, vmax=1.0, interpolation="none")
-    middles, joints, first = [], [], 0
+    middles = []
+    joints = []
+    first = 0
     for joint, members in groupby(names, key=lambda name: re.findall(r"\d+", name)[0]):
         last = first + len(list(members))
         if first:
@@ -135,7 +147,8 @@ def _heading(
 
 def draw_design(design: Design, cell: Cell, unchecked: Sequence[str] = ()) -> Figure:
     """Draw a designed motion for a cell, and what was not checked ("floor", "walls", ...)."""
-    model, trajectory = cell.model, design.excitation.trajectory
+    model = cell.model
+    trajectory = design.excitation.trajectory
     lines = list(_heading(design, cell, unchecked))
     side = float(np.clip(_CELL * model.base.rank, _SMALLEST, _LARGEST))
     beside = _FRONT + 3 * _LEGEND_LINE

@@ -28,7 +28,10 @@ _SAMPLES = 4000
 _LINES = {"flown": "-", "reduced": "--", "stopped": ":"}
 _LETTERS = 12  # Characters that fit the height of a row
 # inch
-_WIDTH, _ROW, _TOP, _BOTTOM = 11.0, 1.25, 0.95, 0.55
+_WIDTH = 11.0
+_ROW = 1.25
+_TOP = 0.95
+_BOTTOM = 0.55
 _DOTS_PER_INCH = 110
 
 
@@ -46,7 +49,8 @@ def draw_motion(
     time = np.linspace(0.0, trajectory.duration, _SAMPLES)
     q, *rates = trajectory.sample(time)
     ends = np.sort([frame.shown(limits.lower), frame.shown(limits.upper)], axis=0)
-    fastest, most = np.degrees(limits.velocity), np.degrees(limits.acceleration)
+    fastest = np.degrees(limits.velocity)
+    most = np.degrees(limits.acceleration)
     columns = (
         (f"position [deg, {frame.name} angles]", frame.shown(q), *ends, style.POSITION),
         ("velocity [deg/s]", frame.shown_rate(rates[0]), -fastest, fastest, style.VELOCITY),
@@ -75,7 +79,8 @@ def _against_limits(axes: Axes, low: float, high: float, values: Array) -> None:
     """Draw limits, set the range of the axis, and ticks at limits and zero."""
     for bound in (low, high):
         axes.axhline(bound, color=style.LIMIT, linewidth=0.9, linestyle=(0, (5, 2)))
-    least, most = min(low, float(values.min())), max(high, float(values.max()))
+    least = min(low, float(values.min()))
+    most = max(high, float(values.max()))
     room = 0.1 * (most - least)
     axes.set_ylim(least - room, most + room)
     axes.set_yticks([low, *([0.0] if low < 0.0 < high else []), high])
@@ -116,7 +121,8 @@ def draw_plan(
                     fontsize=style.SMALL, color=style.INK,
                 )  # fmt: skip
         figure.align_ylabels([row[0] for row in rows])
-        duration, stopping = plan.duration, plan.duration_with_stops
+        duration = plan.duration
+        stopping = plan.duration_with_stops
         share = (
             f" ({percentage(duration / stopping, 1)} of the time with stops)"
             if stopping > 0.0

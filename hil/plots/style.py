@@ -13,7 +13,9 @@ import matplotlib as mpl
 INK, MUTED, RULE = "#1a1a1a", "#666666", "#dddddd"
 LIMIT = "#b3261e"
 POSITION, VELOCITY, ACCELERATION = "#0072b2", "#00795a", "#b0530b"
-SMALL, TEXT, TITLE = 7.5, 9.0, 12.0
+SMALL = 7.5
+TEXT = 9.0
+TITLE = 12.0
 _STYLE = {
     "font.size": TEXT,
     "axes.axisbelow": True,

@@ -21,7 +21,8 @@ def draw_torques(results: Results, series: ReportSeries) -> Figure:
         figure = Figure((_WIDTH, _HEIGHT * len(joints) + 0.6), layout="constrained")
         panels = np.ravel(figure.subplots(len(joints), 1, sharex=True, squeeze=False))
         for j, (panel, joint) in enumerate(zip(panels, joints, strict=True)):
-            measured, predicted = series.example_measured[:, j], series.example_predicted[:, j]
+            measured = series.example_measured[:, j]
+            predicted = series.example_predicted[:, j]
             panel.plot(
                 time, measured, color=style.POSITION, alpha=0.35, linewidth=3.0, label="measured"
             )

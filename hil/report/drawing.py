@@ -25,7 +25,8 @@ INK, MUTED, GRID, BAND, FIRST, SECOND, WIDE = (
 """Variables of the style sheet (light, dark, print); `WIDE` is a light colour for a broad line
 below another one."""
 
-TICK_SIZE, TEXT_SIZE = 10.5, 11.0
+TICK_SIZE = 10.5
+TEXT_SIZE = 11.0
 _WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 370.0, 46.0, 10.0, 20.0, 40.0  # of a panel, px
 _GAP: Final = 24.0  # between plots above each other, px
 _TICK, _PAD, _THIN = 3.0, 6.5, 0.8  # length and distance of text, width of thin lines, px
@@ -74,10 +75,12 @@ def thinned(time: Array, values: Array, bins: int = 500) -> tuple[Array, Array]:
     if time.size <= 2 * bins:
         return time, values
     edges = np.linspace(0, time.size, bins + 1).astype(np.intp)
-    starts, ends = edges[:-1, None], edges[1:, None]
+    starts = edges[:-1, None]
+    ends = edges[1:, None]
     # Rows of equal length: the last sample of an interval is repeated.
     rows = np.minimum(starts + np.arange(int(np.max(ends - starts))), ends - 1)
-    parts, starts = values[rows], edges[:-1]
+    parts = values[rows]
+    starts = edges[:-1]
     extremes = [starts + parts.argmin(axis=1), starts + parts.argmax(axis=1)]
     chosen = np.unique(np.concatenate([[0, time.size - 1], *extremes]))
     return time[chosen], values[chosen]
@@ -88,7 +91,8 @@ def round_ticks(low: float, high: float, most: int) -> tuple[list[float], list[s
     size = (high - low) / most
     decade = 10.0 ** math.floor(math.log10(size))
     step = next((s for s in _STEPS if s * decade >= size * (1.0 - 1e-9)), _STEPS[-1]) * decade
-    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    first = math.ceil(low / step - 1e-9)
+    last = math.floor(high / step + 1e-9)
     ticks = [k * step for k in range(first, last + 1)]
     place = math.floor(math.log10(step) + 1e-9)
     if max(abs(low), abs(high)) < _MOST_DIGITS and place >= -6:
@@ -104,7 +108,8 @@ def padded(values: Array) -> tuple[float, float]:
     finite = values[np.isfinite(values)]
     if not finite.size:
         return 0.0, 1.0
-    low, high = float(finite.min()), float(finite.max())
+    low = float(finite.min())
+    high = float(finite.max())
     # Neighbouring floats have no ticks between them.
     if not high - low > 1e-9 * max(abs(low), abs(high)):
         room = 0.05 * abs(low) or 1.0
@@ -144,7 +149,8 @@ class Axes:
     def segments(self, x: Array, y: Array, colour: str, width: float) -> None:
         """Draw lines that are not connected, (m, 2) each."""
         apart = np.full((len(x), 1), np.nan)
-        across, up = np.hstack([x, apart]).ravel(), np.hstack([y, apart]).ravel()
+        across = np.hstack([x, apart]).ravel()
+        up = np.hstack([y, apart]).ravel()
         self.line(across, up, colour, width, ends=";stroke-linecap:butt")
 
     def dots(self, x: Array, y: Array, colour: str, size: float, *, opacity: float = 1.0) -> None:
@@ -163,7 +169,8 @@ class Axes:
         visible = [shape for shape in self._shapes if shape[0] != "bands" or "stroke" in shape[3]]
         low, high = self.x_limits or padded(_joined(shape[1] for shape in visible))
         bottom, top = self.y_limits or padded(_joined(shape[2] for shape in visible))
-        right, foot = self.left + self.width, self.top + self.height
+        right = self.left + self.width
+        foot = self.top + self.height
 
         def across(x: Array) -> Array:
             share = (np.asarray(x, np.float64) - low) / (high - low)
@@ -335,7 +342,8 @@ class Chart:
 
 def chart_panel(chart: Chart, bins: int = _BINS) -> Panel:
     """Draw a chart; a line has at most two points in each of the `bins` of its x."""
-    panels, top = list[Axes](), _TOP
+    panels = list[Axes]()
+    top = _TOP
     scale = _log10 if chart.log else np.asarray
     low, high = (float(scale(np.array(end))) for end in chart.x_limits)
     for k, plot in enumerate(chart.plots):
@@ -356,7 +364,8 @@ def chart_panel(chart: Chart, bins: int = _BINS) -> Panel:
                 np.array([endless, [0.0, 0.0]]), np.array([[0.0, 0.0], endless]), MUTED, 0.8
             )
         for trace in plot.traces:
-            x, values = scale(chart.x if trace.x is None else trace.x), scale(trace.values)
+            x = scale(chart.x if trace.x is None else trace.x)
+            values = scale(trace.values)
             if trace.dots:
                 axes.dots(x, values, trace.colour, trace.width)
             else:
@@ -379,7 +388,8 @@ def _decades(low: float, high: float) -> list[tuple[float, str]]:
 
     If there are fewer than two: their multiples, or the middle of a range without any.
     """
-    first, last = math.ceil(low), math.floor(high)
+    first = math.ceil(low)
+    last = math.floor(high)
     step = max(1, -(-(last - first + 1) // 6))
     places = [float(k) for k in range(first, last + 1, step)]
     if len(places) < 2:
@@ -397,11 +407,13 @@ def box_panel(
 ) -> Panel:
     """Draw columns of values (m,) as dots with a box: quartiles, median, 1.5 box heights."""
     lines = 1 + max(text.count("\n") for text in labels)
-    width, bottom = 110.0 + 40.0 * len(columns), 12.0 + 13.0 * lines
+    width = 110.0 + 40.0 * len(columns)
+    bottom = 12.0 + 13.0 * lines
     # A scale that shows every value and does not exaggerate small changes.
     every = np.concatenate(columns)
     middle = float(np.median(every))
-    low, high = min(float(every.min()), 0.9 * middle), max(float(every.max()), 1.1 * middle)
+    low = min(float(every.min()), 0.9 * middle)
+    high = max(float(every.max()), 1.1 * middle)
     limits = max(0.0, low - 0.06 * (high - low)), high + 0.06 * (high - low) or 1.0
     axes = Axes(
         _LEFT, _TOP, width - _LEFT - _RIGHT, 206.0 - _TOP, heading, y_limits=limits, y_ticks=5,
@@ -435,11 +447,13 @@ def matrix_panel(matrix: Array, labels: Sequence[str], key: str, title: str) -> 
     """Draw |ρ| of a normalised matrix (n, n), 0 white, 1 black, one label for each row."""
     from PIL import Image  # only pages with a matrix need it
 
-    n, matrix = len(labels), np.abs(matrix)
+    n = len(labels)
+    matrix = np.abs(matrix)
     note = f"{int(np.sum(np.triu(matrix, 1) > 0.9))} of {n * (n - 1) // 2} pairs above 0.9"
     what = f"absolute correlation between {n} base parameters, white for 0 and black for 1"
     cell = min(max(_SIDE / n, _SMALLEST_CELL), _LARGEST_CELL)
-    side, size = n * cell, min(TICK_SIZE, 0.76 * cell)
+    side = n * cell
+    size = min(TICK_SIZE, 0.76 * cell)
     grey = np.round(255.0 * (1.0 - np.clip(np.nan_to_num(matrix), 0.0, 1.0))).astype(np.uint8)
     png = io.BytesIO()
     Image.fromarray(np.repeat(grey[:, :, None], 3, axis=2)).save(png, "png")
@@ -451,7 +465,8 @@ def matrix_panel(matrix: Array, labels: Sequence[str], key: str, title: str) -> 
         f'<rect {area} style="fill:none;stroke:{MUTED};stroke-width:{_THIN:g}"/>',
     ]
     for k, text in enumerate(labels):
-        at, name = _LABELS + (k + 0.5) * cell + 0.36 * size, label(text)
+        at = _LABELS + (k + 0.5) * cell + 0.36 * size
+        name = label(text)
         parts.append(_text(name, _LABELS - 4.0, at, INK, size, "end"))
         upward = _text(name, 0.0, 0.0, INK, size, "start")
         parts.append(

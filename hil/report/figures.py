@@ -117,8 +117,10 @@ def excitation_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Cha
     time = series.excitation_time - series.excitation_time[0]
     charts = []
     for joint in joints:
-        j, unit = joint.number, joint.angle
-        position, velocity = series.excitation_position[:, j], series.excitation_velocity[:, j]
+        j = joint.number
+        unit = joint.angle
+        position = series.excitation_position[:, j]
+        velocity = series.excitation_velocity[:, j]
         note = f"{fixed(float(position.min()), 2)} to {fixed(float(position.max()), 2)} {unit}"
         shaded = _left_out(time, series.excitation_fitted, j)
         plots = (
@@ -137,7 +139,8 @@ def torque_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart]:
     time = series.example_time - series.example_time[0]
     charts = []
     for j, name, unit, error in joints:
-        measured, predicted = series.example_measured[:, j], series.example_predicted[:, j]
+        measured = series.example_measured[:, j]
+        predicted = series.example_predicted[:, j]
         torques = [MEASURED.trace(measured), PREDICTED.trace(predicted)]
         errors = [RESIDUAL.trace(measured - predicted)]
         what = "measured and predicted torque over time, and their difference"
@@ -183,7 +186,8 @@ def part_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart]:
 
 def spectrum_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart]:
     """Return the spectra of the measured torque and of the residual of each joint."""
-    frequency, measured = series.spectrum_frequency, series.spectrum_measured
+    frequency = series.spectrum_frequency
+    measured = series.spectrum_measured
     residual = series.spectrum_residual
     if frequency is None or measured is None or residual is None or not len(frequency):
         return []
@@ -226,7 +230,8 @@ def friction_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart
     """Return the friction law of each joint that moved, with the fitted rows."""
     charts: list[Chart] = []
     for j, name, unit, _ in joints:
-        speed, law = series.law_speed[:, j], series.law_torque[:, j]
+        speed = series.law_speed[:, j]
+        law = series.law_torque[:, j]
         if not np.ptp(speed):
             continue
         there = np.isfinite(series.friction_speed[:, j] + series.friction_torque[:, j])
@@ -259,15 +264,18 @@ def residual_panels(results: Results) -> dict[str, list[Panel]]:
     ):
         panels = found[f"{what}_panels"]
         for j, (joint, profile) in enumerate(zip(judgement.joints, profiles, strict=True)):
-            mean, std = np.array(profile.mean, np.float64), np.array(profile.std, np.float64)
+            mean = np.array(profile.mean, np.float64)
+            std = np.array(profile.std, np.float64)
             if not np.isfinite(mean + std).any():
                 continue
             angle = "rad" if joint.unit == "N·m" else "m"
             note = f"RMS error {significant(joint.rms)} {joint.unit}"
             caption = Caption(f"{what[0]}{j}", joint.joint, note, f"mean residual over {what}")
-            heading, foot = f"mean residual [{joint.unit}]", f"{what} [{angle}{per}]"
+            heading = f"mean residual [{joint.unit}]"
+            foot = f"{what} [{angle}{per}]"
             axes = single(170.0, heading, foot, x_ticks=6)
-            centre, endless = np.array(profile.centre, np.float64), np.array([-np.inf, np.inf])
+            centre = np.array(profile.centre, np.float64)
+            endless = np.array([-np.inf, np.inf])
             axes.bands(endless[None], np.array([[-joint.rms, joint.rms]]), BAND)
             reach = np.where(np.isfinite(std), _INTERVAL * std, 0.0)
             ends = np.stack([mean - reach, mean + reach], axis=1)
@@ -286,7 +294,8 @@ def precision_panels(results: Results) -> list[Panel]:
     panels = []
     required = results.conduct.precision if results.conduct is not None else []
     for k, one in enumerate(required):
-        count, ratio = np.array(one.repetitions, np.float64), np.array(one.ratio)
+        count = np.array(one.repetitions, np.float64)
+        ratio = np.array(one.ratio)
         note = f"{one.worst} is worst"
         what = "95 % interval over the required one, over repetitions"
         axes = single(170.0, "interval / required", "repetitions", x_ticks=6)

@@ -115,7 +115,8 @@ def _shared_x(x: Array, most: int) -> Array:
     if len(x) <= most:
         return x
     edges = _edges(len(x), most)
-    starts, ends = x[edges[:-1]], x[edges[1:] - 1]
+    starts = x[edges[:-1]]
+    ends = x[edges[1:] - 1]
     return np.stack([0.75 * starts + 0.25 * ends, 0.25 * starts + 0.75 * ends], axis=1).ravel()
 
 
@@ -126,7 +127,8 @@ def _extremes(values: Array, most: int) -> Array:
     edges = _edges(len(values), most)
     rows = edges[:-1, None] + np.arange(int(np.max(np.diff(edges))))
     parts = values[np.minimum(rows, edges[1:, None] - 1)]
-    first, last = parts.argmin(axis=1), parts.argmax(axis=1)
+    first = parts.argmin(axis=1)
+    last = parts.argmax(axis=1)
     order = np.sort(np.stack([first, last], axis=1), axis=1)
     return np.take_along_axis(parts, order, axis=1).ravel()
 
@@ -136,7 +138,8 @@ def encoded(values: Array) -> dict[str, Any]:
     finite = np.isfinite(values)
     low = float(values[finite].min()) if finite.any() else 0.0
     high = float(values[finite].max()) if finite.any() else 0.0
-    middle, step = 0.5 * (low + high), (high - low) / 65534.0 or 1.0
+    middle = 0.5 * (low + high)
+    step = (high - low) / 65534.0 or 1.0
     codes = np.full(len(values), _UNKNOWN, "<i2")
     codes[finite] = np.clip(np.rint((values[finite] - middle) / step), -32767, 32767)
     return {

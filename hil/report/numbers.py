@@ -9,7 +9,8 @@ import math
 import re
 
 MISSING = "–"
-_SMALLEST_DECIMAL, _LARGEST_DECIMAL = 1e-4, 1e6
+_SMALLEST_DECIMAL = 1e-4
+_LARGEST_DECIMAL = 1e6
 _MOST_DECIMALS = 6
 _MOMENT = re.compile(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d)(?::[\d.]+)?(Z|[+-]\d\d:\d\d|)")
 

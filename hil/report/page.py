@@ -46,7 +46,8 @@ def report_bytes(
         SeriesError: series and results have different numbers of joints.
     """
     series = series.checked_for(len(results.joint_names))
-    joints, runs = figures.joints_of(results), results.validation
+    joints = figures.joints_of(results)
+    runs = results.validation
     bins = min(_MOST_BINS, max(_FEWEST_BINS, _BINS // len(joints)))
     charts = {
         "torques": figures.torque_charts(series, joints),

@@ -62,7 +62,8 @@ def environment(*scripts: str) -> Environment:
         "policy": policy(every),
     }
     # Figures and tables are numbered in the order of the page.
-    figures, tables = itertools.count(1), itertools.count(1)
+    figures = itertools.count(1)
+    tables = itertools.count(1)
     numbering = {"figure": lambda: next(figures), "table": lambda: next(tables)}
     found.globals |= {"numbers": numbers, "numbering": numbering}
     for name in _FORMATS:

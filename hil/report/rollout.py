@@ -54,7 +54,9 @@ def _chart(result: RolloutResult, errors: Errors, number: int, title: str, headi
     def shown(arm: ArmErrors) -> Array:
         return np.maximum(1e3 * errors(arm), _FLOOR)
 
-    horizons, legends, traces = np.array(result.horizons), ROLLOUT_LEGENDS, list[Trace]()
+    horizons = np.array(result.horizons)
+    legends = ROLLOUT_LEGENDS
+    traces = list[Trace]()
     if result.sample_errors:
         gap = np.full(1, np.nan)
         parts = [part for arm in result.sample_errors for part in (shown(arm), gap)]

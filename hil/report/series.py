@@ -146,7 +146,8 @@ def _step(samples: Samples) -> int:
 
     One of a torque with a low-pass, which applies to rows side by side.
     """
-    time, m = samples.motion.time, len(samples.torque)
+    time = samples.motion.time
+    m = len(samples.torque)
     if m < 2 or samples.torque_bandwidth is not None:
         return 1
     step = max(1, int((m - 1) / max(float(time[-1] - time[0]), 1e-9) / (2.0 * _RATE)))

@@ -27,7 +27,8 @@ from .settings import StudyFolder, StudySettings
 A: Final = "a"
 B: Final = "b"
 LABELS: Final = {A: "A", B: "B"}
-NO_EFFECTS, EFFECTS = "no-effects", "effects"
+NO_EFFECTS = "no-effects"
+EFFECTS = "effects"
 SINES: Final[dict[str, tuple[str, dict[str, str]]]] = {
     "a-middle": ("about the middle of the ranges, frequencies as printed", {}),
     "a-home": ("about the home posture, frequencies as printed", {"offset": "home"}),
@@ -134,7 +135,8 @@ class Execution:
     @property
     def complete(self) -> bool:
         """Whether all archives exist and are intact."""
-        folder, kinds = CampaignFolder(self.root), ("standstill", "excitation", "validation")
+        folder = CampaignFolder(self.root)
+        kinds = ("standstill", "excitation", "validation")
         motions = 1 + self.cell.campaign.repetitions + len(self.plan.validation)
         return (self.root / "manifest.json").exists() and (
             sum(len(folder.completed(kind)) for kind in kinds) >= motions

@@ -53,7 +53,8 @@ TABLE1: Final = (
 )
 """The paper's Table 1: method, N, log det (units not stated), I_c, notes."""
 
-_DRAWS, _SEED = 4000, 20140901
+_DRAWS = 4000
+_SEED = 20140901
 _SHOWN: Final = 1200  # maximum number of rows of a series in a figure
 _MOVING: Final = 1e-3  # speed above which a joint moves, rad/s or m/s
 
@@ -208,7 +209,8 @@ def parameters_of(cell: Cell, truth: Array) -> list[StudyParameter]:
     Rows 41 to 52 are interleaved. Viscous and third friction terms are assumed to be per degree and
     per degree²: per radian the viscous friction would be negligible.
     """
-    model, printed = cell.model, dict[str, dict[str, Any]]()
+    model = cell.model
+    printed = dict[str, dict[str, Any]]()
     for row in TABLE2 if is_printed(cell) else ():
         order = {"f1": 1, "f2": 2}.get(row.parameter[:2], 0) if row.id > N_ESSENTIAL else 0
         printed[row.pivot or row.parameter] = {
@@ -254,20 +256,24 @@ def condition_result(
 
 def _prepared(root: Path, kind: str) -> Prepared:
     """Prepare all archives of a kind, with the standstill, for a fit."""
-    folder, options = CampaignFolder(root), replace(FIXED, in_sample=True)
+    folder = CampaignFolder(root)
+    options = replace(FIXED, in_sample=True)
     paths = [*folder.completed(kind), *folder.completed("standstill")]
     return prepare_sources(gather_sources(paths, options.split, in_sample=True), options, Silent())
 
 
 def _method(key: str, prepared: Prepared) -> MethodResult:
     """Estimate from each repetition and from all."""
-    model, sources = prepared.sources.cell.model, prepared.sources.training
+    model = prepared.sources.cell.model
+    sources = prepared.sources.training
     found = estimate_repetitions(model, prepared.fitted)
     executed = Factor.zero(model)
     parts = [executed_rows(own, one) for own, one in zip(sources, prepared.fitted, strict=True)]
     for one, part in zip(prepared.fitted, parts, strict=True):
         executed = executed + Factor.from_samples(model, one.motion.rows(part), one.torque[part])
-    gram, motion, rows = information(executed), prepared.fitted[0].motion, parts[0]
+    gram = information(executed)
+    motion = prepared.fitted[0].motion
+    rows = parts[0]
     shown = motion.rows(_thinned(rows))
     values = np.array([one.values for one in found.repetitions])
     return MethodResult(
@@ -298,7 +304,8 @@ def motion_form(model: RobotModel, run: Samples) -> Array:
     for j, (block, used) in enumerate(zip(*run.regressor(model), strict=True)):
         usable = run.usable[:, j]
         table = np.column_stack([block, run.torque[:, j]]) * usable[:, None]
-        passed, both = low_passed(run, table)[usable], [*used, n]
+        passed = low_passed(run, table)[usable]
+        both = [*used, n]
         found[np.ix_(both, both)] += passed.T @ passed
     return np.asarray(found / (np.where(run.usable, run.torque, 0.0) ** 2).sum())
 
@@ -321,7 +328,8 @@ def _held_out(
     every = overall[A] + overall[B]
     typical = list(runs)[int(np.argsort(every, kind="stable")[(len(every) - 1) // 2])]
     run = runs[typical]
-    time, shown = run.motion.time, _thinned(moving_rows(run))
+    time = run.motion.time
+    shown = _thinned(moving_rows(run))
 
     def joints(torque: Array) -> list[list[float]]:
         return [_rounded(column) for column in for_figure(time, torque)[shown].T]
@@ -395,8 +403,11 @@ def compared(forms: Array, first: Array, second: Array) -> Comparison:
     """
     means = np.array([first.mean(axis=0), second.mean(axis=0)])
     logs = np.log(np.divide(*relative_errors(forms, means).T[::-1]))
-    ratio, wins, motions = float(np.exp(logs.mean())), int((logs < 0.0).sum()), len(logs)
-    random, units = np.random.default_rng(_SEED), [_blocks(first), _blocks(second)]
+    ratio = float(np.exp(logs.mean()))
+    wins = int((logs < 0.0).sum())
+    motions = len(logs)
+    random = np.random.default_rng(_SEED)
+    units = [_blocks(first), _blocks(second)]
     fewest = min(len(one) for one in units)
     low = high = None
     if fewest >= MIN_UNITS and motions > 1:

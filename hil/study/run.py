@@ -104,7 +104,8 @@ def _rows(
     executed = {best[one.key].key: one for one in conditions[0].methods}
     rows = []
     for search in found:
-        one, method = search.excitation, executed.get(search.key)
+        one = search.excitation
+        method = executed.get(search.key)
         row = MotionRow(key=search.key, words=search.words, executed=method is not None)
         if one is not None:
             row = MotionRow.of(
@@ -124,7 +125,8 @@ COLOURS: Final = (drawing.FIRST, drawing.SECOND)
 
 def study_page(results: StudyResults) -> bytes:
     """Return the page as one HTML file; the same results give the same bytes."""
-    first, n = results.conditions[0], results.n_base
+    first = results.conditions[0]
+    n = results.n_base
     names = [f"{one.printed_id or ''} {one.name}".strip() for one in results.parameters[:n]]
     template = environment().get_template("study.html.j2")
     text = template.render(
@@ -174,7 +176,8 @@ def _boxes(condition: ConditionResult, joint_names: list[str]) -> list[drawing.P
             f"{label} {significant(float(np.median(own)))}"
             for label, own in zip(labels, columns, strict=True)
         )
-        key, what = f"b{condition.key}{j}", "mean |e| in N·m"
+        key = f"b{condition.key}{j}"
+        what = "mean |e| in N·m"
         caption = drawing.Caption(key, name, f"medians {medians}", what)
         panels.append(drawing.box_panel(caption, columns, COLOURS, "mean |e| [N·m]", labels))
     return panels
@@ -183,7 +186,8 @@ def _boxes(condition: ConditionResult, joint_names: list[str]) -> list[drawing.P
 def _examples(condition: ConditionResult, joint_names: list[str]) -> list[drawing.Panel]:
     """Draw one held-out motion in time: measured, predicted by each, and the errors (Fig. 4)."""
     found = condition.held_out
-    time, panels = np.array(found.time), []
+    time = np.array(found.time)
+    panels = []
     for j, name in enumerate(joint_names):
         measured = np.array(found.measured[j])
         names = [one.label for one in condition.methods]
@@ -194,13 +198,15 @@ def _examples(condition: ConditionResult, joint_names: list[str]) -> list[drawin
         errors = [measured - one.values for one in lines]
         reach = 1.05 * max(float(np.abs(error).max()) for error in errors) or 1.0
         both = [drawing.Trace(measured, drawing.WIDE, 4.0), *lines]
-        plots, rms = [drawing.Plot(128.0, "torque [N·m]", both)], []
+        plots = [drawing.Plot(128.0, "torque [N·m]", both)]
+        rms = []
         # A row for each error: where there is noise, one line over another would hide it.
         for which, one, error in zip(names, lines, errors, strict=True):
             trace = drawing.Trace(error, one.colour, 1.0)
             plots.append(drawing.Plot(48.0, f"measured − {which} [N·m]", [trace], reach=reach))
             rms.append(f"{which} {significant(float(np.sqrt(np.mean(error**2))))}")
-        note, what = f"RMS error {', '.join(rms)} N·m", "measured and predicted torque"
+        note = f"RMS error {', '.join(rms)} N·m"
+        what = "measured and predicted torque"
         caption = drawing.Caption(f"e{condition.key}{j}", name, note, what)
         panels.append(drawing.chart_panel(drawing.Chart(caption, time, plots)))
     return panels

@@ -114,7 +114,8 @@ class StudyFolder:
             problem = f"is not the settings of a study ({error})"
             raise InputError(self.settings, problem, remedy=remedy) from error
         for name in StudySettings.model_fields:
-            new, existing = getattr(settings, name), getattr(old, name)
+            new = getattr(settings, name)
+            existing = getattr(old, name)
             if new != existing:
                 raise InputError(
                     self.settings,

@@ -82,8 +82,11 @@ class Program:
     @classmethod
     def of(cls, model: RobotModel, prior: BodyPrior) -> Program:
         """Set up the constraints of a model; the prior gives the size of drives and friction."""
-        layout, b = model.layout, model.base.rank
-        links, s, k = layout.links, layout.size, model.n_parameters - b
+        layout = model.layout
+        b = model.base.rank
+        links = layout.links
+        s = layout.size
+        k = model.n_parameters - b
         bodies = reference_bodies(model.nominal[links], model.chain.translation)
         size = np.where(np.isfinite(prior.std) & (prior.std > 0.0), prior.std, 1.0)
         transform = np.diag(size)
@@ -141,7 +144,8 @@ class Program:
 
     def _constraints(self, clarabel: Any) -> tuple[Array, Array, list[Any]]:
         """Return A, b and the cones K of ``b - A u in K``."""
-        blocks, bounds = [-self.positive], [np.zeros(len(self.positive))]
+        blocks = [-self.positive]
+        bounds = [np.zeros(len(self.positive))]
         cones = [clarabel.NonnegativeConeT(len(self.positive))] if len(self.positive) else []
         for cone in self.cones:
             block = np.zeros((_triangle_size(cone.inside), self.positive.shape[1]))
@@ -171,7 +175,8 @@ def consistent_parameters(
     Raises:
         SolverError: the conic solver found none.
     """
-    program, s = Program.of(model, prior), model.layout.size
+    program = Program.of(model, prior)
+    s = model.layout.size
     rows, target = rows_of(equations)
     known = np.isfinite(prior.std) & (prior.std > 0.0)
     weight = 1.0 / prior.std[known]
@@ -186,7 +191,9 @@ def consistent_parameters(
 
 def without_rounding(model: RobotModel, parameters: Array) -> Array:
     """Return parameters of drives and friction (s + k,) without what rounding left below zero."""
-    x, s, layout = parameters.copy(), model.layout.size, model.layout
+    x = parameters.copy()
+    s = model.layout.size
+    layout = model.layout
     friction = dissipation(model.friction)
     part = slice(s, s + len(friction.combine))
     shares = np.linalg.solve(friction.combine, x[part])
@@ -199,7 +206,8 @@ def without_rounding(model: RobotModel, parameters: Array) -> Array:
 
 def is_consistent(model: RobotModel, parameters: Array) -> bool:
     """Return whether bodies, drives and friction (s + k,) can exist."""
-    s, layout = model.layout.size, model.layout
+    s = model.layout.size
+    layout = model.layout
     losses = dissipation(model.friction)
     friction = parameters[s : s + len(losses.combine)]
     shares = np.linalg.solve(losses.combine, friction)[losses.not_negative]

@@ -95,7 +95,8 @@ def block_covariance(
     solution = solve(equations)
     if prior is not None:
         solution = solve_with_prior(equations, design_effect * prior)
-    root, scores = solution.root, merged(scores, length)
+    root = solution.root
+    scores = merged(scores, length)
     shares = np.empty((len(scores), root.shape[1], root.shape[1]))
     for start in range(0, len(scores), _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
@@ -124,7 +125,8 @@ def cluster_covariance(
     seconds are merged, by a further factor `stretch` if enough remain.
     """
     used = scores.any(axis=1)
-    information, scores = information[used], scores[used]
+    information = information[used]
+    scores = scores[used]
     length = block_length(scores)
     length = max(length, min(stretch * length, len(scores) // _FEWEST_BLOCKS))
     shares = _shares(merged(information, length), solution.root, solution.root)
@@ -192,7 +194,8 @@ def block_length(scores: Array) -> int:
 
 def _lag_correlation(scores: Array) -> float:
     """Return the mean correlation of scores (B, k) with those of the next block."""
-    power, both = (scores**2).sum(axis=0), (scores[1:] * scores[:-1]).sum(axis=0)
+    power = (scores**2).sum(axis=0)
+    both = (scores[1:] * scores[:-1]).sum(axis=0)
     return float(np.mean(both[power > 0.0] / power[power > 0.0])) if power.any() else 0.0
 
 
@@ -218,7 +221,8 @@ def leverage_corrected(shares: Array, scores: Array) -> Array:
     regular[dependent] = False
     squares = float((scores * own).sum())  # zero where dependent
     leverage = float(np.einsum("bii,b->", shares, regular.astype(np.float64)))
-    rows, added = [own[regular]], []
+    rows = [own[regular]]
+    added = []
     identity = np.eye(scores.shape[1])
     for b in dependent:
         u, rest, vt = np.linalg.svd(identity - shares[b])
@@ -237,9 +241,12 @@ def leverage_corrected(shares: Array, scores: Array) -> Array:
 
 def _regular(shares: Array, scores: Array) -> tuple[Array, list[int]]:
     """Return corrected scores (B, k), zero for blocks of high leverage, and those blocks."""
-    lapack, k = scipy.linalg.lapack, scores.shape[1]
-    corrected, dependent = np.zeros_like(scores), []
-    work, diagonal = np.empty((k, k), order="F"), np.arange(k)
+    lapack = scipy.linalg.lapack
+    k = scores.shape[1]
+    corrected = np.zeros_like(scores)
+    dependent = []
+    work = np.empty((k, k), order="F")
+    diagonal = np.arange(k)
     for b, (share, score) in enumerate(zip(shares, scores, strict=True)):
         np.add(share, share.T, out=work)
         work *= -0.5
@@ -277,7 +284,8 @@ def clustered_covariance(
     count = max(int(fine_blocks(samples)[-1]) + 1 for samples in recordings)
     k = solution.root.shape[1]
     information = np.zeros((count, k, k))  # information in coordinates with unit sum of squares
-    scores, rows = np.zeros((count, model.n_parameters)), np.zeros(count, dtype=np.intp)
+    scores = np.zeros((count, model.n_parameters))
+    rows = np.zeros(count, dtype=np.intp)
     for samples in recordings:
         index = fine_blocks(samples)
         np.add.at(rows, index, np.count_nonzero(samples.usable, axis=1))

@@ -74,7 +74,8 @@ def read_at(time: Array, values: Array, at: Array) -> Array:
     column = (-1,) + (1,) * (values.ndim - 1)
     step = (time[left + 1] - time[left]).reshape(column)
     share = (at - time[left]).reshape(column) / step
-    start, end = values[left], values[left + 1]
+    start = values[left]
+    end = values[left + 1]
     bend = step * (1.0 - share) * slope[left] - step * share * slope[left + 1]
     bend += (2.0 * share - 1.0) * (end - start)
     return np.asarray(start + share * (end - start) + share * (1.0 - share) * bend)
@@ -199,7 +200,8 @@ def estimate_delay(
         RecordingError: see :func:`identification.signals.samples.prepare`.
         IdentificationError: no usable row.
     """
-    p, assumed = model.n_parameters, options.torque_delay
+    p = model.n_parameters
+    assumed = options.torque_delay
     narrow = min(options.rigid_bandwidth, DELAY_BANDWIDTH)
     options = replace(options, smooth_torque=False, rigid_bandwidth=narrow)
     samples = prepare(recording, model, noise_variance=noise_variance, options=options)
@@ -213,7 +215,8 @@ def estimate_delay(
         solution = blocks.solution()
         values = solution.values[:p]
         step = np.clip(solution.values[p], -_PROFILE_STEP, _PROFILE_STEP)
-        before, shift = shift, float(np.clip(shift + step, *ends))
+        before = shift
+        shift = float(np.clip(shift + step, *ends))
         if abs(shift - before) <= max(_CONVERGED, _OF_STD * float(np.sqrt(solution.inverse[p, p]))):
             break
     other = _other_minimum(grid, heights, shift, reader.profile(np.array([shift]))[0][0])
@@ -317,7 +320,8 @@ class _Reader:
         clear = model.moving(motion.velocity) & ~near_any_reversal(model, motion, reach)
         cycle = float(np.median(np.diff(motion.time)))
         size = max(1, round(_BIN / cycle))
-        parts, start = [], 0
+        parts = []
+        start = 0
         for segment in samples.segments:
             count = (segment.stop - segment.start) // size
             if count > 1:
@@ -347,15 +351,18 @@ class _Reader:
 
     def at(self, shift: float) -> Samples:
         """Return the bins with the motion of an earlier time, by a shift."""
-        time, usable = self.binned.motion.time, self.binned.usable.copy()
+        time = self.binned.motion.time
+        usable = self.binned.usable.copy()
         fields = {k: v for k, v in self.samples.motion._asdict().items() if v is not None}
         del fields["time"]
         moved = {name: np.zeros((len(time), field.shape[1])) for name, field in fields.items()}
         for raw, b in self.parts:
-            inside, at = self.samples.motion.time[raw], time[b] - shift
+            inside = self.samples.motion.time[raw]
+            at = time[b] - shift
             for name, field in fields.items():
                 moved[name][b] = read_at(inside, field[raw], at)
-            place, clear = np.interp(at, time[b], np.arange(len(at))), self.clear[b]
+            place = np.interp(at, time[b], np.arange(len(at)))
+            clear = self.clear[b]
             near = clear[np.floor(place).astype(int)] & clear[np.ceil(place).astype(int)]
             usable[b] &= near & ((at >= inside[0]) & (at <= inside[-1]))[:, None]
         result = replace(self.binned, motion=Motion(time, **moved), usable=usable)
@@ -363,7 +370,8 @@ class _Reader:
 
     def profile(self, shifts: Array) -> tuple[Array, Array]:
         """Return mean log residual variance at common shifts (K,), and the best parameters."""
-        heights, best = np.full(len(shifts), np.inf), np.zeros(self.model.n_parameters)
+        heights = np.full(len(shifts), np.inf)
+        best = np.zeros(self.model.n_parameters)
         for k, shift in enumerate(shifts.tolist()):
             factor = Factor.of(self.model, self.at(shift))
             moving = factor.samples > 0
@@ -378,7 +386,9 @@ class _Reader:
 
     def linearised(self, shift: float, values: Array, weights: Array | None = None) -> _Blocks:
         """Return normal equations of p parameters and a delay step at a shift, by blocks."""
-        p, model, samples = self.model.n_parameters, self.model, self.at(shift)
+        p = self.model.n_parameters
+        model = self.model
+        samples = self.at(shift)
         blocks, columns = samples.regressor(model)
         load = samples.known_torque(model)
         tables = []

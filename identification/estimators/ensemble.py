@@ -76,7 +76,8 @@ def draw_ensemble(
         names = ", ".join(estimate.undetermined) or "some parameters"
         raise UndeterminedError(f"the uncertainty of {names} is not known")
     draws = _Draws(model, prior, estimate, np.random.default_rng(seed), count)
-    scale, ensemble = 1.0, draws.consistent(factor, 1.0)
+    scale = 1.0
+    ensemble = draws.consistent(factor, 1.0)
     for _ in range(_ROUNDS):
         ratio = float(np.sqrt(np.nanmean(ensemble.spread**2)))
         if count < _FEWEST or abs(ratio - 1.0) < _SPREAD_TOLERANCE:
@@ -97,7 +98,9 @@ class _Draws:
         random: np.random.Generator,
         count: int,
     ) -> None:
-        self.model, self.prior, self.estimate = model, prior, estimate
+        self.model = model
+        self.prior = prior
+        self.estimate = estimate
         self._deviations = _finite_deviations(prior.std)
         root, self._inverse_root = _roots(estimate.covariance)
         self._change = _balanced(random.standard_normal((count, len(root)))) @ root.T
@@ -105,7 +108,8 @@ class _Draws:
 
     def consistent(self, factor: Factor, scale: float) -> Ensemble:
         """Return the nearest consistent arms of the draws."""
-        model, combinations = self.model, self.prior.combinations
+        model = self.model
+        combinations = self.prior.combinations
         combined = combinations * self._deviations
         size = np.linalg.norm(combined, axis=1)
         pull = np.linalg.pinv(combined / size[:, None], rcond=_RANK)
@@ -114,7 +118,8 @@ class _Draws:
         arms = start + (change / size @ pull.T) * self._deviations
         unseen = _not_combined(combined / size[:, None]) / _or_one(self._deviations)
         rows = np.concatenate([self._inverse_root @ combinations, unseen])
-        program, moved = Program.of(model, self.prior), np.zeros(len(arms), dtype=np.bool_)
+        program = Program.of(model, self.prior)
+        moved = np.zeros(len(arms), dtype=np.bool_)
         for k, arm in enumerate(arms):
             if not is_consistent(model, arm):
                 moved[k] = True

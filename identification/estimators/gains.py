@@ -173,11 +173,13 @@ def _reasons(
 
 def _motor_by_motor(total: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
     """Return current noise (n,) and inverse gain (n,), estimated separately per motor."""
-    n, p = len(total), total.shape[1] - 3
+    n = len(total)
+    p = total.shape[1] - 3
     noise, inverses = np.full((2, n), np.nan)
     unknown = np.arange(p + 1)
     for m in np.flatnonzero(rows):
-        gram, current = total[m][np.ix_(unknown, unknown)], total[m][unknown, -1]
+        gram = total[m][np.ix_(unknown, unknown)]
+        current = total[m][unknown, -1]
         own = solve(NormalEquations(gram, current))
         squares = total[m][-1, -1] - own.values @ current
         freedom = max(rows[m] - len(unknown), 1)
@@ -217,10 +219,13 @@ def _gauss_newton(
         unknowns[layout.gains] = start
 
     def problem(unknowns: Array) -> tuple[NormalEquations, float]:
-        information, scores, squares = 0.0, 0.0, 0.0
+        information = 0.0
+        scores = 0.0
+        squares = 0.0
         for k, total in enumerate(totals):
             own = _linearised(layout, k, total[None], unknowns, noise)
-            information, scores = information + own[0][0], scores + own[1][0]
+            information = information + own[0][0]
+            scores = scores + own[1][0]
             squares += float(own[2][0])
         equations = NormalEquations(
             np.asarray(information + np.diag(prior)), np.asarray(scores - prior * unknowns)
@@ -230,8 +235,10 @@ def _gauss_newton(
     if len(start) != layout.size:
         unknowns[: layout.p] = solve(problem(unknowns)[0].part(np.arange(layout.p))).values
     # Steps are halved if the sum of squares increases.
-    damping, cost = 1.0, np.inf
-    best, step = unknowns, np.zeros_like(unknowns)
+    damping = 1.0
+    cost = np.inf
+    best = unknowns
+    step = np.zeros_like(unknowns)
     for _ in range(_ITERATIONS):
         equations, squares = problem(unknowns)
         if squares > cost * (1.0 + 1e-12):
@@ -243,7 +250,9 @@ def _gauss_newton(
         part = equations.part(free)
         step = np.zeros_like(unknowns)
         step[free] = solve(part).values
-        best, cost, damping = unknowns, squares, 1.0
+        best = unknowns
+        cost = squares
+        damping = 1.0
         unknowns = best + step
         if step[free] @ part.A @ step[free] < _CONVERGED:
             break
@@ -287,12 +296,15 @@ def _linearised(
 ) -> tuple[Array, Array, Array]:
     """Return information (B, k, k), scores (B, k) and weighted squares (B,) of the currents."""
     blocks, _, width, _ = gram.shape
-    p, (offsets, scales) = layout.p, layout.drifts[:, run]
+    p = layout.p
+    (offsets, scales) = layout.drifts[:, run]
     information = np.zeros((blocks, layout.size, layout.size))
-    scores, squares = np.zeros((blocks, layout.size)), np.zeros(blocks)
+    scores = np.zeros((blocks, layout.size))
+    squares = np.zeros(blocks)
     friction = np.where(layout.friction, unknowns[:p], 0.0)
     for m in np.flatnonzero(noise > 0.0):
-        inverse, scale = unknowns[p + m], unknowns[scales[m]]
+        inverse = unknowns[p + m]
+        scale = unknowns[scales[m]]
         # Of the columns [W | t | 1 | i].
         torque = np.concatenate([unknowns[:p] + scale * friction, [1.0, unknowns[offsets[m]], 0.0]])
         slope = np.zeros((width, p + 3))

@@ -71,7 +71,8 @@ def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = No
     Raises:
         IdentificationError: no commanded position, or no joint is commanded to move.
     """
-    measured, time = samples.motion.position, samples.motion.time
+    measured = samples.motion.position
+    time = samples.motion.time
     known = np.asarray(np.isfinite(commanded).all(axis=1))
     tolerance = np.full(commanded.shape[1], _COMMAND_TOLERANCE)
     splines = []
@@ -89,7 +90,8 @@ def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = No
         lag = tracking_lag(time[longest], measured[longest], spline)
     if np.isnan(lag).all():
         raise IdentificationError("no joint is commanded to move: no instruments")
-    derivatives, usable = np.zeros((3, *measured.shape)), np.zeros(measured.shape, dtype=np.bool_)
+    derivatives = np.zeros((3, *measured.shape))
+    usable = np.zeros(measured.shape, dtype=np.bool_)
     for rows, spline in splines:
         for joint, shift in enumerate(np.nan_to_num(lag)):
             at = time[rows] - shift
@@ -101,14 +103,20 @@ def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = No
 
 def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
     """Return whether two pairs of times (m,) and commanded positions (m, n) are of one motion."""
-    (time, one), (other_time, other) = first, second
+    (time, one) = first
+    (other_time, other) = second
     if one.shape[1] != other.shape[1]:
         return False
-    rows, others = np.isfinite(one).all(axis=1), np.isfinite(other).all(axis=1)
+    rows = np.isfinite(one).all(axis=1)
+    others = np.isfinite(other).all(axis=1)
     if not rows.any() or not others.any():
         return False
-    time, one, other_time, other = time[rows], one[rows], other_time[others], other[others]
-    start, stop = max(time[0], other_time[0]), min(time[-1], other_time[-1])
+    time = time[rows]
+    one = one[rows]
+    other_time = other_time[others]
+    other = other[others]
+    start = max(time[0], other_time[0])
+    stop = min(time[-1], other_time[-1])
     longer = max(time[-1] - time[0], other_time[-1] - other_time[0])
     if stop - start < _OVERLAP * longer:
         return False
@@ -124,10 +132,12 @@ def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
 def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Array:
     """Return the lag of axes (m, n) behind their command (n,) [s], NaN if not commanded."""
     thin = slice(None, None, max(1, len(time) // _ROWS))
-    time, measured = time[thin], measured[thin]
+    time = time[thin]
+    measured = measured[thin]
     inside = time >= time[0] + LONGEST_LAG
     if np.count_nonzero(inside) >= 2 * ORDER:
-        time, measured = time[inside], measured[inside]
+        time = time[inside]
+        measured = measured[inside]
 
     def misfit(lag: float) -> Array:
         return np.asarray(np.var(measured - command(time - lag), axis=0))
@@ -175,12 +185,14 @@ def solve_cross(total: Array) -> CrossSolution:
     p = len(total) // 2
     length = np.sqrt(np.diag(total)[:-1])
     scale = np.where(length > 0.0, length, 1.0)
-    left, right = scale[:p], scale[p:]
+    left = scale[:p]
+    right = scale[p:]
     u, singular, vt = np.linalg.svd(total[:p, p : 2 * p] / np.outer(left, right))
     large = singular > singular[0] / WORST_CONDITION**2
     lost = np.abs(vt[~large]).max(axis=0, initial=0.0)
     root = np.sqrt(singular[large])
-    own_right, own_left = vt[large].T / root / right[:, None], u[:, large] / root / left[:, None]
+    own_right = vt[large].T / root / right[:, None]
+    own_left = u[:, large] / root / left[:, None]
     return CrossSolution(
         values=own_right @ (own_left.T @ total[:p, -1]),
         right=own_right,
@@ -201,7 +213,8 @@ def estimate_instrumental(
     Raises:
         IdentificationError: the factor has no rows.
     """
-    p, names = model.n_parameters, model.parameter_names
+    p = model.n_parameters
+    names = model.parameter_names
     if not factor.samples.any():
         raise IdentificationError("no row in which samples and instruments move")
     rows = measured_part(factor)
@@ -215,7 +228,8 @@ def estimate_instrumental(
     solution = solve_cross(total)
     strength = np.where(solution.determined, partial_r2(total), 0.0)
     first_stage = strength / np.maximum(1.0 - strength, 1e-12) * len(blocks)
-    cross, moments = blocks[:, :p, p : 2 * p], blocks[:, :p, -1]
+    cross = blocks[:, :p, p : 2 * p]
+    moments = blocks[:, :p, -1]
     length = block_length(moments - cross @ solution.values)
     cross = merged(cross, length)
     scores = merged(moments, length) - cross @ solution.values
@@ -247,9 +261,12 @@ def partial_r2(total: Array) -> Array:
     p = len(total) // 2
     scale = np.sqrt(np.maximum(np.diag(total)[:-1], 1e-300))
     scaled = total[:-1, :-1] / np.outer(scale, scale)
-    zz, zw, ww = scaled[:p, :p], scaled[:p, p:], scaled[p:, p:]
+    zz = scaled[:p, :p]
+    zw = scaled[:p, p:]
+    ww = scaled[p:, p:]
     inverse = partial(np.linalg.pinv, rcond=1.0 / WORST_CONDITION**2, hermitian=True)
-    own, by_instruments = np.diag(inverse(ww)), np.diag(inverse(zw.T @ inverse(zz) @ zw))
+    own = np.diag(inverse(ww))
+    by_instruments = np.diag(inverse(zw.T @ inverse(zz) @ zw))
     known = (own > 0.0) & (by_instruments > 0.0)
     share = np.where(known, own / np.where(known, by_instruments, 1.0), 0.0)
     return np.clip(share, 0.0, 1.0)

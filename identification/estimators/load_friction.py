@@ -77,12 +77,14 @@ def fit_with_load(
         for one in samples
     )
     predicted: list[Array] | None = None
-    passes, change = 0, np.inf
+    passes = 0
+    change = np.inf
     while True:
         result = fit(samples)
         passes += 1
         samples = tuple(one.with_load(model, result.values) for one in samples)
-        before, predicted = predicted, [_predicted(model, result.values, one) for one in samples]
+        before = predicted
+        predicted = [_predicted(model, result.values, one) for one in samples]
         if before is not None:
             change = _change(before, predicted)
         if passes >= most or change < CONVERGED:

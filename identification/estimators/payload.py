@@ -105,12 +105,14 @@ class Run:
             ModelError: the description has no such frame, or it is fixed to the base.
         """
         joint, rotation, translation = model.chain.frame(frame)
-        moved, p = _moved(rotation, translation), model.n_parameters
+        moved = _moved(rotation, translation)
+        p = model.n_parameters
         plan = RegressorPlan.of_bodies(model.chain, model.gravity, joint)
         blocks, columns = samples.regressor(model)
         loads = plan.evaluate(*samples.motion[1:4])
         index = fine_blocks(samples)
-        tables, places = [], []
+        tables = []
+        places = []
         for j, block in enumerate(blocks):
             load = loads.blocks[j] @ moved[loads.columns[j]]
             beside = np.column_stack([load, np.ones(len(block))])
@@ -201,7 +203,8 @@ def identify_payload(
     open_ended = np.isinf(intervals[:, 1])
     centre = np.where(open_ended[1:4], 0.0, found.values[6:9] / mass)
     to_centre = _moved(np.eye(3), -centre)[_INERTIA]
-    six, halves = to_centre @ found.values, found.factor * found.std(to_centre)
+    six = to_centre @ found.values
+    halves = found.factor * found.std(to_centre)
     lower, upper = _off_centre(mass, (intervals[1:4, 1] - intervals[1:4, 0]) / 2.0)
     intervals[4:] = np.column_stack([six - halves - lower, six + halves + upper])
     negative = _impossible(intervals, _ROUNDING * mass * (1.0 + float(centre @ centre)))
@@ -293,7 +296,8 @@ def contradiction(
 def _differs(first: _BodyEstimate | None, second: _BodyEstimate, limits: Array) -> bool:
     """Return whether first moments and mass (4,) differ, beyond chance and limits; None is zero."""
     rows = np.eye(_BODY)[6:]
-    change, variance = rows @ second.values, second.std(rows) ** 2
+    change = rows @ second.values
+    variance = second.std(rows) ** 2
     if first is not None:
         change = change - rows @ first.values
         variance = variance + first.std(rows) ** 2
@@ -385,12 +389,16 @@ def _fit(
     rows = np.sum([run.factor.samples for run in runs], axis=0)
     if not rows.any():
         raise IdentificationError(no_rows_message(model))
-    p, n, r = model.n_parameters, model.n_joints, shape.shape[1]
+    p = model.n_parameters
+    n = model.n_joints
+    r = shape.shape[1]
     part = np.arange(p, p + r)
     # Offsets and friction scales of the runs (R, 2, n).
     drifts = p + r + np.arange(2 * n * len(runs)).reshape(len(runs), 2, n)
     width = p + r + drifts.size
-    weights, friction, values = np.ones(n), np.zeros(p), np.zeros(width)
+    weights = np.ones(n)
+    friction = np.zeros(p)
+    values = np.zeros(width)
 
     def problem_of(length: int | None = None) -> list[_Rows]:
         """Return Gram matrices over the unknowns, of merged blocks."""
@@ -414,7 +422,8 @@ def _fit(
                 found.append((joint, small.T @ gram @ small, used))
         return found
 
-    expected, information = np.zeros(width), np.zeros((width, width))
+    expected = np.zeros(width)
+    information = np.zeros((width, width))
     if known is not None:
         expected[:p], information[:p, :p] = known.values, known.information
 
@@ -481,10 +490,12 @@ def _fit(
 
 def _weights(problem: Sequence[_Rows], values: Array, rows: NDArray[np.intp]) -> Array:
     """Return inverse variances of the residuals (n,), zero without rows."""
-    squares, torque = np.zeros(len(rows)), np.zeros(len(rows))
+    squares = np.zeros(len(rows))
+    torque = np.zeros(len(rows))
     augmented = np.append(-values, 1.0)
     for joint, gram, places in problem:
-        total, own = gram.sum(axis=0), augmented[places]
+        total = gram.sum(axis=0)
+        own = augmented[places]
         squares[joint] += own @ total @ own
         torque[joint] += total[-1, -1]
     squares = np.maximum(squares, _LEAST_NOISE**2 * torque)
@@ -517,7 +528,8 @@ class _BodyEstimate(NamedTuple):
     @property
     def mass(self) -> tuple[float, float, float]:
         """Mass and its interval [kg], infinite if undetermined."""
-        value, half = float(self.values[9]), self.factor * float(self.std(np.eye(_BODY)[[9]])[0])
+        value = float(self.values[9])
+        half = self.factor * float(self.std(np.eye(_BODY)[[9]])[0])
         return value, value - half, value + half
 
     @property
@@ -535,7 +547,8 @@ class _BodyEstimate(NamedTuple):
         """95 % intervals of the centre (3, 2), a ratio (Fieller 1954)."""
         known = np.isfinite(self.std(np.eye(_BODY)))
         covariance = self.factor**2 * self.covariance(np.eye(_BODY))
-        first, mass = self.values[6:9], self.values[9]
+        first = self.values[6:9]
+        mass = self.values[9]
         a = mass**2 - covariance[9, 9]
         b = first * mass - covariance[9, 6:9]
         c = first**2 - np.diag(covariance)[6:9]
@@ -550,12 +563,14 @@ def _body_estimate(
     known: KnownArm | None = None,
 ) -> _BodyEstimate:
     """Estimate the body of the loaded runs, of least norm where undetermined."""
-    fit, determined = _fit(model, runs, np.eye(_BODY), known), np.eye(_BODY)
+    fit = _fit(model, runs, np.eye(_BODY), known)
+    determined = np.eye(_BODY)
     found = fit.determined
     if len(found) < _BODY:
         determined = found
         fit = _fit(model, runs, np.asarray(np.linalg.pinv(determined)), known)
-    std, factor = np.zeros(model.n_joints), fit.clustered.interval_factor
+    std = np.zeros(model.n_joints)
+    factor = fit.clustered.interval_factor
     if scale_std is not None:
         std = scale_std
     return _BodyEstimate(

@@ -71,7 +71,9 @@ LOAD_SHARE: Final = 0.1
 """Deviation of the share of the transmitted torque that becomes friction: strain-wave gears lose
 some 2 to 15 % (Bittencourt and Gunnarsson 2012)."""
 _FEWEST_ROWS: Final = 2  # per parameter, to estimate the noise
-_INERTIA, _MOMENT, _MASS = slice(0, 6), slice(6, 9), 9
+_INERTIA = slice(0, 6)
+_MOMENT = slice(6, 9)
+_MASS = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,12 +187,14 @@ def posterior_values(
     The weights are the inverse variances of the joints' own residuals, iterated from `start` (n,)
     if given.
     """
-    gram, rows = factor.gram, np.maximum(factor.samples, 1)
+    gram = factor.gram
+    rows = np.maximum(factor.samples, 1)
     variance = gram[:, -1, -1] / rows
     floor = factor.smallest_noise**2 * variance + np.finfo(np.float64).tiny
     precision = design_effect * prior.information
     length = np.sqrt(np.maximum(np.diag(precision), np.finfo(np.float64).tiny))
-    values, weights = prior.mean, np.zeros(factor.n_joints)
+    values = prior.mean
+    weights = np.zeros(factor.n_joints)
     if start is not None:
         variance = np.where(start > 0.0, 1.0 / np.where(start > 0.0, start, 1.0), variance)
     for _ in range(_ROUNDS):
@@ -205,7 +209,8 @@ def posterior_values(
             )
             / scale
         )
-        before, variance = variance, factor.squared_errors(values) / rows
+        before = variance
+        variance = factor.squared_errors(values) / rows
         if np.all(np.abs(variance - before) <= _SETTLED * before):
             break
     return values, weights
@@ -299,7 +304,8 @@ class ScoreScatter:
         `root` S (p, k) with S S' the inverse of the information of data and prior, of which
         `precision` (p, p) is the prior's as it counts, see :func:`block_covariance`.
         """
-        data, prior = self.rows @ root @ root.T, root.T @ precision @ root
+        data = self.rows @ root @ root.T
+        prior = root.T @ precision @ root
         return np.asarray(data.T @ data + design_effect * root @ prior @ root.T)
 
 
@@ -361,13 +367,15 @@ def body_prior(
     standard deviation by name:
     ``{"I3m": (1.2, 0.2), "f0_1": (40.0, 40.0)}``.
     """
-    layout, b = model.layout, model.base.rank
+    layout = model.layout
+    b = model.base.rank
     others = model.parameter_names[b:]
     names = layout.names + others
     combinations = np.zeros((model.n_parameters, len(names)))
     combinations[:b, : layout.size] = model.base.grouping
     combinations[b:, layout.size :] = np.eye(len(others))
-    mean, std = np.zeros(len(names)), np.zeros(len(names))
+    mean = np.zeros(len(names))
+    std = np.zeros(len(names))
     whole_torque = _torque_over_columns(model, factor)
     std[layout.size :] = whole_torque[b:]
     for k, term in enumerate(model.friction.terms, layout.size):

@@ -83,7 +83,8 @@ def robust_estimate(
         IdentificationError: no recordings, or no usable row.
     """
     total = total_factor(model, recordings) if total is None else total
-    factor, n = reduced(model, recordings, total), model.n_joints
+    factor = reduced(model, recordings, total)
+    n = model.n_joints
     state = _State(factor, factor.solve(np.ones(n)), np.full(n, np.inf))
     stages = [(Huber(), _STEP_TOLERANCE)] if isinstance(loss, Tukey) else []
     for one, tolerance in [*stages, (loss, TOLERANCE)]:
@@ -170,7 +171,8 @@ def _scales(recordings: Sequence[Samples], residuals: Sequence[Array], solution:
     """Return the standard deviation per joint (n,) from the median of |residual|."""
     usable = np.concatenate([samples.usable for samples in recordings])
     torque = np.concatenate([samples.torque for samples in recordings])
-    left, rows = np.concatenate(residuals), np.count_nonzero(usable)
+    left = np.concatenate(residuals)
+    rows = np.count_nonzero(usable)
     wider = np.sqrt(rows / max(rows - solution.root.shape[1], 1))
     scale = np.full(left.shape[1], np.nan)
     for joint, own in enumerate(usable.T):

@@ -178,7 +178,8 @@ class _Spectra:
         cls, model: RobotModel, samples: Samples, inside: NDArray[np.bool_], delay: float
     ) -> _Spectra:
         """Transform unfiltered samples, prepared with a delay [s], in the rows inside (m,)."""
-        time, usable = samples.motion.time, samples.usable & inside[:, None]
+        time = samples.motion.time
+        usable = samples.usable & inside[:, None]
         load = samples.known_torque(model)
         torque = samples.torque + load
         step = float(np.median(np.diff(time)))
@@ -204,7 +205,8 @@ class _Spectra:
         lag = np.full(len(gain), late, dtype=np.complex128)
         if channel.shape is not None:
             other_gain, other_lag = channel.shape.response(self.frequency, channel.bandwidth)
-            gain, lag = gain * other_gain, lag + other_lag
+            gain = gain * other_gain
+            lag = lag + other_lag
         return gain, lag
 
     def misfits(self, filters: Sequence[_Filter]) -> Array:
@@ -230,8 +232,10 @@ class _Spectra:
 
     def _solved(self, sums: Sequence[_Products], weights: Array) -> Array:
         """Return the parameters (k, p) of joint weights (k, j)."""
-        count, size = len(weights), self.n_parameters
-        matrix, right = np.zeros((count, size * size)), np.zeros((count, size))
+        count = len(weights)
+        size = self.n_parameters
+        matrix = np.zeros((count, size * size))
+        right = np.zeros((count, size))
         for joint, products, weight in zip(self.joints, sums, weights.T, strict=True):
             places = (joint.columns[:, None] * size + joint.columns).ravel()
             matrix[:, places] += weight[:, None] * products.gram.reshape(count, -1)
@@ -342,11 +346,14 @@ class _Segment:
         the sum of the squared window.
         """
         signals = table[:, self.rows]
-        windowed, levels, rows = np.zeros((len(table) + 1, len(self.time))), [], 0.0
+        windowed = np.zeros((len(table) + 1, len(self.time)))
+        levels = []
+        rows = 0.0
         for start, stop in _stretches(self.time, usable[self.rows]):
             window = _window(stop - start + 2)
             slope = np.gradient(window, self.step)[1:-1]
-            window, part = window[1:-1], signals[:, start:stop]
+            window = window[1:-1]
+            part = signals[:, start:stop]
             # Low-passes leave a constant as it is: it is no part of the spectrum of the window.
             level = part @ window**2 / (window @ window)
             part = part - level[:, None]

@@ -82,7 +82,8 @@ def with_torque_scale(
 
 def described(std: Array, what: str = "the scale of torques") -> str:
     """Return what is assumed, such as "torque constants to 3 %"."""
-    low, high = 100.0 * float(np.min(std)), 100.0 * float(np.max(std))
+    low = 100.0 * float(np.min(std))
+    high = 100.0 * float(np.max(std))
     return (
         f"{what} to {low:.2g} %"
         if high < 1.05 * low + 1e-9

@@ -134,14 +134,17 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
         raise CollisionModelError(unread)
     bodies = []
     for item, link in zip(shapes.geometryObjects, names, strict=True):
-        rotation, translation = item.placement.rotation, item.placement.translation
+        rotation = item.placement.rotation
+        translation = item.placement.translation
         if not np.abs(translation).max() <= FARTHEST:
             raise CollisionModelError(
                 f"collision shape {item.name!r} of the robot description is more than "
                 f"{FARTHEST:g} m away from its parent"
             )
-        shape, joint = _convex(item.geometry, link), item.parentJoint - 1
-        pose, hull = coal.Transform3s(rotation, translation), _hull(shape, rotation, translation)
+        shape = _convex(item.geometry, link)
+        joint = item.parentJoint - 1
+        pose = coal.Transform3s(rotation, translation)
+        hull = _hull(shape, rotation, translation)
         bodies.append(Body(link, item.name, joint, shape, pose, hull))
     if not any(body.joint >= 0 for body in bodies):
         raise CollisionModelError("no moving link of the robot description has a collision shape")
@@ -174,11 +177,14 @@ def obstacles(workspace: Workspace) -> list[Body]:
     if workspace.floor is not None:
         normal = np.array([0.0, 0.0, 1.0])
         hull = Hull(normal * workspace.floor, normal, 0.0, 0.0, 0.0, exact=True)
-        shape, pose = coal.Halfspace(normal, workspace.floor), coal.Transform3s.Identity()
+        shape = coal.Halfspace(normal, workspace.floor)
+        pose = coal.Transform3s.Identity()
         bodies.append(Body("floor", "floor", -1, shape, pose, hull, normal=normal))
     for i, box in enumerate(workspace.boxes):
-        lower, upper = np.array(box.lower, dtype=float), np.array(box.upper, dtype=float)
-        middle, half = (lower + upper) / 2.0, (upper - lower) / 2.0
+        lower = np.array(box.lower, dtype=float)
+        upper = np.array(box.upper, dtype=float)
+        middle = (lower + upper) / 2.0
+        half = (upper - lower) / 2.0
         shape = coal.Box(*(upper - lower))
         # separations use the half sides
         hull = Hull(middle, np.array([0.0, 0.0, 1.0]), 0.0, 0.0, 0.0, exact=False)
@@ -188,15 +194,18 @@ def obstacles(workspace: Workspace) -> list[Body]:
 
 
 def _hull(shape: coal.CollisionGeometry, rotation: Array, translation: Array) -> Hull:
-    centre, axis = np.zeros(3), np.array([0.0, 0.0, 1.0])
+    centre = np.zeros(3)
+    axis = np.array([0.0, 0.0, 1.0])
     half_length = radius = ball = 0.0
     exact = True
     if isinstance(shape, coal.Sphere):
         ball = shape.radius
     elif isinstance(shape, coal.Capsule):
-        half_length, ball = shape.halfLength, shape.radius
+        half_length = shape.halfLength
+        ball = shape.radius
     elif isinstance(shape, coal.Cylinder):
-        half_length, radius = shape.halfLength, shape.radius
+        half_length = shape.halfLength
+        radius = shape.radius
     else:
         centre, axis, half_length, radius = _around(_corners(shape))
         exact = False
@@ -205,8 +214,10 @@ def _hull(shape: coal.CollisionGeometry, rotation: Array, translation: Array) ->
 
 def _around(corners: Array) -> tuple[Array, Array, float, float]:
     """Return a cylinder around points (k, 3), along their longest extent."""
-    lower, upper = corners.min(axis=0), corners.max(axis=0)
-    centre, half = (lower + upper) / 2.0, (upper - lower) / 2.0
+    lower = corners.min(axis=0)
+    upper = corners.max(axis=0)
+    centre = (lower + upper) / 2.0
+    half = (upper - lower) / 2.0
     longest = int(np.argmax(half))
     across = np.delete(corners - centre, longest, axis=1)
     radius = float(np.max(np.linalg.norm(across, axis=1)))
@@ -245,7 +256,8 @@ def frames(chain: Chain, q: Array) -> Frames:
     rotation = np.empty((1 + n, 3, 3, m))
     translation = np.zeros((1 + n, 3, m))
     rotation[0] = np.eye(3)[:, :, None]
-    sine, versine = np.sin(q.T), 1.0 - np.cos(q.T)
+    sine = np.sin(q.T)
+    versine = 1.0 - np.cos(q.T)
     for joint in range(n):
         before = rotation[chain.parents[joint] + 1]
         fixed = chain.rotation[joint]
@@ -280,7 +292,8 @@ def placed(bodies: Sequence[Body], at: Frames) -> Bodies:
         if joint < 0:
             centre[:, rows], axis[:, rows] = centres.T[:, :, None], axes.T[:, :, None]
             continue
-        part, rotation = slice(rows[0], rows[-1] + 1), at.rotation[joint + 1]
+        part = slice(rows[0], rows[-1] + 1)
+        rotation = at.rotation[joint + 1]
         np.matmul(centres, rotation, out=centre[:, part])
         centre[:, part] += at.translation[joint + 1][:, None]
         np.matmul(axes, rotation, out=axis[:, part])
@@ -330,7 +343,8 @@ class Separation:
 
     def _along(self, at: Bodies, pair: Indices, sample: Indices, normal: Array) -> Array:
         """Return the bounds (k,) [m] of pairs (k,) at samples (k,) in directions (3, k)."""
-        a, b = self.first[pair], self.second[pair]
+        a = self.first[pair]
+        b = self.second[pair]
         bound = _dot(normal, _at(at.centre, a, sample) - _at(at.centre, b, sample))
         bound -= self._support(a, _dot(normal, _at(at.axis, a, sample)))
         bound -= self._support(b, _dot(normal, _at(at.axis, b, sample)))
@@ -350,8 +364,10 @@ class Separation:
         return height
 
     def _between_axes(self, at: Bodies, pair: Indices, sample: Indices) -> Array:
-        a, b = self.first[pair], self.second[pair]
-        axis_a, axis_b = _at(at.axis, a, sample), _at(at.axis, b, sample)
+        a = self.first[pair]
+        b = self.second[pair]
+        axis_a = _at(at.axis, a, sample)
+        axis_b = _at(at.axis, b, sample)
         between = _at(at.centre, a, sample) - _at(at.centre, b, sample)
         shortest = _between_segments(
             between, axis_a, self._half_length[a], axis_b, self._half_length[b]
@@ -367,7 +383,8 @@ class Separation:
 
     def _from_box(self, at: Bodies, pair: Indices, sample: Indices) -> Array:
         """Use the best of three faces and of the direction from the box to the body's centre."""
-        a, b = self.first[pair], self.second[pair]
+        a = self.first[pair]
+        b = self.second[pair]
         between = _at(at.centre, a, sample) - _at(at.centre, b, sample)
         sides = self._half_sides[:, b]
         outward = between - np.clip(between, -sides, sides)
@@ -382,7 +399,9 @@ class Separation:
 
 def _between_segments(between: Array, u: Array, half_u: Array, v: Array, half_v: Array) -> Array:
     """Return the shortest vectors (3, k) from segments along v to segments along u."""
-    cosine, along_u, along_v = _dot(u, v), _dot(u, between), _dot(v, between)
+    cosine = _dot(u, v)
+    along_u = _dot(u, between)
+    along_v = _dot(v, between)
     across = 1.0 - cosine * cosine
     with np.errstate(divide="ignore", invalid="ignore"):
         s = (cosine * along_v - along_u) / across
@@ -527,7 +546,8 @@ class CollisionChecker:
         mesh_folders: Sequence[str] = (),
     ) -> None:
         self._arguments = urdf, workspace, limits, tuple(mesh_folders)
-        self.workspace, self.margin = workspace, workspace.margin
+        self.workspace = workspace
+        self.margin = workspace.margin
         self._chain = chain = chain_from_urdf(urdf)
         links = link_bodies(pin.buildModelFromXML(urdf), urdf, mesh_folders)
         self._bodies = [*links, *obstacles(workspace)]
@@ -615,21 +635,25 @@ class CollisionChecker:
         """Remove pairs that are always too close; return the least distances of the others."""
         # Removed: two links at most two joints apart that are too close in all postures, and an
         # obstacle and a shape of the first link at a constant distance below the margin.
-        near, samples = min(self.margin, _NEAR), np.arange(_N_POSTURES)
+        near = min(self.margin, _NEAR)
+        samples = np.arange(_N_POSTURES)
         slack = min(_SLACK, near / 2.0)
         checked: list[tuple[int, int]] = []
         required: list[float] = []
-        unchecked, reduced = list[ClosePair](), list[ClosePair]()
+        unchecked = list[ClosePair]()
+        reduced = list[ClosePair]()
         for pair in range(len(self.separation.first)):
             a, b = self.indices(pair)
             joints = self._joints_apart(a, b)
-            least, most = -np.inf, np.inf
+            least = -np.inf
+            most = np.inf
             if joints <= 2:
                 repeated = np.full(_N_POSTURES, pair)
                 bound = self.separation.bound(self._tried.bodies, repeated, samples)
                 if np.all(bound < near + slack):
                     distances = self._distances(pair)
-                    least, most = float(distances.min()), float(distances.max())
+                    least = float(distances.min())
+                    most = float(distances.max())
             close = ClosePair(self._bodies[a].shape_name, self._bodies[b].shape_name, least, most)
             fixed = joints <= 1 and most - least <= _CONSTANT if b >= self._n_links else True
             if most < near and fixed:
@@ -727,7 +751,8 @@ class CollisionChecker:
         blocked = np.zeros(len(q), dtype=np.bool_)
         near = np.flatnonzero(~(lower >= self.required[pairs]))
         for k in near[np.argsort(lower[near], kind="stable")].tolist():
-            pair, sample = int(pairs[k]), int(samples[k])
+            pair = int(pairs[k])
+            sample = int(samples[k])
             if not blocked[sample]:
                 blocked[sample] = not self.distance(pair, path, sample) >= self.required[pair]
         return np.asarray(~blocked)
@@ -768,7 +793,8 @@ class _Nearest:
     """
 
     def __init__(self, checker: CollisionChecker, resolution: float) -> None:
-        self._checker, self._resolution = checker, resolution
+        self._checker = checker
+        self._resolution = resolution
         self.contact: Contact | None = None
         self._deepest = 0.0  # its distance beyond the required one [m]
         self.distances = 0
@@ -860,7 +886,8 @@ def acceleration_bound(
 ) -> Array:
     """Return an upper bound of |qdd| in parts of a motion from `start` to `stop` [s], (n, g)."""
     if isinstance(trajectory, FourierSeries):
-        ramp, length = trajectory.ramp, trajectory.length
+        ramp = trajectory.ramp
+        length = trajectory.length
         between_ramps = (start >= ramp) & (stop <= length - ramp)
         without = trajectory.derivative_bound(2, ramps=False)[:, None]
         return np.where(between_ramps, without, trajectory.derivative_bound(2)[:, None])

@@ -87,7 +87,8 @@ def rest_violations(
 
 
 def _beyond_limits(extrema: Extrema, limits: JointLimits, motion: Motion) -> list[Violation]:
-    rounding, span = position_rounding(limits), limits.upper - limits.lower
+    rounding = position_rounding(limits)
+    span = limits.upper - limits.lower
     # Quantity, extremum, bound, sign of an excess, tolerance, scale.
     rows = [
         ("position", extrema.lower, limits.lower, -1.0, rounding, span),
@@ -182,7 +183,8 @@ def _beyond(
     size = np.abs(values)
     for j, k in enumerate(np.argmax(size, axis=0)):
         if not size[k, j] <= bounds[j]:  # NaN as well
-            posture, time = tuple(motion.position[k].tolist()), float(motion.time[k])
+            posture = tuple(motion.position[k].tolist())
+            time = float(motion.time[k])
             most = float(size[k, j]), float(bounds[j])
             found.append(Violation(kind, subjects[j], *most, time, posture))
     return found

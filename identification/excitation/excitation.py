@@ -102,7 +102,8 @@ class Excitation:
 
 
 def _planned(data: Mapping[str, Any], n_joints: int) -> dict[str, Any]:
-    points, speed = numbers(data["via_points"], 2), numbers(data["speed"], 1)
+    points = numbers(data["via_points"], 2)
+    speed = numbers(data["speed"], 1)
     if len(points) < 2 or points.shape[1] != n_joints or len(speed) != n_joints:
         raise ValueError(f"via points {points.shape} and speeds {speed.shape} of {n_joints} joints")
     return {"via_points": points, "speed": speed, "fly": strict(float, data["fly"])}

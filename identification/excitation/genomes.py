@@ -32,7 +32,8 @@ _DRAWS: Final = 50
 
 def _interpolated(lower: ArrayLike, upper: ArrayLike, genes: Array) -> Array:
     """Return values from exactly `lower` for gene 0 to exactly `upper` for gene 1."""
-    low, high = np.asarray(lower), np.asarray(upper)
+    low = np.asarray(lower)
+    high = np.asarray(upper)
     return np.asarray(np.clip((1.0 - genes) * low + genes * high, low, high))
 
 
@@ -148,7 +149,8 @@ class ViaPointGenome:
 
     def _points(self, coordinates: Array) -> Array:
         """Return via points [rad] for coordinates (..., n) from 0 to 1."""
-        lower, upper = self.limits.lower, self.limits.upper
+        lower = self.limits.lower
+        upper = self.limits.upper
         margin = 0.5 * (1.0 - self.range_share) * (upper - lower)
         return _interpolated(lower + margin, upper - margin, coordinates)
 
@@ -203,7 +205,8 @@ class SineGenome:
     @property
     def frequency_range(self) -> tuple[Array, Array]:
         """Lowest and highest frequencies, (n,) each [rad/s]."""
-        slowest, fastest = self.slowest, self.fastest
+        slowest = self.slowest
+        fastest = self.fastest
         if slowest is None:
             slowest = np.full(self.limits.n_joints, 2.0 * np.pi / self.length)
         if fastest is None:

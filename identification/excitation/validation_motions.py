@@ -53,7 +53,8 @@ def random_validation_motions(
     Raises:
         NoFeasibleMotionError: 100 attempts in a row without a feasible motion.
     """
-    rejected, nearest = Counter[str](), dict[str, Violation]()
+    rejected = Counter[str]()
+    nearest = dict[str, Violation]()
 
     def reject(violations: Sequence[Violation]) -> None:
         """Count a motion once per kind of constraint it breaks; update the smallest violations."""

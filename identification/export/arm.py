@@ -75,7 +75,8 @@ class Arm:
             if one.joint == joint and isinstance(one.element, TorsionSpring):
                 found = self.values[self.model.element_part][one.part]
                 k = float(found[0]) if len(found) else one.element.stiffness or 0.0
-                stiffness, moment = stiffness + k, moment + k * one.element.rest
+                stiffness = stiffness + k
+                moment = moment + k * one.element.rest
         return stiffness, moment / stiffness if stiffness else 0.0
 
     def link(self, joint: int) -> str:

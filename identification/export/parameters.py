@@ -125,8 +125,10 @@ def _rows(model: RobotModel, estimate: Estimate) -> list[tuple[str, str, str, fl
 
 def _standard(model: RobotModel, consistent: ConsistentEstimate) -> dict[str, Any]:
     """Return the consistent standard parameters and friction, joint by joint."""
-    layout, standard = model.layout, consistent.standard
-    inertial, rotors = standard[layout.links].tolist(), standard[layout.rotors].tolist()
+    layout = model.layout
+    standard = consistent.standard
+    inertial = standard[layout.links].tolist()
+    rotors = standard[layout.rotors].tolist()
     terms = list(zip(model.friction.terms, consistent.friction.tolist(), strict=True))
     elements = consistent.estimate.values[model.element_part].tolist()
     return {

@@ -31,7 +31,8 @@ class MissingDrakeError(IdentificationError):
 
 def sdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     """Return the arm as SDF 1.9: links in the frames of their joints, fixed to the world."""
-    model, ranges = arm.model, arm.ranges
+    model = arm.model
+    ranges = arm.ranges
     root = Node("sdf", version="1.9")
     lines = [*remarks, *load_remarks(model, arm.written_load)]
     if lines:
@@ -52,7 +53,8 @@ def sdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
         axis = ElementTree.SubElement(joint, "axis")
         _add(axis, "xyz", as_text(model.chain.axis[j]))
         limit = ElementTree.SubElement(axis, "limit")
-        lower, upper = ranges.lower[j], ranges.upper[j]
+        lower = ranges.lower[j]
+        upper = ranges.upper[j]
         if math.isfinite(lower) and math.isfinite(upper) and lower < upper:
             _add(limit, "lower", as_text(lower))
             _add(limit, "upper", as_text(upper))

@@ -40,7 +40,9 @@ AGREES: Final = 1e-6
 """Largest difference of a text that is read back, relative to the largest torque of a joint."""
 _SEED: Final = 20140903
 # Default ranges of random states: rad or m, rad/s or m/s, rad/s² or m/s².
-_ANYWHERE, _SPEED, _ACCELERATION = math.pi, 2.0, 10.0
+_ANYWHERE = math.pi
+_SPEED = 2.0
+_ACCELERATION = 10.0
 _DRY: Final = (COULOMB, TANH)
 _DRY_LABELS: Final = tuple(term.label for term in _DRY)
 _OF_SPEED: Final = (QUADRATIC, CUBIC)
@@ -56,7 +58,9 @@ class MissingMujocoError(IdentificationError):
 
 def mjcf(arm: Arm, name: str, remarks: Sequence[str] = (), *, step: float = _TIMESTEP) -> str:
     """Return the arm as MuJoCo's XML with a time step [s]; motors are controlled by torque."""
-    model, ranges, rotors = arm.model, arm.ranges, arm.rotors
+    model = arm.model
+    ranges = arm.ranges
+    rotors = arm.rotors
     coupled = np.array((rotors != np.diag(np.diag(rotors))).any(axis=1))
     root = Node("mujoco", model=name)
     _comment(root, [*remarks, *load_remarks(model, arm.written_load)])
@@ -64,10 +68,12 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = (), *, step: float = _TIM
          balanceinertia="true" if arm.balanced else None)  # fmt: skip
     _add(root, "option", gravity=as_text(model.gravity), timestep=as_text(step),
          integrator="implicitfast")  # fmt: skip
-    places, motors = {-1: _add(root, "worldbody")}, Node("actuator")
+    places = {-1: _add(root, "worldbody")}
+    motors = Node("actuator")
     for j, (joint_name, mass) in enumerate(zip(model.joint_names, arm.bodies, strict=True)):
         parent = places[int(model.chain.parents[j])]
-        rotation, translation = model.chain.rotation[j], model.chain.translation[j]
+        rotation = model.chain.rotation[j]
+        translation = model.chain.translation[j]
         if np.linalg.norm(translation) > _SHORTEST:  # shows the arm, without mass and contact
             line = as_text([0.0, 0.0, 0.0, *translation])
             _add(parent, "geom", type="capsule", fromto=line, size=as_text(_THICKNESS), mass="0",
@@ -76,14 +82,17 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = (), *, step: float = _TIM
         six = mass.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         _add(link, "inertial", pos=as_text(mass.centre), mass=as_text(mass.mass),
              fullinertia=as_text(six))  # fmt: skip
-        friction, (stiffness, rest) = arm.friction[j], arm.spring(j)
+        friction = arm.friction[j]
+        (stiffness, rest) = arm.spring(j)
         third = {term.symbol: term for term in model.friction.laws[j].terms}.get("f2")
         damping = [  # of v, v |v| and v³
             friction.get("f1", 0.0),
             # A negative one would accelerate a joint that is faster than the recorded motion.
             *(max(0.0, friction["f2"]) if third == kind else 0.0 for kind in _OF_SPEED),
         ]
-        lower, upper, most = ranges.lower[j], ranges.upper[j], ranges.effort[j]
+        lower = ranges.lower[j]
+        upper = ranges.upper[j]
+        most = ranges.effort[j]
         limited = math.isfinite(lower) and math.isfinite(upper) and lower < upper
         effort = as_text([-most, most]) if math.isfinite(most) else None
         _add(
@@ -210,9 +219,11 @@ MISSING: Final = (MissingMujocoError, MissingDrakeError)
 
 def random_states(arm: Arm, count: int = STATES) -> Motion:
     """Return random states within the limits of an arm."""
-    ranges, n = arm.ranges, arm.model.n_joints
+    ranges = arm.ranges
+    n = arm.model.n_joints
     random = np.random.default_rng(_SEED)
-    lower, upper = np.maximum(ranges.lower, -_ANYWHERE), np.minimum(ranges.upper, _ANYWHERE)
+    lower = np.maximum(ranges.lower, -_ANYWHERE)
+    upper = np.minimum(ranges.upper, _ANYWHERE)
     speed = np.where(np.isfinite(ranges.velocity), ranges.velocity, _SPEED)
     return Motion(
         np.arange(count, dtype=np.float64),
@@ -235,7 +246,10 @@ Part = tuple[str, Callable[[], Array], bool]
 
 def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[Part]:
     """Yield the parts of the model along a motion."""
-    model, q, qdd, terms = arm.model, motion.position, motion.acceleration, arm.model.friction.terms
+    model = arm.model
+    q = motion.position
+    qdd = motion.acceleration
+    terms = arm.model.friction.terms
     yield "the links", lambda: rigid_torque(arm, motion), True
     brakes = _brakes(arm)
     for kind in model.friction.kinds:
@@ -267,7 +281,8 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[Part]:
 
 def _brakes(arm: Arm) -> NDArray[np.bool_]:
     """Return whether each friction term is no power of the speed with a negative coefficient."""
-    terms, values = arm.model.friction.terms, arm.values[arm.model.friction_part]
+    terms = arm.model.friction.terms
+    values = arm.values[arm.model.friction_part]
     of_speed = np.array([one.term in _OF_SPEED for one in terms], dtype=np.bool_)
     return np.asarray(~(of_speed & (values < 0.0)))
 
@@ -340,7 +355,8 @@ def _friction(arm: Arm, motion: Motion, chosen: Sequence[bool], load: Array | No
     model = arm.model
     if load is None and model.friction.has_load:
         load = model.gear_torque(arm.values, *motion[1:4])
-    values, part = np.zeros(model.n_parameters), model.friction_part
+    values = np.zeros(model.n_parameters)
+    part = model.friction_part
     values[part] = np.where(chosen, arm.values[part], 0.0)
     return model.torque(values, *motion[1:5], load)
 
@@ -357,7 +373,8 @@ def _dry(arm: Arm, motion: Motion, *, jumps: bool = False) -> Array:
         terms = arm.model.friction.terms
         dry = _friction(arm, motion, [one.term.label in _DRY_LABELS for one in terms])
         return dry + _at_load(arm, motion) if arm.model.friction.has_load else dry
-    friction, n = arm.model.friction, arm.model.n_joints
+    friction = arm.model.friction
+    n = arm.model.n_joints
     f0 = np.array([row.get("f0", 0.0) for row in arm.friction])
     shares = friction.motor_speeds()
     torque = f0[:n] * np.sign(motion.velocity)
@@ -430,7 +447,8 @@ FORMATS: Final[Mapping[str, Format]] = {
 
 def _tendons(root: Node, arm: Arm, coupled: NDArray[np.bool_], step: float) -> None:
     """Add inertia and friction of coupled motors as fixed tendons."""
-    names, friction = arm.model.joint_names, arm.model.friction
+    names = arm.model.joint_names
+    friction = arm.model.friction
     tendons = Node("tendon")
 
     def add(name: str, share: Array, **figures: str) -> None:

@@ -165,7 +165,8 @@ def _without_locked(urdf: str, model: RobotModel, inertial: Array) -> tuple[Arra
         index = model.joint_names.index(arm.names[parent]) if parent > 0 else -1
         parameters = moved.toDynamicParameters()[list(FROM_PINOCCHIO)]
         carried.setdefault(index, {})[name] = parameters
-    remaining, removed = inertial.copy(), list(carried.get(-1, {}))
+    remaining = inertial.copy()
+    removed = list(carried.get(-1, {}))
     for index, bodies in carried.items():
         if index >= 0:
             rest = remaining[index] - sum(bodies.values())

@@ -78,7 +78,9 @@ def gain_factor(
     `transmission`: motor angles per joint angle (n, n); identity: gains include gear ratios. Blocks
     of `block` seconds count from the origin of the motion.
     """
-    n, p, m = model.n_joints, model.n_parameters, len(samples.motion.time)
+    n = model.n_joints
+    p = model.n_parameters
+    m = len(samples.motion.time)
     turns = np.eye(n) if transmission is None else np.asarray(transmission, dtype=np.float64)
     blocks, columns = samples.regressor(model)
     load = model.elements.known(samples.motion.position)
@@ -86,7 +88,8 @@ def gain_factor(
         load = load + Load(model.chain, model.gravity, payload).torque(*samples.motion[1:4])
     since = samples.motion.time - samples.origin
     index = np.maximum(np.floor(since / block + 1e-9).astype(np.intp), 0)
-    usable, tables = np.zeros((m, n), dtype=np.bool_), np.zeros((n, p + 3, m))
+    usable = np.zeros((m, n), dtype=np.bool_)
+    tables = np.zeros((n, p + 3, m))
     for motor, share in enumerate(np.linalg.inv(turns).T):
         acting = np.flatnonzero(share).tolist()
         usable[:, motor] = samples.usable[:, acting].all(axis=1)
@@ -107,7 +110,8 @@ def standard_factor(model: RobotModel, recordings: Sequence[Samples]) -> Factor:
     The columns are of s standard parameters, friction, springs and balancers; the regressor is
     affine in gravity: W(g) = W0 + gx Wx + gy Wy + gz Wz, so one pass serves any.
     """
-    n, s = model.n_joints, model.layout.size
+    n = model.n_joints
+    s = model.layout.size
     s += len(model.friction.names) + len(model.elements.names)
     plans = [
         RegressorPlan(
@@ -121,7 +125,8 @@ def standard_factor(model: RobotModel, recordings: Sequence[Samples]) -> Factor:
         )
         for gravity in (np.zeros(3), *np.eye(3))
     ]
-    gram, rows = np.zeros((n, 4 * s + 1, 4 * s + 1)), np.zeros(n, dtype=np.intp)
+    gram = np.zeros((n, 4 * s + 1, 4 * s + 1))
+    rows = np.zeros(n, dtype=np.intp)
     for samples in recordings:
         every = max(1, len(samples.torque) // _MOST_ROWS)
         filtered = samples.torque_bandwidth is not None
@@ -148,7 +153,9 @@ def standard_factor(model: RobotModel, recordings: Sequence[Samples]) -> Factor:
 
 def under_gravity(factor: Factor, gravity: Array) -> Factor:
     """Return the part [W | y] of a :func:`standard_factor` under a gravity (3,) [m/s²]."""
-    share, n, s = np.append(1.0, gravity), factor.n_joints, factor.n_parameters // 4
+    share = np.append(1.0, gravity)
+    n = factor.n_joints
+    s = factor.n_parameters // 4
     half = share @ factor.gram[:, :-1, :-1].reshape(n, 4, s * 4 * s)
     found = np.empty((n, s + 1, s + 1))
     found[:, :s, :s] = share @ half.reshape(n, s, 4, s)

@@ -346,7 +346,8 @@ class Factor:
         """Merge runs of `length` blocks; the last one may be shorter."""
         assert self.storage == "gram"
         matrices = tuple(merged(own, length) for own in self.matrices)
-        counts, block = merged(self.counts, length), length * self.block
+        counts = merged(self.counts, length)
+        block = length * self.block
         return replace(self, matrices=matrices, counts=counts, block=block)
 
     def of_blocks(self, block: float) -> Self:
@@ -360,7 +361,8 @@ class Factor:
         """Return the factor of the parameters `chosen` (k,), in that order."""
         place = np.full(self.n_parameters, -1, dtype=np.intp)
         place[chosen] = np.arange(len(chosen))
-        matrices, columns = [], []
+        matrices = []
+        columns = []
         for own, used in zip(self.matrices, self.columns, strict=True):
             stays = np.flatnonzero(place[used] >= 0)
             both = np.append(stays, len(used))
@@ -720,7 +722,8 @@ def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
     )
     chunks: Iterable[tuple[slice, list[Array]]]
     if samples.torque_bandwidth is None:
-        direction, load = samples.motion.direction, samples.motion.load
+        direction = samples.motion.direction
+        load = samples.motion.load
         chunks = model.chunks(q, qd, qdd, direction, load, response=torque)
     else:
         chunks = _filtered(model, samples)

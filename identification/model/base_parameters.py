@@ -71,7 +71,8 @@ class BaseParameters:
         """Return a parameter as a formula: with other terms, and with those lumped into it."""
         text = name
         for value, other in (*others, *self.lumped.get(name, ())):
-            factor, sign = f"{abs(value):.{digits}g}", "+" if value > 0.0 else "-"
+            factor = f"{abs(value):.{digits}g}"
+            sign = "+" if value > 0.0 else "-"
             text += f" {sign} {other}" if factor == "1" else f" {sign} {factor} {other}"
         return text
 

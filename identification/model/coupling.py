@@ -30,7 +30,8 @@ class Coupling:
 
     def __post_init__(self) -> None:
         matrix = np.array(self.motor_from_joint, dtype=np.float64)
-        direct, most = np.abs(np.diag(matrix)), np.abs(matrix).max(axis=1, initial=0.0)
+        direct = np.abs(np.diag(matrix))
+        most = np.abs(matrix).max(axis=1, initial=0.0)
         if np.any(direct <= _UNCOUPLED * most):
             motor = int(np.argmax(direct <= _UNCOUPLED * most)) + 1
             raise ModelError(

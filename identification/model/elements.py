@@ -149,7 +149,8 @@ class ExtensionSpring(Element):
 
     def shapes(self, q: Array) -> Array:
         """Return lever times extension [m²/rad], and the lever [m/rad] (m, 2)."""
-        lever, extension = self.anchors.lever(q), self.anchors.length(q) - self.free_length
+        lever = self.anchors.lever(q)
+        extension = self.anchors.length(q) - self.free_length
         return np.column_stack([lever * extension, lever])
 
 
@@ -173,7 +174,8 @@ class GasCylinder(Element):
     identified: bool = False  #: whether a factor of its torque is a parameter
 
     def __post_init__(self) -> None:
-        base, link = self.anchors.base, self.anchors.link
+        base = self.anchors.base
+        link = self.anchors.link
         end = base + link if self.pulls else abs(base - link)
         left = float(self._volume_left(np.array(end)))
         if not left > 0.0:
@@ -263,7 +265,8 @@ class JointElements:
         Raises:
             ModelError: there is no such joint, or it is prismatic.
         """
-        placed, first = [], 0
+        placed = []
+        first = 0
         for element in elements:
             if element.joint not in joint_names:
                 raise ModelError(

@@ -284,7 +284,8 @@ class FrictionLaw:
         """
         if self.presliding == 0.0:
             return self.sign(velocity)
-        steps, before = np.diff(time), velocity[:-1]
+        steps = np.diff(time)
+        before = velocity[:-1]
         share = before / np.where(before == velocity[1:], 1.0, before - velocity[1:])
         turning = np.flatnonzero(before * velocity[1:] < 0.0)
         turned = position[turning] + 0.5 * (before * steps * share)[turning]
@@ -322,9 +323,11 @@ def presliding_state(position: Array, distance: float) -> Array:
         return state
     sign = np.sign(steps[moved])
     turns = np.append(0, np.flatnonzero(np.diff(sign)) + 1)
-    starts, signs = moved[turns], sign[turns]
+    starts = moved[turns]
+    signs = sign[turns]
     stops = np.append(starts[1:], len(position))
-    before, value = travel[starts - 1], 0.0
+    before = travel[starts - 1]
+    value = 0.0
     for start, stop, s, origin in zip(starts, stops, signs, before, strict=True):
         part = s + (value - s) * np.exp((origin - travel[start:stop]) / distance)
         state[start:stop], value = part, part[-1]

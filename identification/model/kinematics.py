@@ -273,7 +273,8 @@ def _axis(model: pin.Model, index: int) -> tuple[Array, bool]:
             joint=name,
         )
     subspace = _subspace(model, index)
-    linear, angular = subspace[:3], subspace[3:]
+    linear = subspace[:3]
+    angular = subspace[3:]
     revolute = bool(np.any(angular))
     return (angular if revolute else linear).copy(), revolute
 

@@ -36,7 +36,10 @@ N_INERTIA = 6
 N_PRIMITIVES = 12
 
 # moments of inertia do not need the accelerations, which come first
-_ACCELERATION, _ALPHA, _SQUARE, _PRODUCT = 0, 3, 6, 9
+_ACCELERATION = 0
+_ALPHA = 3
+_SQUARE = 6
+_PRODUCT = 9
 ROTATIONAL = slice(_ALPHA, N_PRIMITIVES)
 _TENSOR = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -55,11 +58,13 @@ def wrench_matrix(symbol: int) -> Array:
 
 def write_primitives(motion: Array, out: Array) -> None:
     """Compute primitives (n, 12, k) of all links from velocity and acceleration (n, 2, 2, 3, k)."""
-    omega, speed = motion[:, 0, 0], motion[:, 0, 1]
+    omega = motion[:, 0, 0]
+    speed = motion[:, 0, 1]
     out[:, _ALPHA : _ALPHA + 3] = motion[:, 1, 0]
     np.multiply(omega, omega, out=out[:, _SQUARE : _SQUARE + 3])
     for c in range(3):
-        a, b = (c + 1) % 3, (c + 2) % 3
+        a = (c + 1) % 3
+        b = (c + 2) % 3
         np.multiply(omega[:, a], omega[:, b], out=out[:, _PRODUCT + c])
         # The origin's acceleration is the spatial one + omega x v.
         acceleration = out[:, _ACCELERATION + c]
@@ -77,7 +82,8 @@ def _add_inertia(moment: Array, first: int, second: int) -> None:
     """Add I alpha + omega x I omega for a unit (symmetric) entry of I."""
     entries = {(first, second), (second, first)}
     for row, column in entries:  # I has a one at (row, column)
-        a, b = (row + 1) % 3, (row + 2) % 3
+        a = (row + 1) % 3
+        b = (row + 2) % 3
         moment[row, _ALPHA + column] += 1.0
         # omega x e_row = omega_b e_a - omega_a e_b, times omega_column
         moment[a, _product(b, column)] += 1.0
@@ -86,7 +92,8 @@ def _add_inertia(moment: Array, first: int, second: int) -> None:
 
 def _add_first_moment(moment: Array, force: Array, c: int) -> None:
     """Add e_c x a to the moment, alpha x e_c + omega omega_c - e_c omega^2 to the force."""
-    a, b = (c + 1) % 3, (c + 2) % 3
+    a = (c + 1) % 3
+    b = (c + 2) % 3
     moment[a, _ACCELERATION + b] = -1.0
     moment[b, _ACCELERATION + a] = 1.0
     force[a, [_ALPHA + b, _product(a, c)]] = 1.0
@@ -169,7 +176,8 @@ class RegressorPlan:
     @classmethod
     def of_bodies(cls, chain: Chain, gravity: Array, joint: int | None = None) -> RegressorPlan:
         """Return a plan with only the ten parameters of the link of one joint, or of all links."""
-        n, ten = chain.n_joints, range(len(LINK_SYMBOLS))
+        n = chain.n_joints
+        ten = range(len(LINK_SYMBOLS))
         links = [ten if joint in (None, other) else [] for other in range(n)]
         return cls(chain, gravity, links, [False] * n, None)
 
@@ -253,7 +261,8 @@ class RegressorPlan:
         """
         m, n = q.shape
         torque = np.empty((m, n))
-        bodies, drives = self._body_weights(values), self._drive_weights(values)
+        bodies = self._body_weights(values)
+        drives = self._drive_weights(values)
         with self._borrowed(m) as work:
             for start in range(0, m, work.size):
                 part = slice(start, min(start + work.size, m))
@@ -265,7 +274,8 @@ class RegressorPlan:
 
     def _body_weights(self, values: Array) -> list[tuple[int, Rows, Array]]:
         """Return links with the joints that move them, and wrenches from primitives (6, 12)."""
-        weights, first = [], 0
+        weights = []
+        first = 0
         for link, (symbols, rotor) in enumerate(zip(self.links, self.rotors, strict=True)):
             used = values[first : first + len(symbols)]
             first += len(symbols) + rotor
@@ -328,7 +338,8 @@ class _Workspace:
         self.rows = np.zeros((n, max(rows.response for rows in plan.drive_rows) + 1, size))
         self.size = size
         # without a reference to the plan, which would be a cycle
-        self._drive_rows, self._joint_friction = plan.drive_rows, plan.friction
+        self._drive_rows = plan.drive_rows
+        self._joint_friction = plan.friction
         self._first_drive_row = plan.first_drive_row
         self._q = np.empty((0, n))  # of the motion that is set
         self._motion = LinkMotion(plan.chain, plan.gravity, size)
@@ -437,7 +448,8 @@ class _Workspace:
         if direction is not None:
             self._direction[:, :k] = direction.T
             return
-        velocity, n = self._motion.velocity, friction.n_joints
+        velocity = self._motion.velocity
+        n = friction.n_joints
         if (one := friction.one_law) is not None:
             one.sign(velocity, out=self._direction[:n])
         else:
@@ -476,7 +488,8 @@ class _Workspace:
 
     def update_drives(self, direction: Array | None = None, load: Array | None = None) -> None:
         """Compute the columns of drives, friction and elements for the motion that is set."""
-        q, k = self._q, len(self._q)
+        q = self._q
+        k = len(self._q)
         if self._joint_friction is not None:
             self._write_direction(self._joint_friction, direction, k)
             if self._joint_friction.has_load:
@@ -541,7 +554,8 @@ def joint_arrays(n_joints: int, **arrays: Array) -> tuple[Array, ...]:
 
 def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.intp], ...]]:
     """Return the rows of each joint in the working array, and their parameter indices."""
-    chain, n = plan.chain, plan.chain.n_joints
+    chain = plan.chain
+    n = plan.chain.n_joints
     sizes = [len(symbols) + rotor for symbols, rotor in zip(plan.links, plan.rotors, strict=True)]
     offsets = np.concatenate([[0], np.cumsum(sizes)]).tolist()
     rows: list[list[int]] = [[] for _ in range(n)]
@@ -669,7 +683,8 @@ class _Step:
         self._revolute = revolute
         self._axis = [(a, float(axis[a])) for a in range(3) if axis[a] != 0.0]
         self._carried = after[:-1]
-        self._velocity, self._acceleration = after[0], after[1]
+        self._velocity = after[0]
+        self._acceleration = after[1]
         self._along = [
             (after[0, part, a], after[1, part, a], float(axis[a])) for a, _ in self._axis
         ]
@@ -688,7 +703,8 @@ class _Step:
         if (found := _find_fixed_axis(self.blend)) is not None:
             row, column, sign = found
             self._fixed_axis = (self._shifted[:, :, column], sign, self._carried[:, :, row])
-            rows, columns = _OTHERS[row], _OTHERS[column]
+            rows = _OTHERS[row]
+            columns = _OTHERS[column]
         self._turn = (
             rotation[rows, columns],
             self._shifted[:, :, columns],
@@ -710,7 +726,9 @@ class _Step:
 
     def move(self) -> None:
         """Add the joint's own motion in the child's frame."""
-        velocity, acceleration, speed = self._velocity, self._acceleration, self._speed
+        velocity = self._velocity
+        acceleration = self._acceleration
+        speed = self._speed
         for a, component in self._axis:
             rate = speed if component == 1.0 else component * speed
             if self._revolute:
@@ -759,7 +777,8 @@ def _find_fixed_axis(blend: Array) -> tuple[int, int, float] | None:
 
 def _add_cross(out: Array, left: Array, axis: int, size: Array) -> None:
     """Add ``left x (size e_axis)`` to `out`; vectors along the last axis but one."""
-    a, b = (axis + 1) % 3, (axis + 2) % 3
+    a = (axis + 1) % 3
+    b = (axis + 2) % 3
     out[..., a, :] += left[..., b, :] * size
     out[..., b, :] -= left[..., a, :] * size
 

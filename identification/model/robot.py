@@ -84,7 +84,8 @@ class StandardLayout:
 
     def split(self, pivots: Sequence[int]) -> tuple[list[list[int]], list[bool], list[int]]:
         """Return the link symbols and rotors per joint, and the couplings, among `pivots`."""
-        first, there = self.n_joints * self.width, set(map(int, pivots))
+        first = self.n_joints * self.width
+        there = set(map(int, pivots))
         joints = range(0, first, self.width)
         links = [[k for k in range(_N_LINK) if start + k in there] for start in joints]
         rotors = [self.rotor_inertia and start + _N_LINK in there for start in joints]
@@ -505,7 +506,8 @@ def _require_separate_elements(
     offsets = [j for j, law in enumerate(friction.laws) if OFFSET.symbol in law.symbols]
     columns = np.column_stack([columns, np.tile(np.eye(n)[:, offsets], (m, 1))])
     for one in elements.identified:
-        values, owner = one.columns(q), one.element.joint
+        values = one.columns(q)
+        owner = one.element.joint
         for k, name in enumerate(elements.names[one.part]):
             torque = np.zeros((m, n))
             torque[:, one.joint] = values[:, k]

@@ -41,13 +41,16 @@ class RecordedMotion:
         What MuJoCo cannot simulate acts as along the measured motion, as does the part of the
         arm's torque that a low-pass took from the record.
         """
-        windows, servo, parts = self.windows, self.servo, []
+        windows = self.windows
+        servo = self.servo
+        parts = []
         for stretch, samples in zip(windows.stretches, self.samples, strict=True):
             beside = _removed(stretch, samples, arm) + _late(stretch, arm)
             beside = beside - unsupported_torque(arm, stretch.motion)
             if servo is None:
                 beside = beside + _delayed(stretch, self.delay)
-                position, rate = stretch.motion.position, stretch.after
+                position = stretch.motion.position
+                rate = stretch.after
             else:
                 position, rate = command_of(stretch, servo.delay)
             change = stretch.after - stretch.motion.velocity
@@ -60,7 +63,8 @@ class RecordedMotion:
         torque = []
         for one in self.windows.stretches:
             position, rate = command_of(one, servo.delay)
-            error, slip = position - one.motion.position, rate - one.after
+            error = position - one.motion.position
+            slip = rate - one.after
             torque.append(one.torque - servo.kp * error - servo.kd * slip)
         return self.windows.at_start(torque)[:, None]
 
@@ -69,7 +73,8 @@ def recorded_stretches(
     model: RobotModel, recordings: Sequence[tuple[Samples, Array | None]], step: float
 ) -> tuple[list[Stretch], list[Samples]]:
     """Return the stretches of samples with their commanded positions, and the samples of each."""
-    stretches, owners = [], []
+    stretches = []
+    owners = []
     for samples, commanded in recordings:
         parts = stretches_of(samples, samples.known_torque(model), step, commanded)
         stretches += parts
@@ -86,7 +91,8 @@ def joint_inertia(arm: Arm, step: float) -> Array:
 
 def light_feedback(arm: Arm, step: float, frequency: float) -> Feedback:
     """Return a critically damped feedback of some natural frequency [Hz] for each joint alone."""
-    inertia, rate = joint_inertia(arm, step), 2.0 * np.pi * frequency
+    inertia = joint_inertia(arm, step)
+    rate = 2.0 * np.pi * frequency
     return Feedback(rate**2 * inertia, 2.0 * rate * inertia)
 
 
@@ -114,7 +120,9 @@ def _removed(stretch: Stretch, samples: Samples, arm: Arm) -> Array:
     """Return the part of an arm's torque (g, n) that the low-pass of the record removed."""
     if samples.torque_bandwidth is None:
         return np.zeros_like(stretch.motion.position)
-    model, motion, load = arm.model, samples.motion, None
+    model = arm.model
+    motion = samples.motion
+    load = None
     if model.friction.has_load:
         load = model.gear_torque(arm.values, *motion[1:4])
     whole = model.torque(arm.values, *motion[1:5], load)
@@ -263,7 +271,8 @@ def variants(joint: int) -> list[Variant]:
 
     def scaled(symbols: Sequence[str], factor: float) -> Callable[..., tuple[Arm, RecordedMotion]]:
         def change(arm: Arm, motion: RecordedMotion) -> tuple[Arm, RecordedMotion]:
-            values, model = arm.values.copy(), arm.model
+            values = arm.values.copy()
+            model = arm.model
             part = model.friction_part
             of = [one.owner == joint and one.symbol in symbols for one in model.friction.terms]
             values[part] = np.where(of, factor * values[part], values[part])

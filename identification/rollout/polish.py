@@ -38,7 +38,8 @@ _STEP: Final = 0.02  # of finite differences: dry friction makes the error rough
 _LARGEST: Final = 5.0  # change of a quantity, in its units
 _ITERATIONS: Final = 8
 _SETTLED: Final = 1e-3  # relative change
-_DRY, _VISCOUS = ("f0", "fl"), ("f1", "f2")
+_DRY = ("f0", "fl")
+_VISCOUS = ("f1", "f2")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,8 @@ class Driven:
 
     def residuals(self) -> Array:
         """Return position errors at the horizons (w, h, n), `LARGEST_ERROR` where unstable."""
-        windows, found = self.motion.windows, self.positions()
+        windows = self.motion.windows
+        found = self.positions()
         measured = windows.reached[:, horizon_rows(windows)]
         return np.where(np.isfinite(found), found - measured, LARGEST_ERROR)
 
@@ -115,8 +117,10 @@ def _changed(start: Driven, quantities: list[Quantity], changes: Array) -> Drive
 
 def _quantities(start: Driven) -> list[Quantity]:
     """Return what a polish changes; friction that was identified as none stays so."""
-    arm, servo = start.arm, start.motion.servo
-    model, found = arm.model, list[Quantity]()
+    arm = start.arm
+    servo = start.motion.servo
+    model = arm.model
+    found = list[Quantity]()
     for joint in range(model.n_joints):
         for symbols in (_DRY, _VISCOUS):
             chosen = [one.owner == joint and one.symbol in symbols for one in model.friction.terms]
@@ -144,8 +148,10 @@ def _with_friction(rows: NDArray[np.intp], driven: Driven, change: float) -> Dri
 
 
 def _with_rotor(joint: int, unit: float, driven: Driven, change: float) -> Driven:
-    arm, model = driven.arm, driven.arm.model
-    standard, values = arm.standard.copy(), arm.values.copy()
+    arm = driven.arm
+    model = driven.arm.model
+    standard = arm.standard.copy()
+    values = arm.values.copy()
     rotors = standard[model.layout.rotors]
     rotors[joint] = max(0.0, rotors[joint] + unit * change)
     standard[model.layout.rotors] = rotors
@@ -164,7 +170,8 @@ def _with_gain(name: str, joint: int, driven: Driven, change: float) -> Driven:
 
 
 def _with_delay(driven: Driven, change: float) -> Driven:
-    motion, later = driven.motion, _DELAY_UNIT * change
+    motion = driven.motion
+    later = _DELAY_UNIT * change
     if motion.servo is None:
         motion = replace(motion, delay=motion.delay + later)
     else:

@@ -75,7 +75,9 @@ def identify_servo(stretches: Sequence[Stretch], step: float) -> Servo:
 def _gains_at(stretches: Sequence[Stretch], delay: float, step: float) -> tuple[float, Servo]:
     """Return the share of the torque's variance that is left over, and the gains."""
     rows = round(BLOCK / step)
-    errors, rates, torques = [], [], []
+    errors = []
+    rates = []
+    torques = []
     for one in stretches:
         position, _ = command_of(one, delay)
         rate = np.gradient(position, step, axis=0)
@@ -87,8 +89,10 @@ def _gains_at(stretches: Sequence[Stretch], delay: float, step: float) -> tuple[
     if not errors:
         raise NoServoError(f"no stretch lasts {BLOCK:g} s")
     error, rate, torque = (np.concatenate(part) for part in (errors, rates, torques))
-    n, left = error.shape[1], 0.0
-    kp, kd = np.zeros(n), np.zeros(n)
+    n = error.shape[1]
+    left = 0.0
+    kp = np.zeros(n)
+    kd = np.zeros(n)
     for joint in range(n):
         columns = np.column_stack([error[:, joint], rate[:, joint]])
         size = np.linalg.norm(columns, axis=0)

@@ -156,7 +156,8 @@ def windows_of(stretches: Sequence[Stretch], step: float, horizon: float, stride
     Raises:
         NoWindowError: no stretch is as long.
     """
-    steps, between = round(horizon / step), max(1, round(stride / step))
+    steps = round(horizon / step)
+    between = max(1, round(stride / step))
     starts = [
         np.arange(0, len(one.motion.time) - steps, between, dtype=np.intp) for one in stretches
     ]

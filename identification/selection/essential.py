@@ -125,9 +125,12 @@ def eliminate(
         weights = joint_weights(training)
     path = _Path(training, held_out, weights, rule)
     path.remove_guarded()
-    cut, refused, chosen = len(path.steps) - 1, tuple(names[k] for k in path.refused), path.current
+    cut = len(path.steps) - 1
+    refused = tuple(names[k] for k in path.refused)
+    chosen = path.current
     path.remove_all()
-    part, units = training.restricted(chosen.left), [model.units[k] for k in chosen.left]
+    part = training.restricted(chosen.left)
+    units = [model.units[k] for k in chosen.left]
     classical = estimate_of(units, part, chosen.solution, weights, "")
     name = "essential parameters by weighted least squares"
     return Elimination(
@@ -161,7 +164,9 @@ class _Path:
     """Elimination in progress."""
 
     def __init__(self, total: Factor, held_out: Factor, weights: Array, rule: CutRule) -> None:
-        self._total, self._unseen, self._rule = total, held_out, rule
+        self._total = total
+        self._unseen = held_out
+        self._rule = rule
         self._equations = total.weighted(weights)
         self._blocks = held_out.occupied().by_block(weights)
         self.refused: list[int] = []
@@ -174,7 +179,8 @@ class _Path:
         before: list[int] | None = None
         # Refused removals may be possible after others.
         while before != self.refused:
-            before, self.refused = self.refused, []
+            before = self.refused
+            self.refused = []
             while self.current.spread(self._free) >= self._rule.spread:
                 if len(self.current.left) == 1:
                     break
@@ -199,7 +205,8 @@ class _Path:
 
     def _worst(self) -> tuple[int, float]:
         """Return index and relative standard deviation of the next parameter to remove."""
-        solution, left = self.current.solution, self.current.left
+        solution = self.current.solution
+        left = self.current.left
         if not solution.determined.all():
             own = self._equations.part(left).A
             lost = 1.0 - np.einsum("ij,ji->i", solution.inverse, own)
@@ -211,7 +218,8 @@ class _Path:
         return self._subset(self.current.left[self.current.left != index])
 
     def _subset(self, left: Indices) -> _Subset:
-        solution, values = solve(self._equations.part(left)), np.zeros(len(self._equations.b))
+        solution = solve(self._equations.part(left))
+        values = np.zeros(len(self._equations.b))
         values[left] = solution.values
         variance = np.maximum(np.diag(solution.inverse), 0.0)
         relative = np.sqrt(variance) / np.maximum(np.abs(solution.values), _TINY)
@@ -271,7 +279,8 @@ def _limit(freedom: int) -> float:
 
 def _reason(steps: list[EliminationStep], cut: int, refused: tuple[str, ...], rule: CutRule) -> str:
     """Describe why the cut is at this step."""
-    full, chosen = steps[0], steps[cut]
+    full = steps[0]
+    chosen = steps[cut]
     text = (
         f"{chosen.left} of {full.left} parameters are essential: their relative standard deviations"
         f" differ by a factor of {chosen.spread:.3g}"

@@ -158,7 +158,8 @@ class CandidateSettings:
 
     def describe(self) -> tuple[str, ...]:
         """Return descriptions of the settings, one by one."""
-        how, width = self.preprocessing, self.preprocessing.torque_bandwidth
+        how = self.preprocessing
+        width = self.preprocessing.torque_bandwidth
         left_out = {
             "slow": "slow rows and reversals",
             "halts": "long halts of each joint",
@@ -244,9 +245,11 @@ class Folds:
 
         With speeds `fast` (n,), slower rows are fitted and faster ones are predicted.
         """
-        fitted, beside = Factor.zero(model, FOLDS), Factor.zero(model, FOLDS)
+        fitted = Factor.zero(model, FOLDS)
+        beside = Factor.zero(model, FOLDS)
         for samples in recordings:
-            usable, others = samples.usable, ~samples.usable
+            usable = samples.usable
+            others = ~samples.usable
             if fast is not None:
                 others = np.abs(samples.motion.velocity) > fast
                 usable = usable & ~others
@@ -335,13 +338,15 @@ def choose_settings(
         had_load = now.model.friction.has_load
         for decide in (_friction_terms, _load_friction):
             decision = decide(trial, now)
-            now, choices = decision.settings, [*choices, decision.choice]
+            now = decision.settings
+            choices = [*choices, decision.choice]
         if "delay" in asked and now.model.friction.has_load and not had_load:
             now, choices = _confirm_delay(trial, start, now, choices)
     if "ripple" in asked:
         rippled = [replace(now, model=now.model.with_elements(elements)) for elements in ripples]
         decision = trial.decide("torque ripple", [now, *rippled])
-        now, choices = decision.settings, [*choices, decision.choice]
+        now = decision.settings
+        choices = [*choices, decision.choice]
     trial.weigh(now)
     compared, now, decided = _choose_prior(trial, now, asked)
     if not trial.errors(compared).overall < _MEANINGLESS:
@@ -361,14 +366,16 @@ def _choose_prior(
     if "strength" in asked:
         weights = [replace(now.strength, weight=weight) for weight in STRENGTHS]
         decision = trial.decide(STRENGTH, [replace(now, strength=weight) for weight in weights])
-        now, choices = decision.settings, [decision.choice]
+        now = decision.settings
+        choices = [decision.choice]
     compared = now
     if "consistency" in asked:
         possible = replace(now, strength=replace(now.strength, consistent=True))
         # What bodies that cannot exist fit better is the most that they can predict better.
         if trial.fitted_error(now) < (1.0 - IMPOSSIBLE_WORTHWHILE) * trial.fitted_error(possible):
             decision = trial.decide(CONSISTENT, [possible, now], IMPOSSIBLE_WORTHWHILE)
-            now, choices = decision.settings, [*choices, decision.choice]
+            now = decision.settings
+            choices = [*choices, decision.choice]
         else:
             now = possible
     return compared, now, choices
@@ -506,7 +513,8 @@ class _Trial:
     """Scores of settings, with cached factors."""
 
     def __init__(self, ready: Ready, known: Known | None) -> None:
-        self._ready, self._known = ready, known
+        self._ready = ready
+        self._known = known
         self._samples: dict[Preprocessing, list[Samples]] = {}
         self._directed: dict[tuple[Preprocessing, tuple[float, ...]], list[Samples]] = {}
         self._tables: dict[tuple[Columns, Preprocessing], _Reduced] = {}
@@ -613,7 +621,8 @@ class _Trial:
     def _estimator(
         self, settings: CandidateSettings, reduced: _Reduced
     ) -> Callable[[Factor], Array]:
-        effect, prior = settings.strength.design_effect(self._effect), reduced.prior
+        effect = settings.strength.design_effect(self._effect)
+        prior = reduced.prior
         _, of_all = posterior_values(reduced.folds.fitted, prior.gaussian, effect)
 
         def estimate(factor: Factor) -> Array:
@@ -646,7 +655,8 @@ class _Trial:
 
     def has_friction(self, settings: CandidateSettings) -> bool:
         """Return whether the fitted friction of every joint stays near Coulomb's at all speeds."""
-        model, reduced = settings.model, self._reduced(settings)
+        model = settings.model
+        reduced = self._reduced(settings)
         values = self._estimator(settings, reduced)(reduced.folds.fitted)
         table = model.friction.table(values[model.friction_part])
         fastest = np.max(
@@ -692,7 +702,8 @@ class _Trial:
 
         The load is that of the estimate without friction that depends on it.
         """
-        model, how = settings.model, settings.preprocessing
+        model = settings.model
+        how = settings.preprocessing
         if how not in self._samples:
             self._samples[how] = [*self._ready(model, how)]
         key = how, tuple(law.presliding for law in model.friction.laws)
@@ -751,7 +762,8 @@ def _sweep(
             if swept.size is not None:
                 candidates = [candidates[k] for k in trial.walk(candidates, swept.size)]
             decision = trial.decide(swept.name, candidates, certainty=certainty)
-            now, choices = decision.settings, [*choices, decision.choice]
+            now = decision.settings
+            choices = [*choices, decision.choice]
         if now.key == before.key:
             break
     return now, choices
@@ -799,7 +811,8 @@ def _nearby_bandwidths(now: CandidateSettings) -> list[CandidateSettings]:
 
 def _nearby_lags(now: CandidateSettings, filtered: CandidateSettings) -> list[CandidateSettings]:
     """Return delays near the lag of a causal low-pass, in its place."""
-    how, width = filtered.preprocessing, filtered.preprocessing.torque_bandwidth or math.inf
+    how = filtered.preprocessing
+    width = filtered.preprocessing.torque_bandwidth or math.inf
     lag = how.torque_shape.lag(width)
     return [_with(now, torque_delay=how.torque_delay + share * lag) for share in NEARBY]
 

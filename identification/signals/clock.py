@@ -163,12 +163,16 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
         RecordingError: NaN or infinity, or constant time stamps.
     """
     recording.check_finite()
-    time, signals = recording.time, recording.position
+    time = recording.time
+    signals = recording.position
     if recording.velocity is not None:
         signals = np.hstack([signals, recording.velocity])
     base = time_base(time, recording.gap_before)
     even, repeated, idle = time.copy(), *np.zeros((2, len(time)), np.bool_)
-    evidence, scatter, missing, longer = [], [], 0, 0.0
+    evidence = []
+    scatter = []
+    missing = 0
+    longer = 0.0
     for part in recording.segments():
         even[part] += longer
         repeated[part] = _repeated(time[part], signals[part])
@@ -178,7 +182,8 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
         number = _numbers(time[rows], signals[rows], base.step)
         new = np.diff(number, prepend=-1.0) > 0.0
         idle[rows[~new]] = True
-        rows, number = rows[new], number[new]
+        rows = rows[new]
+        number = number[new]
         if len(rows) < _SHORTEST:
             continue
         lost = int(number[-1]) + 1 - len(rows)
@@ -193,7 +198,9 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
         scatter.append(late / base.step)
         evidence.append((number, times, signals[rows], late))
     scattered = np.concatenate([np.zeros(1), *scatter])
-    share, deviation, residuals = np.nan, np.nan, (1.0, 1.0)
+    share = np.nan
+    deviation = np.nan
+    residuals = (1.0, 1.0)
     if np.abs(scattered).max() > UNIFORM:
         parts = [_residuals(*part, base.step) for part in evidence]
         share, deviation, residuals = _stamp_share(*map(np.concatenate, zip(*parts, strict=True)))
@@ -238,7 +245,8 @@ def _numbers(time: Array, signals: Array, step: float) -> Array:
 def _steps_by_position(time: Array, signals: Array, step: float) -> Array:
     """Return the steps of an even clock between samples (m - 1,), by stamps and positions."""
     phased = _steps_by_phase(time, step)
-    moved, resolution = np.diff(signals, axis=0), _resolution(signals)[1:]
+    moved = np.diff(signals, axis=0)
+    resolution = _resolution(signals)[1:]
     before, after = (_run(signals, side) for side in (-1, 1))
     pace = np.add(*(np.abs(_run(signals, side)) for side in (-1, 1))) / (2 * _BESIDE)
     steps = phased
@@ -247,7 +255,8 @@ def _steps_by_position(time: Array, signals: Array, step: float) -> Array:
         passed = [np.maximum(_run(number, side), 0.5) for side in (-1, 1)]
         each = (before + after) / (passed[0] + passed[1])
         noise = np.maximum(_robust_rms(moved - each * steps[:, None]), resolution)
-        unit, way = each / noise, moved / noise
+        unit = each / noise
+        way = moved / noise
         clarity = (unit**2).sum(axis=1)
         whole_steps = np.rint((unit * way).sum(axis=1) / np.maximum(clarity, 1.0))
         alike = (np.abs(way - unit * whole_steps[:, None]) < _OUTLIER + 0.5 * pace / noise).all(
@@ -304,7 +313,8 @@ def _repeated(time: Array, signals: Array) -> Rows:
 
 def _steady(before: Array, after: Array, most: float) -> Rows:
     """Return where the square of speeds (m, k) changes by at most this share."""
-    change, mean = (after - before) ** 2, (after + before) ** 2 / 4.0
+    change = (after - before) ** 2
+    mean = (after + before) ** 2 / 4.0
     return np.asarray(change.sum(axis=1) < most * mean.sum(axis=1))
 
 
@@ -340,7 +350,8 @@ def _residuals(
     at = np.arange(len(number))
     # From other samples than the residual, for independent noise.
     ahead = half // 2 + len(_CUBIC)
-    there, behind = np.minimum(at + ahead, at[-1]), np.maximum(at - ahead, 0)
+    there = np.minimum(at + ahead, at[-1])
+    behind = np.maximum(at - ahead, 0)
 
     def change(values: Array) -> Array:
         mean = scipy.ndimage.uniform_filter1d(values, half, axis=0, mode="nearest")
@@ -357,9 +368,11 @@ def _stamp_share(
     """Return the share of `late` (m, k) in `measured`, its deviation, and both residuals."""
     level = np.minimum(_robust_rms(measured), _robust_rms(measured - late))
     level = np.maximum(level, _ROUNDING * resolution)
-    measured, late = measured / level, late / level
+    measured = measured / level
+    late = late / level
     inlier = np.minimum(np.abs(measured), np.abs(measured - late)) < _OUTLIER
-    measured, late = np.where(inlier, measured, 0.0), np.where(inlier, late, 0.0)
+    measured = np.where(inlier, measured, 0.0)
+    late = np.where(inlier, late, 0.0)
     weight = float((late**2).sum())
     if weight == 0.0:
         return 0.5, np.inf, (1.0, 1.0)

@@ -202,7 +202,8 @@ def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 def _leaves_peak(channel: Array, start: int, stop: int, resolution: float) -> bool:
     """Return whether a channel leaves a flat top faster than a parabola."""
-    length, top = stop - start, channel[start]
+    length = stop - start
+    top = channel[start]
     outside = [channel[max(0, start - length) : start], channel[stop : stop + length]]
     falls = [float(np.abs(side - top).max(initial=0.0)) for side in outside]
     return max(falls) > _FALL * resolution

@@ -342,7 +342,8 @@ def _offset(first: Recording, other: Recording) -> float | None:
 def _lag(a: Array, b: Array) -> int | None:
     """Return the rows by which b (k, n) lags a (l, n) at the least mean square difference."""
     lags = np.arange(1 - len(a), len(b))
-    first, last = np.maximum(0, -lags), np.minimum(len(a), len(b) - lags)
+    first = np.maximum(0, -lags)
+    last = np.minimum(len(a), len(b) - lags)
     rows = last - first
     enough = rows >= _OVERLAP * max(len(a), len(b))
     if not enough.any():

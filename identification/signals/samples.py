@@ -233,8 +233,10 @@ def smooth(
     smooth keep their position, at rest.
     """
     position = recording.position.copy()
-    velocity, acceleration = np.zeros_like(position), np.zeros_like(position)
-    bandwidth, longest = np.full(recording.n_joints, np.inf), 0
+    velocity = np.zeros_like(position)
+    acceleration = np.zeros_like(position)
+    bandwidth = np.full(recording.n_joints, np.inf)
+    longest = 0
     speed = recording.velocity if options.velocity == "measured" else None
 
     def spline_of(time: Array, measured: Array, variance: Array | None) -> SmoothingSpline:
@@ -245,7 +247,8 @@ def smooth(
         time = recording.time[segment]
         if len(time) < SHORTEST_STRETCH:
             continue
-        spline, at = spline_of(time, position[segment], noise_variance), time - options.torque_delay
+        spline = spline_of(time, position[segment], noise_variance)
+        at = time - options.torque_delay
         position[segment] = spline(at)
         if speed is None:
             velocity[segment], acceleration[segment] = spline(at, 1), spline(at, 2)
@@ -253,7 +256,8 @@ def smooth(
             slope = spline_of(time, speed[segment], None)
             velocity[segment], acceleration[segment] = slope(at), slope(at, 1)
         if len(time) > longest:
-            longest, bandwidth = len(time), spline.bandwidth
+            longest = len(time)
+            bandwidth = spline.bandwidth
     return Motion(recording.time, position, velocity, acceleration), bandwidth
 
 
@@ -283,7 +287,8 @@ def prepare(
         raise RecordingError("the recording has no joint torque to fit")
     motion, bandwidth = _smoothed(recording, noise_variance, options, motions)
     segments = tuple(recording.segments())
-    torque, torque_bandwidth = recording.torque, None
+    torque = recording.torque
+    torque_bandwidth = None
     if options.torque_bandwidth is not None:
         torque_bandwidth = np.full(recording.n_joints, options.torque_bandwidth)
     if options.smooth_torque:
@@ -336,7 +341,8 @@ def _noise_bandwidth(
     """Return the bandwidth per joint (n,) [Hz] that removes the torque noise variance (n,)."""
     assert recording.torque is not None
     longest = max(segments, key=lambda segment: int(segment.stop - segment.start))
-    time, measured = recording.time[longest], recording.torque[longest]
+    time = recording.time[longest]
+    measured = recording.torque[longest]
     return fit_smoothing_spline(time, measured, _attainable(time, measured, variance)).bandwidth
 
 

@@ -88,7 +88,8 @@ def difference_variance(time: Array, values: Array) -> Array:
 
 
 def _difference_variance(time: Array, values: Array, order: int) -> Array:
-    total, count = np.zeros(values.shape[1]), len(time) - order
+    total = np.zeros(values.shape[1])
+    count = len(time) - order
     for start in range(0, count, _ROWS_AT_ONCE):
         rows = slice(start, min(start + _ROWS_AT_ONCE, count) + order)
         windows = np.lib.stride_tricks.sliding_window_view(time[rows], order + 1)
@@ -124,7 +125,8 @@ def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> f
 def _power(time: Array, signals: Array, segments: Sequence[slice]) -> tuple[Array, Array]:
     """Return frequencies (f,) above zero and power spectral densities (f, c)."""
     longest = max(segments, key=lambda one: int(one.stop - one.start), default=slice(0, 0))
-    time, signals = time[longest], signals[longest]
+    time = time[longest]
+    signals = signals[longest]
     if time.size < _FEWEST:
         return np.empty(0), np.empty((0, signals.shape[1]))
     interval = float(np.median(np.diff(time)))
@@ -215,9 +217,11 @@ class _Problem:
         """Set up the problem with about this knot spacing [s]."""
         span = float(time[-1] - time[0])
         intervals = max(1, round(span / spacing))
-        spacing, density = span / intervals, len(time) / intervals
+        spacing = span / intervals
+        density = len(time) / intervals
         rows = _rows(float(time[0]), spacing, intervals, time)
-        gram, penalty = _gram_band(rows), _penalty_band(intervals)
+        gram = _gram_band(rows)
+        penalty = _penalty_band(intervals)
         lightest = _LIGHTEST * density
         factor = (scipy.linalg.cholesky_banded(gram + lightest * penalty, lower=True), True)
         closest = scipy.linalg.cho_solve_banded(factor, rows.T @ values)
@@ -246,18 +250,21 @@ class _Problem:
         By Newton's method in logarithms, or bisection where a step would leave the bracket.
         """
         low, high = (float(np.log(self.penalty_at(width))) for width in (widest, 0.0))
-        point, high_tried = low, False
+        point = low
+        high_tried = False
         while high - low > _PENALTY:
             excess, slope = self._excess(channel, float(np.exp(point)), tolerance)
             if excess > 0.0:
-                high, high_tried = point, True
+                high = point
+                high_tried = True
             else:
                 low = point
             target = point - excess / max(slope, _FLAT)
             if abs(target - point) < _PENALTY:
                 return float(np.exp(np.clip(target, low, high)))
             if target >= high and not high_tried:
-                target, high_tried = high, True
+                target = high
+                high_tried = True
             elif not low < target < high:
                 target = 0.5 * (low + high)
             point = target
@@ -312,7 +319,8 @@ def _rows(
 
 def _gram_band(rows: scipy.sparse.csr_array) -> Array:
     """Return the lower band (6, k) of rows' rows."""
-    columns, weights = rows.indices.reshape(-1, ORDER), rows.data.reshape(-1, ORDER)
+    columns = rows.indices.reshape(-1, ORDER)
+    weights = rows.data.reshape(-1, ORDER)
     band = np.zeros((ORDER, rows.shape[1]))
     for k in range(ORDER):
         for offset in range(ORDER - k):

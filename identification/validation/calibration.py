@@ -48,7 +48,8 @@ class TorqueMeans:
     @classmethod
     def of(cls, model: RobotModel, recordings: Iterable[Samples]) -> TorqueMeans:
         """Average recordings in blocks, one after the other."""
-        n, p = model.n_joints, model.n_parameters
+        n = model.n_joints
+        p = model.n_parameters
         empty = (
             np.zeros((0, n, p + 1)),
             np.zeros(0, dtype=np.intp),
@@ -164,7 +165,8 @@ def _means(model: RobotModel, samples: Samples) -> tuple[Array, NDArray[np.intp]
     if samples.mask is not None:
         for reason in (EDGE, SATURATED):
             known &= ~samples.mask.reasons[reason]
-    index, p = block_index(samples), model.n_parameters
+    index = block_index(samples)
+    p = model.n_parameters
     present = np.unique(index)
     count = count_by_block(index, known)[present]
     places = [np.append(own, p) for own in model.plan.columns]

@@ -155,7 +155,8 @@ class _Trial(NamedTuple):
 
     def ambiguous_with(self, other: _Trial) -> bool:
         """Return whether another order, or order instead of sign, explains nearly as much."""
-        mine, its = self.cause.fault, other.cause.fault
+        mine = self.cause.fault
+        its = other.cause.fault
         return (
             mine.discrete
             and its.discrete
@@ -185,7 +186,9 @@ class _Search:
         names: Sequence[str],
         noise: Array | None = None,
     ) -> None:
-        self._model, self._values, self._names = model, values, names
+        self._model = model
+        self._values = values
+        self._names = names
         self._noise = np.zeros(model.n_joints) if noise is None else np.nan_to_num(noise)
         travel = np.max([np.ptp(one.motion.position, axis=0) for one in recordings], axis=0)
         self._moved = np.flatnonzero(travel > STUCK_MOVEMENT)
@@ -205,7 +208,8 @@ class _Search:
 
     def trials(self) -> list[_Trial]:
         """Try the correction of each fault."""
-        model, values = self._model, self._values
+        model = self._model
+        values = self._values
         tables = _Tables.of(model, self._recordings, values)
         target = tables.torques
         none = np.zeros((*tables.gram.shape[:3], 0))
@@ -217,7 +221,10 @@ class _Search:
         excluded = self._excluded(usual, noise)
         trials = []
         for fault in self._faults(tables):
-            own, measured, seen, joints = none, target.copy(), tables, list(fault.joints)
+            own = none
+            measured = target.copy()
+            seen = tables
+            joints = list(fault.joints)
             if fault.part is not None:
                 if fault.part not in separate:
                     every = _columns_of(tables, model, values, Fault("changed arm", (), fault.part))
@@ -300,7 +307,9 @@ class _Search:
 
     def _other_recordings(self, tables: _Tables, fault: Fault) -> Part:
         """Return the recordings in which a fault is largest, estimated separately in each."""
-        model, alike, columns = self._model, fault, []
+        model = self._model
+        alike = fault
+        columns = []
         if fault.kind == "changed arm":
             alike = Fault("payload")
         for k in range(1, len(self._recordings)):
@@ -319,7 +328,8 @@ class _Search:
         """Yield the blocks from each time on."""
         blocks = len(tables.recording)
         for first in range(_FEWEST_BLOCKS, blocks - _FEWEST_BLOCKS + 1):
-            k, start = int(tables.recording[first]), tables.start[first]
+            k = int(tables.recording[first])
+            start = tables.start[first]
             words = f"{self._names[k]} from {start:.3g} s on" if start > 0.0 else self._names[k]
             if k < len(self._recordings) - 1:
                 words += " and what follows it"
@@ -364,8 +374,11 @@ class _Tables:
     @classmethod
     def of(cls, model: RobotModel, recordings: Sequence[Samples], values: Array) -> _Tables:
         """Reduce some thousand rows."""
-        count, step = -(-_BLOCKS // len(recordings)), _step(recordings, _MOST_ROWS)
-        grams, rows, starts = [], [], []
+        count = -(-_BLOCKS // len(recordings))
+        step = _step(recordings, _MOST_ROWS)
+        grams = []
+        rows = []
+        starts = []
         for samples in recordings:
             some = np.arange(step // 2, len(samples.torque), step)
             tables = _tables(model, samples, values, some)
@@ -408,7 +421,8 @@ class _Few:
 
     @staticmethod
     def _score(model: RobotModel, recordings: Sequence[Samples]) -> _Score:
-        count, p = -(-_BLOCKS // len(recordings)), model.n_parameters
+        count = -(-_BLOCKS // len(recordings))
+        p = model.n_parameters
         parts = [
             Factor.of(
                 model,
@@ -430,7 +444,8 @@ class _Few:
 
 def _tables(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.intp]) -> Array:
     """Return the columns of some rows of each joint (n, k, q)."""
-    n, p = model.n_joints, model.n_parameters
+    n = model.n_joints
+    p = model.n_parameters
     payload = RegressorPlan.of_bodies(model.chain, model.gravity, n - 1)
     filtered = samples.torque_bandwidth is not None or samples.parent is not None
     part = np.arange(len(samples.torque)) if filtered else some
@@ -454,7 +469,8 @@ def _tables(model: RobotModel, samples: Samples, values: Array, some: NDArray[np
 
 def _rate(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.intp]) -> Array:
     """Return the rate of the predicted torque (k, n) in some rows, from their neighbours."""
-    after, before = np.minimum(some + 1, len(samples.torque) - 1), np.maximum(some - 1, 0)
+    after = np.minimum(some + 1, len(samples.torque) - 1)
+    before = np.maximum(some - 1, 0)
     now, first, last = (samples.motion.rows(rows) for rows in (some, before, after))
     direction = now.direction
     if direction is None:
@@ -507,7 +523,8 @@ class _Score(NamedTuple):
         It is compared with the fit `usual` without this correction, sums of squared noise (n,),
         and the fit with separate parameters for the part, if any.
         """
-        before, after = usual.shares(usual.fitted), self.shares(self.fitted)
+        before = usual.shares(usual.fitted)
+        after = self.shares(self.fitted)
         every = np.flatnonzero(before > 0.0)
         own = np.array(joints, dtype=np.intp) if len(joints) else every
         own = own[np.isin(own, every)]
@@ -582,7 +599,8 @@ def _score(tables: _Tables, added: Array, target: Array) -> _Score:
     usual = np.maximum(whole.squares(_solved(whole.weighted(np.ones(n)))), floor)
     weights = np.maximum(tables.rows.sum(axis=0), 1) / usual
     total = whole.weighted(weights)
-    squares, coefficients = np.zeros((blocks, n)), []
+    squares = np.zeros((blocks, n))
+    coefficients = []
     for k in range(_FOLDS):
         own = slice(k, None, _FOLDS)
         fold = _Sums(*(part[k] for part in folds))
@@ -610,7 +628,8 @@ class _Sums(NamedTuple):
     def squares(self, values: Array) -> Array:
         """Return the sum of squared errors (..., n) of coefficients (p + r,)."""
         p = self.parameters.shape[-1]
-        first, second = values[:p], np.append(-values[p:], 1.0)
+        first = values[:p]
+        second = np.append(-values[p:], 1.0)
         of_parameters = (self.parameters @ first - 2.0 * (self.mixed @ second)) @ first
         return np.asarray(of_parameters + (self.beside @ second) @ second)
 
@@ -639,7 +658,8 @@ def _size(fault: Fault, score: _Score, tables: _Tables, own: Array) -> tuple[flo
         columns = own[..., :p, 0].reshape(-1, p)
         column = columns[np.argmax(columns.any(axis=1))]
         power = tables.gram[:, fault.joints[0], :p, :p].sum(axis=0) @ column
-        size, scale = power @ column, (score.values * (column != 0.0)) @ power
+        size = power @ column
+        scale = (score.values * (column != 0.0)) @ power
         if np.any(scale == 0.0):  # none of the torque is of the column
             return None, 0.0
         sizes = sizes * size / scale
@@ -649,7 +669,8 @@ def _size(fault: Fault, score: _Score, tables: _Tables, own: Array) -> tuple[flo
 def _columns_of(tables: _Tables, model: RobotModel, values: Array, fault: Fault) -> Array:
     """Return the columns of a fault as combinations of those of a table (B, n, q, r)."""
     blocks, n, width, _ = tables.gram.shape
-    p, joints = model.n_parameters, list(fault.joints or range(model.n_joints))
+    p = model.n_parameters
+    joints = list(fault.joints or range(model.n_joints))
     count = {"payload": _LOAD, "changed arm": p, "load friction": n}.get(fault.kind, 1)
     columns = np.zeros((n, width, count))
     if fault.kind == "delay":
@@ -670,12 +691,15 @@ def _columns_of(tables: _Tables, model: RobotModel, values: Array, fault: Fault)
 def corrected(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
     """Return samples with a wrong sign or order corrected."""
     n = model.n_joints
-    sign, order = np.ones(n), np.arange(n)
+    sign = np.ones(n)
+    order = np.arange(n)
     if fault.kind.endswith("sign"):
         sign[list(fault.joints)] = -1.0
     else:
         order[list(fault.joints)] = fault.joints[::-1]
-    motion, torque, usable = samples.motion, samples.torque, samples.usable
+    motion = samples.motion
+    torque = samples.torque
+    usable = samples.usable
     if fault.kind in _OF_MOTION:
         load = None if motion.load is None else motion.load[:, order]
         motion = Motion(motion.time, *(part[:, order] * sign for part in motion[1:4]))

@@ -67,7 +67,8 @@ class _Part(NamedTuple):
         torque, error = np.zeros((2, model.n_joints))
         sums: tuple[list[Array], list[Array]] = ([], [])
         for samples in recordings:
-            usable, block = samples.usable, block_index(samples)
+            usable = samples.usable
+            block = block_index(samples)
             predicted = samples.predicted_torque(model, values)
             left = np.where(usable, samples.torque - predicted, 0.0)
             torque += np.einsum("mj,mj,mj->j", samples.torque, samples.torque, usable)
@@ -95,12 +96,15 @@ def find_changes(
         beyond = unseen.relative[joint] ** 2 - usual[joint] ** 2
         trials = []
         for k, kind in enumerate(_KINDS):
-            own, reference = unseen.shares[k], fitted.shares[k]
+            own = unseen.shares[k]
+            reference = fitted.shares[k]
             base = 1.0 + float(np.nan_to_num(reference.mean[joint]))
-            share, std = float(own.mean[joint]), float(own.std[joint])
+            share = float(own.mean[joint])
+            std = float(own.std[joint])
             if not np.isfinite(share) or base <= 0.0:
                 continue
-            ratio, deviation = (1.0 + share) / base, std / base
+            ratio = (1.0 + share) / base
+            deviation = std / base
             error = unseen.error[joint] - unseen.explained[k, joint]
             left = float(_relative(error, unseen.torque[joint]))
             explains = unseen.relative[joint] ** 2 - left**2 > _EXPLAINED * beyond

@@ -92,7 +92,8 @@ def find_gravity(model: RobotModel, training: Factor, held_out: Factor) -> Gravi
     def fitted(gravity: Array) -> tuple[Array, Array]:
         """Return parameters, joints weighted by their residuals, and the squared errors (n,)."""
         factor = under_gravity(training, gravity)
-        errors, values = factor.gram[:, -1, -1], np.empty(0)
+        errors = factor.gram[:, -1, -1]
+        values = np.empty(0)
         floor = 1e-12 * errors + 1e-300
         for _ in range(_PASSES):
             values = _solved(factor, training.samples / np.maximum(errors, floor))
@@ -113,7 +114,8 @@ def find_gravity(model: RobotModel, training: Factor, held_out: Factor) -> Gravi
     first = min(starts, key=misfit)
     if not np.any(first):
         return GravityDirection(model.gravity, model.gravity, 1.0)
-    best, least = first, misfit(first)
+    best = first
+    least = misfit(first)
     for _ in range(_MOST_TURNS):
         values, errors = fitted(best)
         turn = _turn(training, best, values, training.samples / errors)
@@ -124,7 +126,8 @@ def find_gravity(model: RobotModel, training: Factor, held_out: Factor) -> Gravi
                 break
         else:
             break
-        best, least = turned, height
+        best = turned
+        least = height
     counts = held_out.samples > 0
     change = np.log(unseen(best)) - np.log(unseen(model.gravity))
     ratio = float(np.exp(change[counts].mean())) if counts.any() else 1.0
@@ -137,7 +140,8 @@ def _turn(factor: Factor, gravity: Array, values: Array, weights: Array) -> Arra
     The factor is a :func:`standard_factor`, with joints weighted (n,); values (s,) are those of the
     fit under this gravity.
     """
-    s, across = len(values), np.linalg.svd(gravity[None, :])[2][1:]
+    s = len(values)
+    across = np.linalg.svd(gravity[None, :])[2][1:]
     # Columns [W | torque of values by gravity along each direction across | y].
     change = np.zeros((4 * s + 1, s + 3))
     change[: 4 * s, :s] = np.kron(np.append(1.0, gravity)[:, None], np.eye(s))
@@ -163,7 +167,8 @@ def repetition_noise(
     The residual of parameters (p,), through a low-pass [Hz] if given, is compared at equal times,
     rounded to the sampling interval; NaN for a joint that never moves at the same time twice.
     """
-    step, parts = 0.0, []
+    step = 0.0
+    parts = []
     for samples in recordings:
         step = step or float(np.median(np.diff(samples.motion.time)))
         index = np.rint((samples.motion.time - samples.origin) / step).astype(np.int64)
@@ -302,6 +307,18 @@ class Evidence:
         return float(np.sqrt(noise / power)) if power > 0.0 else None
 
 
+def _implausible(
+    model: RobotModel,
+    estimate: Estimate,
+    unseen: Factor,
+    error: PredictionError,
+    speed: Array,
+    context: CellContext,
+) -> Implausible:
+    added = context.added_friction
+    return implausibilities(model, estimate, unseen, error.rms, speed=speed, added=added)
+
+
 def gather(
     model: RobotModel,
     result: RepeatedEstimate,
@@ -322,20 +339,20 @@ def gather(
     noise is measured. `nominal` are parameters (p,); with `in_sample` the held-out motions are the
     training. `unseen` is the sum of the held-out factors, if known.
     """
-    pooled, others = result.pooled, () if in_sample else held_out
+    pooled = result.pooled
     values = pooled.values
     unseen = total_factor(model, held_out) if unseen is None else unseen
-    few, few_unseen = training[:_MOST_RECORDINGS], held_out[:_MOST_RECORDINGS]
-    standard = standard_factor(model, few), standard_factor(model, few_unseen)
+    few = training[:_MOST_RECORDINGS]
+    few_unseen = held_out[:_MOST_RECORDINGS]
+    standard = [standard_factor(model, some) for some in (few, few_unseen)]
     repeated = same_motion and len(result.repetitions) > 1
     noise = repetition_noise(model, values, training, SLOW) if repeated else None
     floor = noise_floor(model, values, few, noise)
     error = _error(model, values, held_out)
-    slow = None
-    if noise is not None:
-        slow = _slow_errors(model, result, held_out, error, unseen, noise)
+    slow = None if noise is None else _slow_errors(model, result, held_out, error, unseen, noise)
     speed = np.abs(np.concatenate([run.motion.velocity for run in held_out])).max(axis=0)
-    added, motors = context.added_friction, context.motor_from_joint
+    others = () if in_sample else held_out
+    motors = context.motor_from_joint
     return Evidence(
         estimate=pooled,
         held_out=error,
@@ -351,7 +368,7 @@ def gather(
         gravity=find_gravity(model, *standard),
         load=find_load(model, few, few_unseen, *standard),
         nominal=None if nominal is None else _error(model, nominal, held_out),
-        implausible=implausibilities(model, pooled, unseen, error.rms, speed=speed, added=added),
+        implausible=_implausible(model, pooled, unseen, error, speed, context),
         consistency=consistency,
         dissipation=dissipation_of(model, pooled, speed),
         residuals=check_residuals(
@@ -410,7 +427,8 @@ def _one_way(recordings: Sequence[Samples]) -> NDArray[np.bool_]:
         [np.count_nonzero(sign * v > 0.0, axis=0) for v in velocities] for sign in (1.0, -1.0)
     ]
     forwards, backwards = np.array(directions).sum(axis=1)
-    fewer, moved = np.minimum(forwards, backwards), forwards + backwards
+    fewer = np.minimum(forwards, backwards)
+    moved = forwards + backwards
     return np.asarray((moved > 0) & (fewer < _OTHER_WAY * moved))
 
 
@@ -426,7 +444,8 @@ def _disagreement(result: RepeatedEstimate) -> Array:
 def _estimation_noise(result: RepeatedEstimate, held_out: Factor) -> Array:
     """Return the standard deviation (n,) of predicted torque by scatter of the estimates."""
     values = np.array([one.values for one in result.repetitions])
-    differences, count = values - values.mean(axis=0), len(values)
+    differences = values - values.mean(axis=0)
+    count = len(values)
     torque = np.einsum("ri,jik,rk->j", differences, held_out.gram[:, :-1, :-1], differences)
     variance = torque / (count * (count - 1)) / np.maximum(held_out.samples, 1)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

@@ -95,7 +95,9 @@ def _wrong_signs(
     model: RobotModel, estimate: Estimate, speed: Array, added: Collection[str] = ()
 ) -> Iterator[tuple[str, NDArray[np.bool_], bool]]:
     """Yield messages on wrong signs, the parameters (p,) that cause them, and if by added terms."""
-    values, first, count = estimate.values, model.base.rank, len(estimate.values)
+    values = estimate.values
+    first = model.base.rank
+    count = len(estimate.values)
     for joint, (name, law) in enumerate(zip(model.joint_names, model.friction.laws, strict=True)):
         one = speed[joint : joint + 1]
         top, coulomb, stated = np.zeros((3, count))
@@ -161,12 +163,15 @@ class Dissipation(NamedTuple):
 
 def dissipation_of(model: RobotModel, estimate: Estimate, speed: Array) -> Dissipation:
     """Return the friction of each joint at its highest speed (n,) [rad/s or m/s]."""
-    first, count = model.base.rank, len(estimate.values)
-    torque, std = np.zeros(model.n_joints), np.full(model.n_joints, np.inf)
+    first = model.base.rank
+    count = len(estimate.values)
+    torque = np.zeros(model.n_joints)
+    std = np.full(model.n_joints, np.inf)
     determined = np.isfinite(np.diag(estimate.covariance))
     covariance = np.where(np.outer(determined, determined), estimate.covariance, 0.0)
     for joint, law in enumerate(model.friction.laws):
-        top, one = np.zeros(count), speed[joint : joint + 1]
+        top = np.zeros(count)
+        one = speed[joint : joint + 1]
         for k, (_, term, owner, motor, _) in enumerate(model.friction.terms, start=first):
             if owner == joint and not motor and term.is_friction:
                 top[k] = term.column(one, law.sign(one))[0]
@@ -305,8 +310,10 @@ def check_consistency(
     found = consistent_estimate(
         model, training, unconstrained, weights=weights, prior=prior, design_effect=design_effect
     )
-    values, free = found.estimate.values, unconstrained.values
-    shift, links = np.abs(found.shift), model.layout.links
+    values = found.estimate.values
+    free = unconstrained.values
+    shift = np.abs(found.shift)
+    links = model.layout.links
     rise = held_out.relative_errors(values) - held_out.relative_errors(free)
     torque = np.sqrt(held_out.gram[:, -1, -1] / np.maximum(held_out.samples, 1))
     rise[little_torque(torque, ~model.chain.revolute)] = np.nan
@@ -431,16 +438,21 @@ def nominal_scale(
     if all(run.torque_bandwidth is None for run in runs):
         step = max(1, sum(len(run.torque) for run in runs) // _MOST_ROWS)
         runs = [run.thinned(step) for run in runs]
-    found, regressors = [], [run.regressor(model) for run in runs]
+    found = []
+    regressors = [run.regressor(model) for run in runs]
     for joint in range(model.n_joints):
-        columns, turning = regressors[0].columns[joint], [joint]
+        columns = regressors[0].columns[joint]
+        turning = [joint]
         inertial = columns < model.base.rank
         if model.coupling is not None:
             turns = model.coupling.motor_from_joint
             turning = sorted({joint, *np.flatnonzero((turns.T @ turns)[joint]).tolist()})
-        tables, torques, deviations = [], [], []
+        tables = []
+        torques = []
+        deviations = []
         for run, (blocks, _) in zip(runs, regressors, strict=True):
-            rows, block = run.usable[:, joint], blocks[joint]
+            rows = run.usable[:, joint]
+            block = blocks[joint]
             table = [block[:, inertial] @ nominal[columns[inertial]], block[:, ~inertial]]
             if not rotors_known:
                 table.append(run.as_measured(joint, run.motion.acceleration[:, turning]))
@@ -457,7 +469,8 @@ def _scale(table: Array, torque: Array, deviations: Array, *, share: float) -> t
 
     The first column deviates by a share of itself and by each of `deviations`.
     """
-    rigid, others = table[:, 0], table[:, 1:]
+    rigid = table[:, 0]
+    others = table[:, 1:]
     if len(torque) < 10 * _BLOCKS or not rigid.any():
         return np.nan, np.inf
     size = np.linalg.norm(others, axis=0)
@@ -580,7 +593,8 @@ def _pieces(recording: Recording) -> Iterator[list[slice]]:
 
 def _steps_of(recording: Recording, parts: Sequence[slice], name: str) -> PositionSteps:
     """Return the lasting steps within stretches of a recording."""
-    time, position = recording.time, recording.position
+    time = recording.time
+    position = recording.position
     pieces = [_departures(time[part], position[part]) for part in parts]
     departure, speed, change = map(np.concatenate, zip(*pieces, strict=True))
     steps = np.concatenate([np.diff(time[part]) for part in parts])[:, None]
@@ -609,7 +623,8 @@ def _steps_of(recording: Recording, parts: Sequence[slice], name: str) -> Positi
     jumps: list[PositionJump] = []
     logged: list[PositionJump] = []
     for joint, k in np.argwhere(lasting.T):
-        row, jump = int(after[k]), float(departure[k, joint])
+        row = int(after[k])
+        jump = float(departure[k, joint])
         found = PositionJump(name, recording.joint_names[joint], float(time[row] - time[0]), jump)
         by_log = every[k] or (by_whole_steps[k, joint] and often)
         by_log |= _on_path(time, position[:, joint], row, jump)
@@ -665,7 +680,8 @@ def _without_clock(departure: Array, speed: Array, steps: Array) -> tuple[Array,
     noise = np.array(
         [_NORMAL * np.median(some) if (some := one[one > 0.0]).size else np.inf for one in size.T]
     )
-    off, rate = departure / noise, speed / noise
+    off = departure / noise
+    rate = speed / noise
     weight = (rate**2).sum(axis=1, keepdims=True) - rate**2
     # Time error of the other joints, regularised by one step.
     error = ((rate * off).sum(axis=1, keepdims=True) - rate * off) / (weight + steps**-2)

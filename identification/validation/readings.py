@@ -223,7 +223,8 @@ def find_readings(
         again = started()
         single = again.single_as_good_as(search.score, as_recorded)
         if single is not None:
-            search, steps = again, [single]
+            search = again
+            steps = [single]
     nearest = search.nearest()
     score = score_of(search.model, search.samples)
     return Readings(
@@ -242,7 +243,8 @@ class _Search:
         *,
         unit_is_open: bool,
     ) -> None:
-        self.model, self.samples = model, samples
+        self.model = model
+        self.samples = samples
         self._mountings = mountings
         self._unit_is_open = unit_is_open
         self.score = score_of(model, samples)
@@ -343,7 +345,8 @@ class _Search:
                 errors[order] = fitted_error(self.model, samples)
             return errors[order]
 
-        n, rng = self.model.n_joints, np.random.default_rng(0)
+        n = self.model.n_joints
+        rng = np.random.default_rng(0)
         for start in range(starts):
             order = tuple(range(n)) if start == 0 else tuple(rng.permutation(n).tolist())
             while True:
@@ -375,7 +378,9 @@ class _Search:
             and other.score.driven.sum() <= best.score.driven.sum()
         }
         before = self.score.overall
-        self.model, self.samples, self.score = best.model, best.samples, best.score
+        self.model = best.model
+        self.samples = best.samples
+        self.score = best.score
         self._trials = None
         ratio, sigmas, _ = best.against
         ranked = sorted(alike.items(), key=lambda pair: pair[1])
@@ -440,7 +445,8 @@ class _Search:
 
 def _moved(model: RobotModel, samples: Samples, change: Change) -> Samples:
     """Return samples with signs, orders, unit or zero of the joints changed."""
-    meaning, joints = change.meaning, change.joints
+    meaning = change.meaning
+    joints = change.joints
     motion = samples.motion
     if meaning.endswith("order"):
         return _reordered(model, samples, change)
@@ -472,7 +478,8 @@ _FAULTS: Final[Mapping[str, Kind]] = {
 
 def _reordered(model: RobotModel, samples: Samples, change: Change) -> Samples:
     """Return samples with joints read from other places, one exchange after the other."""
-    order, now = np.arange(model.n_joints), np.arange(model.n_joints)
+    order = np.arange(model.n_joints)
+    now = np.arange(model.n_joints)
     order[list(change.joints)] = change.places
     for joint in range(model.n_joints):
         place = int(np.flatnonzero(now == order[joint])[0])
@@ -578,7 +585,8 @@ def _friction_columns(model: RobotModel, samples: Samples) -> Array:
     columns = np.zeros((model.n_joints, model.n_parameters))
     for place, (_, term, joint, motor, _) in enumerate(model.friction.terms, model.base.rank):
         if not motor and term.is_friction and not term.of_load:
-            law, here = model.friction.laws[joint], speed[joint : joint + 1]
+            law = model.friction.laws[joint]
+            here = speed[joint : joint + 1]
             columns[joint, place] = term.column(here, law.sign(here))[0]
     return columns
 
@@ -587,7 +595,8 @@ def compare(score: Score, other: Score, model: RobotModel) -> Comparison:
     """Compare two readings, joint by joint and block by block; joints with little torque aside."""
     torque = np.sqrt(other.torque)
     counts = (torque > 0.0) & ~little_torque(torque, ~np.array(model.chain.revolute))
-    mine, its = score.squares[:, counts], other.squares[:, counts]
+    mine = score.squares[:, counts]
+    its = other.squares[:, counts]
     tested = (mine > 0.0) & (its > 0.0)
     totals = np.where(tested, mine, 0.0).sum(axis=0), np.where(tested, its, 0.0).sum(axis=0)
     both = (totals[0] > 0.0) & (totals[1] > 0.0)
@@ -637,8 +646,10 @@ class Axes(NamedTuple):
         return axes
 
     def _after(self, change: Change) -> Axes:
-        meaning, own = change.meaning, list(change.joints)
-        order, sign = np.arange(len(self.zero)), np.ones(len(self.zero))
+        meaning = change.meaning
+        own = list(change.joints)
+        order = np.arange(len(self.zero))
+        sign = np.ones(len(self.zero))
         if meaning.endswith("order"):
             order[own] = change.places
         elif meaning.endswith("sign"):
@@ -666,7 +677,8 @@ class Axes(NamedTuple):
     def read(self, recording: Recording) -> Recording:
         """Return a recording as read."""
         scale = self.factor * self.position_sign
-        velocity, torque = recording.velocity, recording.torque
+        velocity = recording.velocity
+        torque = recording.torque
         return replace(
             recording,
             position=recording.position[:, self.position_order] * scale + self.zero,

@@ -57,7 +57,8 @@ def block_mean(parts: Sequence[Array], repeated: int = 1) -> BlockMean:
     for part in parts[:repeated]:
         shared[:, : part.shape[1]] += part
     values, weights = np.concatenate([shared, *parts[repeated:]], axis=1)
-    total, blocks = weights.sum(axis=0), np.count_nonzero(weights, axis=0)
+    total = weights.sum(axis=0)
+    blocks = np.count_nonzero(weights, axis=0)
     enough = blocks >= FEWEST_BLOCKS
     divisor = np.where(enough, total, 1.0)
     mean = values.sum(axis=0) / divisor
@@ -124,8 +125,10 @@ def _profile(
             lowest[joint] = moving.min(initial=lowest[joint])
             highest[joint] = moving.max(initial=highest[joint])
     moved = np.isfinite(lowest) & (highest > lowest)
-    lowest, highest = np.where(moved, lowest, 0.0), np.where(moved, highest, 1.0)
-    edges, sums = np.linspace(lowest, highest, BINS + 1, axis=1), []
+    lowest = np.where(moved, lowest, 0.0)
+    highest = np.where(moved, highest, 1.0)
+    edges = np.linspace(lowest, highest, BINS + 1, axis=1)
+    sums = []
     for run, residual, own in zip(runs, left, over, strict=True):
         block = block_index(run)
         found = np.zeros((2, int(block[-1]) + 1, len(edges), BINS))
@@ -168,7 +171,8 @@ class Ripple(NamedTuple):
 
 def _ripple_sums(samples: Samples, residual: Array, motor_from_joint: Array) -> Array:
     """Sum a residual (m, n) times cosine and sine, and their squares (2, B, n, H, 2)."""
-    block, motor = block_index(samples), samples.motion.position @ motor_from_joint.T
+    block = block_index(samples)
+    motor = samples.motion.position @ motor_from_joint.T
     count = int(block[-1]) + 1
     found = np.zeros((2, count, residual.shape[1], len(HARMONICS), 2))
     for joint, rows in enumerate(samples.usable.T):
@@ -221,7 +225,8 @@ def _friction_drift(sums: Sequence[Array]) -> FrictionDrift | None:
 
     def about_means(values: Array) -> Array:
         """Subtract the weighted mean over the recordings from values (P, n), part by part."""
-        table, own = values.reshape(-1, parts, n), weight.reshape(-1, parts, n)
+        table = values.reshape(-1, parts, n)
+        own = weight.reshape(-1, parts, n)
         total = own.sum(axis=0)
         mean = (own * table).sum(axis=0) / np.where(total > 0.0, total, 1.0)
         return np.asarray((table - mean).reshape(-1, n))
@@ -352,7 +357,8 @@ def check_residuals(
 
     Drift is tested on the training recordings in order; ripple needs motor angles per joint (n, n).
     """
-    runs, fitted = [*training, *held_out], len(training)
+    runs = [*training, *held_out]
+    fitted = len(training)
     left = [
         np.where(run.usable, run.torque - run.predicted_torque(model, values), 0.0) for run in runs
     ]
@@ -369,7 +375,8 @@ def check_residuals(
     if motor_from_joint is not None:
         waves = [_ripple_sums(*one, motor_from_joint) for one in zip(runs, left, strict=True)]
         ripple = Ripple(block_mean(waves, repeated))
-    friction_power, seen = sum(one[1].sum(axis=0) for one in drift), torque[:fitted].sum(axis=0)
+    friction_power = sum(one[1].sum(axis=0) for one in drift)
+    seen = torque[:fitted].sum(axis=0)
     judged = slice(fitted if held_out else 0, None)
     usable = [run.usable for run in runs]
     outliers = find_outliers(

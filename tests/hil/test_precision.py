@@ -66,12 +66,12 @@ class TestRequirements:
         ("text", "message"),
         [
             ("everything 5%, parameters 5%, colour of arm 3%", "'colour of arm 3%' is not a known"),
-            ("parameters", "is not a quantity with a number.*parameters 5%"),
+            ("parameters", "is not a quantity with a number.*parameters 5 %"),
             (
                 "everything 2",
-                "has no per cent; write everything 5%; write one or several of: param",
+                "has no per cent; write everything 5 %; write one or several of: param",
             ),
-            ("parameters 5", "has no per cent; write parameters 5%"),
+            ("parameters 5", "has no per cent; write parameters 5 %"),
             ("torque 2%", "has the unit %; write torque 2, in N·m"),
             ("torque 2 kg", "has the unit kg; write torque 2, in N·m"),
             ("parameters 0%", "no precision above zero"),

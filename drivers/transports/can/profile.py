@@ -42,7 +42,8 @@ class CanError(TransportError):
 
     def __init__(self, reason: str) -> None:
         DriverError.__init__(self, f"CAN: {reason}; {self.remedy}")
-        self.link, self.reason = "CAN", reason
+        self.link = "CAN"
+        self.reason = reason
 
 
 class CanBusLoadError(CanError, remedy="use a longer cycle, a faster bus or fewer axes, or UDP"):
@@ -164,7 +165,8 @@ class TransferAssembler:
         if len(payload) <= _PREFIX.size or (payload[1] == 0 and len(payload) <= _HEAD.size):
             self._discarded["malformed"] += 1
             return None
-        transfer, index = payload[0], payload[1]
+        transfer = payload[0]
+        index = payload[1]
         ended = self._ended.get(transfer)
         if ended is not None and abs(time - ended) <= DUPLICATE_TIME:
             return None
@@ -175,7 +177,9 @@ class TransferAssembler:
                 self._discarded["torn"] += 1
                 if transfer != self._transfer:
                     self._ended[self._transfer] = time
-            self._transfer, self._parts, self._done = transfer, {}, False
+            self._transfer = transfer
+            self._parts = {}
+            self._done = False
         self._last = time
         self._parts[index] = payload
         packet = self._complete()
@@ -214,7 +218,8 @@ class End:
     def __init__(self, rates: BusRates, sends: int) -> None:
         self.rates, self.discarded = rates, Counter[str]()
         self.cyclic_length: int | None = None
-        self._sends, self._receives = sends, UP if sends == DOWN else DOWN
+        self._sends = sends
+        self._receives = UP if sends == DOWN else DOWN
         self._transfer = -1
         self._assembler = TransferAssembler(self.discarded)
 

@@ -74,11 +74,14 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
 
     Every motion that replaces another satisfies all constraints and has a larger fitness.
     """
-    best, value = (genes.copy(), scores), float(ascent.fitness(scores)[0])
+    best = (genes.copy(), scores)
+    value = float(ascent.fitness(scores)[0])
     slopes = ascent.linearise(genes, scores)
     if slopes is None:
         return best
-    bundle, failures, box = [_Cut(best[0], value, slopes)], 0, _BOX
+    bundle = [_Cut(best[0], value, slopes)]
+    failures = 0
+    box = _BOX
     for _ in range(steps):
         if box < _SMALLEST or ascent.stop():
             break
@@ -95,7 +98,9 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
         if values[index] > value + least:
             if values[index] - value > 0.5 * gain:
                 box = min(1.5 * box, _WIDEST)
-            best, value, failures = (tried[index].copy(), found.take(index)), values[index], 0
+            best = (tried[index].copy(), found.take(index))
+            value = values[index]
+            failures = 0
             slopes = ascent.linearise(best[0], best[1])
             if slopes is None:
                 break
@@ -129,10 +134,12 @@ def _step(bundle: list[_Cut], genes: Array, fitness: float, box: float) -> tuple
     rows = np.concatenate([-cut.slopes.rows for cut in bundle])
     left = np.concatenate([np.maximum(cut.left(genes), 0.0) for cut in bundle])
     within = left < box * np.abs(rows).sum(axis=1)  # the others hold in all of the box
-    rows, left = rows[within], left[within]
+    rows = rows[within]
+    left = left[within]
     gradients = np.array([-cut.slopes.gradient for cut in bundle])
     scale = np.abs(rows).max(axis=1, initial=0.0)
-    unit, zero = np.eye(n), np.zeros((n, 1))
+    unit = np.eye(n)
+    zero = np.zeros((n, 1))
     matrix = np.block(
         [
             [rows / scale[:, None], np.zeros((len(rows), 1))],
@@ -141,7 +148,8 @@ def _step(bundle: list[_Cut], genes: Array, fitness: float, box: float) -> tuple
             [gradients, np.ones((len(gradients), 1))],
         ]
     )
-    upper, lower = np.minimum(box, 1.0 - genes), np.minimum(box, genes)
+    upper = np.minimum(box, 1.0 - genes)
+    lower = np.minimum(box, genes)
     bound = np.concatenate((left / scale, upper, lower, offsets))
     quadratic = scipy.sparse.diags_array(np.append(np.full(n, _CURVATURE), 0.0)).tocsc()
     settings: Any = clarabel.DefaultSettings()

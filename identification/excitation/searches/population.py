@@ -79,7 +79,8 @@ class Scores(NamedTuple):
     @classmethod
     def of_rows(cls, rows: Array) -> Self:
         """Return the scores in an array (m, ROW)."""
-        measures, (precision, duration) = rows[:, :_MEASURES], rows[:, _MEASURES : _MEASURES + 2].T
+        measures = rows[:, :_MEASURES]
+        (precision, duration) = rows[:, _MEASURES : _MEASURES + 2].T
         return cls(measures, precision, duration, rows[:, _MEASURES + 2 :])
 
 
@@ -209,7 +210,8 @@ class Front:
             better = np.flatnonzero(np.all(scale.gains(self.measures) > 0.0, axis=1))
             part = better if len(better) else part
         values = columns(self.measures[part], self.criteria)
-        span, sense = np.ptp(values, axis=0), columns(SENSE, self.criteria)
+        span = np.ptp(values, axis=0)
+        sense = columns(SENSE, self.criteria)
         height = (values - values.min(axis=0)) / np.where(span > 0.0, span, 1.0) @ sense
         highest = part[height >= height.max() - _EQUAL]
         if scale is None or len(highest) == 1:

@@ -115,7 +115,8 @@ def polish(
         strategy.tell(list(asked), _ranks(excess, values).tolist())
         index = int(np.lexsort((-values, excess))[0])  # the first of equal ones
         if (excess[index], -values[index]) < (least, -most):
-            least, most = float(excess[index]), float(values[index])
+            least = float(excess[index])
+            most = float(values[index])
             best = asked[index].copy(), found.take(index)
         evaluated += size
         if not _SMALLEST_STEP < float(np.max(strategy.stds)) < np.inf:
@@ -359,9 +360,13 @@ class _Search:
         scored: Callable[[int], None] | None,
         stop: Callable[[], bool],
     ) -> None:
-        self._population, self._settings, self._journal = population, settings, journal
+        self._population = population
+        self._settings = settings
+        self._journal = journal
         self._genome = population.problem.genome
-        self._progress, self._scored, self._stop = progress, scored, stop
+        self._progress = progress
+        self._scored = scored
+        self._stop = stop
         self._stopped = self._exhausted = False
         self._phase: Phase = "sample"
         self._goal: Goal | None = None
@@ -404,7 +409,8 @@ class _Search:
             # better only at the search's sample period, or other genes of the same motion
             worse = not goal.precise and goal.is_worse(criteria, origin[1])
             if criteria == origin[1] or worse:
-                genes, (trajectory, criteria) = start, origin
+                genes = start
+                (trajectory, criteria) = origin
         return Design(
             genes=genes.copy(),
             excitation=Excitation(
@@ -450,7 +456,8 @@ class _Search:
         With several starts half of the steps are shared by this motion and the best ones of the
         first generation; the other half improve what is best then.
         """
-        settings, fitness = self._settings, goal.polish_fitness(scores)
+        settings = self._settings
+        fitness = goal.polish_fitness(scores)
         ascent = Ascent(
             self._score,
             lambda genes, scores: self._population.linearise(
@@ -459,7 +466,8 @@ class _Search:
             fitness,
             self._should_stop,
         )
-        steps, best = settings.gradient, (genes, scores)
+        steps = settings.gradient
+        best = (genes, scores)
         if settings.starts > 1:
             each = steps // (2 * settings.starts)
             others = self._first_best(fitness, settings.starts - 1, genes)
@@ -481,7 +489,9 @@ class _Search:
 
     def _make_goal(self) -> Goal:
         """Return the goal, with a scale from random motions if the method needs one."""
-        scale, method, settings = None, self._method, self._settings
+        scale = None
+        method = self._method
+        settings = self._settings
         if method.scaled:
             scores = self._score(self._genome.sample(np.random.default_rng(_SCALE), SAMPLE_COUNT))
             try:
@@ -514,7 +524,8 @@ class _Search:
 
     def _report(self) -> None:
         """Count the generation and report progress."""
-        goal, front = self._goal, self._front
+        goal = self._goal
+        front = self._front
         self._generations += self._phase == "search"
         if self._progress is None:
             return

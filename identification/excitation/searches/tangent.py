@@ -113,7 +113,8 @@ def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent
     (motion,) = problem.genome.motions(genes[None])
     if isinstance(motion, PlannerError):
         raise motion
-    states, constraints = states_of(motion), problem.constraints
+    states = states_of(motion)
+    constraints = problem.constraints
     # Steps of velocity as wide as its change between two samples: sgn(qd) jumps between them.
     swing = np.abs(np.diff(states[1], axis=0)).max(axis=0)
     n = states.shape[2]
@@ -156,7 +157,8 @@ def _neighbours(states: Array, steps: Array) -> Iterator[tuple[int, int, Array, 
     """Yield for each state of each joint the states (3, N, n) above and below, and their gap."""
     for kind, joint in np.ndindex(steps.shape):
         step = float(steps[kind, joint])
-        above, below = states.copy(), states.copy()
+        above = states.copy()
+        below = states.copy()
         above[kind, :, joint] += step
         below[kind, :, joint] -= step
         yield kind, joint, above, below, 2.0 * step
@@ -166,7 +168,8 @@ def _excitation(
     objective: Objective, states: Array, steps: Array, weights: Array | None, period: float
 ) -> tuple[Array, float]:
     """Return the slopes of the weighted criteria by the states (3, N, n), and by the duration."""
-    by_duration, of_joints = 0.0, None
+    by_duration = 0.0
+    of_joints = None
     if weights is None:
         precision = objective.precision
         assert precision is not None
@@ -222,8 +225,10 @@ def _runs(which: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
 
 def _distances(checker: CollisionChecker, q: Array) -> Iterator[tuple[Pull, float]]:
     """Yield slope and margin [m] of each approach of two bodies along postures (N, n)."""
-    path, n = checker.path(q), q.shape[1]
-    pairs, count = len(checker.required), len(q)
+    path = checker.path(q)
+    n = q.shape[1]
+    pairs = len(checker.required)
+    count = len(q)
     pair, sample = np.indices((pairs, count)).reshape(2, -1)
     bound = checker.separation.bound(path.bodies, pair, sample).reshape(pairs, count)
     near = bound < checker.required[:, None] + _NEAR

@@ -110,7 +110,8 @@ class ErrorFacts:
         yield from self._of_axes(naming)
 
     def _of_axes(self, naming: Naming) -> Iterator[Finding]:
-        check, limit = "error on unseen motion", percentage(self.limits.axis)
+        check = "error on unseen motion"
+        limit = percentage(self.limits.axis)
 
         def share(joint: int) -> str:
             return percentage(self.relative[joint])
@@ -159,7 +160,8 @@ class UnexplainedFacts:
     @classmethod
     def of(cls, evidence: Evidence, limits: Thresholds) -> UnexplainedFacts | None:
         """Compare the error with the noise; None if faults were found, or not tested."""
-        floor, causes = evidence.floor, evidence.causes
+        floor = evidence.floor
+        causes = evidence.causes
         if floor is None or causes is None or causes:
             return None
         overall = evidence.held_out.overall
@@ -292,7 +294,8 @@ class SystematicFacts:
     @classmethod
     def of(cls, evidence: Evidence, limits: Thresholds) -> SystematicFacts:
         """Compare the shares with their limits."""
-        share, apart = evidence.systematic, evidence.systematic_without_friction
+        share = evidence.systematic
+        apart = evidence.systematic_without_friction
         repeated = share is not None
         share = np.zeros(len(evidence.held_out.rows)) if share is None else np.nan_to_num(share)
         beyond = (share if apart is None else np.nan_to_num(apart)) > limits.systematic

@@ -34,7 +34,8 @@ class OutlierFacts:
         """Compare the errors with and without outliers."""
         if evidence.residuals is None:
             return None
-        outliers, error = evidence.residuals.outliers, evidence.held_out
+        outliers = evidence.residuals.outliers
+        error = evidence.held_out
         few = (outliers.power > limits.outlying_power) & (outliers.share < limits.outliers)
         # An error of rounding has a distribution of its own.
         few &= (outliers.share > 0.0) & (np.nan_to_num(error.relative) > limits.pattern)

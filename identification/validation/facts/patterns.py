@@ -101,7 +101,8 @@ class ProfileFacts:
         quantity: Literal["speed", "position"],
         limits: Thresholds,
     ) -> ProfileFacts:
-        share, worst = checks.share(profile.rms), []
+        share = checks.share(profile.rms)
+        worst = []
         for joint in range(len(share)):
             place, error = profile.worst(joint)
             torque, length = ("N·m", "rad") if evidence.revolute(joint) else ("N", "m")

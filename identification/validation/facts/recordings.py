@@ -129,7 +129,8 @@ class DelayFacts:
     @classmethod
     def of(cls, evidence: Evidence, limits: Thresholds) -> DelayFacts | None:
         """Compare the estimated delay with the assumed one."""
-        delays, assumed = evidence.context.delays, evidence.context.assumed_delay
+        delays = evidence.context.delays
+        assumed = evidence.context.assumed_delay
         if delays is None:
             return None
         # With a poor motion a delay cannot be separated from the parameters.

@@ -31,12 +31,14 @@ class NominalFacts:
         """Compare it with the error of the identified model."""
         if evidence.nominal is None:
             return None
-        nominal, identified = evidence.nominal.overall, evidence.held_out.overall
+        nominal = evidence.nominal.overall
+        identified = evidence.held_out.overall
         return cls(nominal, identified, identified > nominal + limits.nominal)
 
     def findings(self, _: Naming) -> Iterator[Finding]:
         """Yield which model predicts better."""
-        nominal, identified = percentage(self.nominal, 1), percentage(self.identified, 1)
+        nominal = percentage(self.nominal, 1)
+        identified = percentage(self.identified, 1)
         if self.better:
             yield Finding(
                 "against the nominal model",
@@ -68,12 +70,14 @@ class ControllerFacts:
         """Compare it with the error of the identified model."""
         if evidence.context.controller is None:
             return None
-        controller, identified = evidence.context.controller.overall, evidence.held_out.overall
+        controller = evidence.context.controller.overall
+        identified = evidence.held_out.overall
         return cls(controller, identified, identified > controller + limits.nominal)
 
     def findings(self, _: Naming) -> Iterator[Finding]:
         """Yield which model predicts better."""
-        controller, identified = percentage(self.controller, 1), percentage(self.identified, 1)
+        controller = percentage(self.controller, 1)
+        identified = percentage(self.identified, 1)
         if self.better:
             yield Finding(
                 "against the controller's model",

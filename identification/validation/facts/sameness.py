@@ -146,7 +146,8 @@ class FrictionFacts:
         if change is None:
             return None if changes is None else cls._of_changes(changes, limits)
         nothing = np.zeros(len(evidence.held_out.rows))
-        share, apart = evidence.systematic, evidence.systematic_without_friction
+        share = evidence.systematic
+        apart = evidence.systematic_without_friction
         share = nothing if share is None else np.nan_to_num(share)
         beyond = (share if apart is None else np.nan_to_num(apart)) > limits.systematic
         explained = (share > limits.systematic) & ~beyond
@@ -160,7 +161,8 @@ class FrictionFacts:
 
     @classmethod
     def _of_changes(cls, changes: ChangeFacts, limits: Thresholds) -> FrictionFacts:
-        change, joints = changes.ratio - 1.0, changes.friction
+        change = changes.ratio - 1.0
+        joints = changes.friction
         far = joints & changes.matters & (np.abs(change) > FRICTION_CHANGE)
         return cls(change, joints, axes=joints, wrong=bool(far.any()), limit=limits.friction)
 

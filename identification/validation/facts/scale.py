@@ -95,7 +95,8 @@ class SignFacts:
         """Compare the torque with nominal inertias and friction."""
         none = np.zeros(len(evidence.held_out.rows), dtype=np.bool_)
         negated = none if scale is None else np.isfinite(scale.scale) & scale.negated
-        driving, friction = none, tuple("" for _ in none)
+        driving = none
+        friction = tuple("" for _ in none)
         if (dissipation := evidence.dissipation) is not None:
             positive = scale is not None and bool(np.any(scale.scale - scale.tolerance > 0.0))
             driving = dissipation.all_driving & (not (positive or bool(negated.any())))
@@ -161,7 +162,8 @@ class PhysicalSignFacts:
     @classmethod
     def of(cls, evidence: Evidence, signs: SignFacts) -> PhysicalSignFacts:
         """Leave out signs that opposite torques explain."""
-        implausible, consistency = evidence.implausible, evidence.consistency
+        implausible = evidence.implausible
+        consistency = evidence.consistency
         if signs.all_opposite:
             return cls((), (), implausible.added)
         impossible = list(implausible.impossible)
