@@ -270,7 +270,11 @@ class _Search:
         """Adopt the change that fits best; None if none is significant."""
         trials = self.tried()
         good = [
-            trial for trial in trials if _is_better(trial.against) and not self._is_spoilt(trial)
+            trial
+            for trial in trials
+            if _is_better(trial.against)
+            and trial.score.overall < self.score.overall
+            and not self._is_spoilt(trial)
         ]
         if not good:
             return None
@@ -398,7 +402,9 @@ class _Search:
             closer = ranked[:_CLOSER]
             meanings = {change.meaning for change in closer}
             for change in ranked:
-                if change.meaning not in meanings:
+                # An arm that hangs weighs as one that stands, all torques negated.
+                everywhere = change == Change("torque sign", tuple(range(self.model.n_joints)))
+                if change.meaning not in meanings or everywhere:
                     meanings.add(change.meaning)
                     closer.append(change)
             trials = [self._try(change) for change in closer]
