@@ -20,7 +20,7 @@ class ChildProcess:
     """A Python program as a child; nothing of this process' main module is imported again in it.
 
     It is in its own session, so that the end of the terminal and Ctrl-C reach only the parent, and
-    has no standard input. It imports from the same folders. Its standard error is kept in memory.
+    has no standard input. It imports from the same folders. Its standard error goes to memory.
     Its death is seen by `alive`; how it detects that of the parent is its own affair (a heartbeat,
     or the end of a socket).
 

@@ -79,7 +79,7 @@ class Rollout(NamedTuple):
     """A rollout, and the arm that was polished on the way."""
 
     result: RolloutResult
-    polished: Arm | None  #: if it was kept
+    polished: Arm | None  #: if it predicts held-out windows better
     remarks: tuple[str, ...]  #: for its file
 
 
@@ -307,7 +307,7 @@ def _about(motion: RecordedMotion, prepared: Prepared) -> list[str]:
 
 
 def write_rollout(folder: Path, rollout: Rollout) -> str:
-    """Write `rollout.json`, `polished.xml` of a polish that was kept, and a section of the report.
+    """Write `rollout.json`, a better polished arm as `polished.xml`, and a section of the report.
 
     Returns:
         why the report of the folder has no section; empty if it has.

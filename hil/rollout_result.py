@@ -46,7 +46,7 @@ class PolishResult(Frozen):
     """Parameters that were fitted to simulated windows of the fitted motion."""
 
     accepted: bool  #: whether the held-out windows are predicted better
-    reason: str  #: why it was kept or not, one sentence
+    reason: str  #: why it is used or not, one sentence
     windows: int  #: of the fitted motion
     change: float  #: mean of the logarithms of held-out errors, polished over identified
     errors: ArmErrors  #: of the polished arm on the held-out windows

@@ -198,72 +198,6 @@ class LivePort:
         self._closed = False
         self._restart_reader()
 
-    @classmethod
-    def open(
-        cls,
-        cell: Cell,
-        *,
-        transport: TransportSpec | None = None,
-        only_axis: int | None = None,
-        realtime: RealTimeSettings | None = None,
-        finish: Callable[[], None] = lambda: None,
-        live: LiveView | None = None,
-    ) -> LivePort:
-        """Start both processes on the cell's link, or on another `transport` to it.
-
-        From here on large arrays of this process return to the system when they are freed.
-
-        Args:
-            cell: the cell.
-            transport: in place of the cell's own.
-            only_axis: the only axis, from 1, that is opened; None for all.
-            realtime: what the exchange requests from the system.
-            finish: asks the controller to end the session.
-            live: where viewers may connect.
-
-        Raises:
-            LiveViewError: the live view cannot be served.
-            CellError: the cell names no real link.
-            ControllerFault: the link cannot be opened, or the system refuses a process.
-        """
-        return_large_arrays()
-        spec = transport if transport is not None else cell.transport_spec()
-        settings = ExchangeSettings(
-            transport=spec,
-            drive_train=cell.drive_train,
-            guard_limits=cell.guard_limits,
-            period=cell.period,
-            session=cell.session_settings(only_axis=only_axis),
-            realtime=realtime or RealTimeSettings(),
-            preload=("planner",),
-        )
-        try:
-            exchange = ExchangeProcess.start(settings)
-        except DriverError as error:
-            raise ControllerFault(str(error)) from error
-        except OSError as error:
-            raise ControllerFault(f"the exchange process cannot be started: {error}") from error
-        # At once: the archive process may take longer to start than the exchange waits for a beat.
-        heart = Heartbeat(exchange.send_heartbeat)
-        heart.start()
-        try:
-            archive = ArchiveProcessHandle.start(exchange, len(cell.joint_names))
-        except BaseException as error:
-            heart.end()
-            exchange.finish()
-            exchange.close()
-            if isinstance(error, OSError):
-                raise ControllerFault(f"the archive process cannot be started: {error}") from error
-            raise
-        port = cls(cell, exchange, archive, heart, finish, only_simulated=spec.is_local)
-        if live is not None:
-            try:
-                port._serve(live)
-            except BaseException:
-                port._shut()
-                raise
-        return port
-
     # --- the session
 
     @property
@@ -519,15 +453,59 @@ class LiveLink(MotionLink):
         finish: Callable[[], None] = lambda: None,
         live: LiveView | None = None,
     ) -> Self:
-        """Open the port, see `LivePort.open`."""
-        port = LivePort.open(
-            cell,
-            transport=transport,
-            only_axis=only_axis,
-            realtime=realtime,
-            finish=finish,
-            live=live,
+        """Start exchange and archive process on the cell's link, or on another `transport` to it.
+
+        From here on large arrays of this process return to the system when they are freed.
+
+        Args:
+            cell: the cell.
+            transport: in place of the cell's own.
+            only_axis: the only axis, from 1, that is opened; None for all.
+            realtime: what the exchange requests from the system.
+            finish: asks the controller to end the session.
+            live: where viewers may connect.
+
+        Raises:
+            LiveViewError: the live view cannot be served.
+            CellError: the cell names no real link.
+            ControllerFault: the link cannot be opened, or the system refuses a process.
+        """
+        return_large_arrays()
+        spec = transport if transport is not None else cell.transport_spec()
+        settings = ExchangeSettings(
+            transport=spec,
+            drive_train=cell.drive_train,
+            guard_limits=cell.guard_limits,
+            period=cell.period,
+            session=cell.session_settings(only_axis=only_axis),
+            realtime=realtime or RealTimeSettings(),
+            preload=("planner",),
         )
+        try:
+            exchange = ExchangeProcess.start(settings)
+        except DriverError as error:
+            raise ControllerFault(str(error)) from error
+        except OSError as error:
+            raise ControllerFault(f"the exchange process cannot be started: {error}") from error
+        # At once: the archive process may take longer to start than the exchange waits for a beat.
+        heart = Heartbeat(exchange.send_heartbeat)
+        heart.start()
+        try:
+            archive = ArchiveProcessHandle.start(exchange, len(cell.joint_names))
+        except BaseException as error:
+            heart.end()
+            exchange.finish()
+            exchange.close()
+            if isinstance(error, OSError):
+                raise ControllerFault(f"the archive process cannot be started: {error}") from error
+            raise
+        port = LivePort(cell, exchange, archive, heart, finish, only_simulated=spec.is_local)
+        if live is not None:
+            try:
+                port._serve(live)
+            except BaseException:
+                port._shut()
+                raise
         return cls(cell, port)
 
     def __enter__(self) -> Self:

@@ -119,7 +119,7 @@ def design(
             [campaign].
         given: Archive or campaign folder of earlier recordings of this arm (repeatable): the motion
             adds what they do not determine, and the criteria are those of all together.
-        precision: Required halves of 95 % intervals, such as "parameters 5%, torque 2": the motion
+        precision: Required halves of 95 % intervals, such as "parameters 5 %, torque 2": the motion
             minimises the largest ratio of predicted to required interval.
         purpose: payload: a motion of at most ten seconds that weighs a payload (`hil payload`), on
             an arm that is known, if possible from --given.

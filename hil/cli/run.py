@@ -62,7 +62,7 @@ def run(
         no_identify: Only run; no parameters and no report.
         until_precise: End the repetitions when the required precision is reached, or when more of
             them do not help. Their number in [campaign] is the limit.
-        precision: Required, such as "parameters 5%, torque 10". Default: that of the design.
+        precision: Required, such as "parameters 5 %, torque 10". Default: that of the design.
         live: Stream the run to Foxglove; on 127.0.0.1 unless HOST is given.
     """
     if dry_run and accept_dry_run:

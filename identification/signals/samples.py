@@ -97,7 +97,7 @@ class Samples:
         """Return samples start to stop (exclusive), filtered as part of these."""
         part = slice(start, stop)
         motion = self.motion.rows(part)
-        if motion.direction is not None:  # the whole recording's is not kept
+        if motion.direction is not None:  # a view would hold the whole recording's
             motion = motion._replace(direction=motion.direction.copy())
         segments = [
             slice(max(one.start, start) - start, min(one.stop, stop) - start)

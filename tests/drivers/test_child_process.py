@@ -1,4 +1,4 @@
-"""A child process: what it inherits, what is kept of it, and how its end is seen."""
+"""A child process: what it inherits, its error output, and how its end is seen."""
 
 from __future__ import annotations
 
