@@ -298,7 +298,8 @@ def precision_panels(results: Results) -> list[Panel]:
         ratio = np.array(one.ratio)
         note = f"{one.worst} is worst"
         what = "95 % interval over the required one, over repetitions"
-        axes = single(170.0, "interval / required", "repetitions", x_ticks=6)
+        whole = min(6, int(count.max()))  # so many ticks at most are whole numbers
+        axes = single(170.0, "interval / required", "repetitions", x_ticks=whole)
         axes.x_limits = 0.5, float(count.max()) + 0.5
         promised = np.full(2, np.nan if one.promised is None else one.promised)
         shown = np.concatenate([ratio, promised, [0.0, 1.1]])

@@ -168,7 +168,11 @@
         figure: figure, plot: plot, chart: chart, shared: shared, y: y, limits: plot.limits,
         lines: [], strips: [], zeros: [], group: group, name: chart.key + "-" + k
       };
-      if (chart.log) figure.xaxis.each(function (axis) { axis.ticker.desired_num_ticks = 4; });
+      if (chart.log) figure.xaxis.each(function (axis) {
+        // A few instants are each a tick; of a spectrum round ones are.
+        if (sharedX.length <= 6) axis.ticker = new Bokeh.FixedTicker({ ticks: Array.from(sharedX) });
+        else axis.ticker.desired_num_ticks = 4;
+      });
       if (!chart.log) figure.yaxis.each(function (axis) { axis.ticker.desired_num_ticks = plot.height > 80 ? 5 : 3; });
       if (!last) figure.xaxis.each(function (axis) { axis.visible = false; });
       if (plot.shaded.length) {
