@@ -24,7 +24,7 @@ from .state import CampaignState
 from .warmup import WarmUpRecord, drift_wanted
 
 State = Literal["done", "next", "blocked"]
-NOT_WANTED: Final = "none wanted (warmup_drift)"
+NOT_REQUIRED: Final = "not required (warmup_drift)"
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def _gate(campaign: CampaignState, found: Step, record: Path) -> Step:
 
 def _warmed(campaign: CampaignState) -> Step:
     if not drift_wanted(campaign.cell):
-        return Step("done", NOT_WANTED)
+        return Step("done", NOT_REQUIRED)
     warm = WarmUpRecord.load(campaign.folder.warmup, campaign.folder.plan_hash)
     if warm is None and _motions(campaign, "excitation", "repetitions").done:
         return Step("done", "left out")
@@ -211,7 +211,7 @@ def _conducted_warm_up(folder: CampaignFolder) -> Step:
     """Return the step for the report: done if the arm was warm, or no warm-up was wanted."""
     warm = WarmUpRecord.load(folder.warmup, folder.plan_hash)
     if warm is None and not drift_wanted(Cell.load(folder.cell)):
-        return Step("done", NOT_WANTED)
+        return Step("done", NOT_REQUIRED)
     return _warm_up(warm)
 
 
