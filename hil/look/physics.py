@@ -149,7 +149,7 @@ class Finding:
         if any(rival[1].sigmas < SEPARATE and _repeats(rival[0], steps) for rival in rivals):
             certainty = "open"
         reason = f"error {ratio:.2f} times that as recorded ({-sigmas:.0f} standard errors)"
-        if ratio > 1.0 - 0.05:
+        if all(step.by_friction for step in steps):
             reason = "friction would drive the joint otherwise"
         return Row(aspect, text, certainty, reason, decide)
 
@@ -418,6 +418,11 @@ def channel_rows(delay: DelayEstimate | None, low_pass: Preprocessing | None) ->
         yield Row(
             "delay", "none", "sure", f"{1e3 * delay.delay:.1f} ± {1e3 * delay.half_interval:.1g} ms"
         )
+    elif abs(delay.delay) > delay.half_interval:
+        side = "behind" if delay.delay > 0.0 else "before"
+        text = f"perhaps: torque {1e3 * abs(delay.delay):.0f} ms {side} the position"
+        reason = f"± {1e3 * delay.half_interval:.1g} ms; other parts are not predicted better"
+        yield Row("delay", text, "open", reason, "record faster motion")
     else:
         yield Row("delay", "none seen", "likely", str(delay.reason), "record faster motion")
     if low_pass is None or low_pass.torque_bandwidth is None:

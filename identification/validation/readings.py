@@ -68,6 +68,7 @@ _IMPROVES: Final = 0.98  # error ratio of one exchange from which a whole order 
 _ORDERS: Final = 2  # best orders of each kind that are compared
 _CLOSER: Final = 12  # changes of least error on fewer rows, which are compared
 _MOST_STEPS: Final = 6
+_POSTURES: Final = 35  # at which the inertia about each axis is evaluated
 _SPEED: Final = 0.9  # quantile of the speed at which friction is judged
 _ZEROS: Final = (-135.0, -90.0, -45.0, -20.0, 20.0, 45.0, 90.0, 135.0, 180.0)  # deg
 _NEARER: Final = (-0.5, -0.25, 0.25, 0.5)  # of a zero, tried about it
@@ -168,9 +169,18 @@ class Step:
     alike: tuple[tuple[Change, float], ...] = ()
 
     @property
+    def by_friction(self) -> bool:
+        """Whether the error speaks for it little or not at all, but friction does."""
+        return self.ratio > 1.0 - _ALIKE
+
+    @property
     def sure(self) -> bool:
-        """Whether nothing else fits alike, and the arm explains the torque."""
-        return not self.alike and self.error < EXPLAINED
+        """Whether nothing else fits alike, and the arm explains the torque.
+
+        Friction alone says it of a whole arm; of one joint a lag of the torque looks the same.
+        """
+        of_one_joint = len(self.change.joints) == 1
+        return not self.alike and self.error < EXPLAINED and not (self.by_friction and of_one_joint)
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,14 +265,22 @@ class _Search:
         joints = tuple(np.flatnonzero(self.score.driven).tolist())
         if not joints:
             return None
-        moved = np.abs(self.score.friction) > _DISSIPATES
+        friction = self.score.friction
+        clear = friction[np.abs(friction) > _DISSIPATES]
         kinds: tuple[Meaning, ...] = ("torque sign", "position sign")
-        if len(joints) >= max(2, int(moved.sum())):
+        # All torques negated: with other bodies an arm predicts them alike, so that the error does
+        # not decide, but friction and inertia do: a lag of the torque turns none of all.
+        everywhere = (
+            len(clear) > 1
+            and bool(np.all(clear < 0.0))
+            and inertial_share(self.model, self.samples).sum() < 0.0
+        )
+        if everywhere:
             kinds = ("torque sign",)
             joints = tuple(range(self.model.n_joints))
         trials = [self._try(Change(kind, joints)) for kind in kinds]
         best = min(trials, key=lambda trial: trial.against.ratio)
-        if best.against.ratio > 1.0 + _ALIKE or best.against.sigmas > SURE:
+        if not everywhere and (best.against.ratio > 1.0 + _ALIKE or best.against.sigmas > SURE):
             return None
         return self._adopt(best, trials)
 
@@ -278,11 +296,12 @@ class _Search:
         ]
         if not good:
             return None
+        zeros = [trial for trial in good if trial.change.meaning == "zero"]
+        if zeros:  # an angle between those tried may fit as well as another change
+            good.append(self._nearer(min(zeros, key=lambda trial: trial.against.ratio)))
         best = min(good, key=lambda trial: trial.against.ratio)
         close = [trial for trial in good if self._are_alike(trial, best)]
         best = min(close, key=lambda trial: (int(trial.score.driven.sum()), trial.against.ratio))
-        if best.change.meaning == "zero":
-            best = self._nearer(best)
         return self._adopt(best, good)
 
     def single_as_good_as(self, score: Score, tried: Sequence[Trial]) -> Step | None:
@@ -563,6 +582,32 @@ def score_of(model: RobotModel, samples: Samples) -> Score:
     friction = np.array(estimates) @ _friction_columns(model, samples).T
     deviation = np.sqrt((_FOLDS - 1) * friction.var(axis=0))
     return _score(factor, squares, friction.mean(axis=0), deviation)
+
+
+def inertial_share(model: RobotModel, samples: Samples) -> Array:
+    """Return the torque of each joint's own acceleration over its torque (n,), both RMS.
+
+    By a fit; negative where the fit has a negative inertia about the axis.
+    """
+    factor = Factor.of(model, samples)
+    prior = body_prior(model, factor).gaussian
+    values = posterior_values(factor, prior, _ROWS_PER_FACT)[0]
+    motion = samples.motion
+    position = motion.position[:: max(1, len(motion.position) // _POSTURES)]
+    still = np.zeros_like(position)
+    weight = model.torque(values, position, still, still)
+    units = np.eye(model.n_joints)
+    inertia = np.array(
+        [
+            np.mean(
+                model.torque(values, position, still, still + unit)[:, joint] - weight[:, joint]
+            )
+            for joint, unit in enumerate(units)
+        ]
+    )
+    acceleration = np.sqrt(np.mean(motion.acceleration**2, axis=0))
+    torque = np.sqrt(np.mean(samples.torque**2, axis=0))
+    return np.asarray(inertia * acceleration / np.where(torque > 0.0, torque, 1.0))
 
 
 def _squares(factor: Factor, values: Array, blocks: slice | NDArray[np.bool_]) -> Array:

@@ -8,6 +8,7 @@ import pty
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from hil.importers.recording import ImportOptions
 from hil.look import Look, look_at
 from hil.look.conclusions import concluded
 from hil.look.maps import entries_of
+from hil.look.physics import channel_rows
+from identification.estimators.delay import DelayEstimate
 from identification.validation.readings import Axes, Change
 from tests.hil.simulated_logs import write_log, write_moving_log
 from tests.hil.test_log_kinds import JOINTS, URDF
@@ -105,6 +108,19 @@ def test_a_planted_meaning_is_named(
 ) -> None:
     found = look(urdf, tmp_path / "a.csv", table, **plant(table))
     assert words in reading(found, aspect)[0]
+
+
+def test_a_delay_that_other_parts_do_not_confirm_is_open() -> None:
+    delay = DelayEstimate(
+        delay=0.03, std=0.003, assumed=0.0, cycle=0.004, interval_factor=2.0,
+        reason="95 % interval of ± 6 ms", significant=False,
+    )  # fmt: skip
+    row, _ = channel_rows(delay, None)
+    assert (row.reading, row.certainty) == ("perhaps: torque 30 ms behind the position", "open")
+    early, _ = channel_rows(replace(delay, delay=-0.03), None)
+    assert early.reading == "perhaps: torque 30 ms before the position"
+    unseen, _ = channel_rows(replace(delay, delay=0.005), None)
+    assert unseen.reading == "none seen"
 
 
 def test_degrees_are_concluded(tmp_path: Path, urdf: Path, table: Mapping[str, Floats]) -> None:
