@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hil.annotate import annotate as write_annotated
 from hil.errors import InputError
 from hil.files import make_folder, write_output
 from hil.identified_campaign import identify_paths
@@ -286,6 +285,8 @@ def write_arm(
         found = replace(found, paths=tuple(places.get(path, path) for path in found.paths))
     results = write_outcome(place, found, reporter)
     if annotate:
+        from hil.annotate import annotate as write_annotated  # only for these copies
+
         copies = write_annotated(found, place)
         reporter.say(f"annotated for viewers: {', '.join(map(str, copies))}")
     if sources is not None:

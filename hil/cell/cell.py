@@ -86,6 +86,11 @@ class Cell:
         """Folders that contain the packages of `package://` mesh paths."""
         return tuple(str(self.path.parent / name) for name in self.file.cell.mesh_folders)
 
+    @property
+    def stated(self) -> CellFile:
+        """Content of the text, without changes such as those of :meth:`with_friction`."""
+        return _parse(self.path, self.text)
+
     @cached_property
     def model(self) -> RobotModel:
         """Rigid body model with rotor inertias and friction law, from the URDF."""

@@ -121,11 +121,13 @@ class LazyCommands(UserDict[str, Any]):
         """Return the command, importing it on first use."""
         known = super().__getitem__(name)
         if known is None:
-            # Modules leave nothing to collect; looking for it takes a tenth of their time.
+            # Modules leave nothing to collect: looking for it takes a tenth of their time now, and
+            # would again during the command and at its end.
             gc.disable()
             try:
                 known = self[name] = _command(name)
             finally:
+                gc.freeze()
                 gc.enable()
         return known
 

@@ -33,7 +33,7 @@ from identification.validation.plausibility import (
 from identification.validation.prediction import PredictionError, pooled_error
 
 from .prepared import Prepared
-from .sources import Source, cell_of
+from .sources import Source
 
 Array = NDArray[np.float64]
 
@@ -182,8 +182,7 @@ def _added_friction(prepared: Prepared) -> tuple[str, ...]:
     chosen = prepared.settings.friction
     if not any(choice.name == _FRICTION_AT_SPEED for choice in prepared.settings.choices):
         return ()
-    path = prepared.sources.training[0].path
-    stated = cell_of(open_archive(path, fields=("cycle",))).file.robot.friction
+    stated = prepared.sources.cell.stated.robot.friction
     added = [
         term.symbol
         for term in TERMS

@@ -11,13 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from shutil import copyfile
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import zstandard
-from rosbags.highlevel import AnyReader
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.typesys import Stores, get_typestore
-from ruamel.yaml import YAML
 
 from hil.archive.container import MOST_INFLATION
 from hil.errors import SourceError
@@ -25,6 +23,9 @@ from hil.importers import mcap_messages
 from hil.importers.mcap_messages import Topic
 from hil.importers.ros_messages import MessageError, decoded, typestore_of
 from hil.reading import open_file, read_text
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
 
 SUFFIXES: Final = (".db3", ".mcap", ".bag")
 _PACKED: Final = (".zstd", ".zst")
@@ -65,6 +66,8 @@ def _require_parts(folder: Path, present: set[str]) -> None:
     metadata = folder / "metadata.yaml"
     if not metadata.is_file():
         return
+    from ruamel.yaml import YAML  # only for bags
+
     try:
         content = YAML(typ="safe").load(read_text(metadata))
         named = content["rosbag2_bagfile_information"]["relative_file_paths"]
@@ -223,6 +226,8 @@ class _ReaderPart(_Part):
 
 @contextmanager
 def _reader_part(file: Path, path: Path) -> Iterator[_ReaderPart]:
+    from rosbags.highlevel import AnyReader  # only for bags
+
     try:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()

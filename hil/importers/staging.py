@@ -25,7 +25,6 @@ from hil.importers.recording import (
 )
 from hil.importers.robot import Use
 from hil.importers.usable import require_motion, require_torque
-from hil.look.conclusions import concluded
 from hil.progress import Reporter
 
 MAP: Final = "map.toml"
@@ -101,6 +100,8 @@ def staged(
                 if is_archive(path):
                     archives.append(path)
                     continue
+                from hil.look.conclusions import concluded  # only for logs and bags
+
                 archive = _free(Path(folder), path)
                 recording = import_recording(path, archive, robot_of, options, use=use)
                 require_motion(archive, path)

@@ -14,7 +14,7 @@ from hil.identify.sources import cell_of, source_of
 from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, import_recording
 from hil.importers.robot import Robot, Use
 from hil.look.result import Choice, Look
-from hil.look.run import SETTINGS, look_at
+from hil.look.run import SETTINGS, look_at_joints
 from hil.terminal_text import typed
 from identification.errors import IdentificationError
 from identification.signals.samples import prepare
@@ -48,7 +48,7 @@ def concluded(
         return imported
     if not _is_suspect(imported.archive):
         return imported
-    found = look_at(source, robot_of, options)
+    found = look_at_joints(source, imported)
     if found.error is not None and found.error > _OTHER_ARM:
         raise _other_arm(source, found.error)
     if found.questions:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,7 +18,7 @@ from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, i
 from hil.importers.usable import require_motion
 from hil.look import physics, signals
 from hil.look.maps import with_entries
-from hil.look.result import Look, Row
+from hil.look.result import Group, Look, Row
 from hil.look.undescribed import undescribed_robot
 from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate, estimate_delay
@@ -74,23 +75,49 @@ def _with_torque(
     source: Path, recorded: Source, imported: ImportedRecording, cell: Cell, rows: list[Row]
 ) -> Look:
     recording = recorded.recording
-    model = cell.model
     if recording.torque is None:
         rows.append(physics.current_only())
         return Look(source.name, tuple(rows), (), (), imported.map_text)
+    finding = _finding(source, imported, cell, recording)
+    delay, low_pass = _channel(finding.axes.read(recording), finding.readings.model)
+    channel = physics.channel_rows(delay, low_pass)
+    groups = physics.determined(finding.readings)
+    return _look_of(finding, (*rows, *finding.rows(), *channel), groups)
+
+
+def look_at_joints(source: Path, imported: ImportedRecording) -> Look:
+    """Return what the torque of an imported recording says of its joints, and no more.
+
+    Raises:
+        SourceError: the recording cannot be used.
+    """
+    opened = open_archive(imported.archive)
+    cell = cell_of(opened)
+    finding = _finding(source, imported, cell, source_of(opened, cell).recording)
+    return _look_of(finding, finding.rows(), ())
+
+
+def _finding(
+    source: Path, imported: ImportedRecording, cell: Cell, recording: Recording
+) -> physics.Finding:
     readings = _readings(cell, recording, imported)
-    axes = Axes.of((step.change for step in readings.steps), model.n_joints)
-    finding = physics.Finding(cell, recording, readings, axes, imported.map_text, source)
-    delay, low_pass = _channel(axes.read(recording), readings.model)
-    rows += finding.rows()
-    rows += physics.channel_rows(delay, low_pass)
-    questions = finding.questions()
-    groups = physics.determined(readings)
-    text = imported.map_text
+    axes = Axes.of((step.change for step in readings.steps), cell.model.n_joints)
+    return physics.Finding(cell, recording, readings, axes, imported.map_text, source)
+
+
+def _look_of(finding: physics.Finding, rows: Sequence[Row], groups: tuple[Group, ...]) -> Look:
+    text = finding.map_text
     if text is not None:
         text = with_entries(text, finding.entries())
-    error = readings.score.overall
-    return Look(source.name, tuple(rows), questions, groups, text, finding.options(), error)
+    return Look(
+        finding.source.name,
+        tuple(rows),
+        finding.questions(),
+        groups,
+        text,
+        finding.options(),
+        finding.readings.score.overall,
+    )
 
 
 def _readings(cell: Cell, recording: Recording, imported: ImportedRecording) -> Readings:

@@ -17,6 +17,7 @@ positive definite instead of I_im >= 0.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -80,6 +81,7 @@ class Program:
     positive: Array  # rows (r, v) whose product with u is not negative
 
     @classmethod
+    @lru_cache(maxsize=4)  # the folds of a recording have one model and prior
     def of(cls, model: RobotModel, prior: BodyPrior) -> Program:
         """Set up the constraints of a model; the prior gives the size of drives and friction."""
         layout = model.layout
@@ -120,7 +122,7 @@ class Program:
         # as where the data are many orders of magnitude more precise.
         q, triangle = np.linalg.qr(_of_full_rank(rows @ self.to_parameters))
         middle = np.linalg.solve(triangle, q[: len(target)].T @ target)
-        constraints, bounds, cones = self._constraints(clarabel)
+        constraints, bounds, cones = self._constraints
         settings = clarabel.DefaultSettings()
         settings.verbose = False
         settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = _TOLERANCE
@@ -142,8 +144,11 @@ class Program:
         u = middle + np.linalg.solve(triangle, np.array(solution.x))
         return self.to_parameters @ self._inside(u)
 
-    def _constraints(self, clarabel: Any) -> tuple[Array, Array, list[Any]]:
-        """Return A, b and the cones K of ``b - A u in K``."""
+    @cached_property
+    def _constraints(self) -> tuple[Array, Array, list[Any]]:
+        """A, b and the cones K of ``b - A u in K``."""
+        import clarabel
+
         blocks = [-self.positive]
         bounds = [np.zeros(len(self.positive))]
         cones = [clarabel.NonnegativeConeT(len(self.positive))] if len(self.positive) else []

@@ -192,7 +192,7 @@ def posterior_values(
     variance = gram[:, -1, -1] / rows
     floor = factor.smallest_noise**2 * variance + np.finfo(np.float64).tiny
     precision = design_effect * prior.information
-    length = np.sqrt(np.maximum(np.diag(precision), np.finfo(np.float64).tiny))
+    least = np.maximum(precision.diagonal(), np.finfo(np.float64).tiny)
     values = prior.mean
     weights = np.zeros(factor.n_joints)
     if start is not None:
@@ -200,11 +200,11 @@ def posterior_values(
     for _ in range(_ROUNDS):
         weights = np.where(factor.samples > 0, 1.0 / np.maximum(variance, floor), 0.0)
         equations = factor.weighted(weights)
-        scale = np.sqrt(np.diag(equations.A) + length**2)
+        scale = np.sqrt(equations.A.diagonal() + least)
         values = (
             prior.mean
             + np.linalg.solve(
-                (equations.A + precision) / np.outer(scale, scale),
+                (equations.A + precision) / (scale[:, None] * scale),
                 (equations.b - equations.A @ prior.mean) / scale,
             )
             / scale

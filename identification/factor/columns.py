@@ -104,6 +104,54 @@ def gain_factor(
     return Factor.of_rows([(index, tables)], count_by_block(index, usable), every, names)
 
 
+def every_torque_factor(model: RobotModel, samples: Samples) -> Factor:
+    """Reduce the usable rows of a recording to [W | y_1 ... y_n], whatever its torques are of.
+
+    :func:`of_torques` gives the factor of one order and signs of the n torques.
+    """
+    n = model.n_joints
+    p = model.n_parameters
+    every = samples.torque.T
+    chunks = (
+        (
+            np.zeros(part.stop - part.start, dtype=np.intp),
+            [
+                np.concatenate(
+                    [block[:-1], np.where(samples.usable[part, joint], every[:, part], 0.0)]
+                )
+                for joint, block in enumerate(tables)
+            ],
+        )
+        for part, tables in augmented_rows(model, samples)
+    )
+    columns = tuple(np.append(own, np.arange(p, p + n - 1)) for own in model.plan.columns)
+    names = (*model.parameter_names, *(f"torque {joint}" for joint in range(1, n)))
+    counts = np.count_nonzero(samples.usable, axis=0)[None]
+    return Factor.of_rows(chunks, counts, columns, names)
+
+
+def of_torques(factor: Factor, order: NDArray[np.intp], sign: Array) -> Factor:
+    """Return the part [W | y] of an :func:`every_torque_factor`.
+
+    The torque of joint j is recorded in place ``order[j]`` of n, with the sign ``sign[j]``.
+    """
+    n = factor.n_joints
+    matrices = []
+    for joint, gram in enumerate(factor.matrices):
+        width = gram.shape[1] - n
+        places = np.append(np.arange(width), width + order[joint])
+        part = gram[:, places[:, None], places]
+        part[:, -1] *= sign[joint]
+        part[:, :, -1] *= sign[joint]
+        matrices.append(part)
+    return replace(
+        factor,
+        matrices=tuple(matrices),
+        columns=tuple(own[: 1 - n] if n > 1 else own for own in factor.columns),
+        parameter_names=factor.parameter_names[: len(factor.parameter_names) + 1 - n],
+    )
+
+
 def standard_factor(model: RobotModel, recordings: Sequence[Samples]) -> Factor:
     """Reduce some `_MOST_ROWS` usable rows of each recording to [W0 | Wx | Wy | Wz | y].
 

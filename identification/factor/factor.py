@@ -225,17 +225,26 @@ class Factor:
 
     def weighted(self, weights: Array) -> NormalEquations:
         """Return the normal equations with one weight per joint (n,): 1/variance."""
-        total = np.tensordot(weights, self.gram, axes=1)
+        # One product of flat matrices: the general sum takes several times as long.
+        total = (weights @ self.gram.reshape(len(weights), -1)).reshape(self.gram.shape[1:])
         return NormalEquations(
             A=total[:-1, :-1], b=total[:-1, -1], yy=float(total[-1, -1]), n=int(self.samples.sum())
         )
 
     def squared_errors(self, values: Array) -> Array:
         """Return the sum of squared torque errors of parameters (p,) per joint (n,)."""
-        squares = np.zeros(self.n_joints)
-        for joint, used in enumerate(self.columns):
-            augmented = np.append(-values[used], 1.0)
-            squares[joint] = augmented @ self._sums[joint] @ augmented
+        augmented = np.ones(self.n_parameters + 1)
+        np.negative(values, out=augmented[:-1])
+        return np.maximum((self.gram @ augmented) @ augmented, 0.0)
+
+    def squared_errors_by_block(self, values: Array) -> Array:
+        """Return the sum of squared torque errors (B, n) of own parameters of each block (B, p)."""
+        assert self.storage == "gram"
+        augmented = np.column_stack([-values, np.ones(len(values))])
+        squares = np.zeros((len(self), self.n_joints))
+        for joint, grams in enumerate(self.matrices):
+            own = augmented[:, self._places(joint)]
+            squares[:, joint] = (own[:, None] @ grams @ own[:, :, None])[:, 0, 0]
         return np.maximum(squares, 0.0)
 
     def residual_rms(self, values: Array) -> Array:

@@ -54,12 +54,12 @@ class StandardLayout:
         """Number s of standard parameters."""
         return self.n_joints * self.width + len(self.pairs)
 
-    @property
+    @cached_property
     def links(self) -> Places:
         """Indices of the ten inertial parameters of each link (n, 10)."""
         return self._joint_blocks[:, :_N_LINK]
 
-    @property
+    @cached_property
     def rotors(self) -> Places:
         """Indices of the rotor inertias (n,), or (0,)."""
         return self._joint_blocks[:, _N_LINK:].reshape(-1)

@@ -270,18 +270,20 @@ class Folds:
         """Return the factor of all segments but k."""
         return self.fitted.without(slice(k, k + 1))
 
+    @property
+    def separable(self) -> bool:
+        """Whether rows are fitted without any one of the segments."""
+        others = self.fitted.samples - self.fitted.counts
+        return bool(others.any(axis=1).all())
+
     def errors(
         self, estimate: Callable[[Factor], Array], rows: Literal["all", "fitted"] = "all"
     ) -> Errors:
         """Return prediction errors of ``estimate(factor without a segment)`` on its rows."""
         targets = self.predicted if rows == "all" else self.fitted
-        squares = np.array(
-            [
-                targets.blocks(np.arange(FOLDS) == k).squared_errors(estimate(self.without(k)))
-                for k in range(FOLDS)
-            ]
-        )
-        return Errors(squares, np.array([table[:, -1, -1] for table in targets.matrices]).T)
+        values = np.array([estimate(self.without(k)) for k in range(FOLDS)])
+        torque = np.array([table[:, -1, -1] for table in targets.matrices]).T
+        return Errors(targets.squared_errors_by_block(values), torque)
 
 
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
@@ -610,7 +612,7 @@ class _Trial:
         reduced = self._reduced(settings)
         n = settings.model.n_joints
         unknown = Errors(np.full((FOLDS, n), np.inf), np.ones((FOLDS, n)))
-        if not all(reduced.folds.without(k).samples.any() for k in range(FOLDS)):
+        if not reduced.folds.separable:
             return unknown
         estimate = self._estimator(settings, reduced)
         try:
@@ -704,9 +706,9 @@ class _Trial:
         """
         model = settings.model
         how = settings.preprocessing
-        if how not in self._samples:
-            self._samples[how] = [*self._ready(model, how)]
         key = how, tuple(law.presliding for law in model.friction.laws)
+        if how not in self._samples:
+            self._samples[how] = self._directed[key] = [*self._ready(model, how)]
         if key not in self._directed:
             self._directed[key] = [
                 each.with_friction_direction(model) for each in self._samples[how]

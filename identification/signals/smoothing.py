@@ -91,15 +91,22 @@ def _difference_variance(time: Array, values: Array, order: int) -> Array:
     total = np.zeros(values.shape[1])
     count = len(time) - order
     for start in range(0, count, _ROWS_AT_ONCE):
-        rows = slice(start, min(start + _ROWS_AT_ONCE, count) + order)
-        windows = np.lib.stride_tricks.sliding_window_view(time[rows], order + 1)
-        scale = windows[:, -1:] - windows[:, :1]
-        apart = (windows[:, :, None] - windows[:, None, :]) / scale[:, :, None]
-        apart[:, np.arange(order + 1), np.arange(order + 1)] = 1.0
-        weights = 1.0 / apart.prod(axis=2)
-        weights /= np.linalg.norm(weights, axis=1, keepdims=True)
-        stacked = np.lib.stride_tricks.sliding_window_view(values[rows], order + 1, axis=0)
-        total += np.sum(np.einsum("mck,mk->mc", stacked, weights) ** 2, axis=0)
+        rows = min(_ROWS_AT_ONCE, count - start)
+        channels = np.ascontiguousarray(values[start : start + rows + order].T)
+        times = [time[start + k : start + k + rows] for k in range(order + 1)]
+        scale = times[-1] - times[0]
+        weights = np.ones((order + 1, rows))
+        for k in range(order + 1):
+            for earlier in range(k):
+                apart = (times[k] - times[earlier]) / scale
+                weights[k] *= apart
+                weights[earlier] *= -apart
+        np.divide(1.0, weights, out=weights)
+        weights /= np.linalg.norm(weights, axis=0)
+        difference = weights[0] * channels[:, :rows]
+        for k in range(1, order + 1):
+            difference += weights[k] * channels[:, k : k + rows]
+        total += np.einsum("cm,cm->c", difference, difference)
     return np.asarray(total / count)
 
 

@@ -19,11 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.estimators.prior import body_prior, posterior_values
+from identification.factor.columns import every_torque_factor, of_torques
 from identification.factor.factor import Factor
+from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples
-from identification.validation.causes import Fault, Kind, corrected
+from identification.validation.causes import Fault, corrected
 from identification.validation.finding import little_torque
 
 Array = NDArray[np.float64]
@@ -75,6 +77,7 @@ _NEARER: Final = (-0.5, -0.25, 0.25, 0.5)  # of a zero, tried about it
 _DEGREE: Final = np.pi / 180.0
 _SIGNS: Final[tuple[Meaning, ...]] = ("torque sign", "position sign", "axis sign")
 _IN_ORDER: Final[tuple[Meaning, ...]] = ("torque order", "position order", "joint order")
+_GRAVITIES: Final[tuple[Meaning, ...]] = ("mounting", "no gravity")
 
 
 class Change(NamedTuple):
@@ -94,6 +97,10 @@ class Change(NamedTuple):
     def places(self) -> tuple[int, ...]:
         """The joints in whose place those of `joints` are read, for an order."""
         return self.order or self.joints[::-1]
+
+
+_AS_READ: Final = Change("position order")
+"""No change: an order of no joints."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,6 +266,7 @@ class _Search:
         self._unit_is_open = unit_is_open
         self.score = score_of(model, samples)
         self._trials: list[Trial] | None = None
+        self._tries: dict[Change, Trial] = {}
 
     def by_friction(self) -> Step | None:
         """Adopt the sign of joints that friction would drive; None if it drives none."""
@@ -343,7 +351,7 @@ class _Search:
             and trial.score.overall < (1.0 + _ALIKE) * best.score.overall
         )
 
-    def _orders(self, trials: Sequence[Trial]) -> Iterator[Trial]:
+    def _orders(self, trials: Sequence[Trial], fits: _Fits) -> Iterator[Trial]:
         """Yield whole orders: from several starts, the best exchange while the error falls."""
         is_poor = self.score.overall > EXPLAINED
         for kind in _IN_ORDER:
@@ -351,34 +359,10 @@ class _Search:
             if not is_poor and not any(trial.against.ratio < _IMPROVES for trial in own):
                 continue
             tried = {_whole_order(trial.change, self.model.n_joints) for trial in own}
-            for order in self._best_orders(kind, _STARTS if is_poor else 1):
+            for order in _best_orders(fits, kind, _STARTS if is_poor else 1):
                 change = _order_change(kind, order)
                 if change.joints and order not in tried:
                     yield self._try(change)
-
-    def _best_orders(self, kind: Meaning, starts: int) -> list[tuple[int, ...]]:
-        """Return the orders of least error on few rows."""
-        few = _thinned(self.samples, _FEWER_ROWS)
-        errors: dict[tuple[int, ...], float] = {}
-
-        def error(order: tuple[int, ...]) -> float:
-            if order not in errors:
-                change = _order_change(kind, order)
-                samples = _reordered(self.model, few, change) if change.joints else few
-                errors[order] = fitted_error(self.model, samples)
-            return errors[order]
-
-        n = self.model.n_joints
-        rng = np.random.default_rng(0)
-        for start in range(starts):
-            order = tuple(range(n)) if start == 0 else tuple(rng.permutation(n).tolist())
-            while True:
-                others = [_exchanged(order, pair) for pair in combinations(range(n), 2)]
-                best = min(others, key=error)
-                if error(best) >= error(order):
-                    break
-                order = best
-        return sorted(errors, key=lambda order: errors[order])[:_ORDERS]
 
     def _is_spoilt(self, trial: Trial) -> bool:
         """Whether a change that concerns few joints fits another one worse, or drives one."""
@@ -405,6 +389,7 @@ class _Search:
         self.samples = best.samples
         self.score = best.score
         self._trials = None
+        self._tries.clear()
         ratio, sigmas, _ = best.against
         ranked = sorted(alike.items(), key=lambda pair: pair[1])
         return Step(best.change, best.score.overall, before, ratio, sigmas, tuple(ranked))
@@ -412,11 +397,8 @@ class _Search:
     def tried(self) -> list[Trial]:
         """Return the changes of least error, tried on all rows."""
         if self._trials is None:
-            few = _thinned(self.samples, _FEWER_ROWS)
-            errors: dict[Change, float] = {}
-            for change in self._changes():
-                model, samples = self._changed(change, few)
-                errors[change] = fitted_error(model, samples)
+            fits = _Fits(self.model, _thinned(self.samples, _FEWER_ROWS), self._mountings)
+            errors = {change: fits.error(change) for change in self._changes()}
             ranked = sorted(errors, key=lambda change: errors[change])
             closer = ranked[:_CLOSER]
             meanings = {change.meaning for change in closer}
@@ -427,7 +409,7 @@ class _Search:
                     meanings.add(change.meaning)
                     closer.append(change)
             trials = [self._try(change) for change in closer]
-            self._trials = [*trials, *self._orders(trials)]
+            self._trials = [*trials, *self._orders(trials, fits)]
         return self._trials
 
     def _nearer(self, best: Trial) -> Trial:
@@ -456,16 +438,57 @@ class _Search:
             yield from (Change(kind, pair) for kind in _IN_ORDER)
 
     def _try(self, change: Change) -> Trial:
-        model, samples = self._changed(change, self.samples)
-        score = score_of(model, samples)
-        return Trial(change, model, samples, score, compare(score, self.score, self.model))
+        if change not in self._tries:
+            model = _mounted(self.model, change, self._mountings)
+            samples = _moved(self.model, self.samples, change)
+            score = score_of(model, samples)
+            against = compare(score, self.score, self.model)
+            self._tries[change] = Trial(change, model, samples, score, against)
+        return self._tries[change]
 
-    def _changed(self, change: Change, samples: Samples) -> tuple[RobotModel, Samples]:
-        if change.meaning == "mounting":
-            return self._mountings[change.name], samples
-        if change.meaning == "no gravity":
-            return self._mountings[""], samples
-        return self.model, _moved(self.model, samples, change)
+
+class _Fits:
+    """Fits to all of few rows under changes of a reading.
+
+    A motion is reduced once for all torques: orders and signs of torques are parts of its sums.
+    """
+
+    def __init__(
+        self, model: RobotModel, samples: Samples, mountings: Mapping[str, RobotModel]
+    ) -> None:
+        self.model = model
+        self._samples = samples
+        self._mountings = mountings
+        self._sums: dict[Change, Factor] = {}  # by the change of the motion
+
+    def error(self, change: Change) -> float:
+        """Return the logarithm of the squared error of a fit, summed over the joints."""
+        model = _mounted(self.model, change, self._mountings)
+        motion = _of_motion(change)
+        if motion not in self._sums:
+            moved = _moved(self.model, self._samples, motion)
+            self._sums[motion] = every_torque_factor(model, moved)
+        axes = Axes.of([change], self.model.n_joints)
+        sums = self._sums[motion]
+        factor = of_torques(sums, axes.torque_order, axes.torque_sign)
+        prior = body_prior(model, factor).gaussian
+        squares = factor.squared_errors(posterior_values(factor, prior, _ROWS_PER_FACT)[0])
+        return float(np.log(np.where(squares > 0.0, squares, 1.0)).sum())
+
+
+def _of_motion(change: Change) -> Change:
+    """Return the change of the motion that is part of a change, or of a mounting."""
+    if change.meaning in ("torque sign", "torque order"):
+        return _AS_READ
+    if change.meaning == "axis sign":
+        return change._replace(meaning="position sign")
+    if change.meaning.endswith("order"):
+        return Change("position order", change.joints, order=change.places)
+    return change
+
+
+def _mounted(model: RobotModel, change: Change, mountings: Mapping[str, RobotModel]) -> RobotModel:
+    return mountings[change.name] if change.meaning in _GRAVITIES else model
 
 
 def _moved(model: RobotModel, samples: Samples, change: Change) -> Samples:
@@ -473,6 +496,8 @@ def _moved(model: RobotModel, samples: Samples, change: Change) -> Samples:
     meaning = change.meaning
     joints = change.joints
     motion = samples.motion
+    if meaning in _GRAVITIES:
+        return samples
     if meaning.endswith("order"):
         return _reordered(model, samples, change)
     if meaning in ("torque sign", "axis sign"):
@@ -494,24 +519,42 @@ def _moved(model: RobotModel, samples: Samples, change: Change) -> Samples:
     return replace(samples, motion=motion, mask=None).with_friction_direction(model)
 
 
-_FAULTS: Final[Mapping[str, Kind]] = {
-    "torque order": "torque order",
-    "position order": "position order",
-    "joint order": "joint order",
-}
-
-
 def _reordered(model: RobotModel, samples: Samples, change: Change) -> Samples:
-    """Return samples with joints read from other places, one exchange after the other."""
-    order = np.arange(model.n_joints)
-    now = np.arange(model.n_joints)
-    order[list(change.joints)] = change.places
-    for joint in range(model.n_joints):
-        place = int(np.flatnonzero(now == order[joint])[0])
-        if place != joint:
-            now[[joint, place]] = now[[place, joint]]
-            samples = corrected(model, samples, Fault(_FAULTS[change.meaning], (joint, place)))
-    return samples
+    """Return samples with joints read from other places."""
+    order = np.array(_whole_order(change, model.n_joints))
+    motion = samples.motion
+    torque = samples.torque
+    usable = samples.usable
+    if change.meaning != "torque order":
+        load = None if motion.load is None else motion.load[:, order]
+        motion = Motion(motion.time, *(part[:, order] for part in motion[1:4]), load=load)
+        usable = usable[:, order]
+    if change.meaning != "position order":
+        torque = torque[:, order]
+    result = replace(samples, motion=motion, torque=torque, usable=usable, mask=None)
+    return result.with_friction_direction(model)
+
+
+def _best_orders(fits: _Fits, kind: Meaning, starts: int) -> list[tuple[int, ...]]:
+    """Return the orders of least error on few rows."""
+    errors: dict[tuple[int, ...], float] = {}
+
+    def error(order: tuple[int, ...]) -> float:
+        if order not in errors:
+            errors[order] = fits.error(_order_change(kind, order))
+        return errors[order]
+
+    n = fits.model.n_joints
+    rng = np.random.default_rng(0)
+    for start in range(starts):
+        order = tuple(range(n)) if start == 0 else tuple(rng.permutation(n).tolist())
+        while True:
+            others = [_exchanged(order, pair) for pair in combinations(range(n), 2)]
+            best = min(others, key=error)
+            if error(best) >= error(order):
+                break
+            order = best
+    return sorted(errors, key=lambda order: errors[order])[:_ORDERS]
 
 
 def _exchanged(order: tuple[int, ...], pair: tuple[int, int]) -> tuple[int, ...]:
@@ -555,14 +598,6 @@ def _thinned(samples: Samples, rows: int) -> Samples:
 def _factor(model: RobotModel, samples: Samples) -> Factor:
     index = np.arange(len(samples.torque)) * _BLOCKS // max(1, len(samples.torque))
     return Factor.of(model, samples, index=index)
-
-
-def fitted_error(model: RobotModel, samples: Samples) -> float:
-    """Return the sum over the joints of the logarithm of the squared error of a fit to all rows."""
-    factor = Factor.of(model, samples)
-    prior = body_prior(model, factor).gaussian
-    squares = factor.squared_errors(posterior_values(factor, prior, _ROWS_PER_FACT)[0])
-    return float(np.log(np.where(squares > 0.0, squares, 1.0)).sum())
 
 
 def score_of(model: RobotModel, samples: Samples) -> Score:
