@@ -165,9 +165,11 @@ class TestOutcome:
         first = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
         assert {"results.json", "report.html", "parameters.csv", "identified.urdf"} <= set(first)
         written = Results.load(tmp_path / "results.json")
-        assert written == found.results.model_copy(
-            update={"exports": written.exports, "occasion": written.occasion}
-        )
+        of_the_command = {
+            name: getattr(written, name) for name in ("exports", "occasion", "settings")
+        }
+        assert None not in of_the_command.values()
+        assert written == found.results.model_copy(update=of_the_command)
         (tmp_path / "report.html").unlink()
         (tmp_path / "report.html").mkdir()
         other = replace(found, results=found.results.model_copy(update={"name": "other"}))
