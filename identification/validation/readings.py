@@ -281,7 +281,7 @@ class _Search:
         everywhere = (
             len(clear) > 1
             and bool(np.all(clear < 0.0))
-            and inertial_share(self.model, self.samples).sum() < 0.0
+            and inertial_torque(self.model, self.samples).sum() < 0.0
         )
         if everywhere:
             kinds = ("torque sign",)
@@ -619,10 +619,10 @@ def score_of(model: RobotModel, samples: Samples) -> Score:
     return _score(factor, squares, friction.mean(axis=0), deviation)
 
 
-def inertial_share(model: RobotModel, samples: Samples) -> Array:
-    """Return the torque of each joint's own acceleration over its torque (n,), both RMS.
+def inertial_torque(model: RobotModel, samples: Samples) -> Array:
+    """Return the torque of each joint's own RMS acceleration (n,) [N·m or N], by a fit.
 
-    By a fit; negative where the fit has a negative inertia about the axis.
+    It is negative where the fit has a negative inertia about the axis.
     """
     factor = Factor.of(model, samples)
     prior = body_prior(model, factor).gaussian
@@ -641,8 +641,7 @@ def inertial_share(model: RobotModel, samples: Samples) -> Array:
         ]
     )
     acceleration = np.sqrt(np.mean(motion.acceleration**2, axis=0))
-    torque = np.sqrt(np.mean(samples.torque**2, axis=0))
-    return np.asarray(inertia * acceleration / np.where(torque > 0.0, torque, 1.0))
+    return np.asarray(inertia * acceleration)
 
 
 def _squares(factor: Factor, values: Array, blocks: slice | NDArray[np.bool_]) -> Array:
