@@ -23,7 +23,7 @@ from hil.files import file_digest
 from hil.identify import Identification, Options, identify_paths
 from hil.identify.cell_context import torque_limits
 from hil.identify.estimating import OF_PRIOR, Posterior
-from hil.identify.prepared import Prepared, Settings, prepared_with
+from hil.identify.prepared import Prepared, prepared_with
 from hil.identify.sources import gather_sources
 from hil.outcome import PARAMETERS_JSON, RESULTS, archive_digests, provenance_of, single_line
 from hil.progress import Reporter
@@ -230,7 +230,7 @@ def stored_model(folder: Path, reporter: Reporter, predict: Sequence[Path] = ())
     if provenance.get("verdict") != single_line(present["verdict"]):
         raise NotReusableError(f"{RESULTS} and {PARAMETERS_JSON} are not of one identification")
     try:
-        used = Settings.from_dict(settings.settings)
+        used = settings.decided()
     except ValueError as error:
         raise NotReusableError(f"{RESULTS} has other settings ({error})") from error
     by_use: dict[bool, list[Path]] = {True: [], False: []}

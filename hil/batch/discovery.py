@@ -21,9 +21,10 @@ from hil.campaign.folder import CampaignFolder, Entry
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.files import digest, file_digest, json_digest
-from hil.identify.prepared import Settings, stated_delay
+from hil.identify.prepared import stated_delay
 from hil.progress import Reporter
 from hil.terminal_text import typed
+from identification.selection.settings import Settings
 
 from .cache import BESIDE, CacheError, CacheLocation, code_digest
 from .cluster import Cluster, Task, Unused, reason_of
@@ -309,7 +310,7 @@ def cell_in(archive: Archive, settings: Settings | None = None) -> Cell:
 def cell_from(text: str, urdf: str, *friction: tuple[str, Any]) -> Cell:
     """Return the cell of these texts, with a friction law of these entries if given."""
     cell = Cell.from_texts(text, urdf, Path("cell.toml"))
-    return cell.with_friction(**dict(friction)) if friction else cell
+    return cell.with_friction(**dict(friction))
 
 
 def arm_digest(cell: Cell, drive_train: bytes | None, *, simulated: bool = False) -> str:

@@ -29,7 +29,7 @@ from hil.identify.torque_scale import torque_scale
 from hil.progress import Reporter
 from identification.excitation import midpoints
 from identification.factor.factor import Factor, inverse_variance
-from identification.selection.inner_prediction import Strength
+from identification.selection.settings import Strength
 
 from .precision_record import IN_A_ROW, Look, PrecisionRecord, Reached
 from .state import CampaignState

@@ -29,7 +29,7 @@ from identification.excitation.precision import Precision
 from identification.factor.factor import Factor, inverse_variance
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.selection.inner_prediction import Strength
+from identification.selection.settings import Strength
 from planner import Trajectory
 
 from .given import given_sources

@@ -57,7 +57,7 @@ from identification.factor.factor import (
     solve,
     total_factor,
 )
-from identification.selection.inner_prediction import Strength
+from identification.selection.settings import Strength
 from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.calibration import Refit

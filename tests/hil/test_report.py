@@ -36,7 +36,7 @@ from hil.report.rendering import environment
 from hil.results import Results
 from identification.excitation import CRITERIA, METHODS
 from identification.excitation.criteria import Criterion
-from identification.selection.inner_prediction import Choice
+from identification.selection.settings import Choice
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2
 
 pytestmark = pytest.mark.long
