@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.cell.text import urdf_limits
 from hil.errors import HilError, InputError
@@ -28,6 +27,7 @@ from hil.identify.sources import gather_sources
 from hil.outcome import PARAMETERS_JSON, RESULTS, archive_digests, provenance_of, single_line
 from hil.progress import Reporter
 from hil.reading import parse_json, path_exists, read_text
+from hil.recorded_campaign import RecordedCampaign
 from hil.results import Results, SettingsResult
 from identification import Estimate, Factor, Samples
 from identification.errors import IdentificationError
@@ -288,7 +288,7 @@ def _archives_of(folder: Path, settings: SettingsResult) -> list[Path]:
         NotReusableError: there are none.
     """
     if path_exists(folder / "manifest.json"):
-        campaign = CampaignFolder(folder)
+        campaign = RecordedCampaign(folder)
         kinds = ("excitation", "validation", "standstill")
         return [path for kind in kinds for path in campaign.completed(kind)]
     inside = sorted(folder.glob("*.mcap"))
