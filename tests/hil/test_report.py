@@ -30,7 +30,8 @@ from hil.report import (
     page,
     report_bytes,
 )
-from hil.report.drawing import _decades, chart_panel, round_ticks, single, thinned
+from hil.report.chart import thinned
+from hil.report.drawing import _decades, chart_panel, round_ticks, single
 from hil.report.interactive import chart_data, encoded
 from hil.report.rendering import environment
 from hil.results import Results
