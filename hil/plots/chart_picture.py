@@ -44,9 +44,12 @@ def draw_charts(
                 if len(columns) > 1:
                     axes[0].legend(*_entries([chart], legends), fontsize=style.SMALL)
         if len(columns) == 1:
-            lines, texts = _entries(columns[0], legends)
-            place = "outside upper center"
-            figure.legend(lines, texts, loc=place, ncols=5, fontsize=style.SMALL)
+            figure.legend(
+                *_entries(columns[0], legends),
+                loc="outside upper center",
+                ncols=5,
+                fontsize=style.SMALL,
+            )
     return figure
 
 

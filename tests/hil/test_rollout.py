@@ -95,9 +95,7 @@ class TestSectionOfTheReport:
         assert "nan" not in section.lower()
         assert section.count(">0.2</text>") >= len(found.joint_names)  # ticks at the horizons
 
-    def test_the_picture_has_the_errors_of_all_joints_and_the_shares_of_each(
-        self, folder: Path
-    ) -> None:
+    def test_the_picture_has_errors_and_shares(self, folder: Path) -> None:
         run("rollout", folder, "--samples", "3")
         found = RolloutResult.load(folder / ROLLOUT)
         errors, shares = overview_charts(found)
