@@ -58,7 +58,8 @@ from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.selection.essential import eliminate
-from identification.selection.inner_prediction import CandidateSettings, choose_settings
+from identification.selection.inner_prediction import choose_settings
+from identification.selection.settings import Settings
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples, prepare
 from identification.validation.prediction import prediction_error
@@ -140,8 +141,7 @@ def _with_low_pass(
     def low_passes(of: RobotModel, how: Preprocessing) -> tuple[Preprocessing, ...]:
         return possible_low_passes(recording, of, options=how)
 
-    start = CandidateSettings(model, options)
-    return choose_settings(ready, start, {"low-pass"}, low_passes)[0].preprocessing
+    return choose_settings(model, ready, Settings(options), {"low-pass"}, low_passes).preprocessing
 
 
 Estimator = Callable[[RobotModel, Samples], Array]

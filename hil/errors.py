@@ -106,6 +106,13 @@ class ArchiveWriteError(ArchiveError):
     """An archive that cannot be created or written."""
 
 
+class CampaignFolderError(InputError):
+    """A campaign folder that cannot be used."""
+
+    def __init__(self, folder: Path, problem: str, remedy: str) -> None:
+        super().__init__(folder, problem, remedy=remedy)
+
+
 class SourceError(InputError):
     """A foreign recording that cannot be imported."""
 

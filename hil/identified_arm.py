@@ -28,6 +28,7 @@ from hil.importers.staging import Staging, staged
 from hil.outcome import write_outcome
 from hil.output_folder import SOURCES, folder_beside, sources_text
 from hil.progress import Reporter, Silent
+from hil.report.figures import MEASURED, NOMINAL, PREDICTED, RESIDUAL, joints_of, torque_charts
 from hil.results import Results
 from identification.validation.verdict import Verdict
 
@@ -129,9 +130,10 @@ class IdentifiedArm:
 
     def plot(self) -> Figure:
         """Draw measured torque of the held-out motion, and that of identified and nominal model."""
-        from hil.plots.torque_picture import draw_torques  # only for this picture
+        from hil.plots.chart_picture import draw_charts  # only for this picture
 
-        return draw_torques(self.results, self.identification.series)
+        charts = torque_charts(self.identification.series, joints_of(self.results))
+        return draw_charts([charts], [MEASURED, PREDICTED, NOMINAL, RESIDUAL])
 
     def save(
         self,

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.cell.text import urdf_limits
 from hil.errors import HilError, InputError
@@ -23,11 +22,12 @@ from hil.files import file_digest
 from hil.identify import Identification, Options, identify_paths
 from hil.identify.cell_context import torque_limits
 from hil.identify.estimating import OF_PRIOR, Posterior
-from hil.identify.prepared import Prepared, Settings, prepared_with
+from hil.identify.prepared import Prepared, prepared_with
 from hil.identify.sources import gather_sources
 from hil.outcome import PARAMETERS_JSON, RESULTS, archive_digests, provenance_of, single_line
 from hil.progress import Reporter
 from hil.reading import parse_json, path_exists, read_text
+from hil.recorded_campaign import RecordedCampaign
 from hil.results import Results, SettingsResult
 from identification import Estimate, Factor, Samples
 from identification.errors import IdentificationError
@@ -230,7 +230,7 @@ def stored_model(folder: Path, reporter: Reporter, predict: Sequence[Path] = ())
     if provenance.get("verdict") != single_line(present["verdict"]):
         raise NotReusableError(f"{RESULTS} and {PARAMETERS_JSON} are not of one identification")
     try:
-        used = Settings.from_dict(settings.settings)
+        used = settings.decided()
     except ValueError as error:
         raise NotReusableError(f"{RESULTS} has other settings ({error})") from error
     by_use: dict[bool, list[Path]] = {True: [], False: []}
@@ -288,7 +288,7 @@ def _archives_of(folder: Path, settings: SettingsResult) -> list[Path]:
         NotReusableError: there are none.
     """
     if path_exists(folder / "manifest.json"):
-        campaign = CampaignFolder(folder)
+        campaign = RecordedCampaign(folder)
         kinds = ("excitation", "validation", "standstill")
         return [path for kind in kinds for path in campaign.completed(kind)]
     inside = sorted(folder.glob("*.mcap"))

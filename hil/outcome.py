@@ -101,7 +101,7 @@ def settings_result(found: Identification) -> SettingsResult:
         split=first.recording.n_samples / first.whole.n_samples,
         in_sample=sources.in_sample,
         estimator=found.estimation.estimator,
-        settings=found.prepared.settings.to_dict(),
+        settings=SettingsResult.entries(found.prepared.settings),
     )
 
 

@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 from hil.errors import InputError
 from hil.reading import parse_json, read_text
 from identification.excitation.criteria import Criteria
 from identification.selection.essential import EliminationStep
-from identification.selection.inner_prediction import Choice
+from identification.selection.settings import Choice, Settings
 from identification.text import percentage
 from identification.validation.finding import Finding
 
@@ -441,7 +442,24 @@ class SettingsResult(Frozen):
     split: float  #: Fitted share of the first fitted recording
     in_sample: bool
     estimator: str
-    settings: dict[str, Any]  #: :meth:`hil.identify.prepared.Settings.to_dict`
+    settings: dict[str, Any]  #: Entries of :class:`Settings`, without its choices
+
+    @classmethod
+    def entries(cls, settings: Settings) -> dict[str, Any]:
+        """Return the value of `settings`: their choices are in :attr:`Results.choices`."""
+        entries: dict[str, Any] = _SETTINGS.dump_python(replace(settings, choices=()), mode="json")
+        return entries
+
+    def decided(self) -> Settings:
+        """Return the settings.
+
+        Raises:
+            ValueError: they are those of another version.
+        """
+        return _SETTINGS.validate_python(self.settings)
+
+
+_SETTINGS: Final = TypeAdapter(Settings)
 
 
 class Results(Frozen):

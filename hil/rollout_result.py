@@ -17,7 +17,7 @@ ROLLOUT: Final = "rollout.json"
 JUDGED: Final = 2
 """Index of the horizon at which joint and effect are named: 0.5 s."""
 _BAND: Final = 1  # index of the horizon of the band: 0.2 s
-_WANTED: Final = (0.88, 0.99)  # share of measured positions in a 95 % band
+WANTED: Final = (0.88, 0.99)  # share of measured positions in a 95 % band
 
 
 class ArmErrors(Frozen):
@@ -98,7 +98,7 @@ class RolloutResult(Frozen):
     @property
     def band_holds(self) -> bool:
         """Whether that share is near 95 %."""
-        return _WANTED[0] <= self.band <= _WANTED[1]
+        return WANTED[0] <= self.band <= WANTED[1]
 
     @property
     def message(self) -> str:
@@ -138,7 +138,7 @@ class RolloutResult(Frozen):
             return ""
         return (
             f"{percentage(self.band, 1)} at {self.horizons[_BAND]:g} s is not"
-            f" {percentage(_WANTED[0])} to {percentage(_WANTED[1])}: do not rely on this band"
+            f" {percentage(WANTED[0])} to {percentage(WANTED[1])}: do not rely on this band"
         )
 
     def stability(self) -> list[str]:

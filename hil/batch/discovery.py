@@ -16,14 +16,14 @@ from typing import Any, Final, NamedTuple
 
 from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
 from hil.archive.header import KINDS
-from hil.campaign.errors import CampaignFolderError
-from hil.campaign.folder import CampaignFolder, Entry
 from hil.cell import Cell
-from hil.errors import ArchiveError, InputError
+from hil.errors import ArchiveError, CampaignFolderError, InputError
 from hil.files import digest, file_digest, json_digest
-from hil.identify.prepared import Settings, stated_delay
+from hil.identify.prepared import stated_delay
 from hil.progress import Reporter
+from hil.recorded_campaign import Entry, RecordedCampaign
 from hil.terminal_text import typed
+from identification.selection.settings import Settings
 
 from .cache import BESIDE, CacheError, CacheLocation, code_digest
 from .cluster import Cluster, Task, Unused, reason_of
@@ -309,7 +309,7 @@ def cell_in(archive: Archive, settings: Settings | None = None) -> Cell:
 def cell_from(text: str, urdf: str, *friction: tuple[str, Any]) -> Cell:
     """Return the cell of these texts, with a friction law of these entries if given."""
     cell = Cell.from_texts(text, urdf, Path("cell.toml"))
-    return cell.with_friction(**dict(friction)) if friction else cell
+    return cell.with_friction(**dict(friction))
 
 
 def arm_digest(cell: Cell, drive_train: bytes | None, *, simulated: bool = False) -> str:
@@ -503,16 +503,16 @@ def _manifests(places: Iterable[str]) -> tuple[dict[str, dict[str, Entry]], list
 
 
 @contextmanager
-def _campaign_records(campaign: str) -> Iterator[CampaignFolder]:
+def _campaign_records(campaign: str) -> Iterator[RecordedCampaign]:
     """Provide the folder of a campaign; of one at a URL, a folder with its manifest only."""
     if not is_url(campaign):
-        yield CampaignFolder(Path(campaign))
+        yield RecordedCampaign(Path(campaign))
         return
     with TemporaryDirectory(prefix="hil-") as copy:
         text = text_at(f"{campaign}/manifest.json")
         if text is not None:
             Path(copy, "manifest.json").write_text(text, encoding="utf-8")
-        yield CampaignFolder(Path(copy))
+        yield RecordedCampaign(Path(copy))
 
 
 def _not_needed(place: str, latest: _Attempts) -> str:

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.identify.estimating import Posterior, fit_of
-from hil.identify.prepared import Settings
 from identification import IdentificationError
 from identification.estimators.consistent import SolverError
 from identification.estimators.covariance import solve_with_prior
 from identification.estimators.delay import with_uncertain_delay
 from identification.estimators.least_squares import no_narrower
 from identification.factor.factor import QR_CONDITION, Estimate, Factor, require_rows
+from identification.selection.settings import Settings
 
 from .cluster import Unused
 from .discovery import ArchiveRef, cell_from

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from hil.archive import Archive
 from hil.errors import ArchiveError
 from hil.files import json_digest
-from hil.identify.prepared import Settings, known_parameters, samples_of, validation_samples
+from hil.identify.prepared import known_parameters, samples_of, validation_samples
 from hil.identify.sources import Source, known_warnings, source_of
 from identification.estimators.delay import rate_products
 from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.prior import ScoreScatter, body_prior
 from identification.factor.factor import Estimate, Factor
+from identification.selection.settings import Settings
 
 from .cache import Arrays, CacheLocation, code_digest
 from .cluster import Unused, reason_of

@@ -17,9 +17,10 @@ from hil.errors import InputError
 from hil.files import json_digest
 from hil.identify.estimating import fit_with_transmitted_load
 from hil.identify.options import Options
-from hil.identify.prepared import MAX_RECORDINGS, Settings, carried_over, decide, samples_of
+from hil.identify.prepared import MAX_RECORDINGS, carried_over, decide, samples_of
 from hil.identify.sources import Source, Sources, all_fitted
 from hil.progress import Reporter, Silent
+from identification.selection.settings import Settings
 
 from .cache import CacheLocation, code_digest
 from .cluster import Cluster, Death, Task, Unused, outcome_of, reason_of
@@ -127,7 +128,7 @@ def _with_loading(settings: Settings, sources: Sources) -> Settings:
 
     All archives of an arm have them, so that their factors can be added.
     """
-    cell = settings.with_friction_law(sources.cell)
+    cell = sources.cell.with_friction(**settings.friction)
     if not cell.model.friction.has_load:
         return settings
     fitted = [samples_of(source, cell, settings) for source in sources.training[:MAX_RECORDINGS]]

@@ -3,10 +3,11 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from hil.errors import CampaignFolderError
+
 if TYPE_CHECKING:
     from .campaign import Campaign
     from .errors import (
-        CampaignFolderError,
         MotionFailedError,
         MotionRefusedError,
         NotRehearsedError,

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING
 from hil.archive.live import LiveView
 from hil.cell import Cell
 from hil.design.requirements import Requirement
-from hil.errors import HilError, InputError
+from hil.errors import CampaignFolderError, HilError, InputError
 from hil.identify.options import Options
 from hil.progress import Reporter, Silent
 from identification.excitation import Excitation
 
-from .errors import CampaignFolderError
 from .folder import LOCK, CampaignFolder
 from .link import MotionLink
 from .operator import Operator, RunWatch, Stop, Unattended

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.errors import ArchiveError
+from hil.recorded_campaign import load_record
 from hil.terminal_text import typed
 
 from .errors import AgainstGravityError, DryRunError
-from .folder import CampaignFolder, load_record, save_record
+from .folder import CampaignFolder, save_record
 from .state import CampaignState
 
 Array = NDArray[np.float64]

@@ -10,15 +10,8 @@ from typing import ClassVar, Final
 from drivers.errors import Check, GuardError, RefusalError
 from drivers.events import Refused
 from hil.cell import AngleFrame, Cell
-from hil.errors import ExecutionError, HilError, InputError, UnsafeError
+from hil.errors import ExecutionError, HilError, UnsafeError
 from hil.terminal_text import plural, typed
-
-
-class CampaignFolderError(InputError):
-    """A campaign folder that cannot be used."""
-
-    def __init__(self, folder: Path, problem: str, remedy: str) -> None:
-        super().__init__(folder, problem, remedy=remedy)
 
 
 class MotionRefusedError(UnsafeError):

@@ -10,13 +10,12 @@ import io
 import json
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
-
 from hil.archive import ArchiveName
+from hil.errors import CampaignFolderError
 from hil.files import (
     digest,
     file_digest,
@@ -25,12 +24,13 @@ from hil.files import (
     write_atomically,
     write_output,
 )
-from hil.reading import is_not_a_file, open_file, parse_json, parse_toml, path_exists, read_text
+from hil.reading import open_file, parse_toml
+from hil.recorded_campaign import Below, Entry, Manifest, RecordedCampaign
 from hil.terminal_text import typed
 from identification.errors import ModelError
 from identification.model.urdf_text import urdf_tree
 
-from .errors import CampaignFolderError, NotRehearsedError
+from .errors import NotRehearsedError
 
 if TYPE_CHECKING:
     from hil.cell import Cell
@@ -45,43 +45,6 @@ MESH: Final = "mesh "  # Prefix of the entry of a mesh, by its name in the URDF
 MISSING: Final = "missing"
 _ANOTHER: Final = "{} is not the one this campaign began with"
 _RESTORE: Final = "restore it, or begin a new campaign"
-
-
-def read_back(kind: type[T], text: str, *, strict: bool = True) -> T:
-    """Return an object of a dataclass or model from its JSON.
-
-    With `strict` texts are refused as numbers; a model may write infinite numbers as texts.
-
-    Raises:
-        ValueError: it is not JSON, or a field is invalid; names the first one.
-    """
-    try:
-        return TypeAdapter(kind).validate_json(text, strict=strict or None)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise ValueError(f"{place}: {first['msg']}" if place else str(first["msg"])) from error
-
-
-def load_record(
-    kind: type[T], path: Path, remedy: str, *, version: int = 0, strict: bool = True
-) -> T | None:
-    """Read the file of a campaign's step; return None where there is none.
-
-    CampaignFolderError, with this remedy: it cannot be read, or has another `format_version` than
-    `version` (0 for any); see `read_back` for `strict`.
-    """
-    if not path_exists(path):
-        return None
-    try:
-        text = read_text(path)
-        if version and (found := parse_json(text)["format_version"]) != version:
-            raise ValueError(f"format version {found}, this is {version}")
-        return read_back(kind, text, strict=strict)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        cause = getattr(error, "strerror", None) or error
-        problem = f"{path.name} cannot be read ({cause})"
-        raise CampaignFolderError(path.parent, problem, remedy) from error
 
 
 def save_record(path: Path, record: Any, version: int) -> None:
@@ -128,71 +91,23 @@ def _sum(path: Path) -> str | None:
 
 
 @dataclass(frozen=True)
-class Entry:
-    """One closed archive: file name, outcome of its motion, SHA-256, and reason of the outcome.
-
-    The outcome is "rejected" for a completed motion that failed its quality check.
-
-    Raises:
-        ValueError: `name` is a path to another folder.
-    """
-
-    name: str
-    outcome: str
-    sha256: str
-    reason: str = ""
-
-    def __post_init__(self) -> None:
-        if Path(self.name).name != self.name or not self.name.strip("."):
-            raise ValueError(f"{self.name!r} is not the name of a file in archives/")
-
-    @property
-    def kind(self) -> str:
-        """Kind of its motion; "" for another file name."""
-        name = ArchiveName.parse(self.name)
-        return "" if name is None else name.kind
-
-
-@dataclass(frozen=True)
-class _Manifest:
-    inputs: dict[str, str]
-    archives: list[Entry]
-
-
-class _Below:
-    """A path in the folder."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-
-    def __get__(self, folder: CampaignFolder, _owner: object = None) -> Path:
-        return folder.root / self._name
-
-
-@dataclass(frozen=True)
-class CampaignFolder:
-    """Paths below one campaign folder, and its manifest.
+class CampaignFolder(RecordedCampaign):
+    """Paths below one campaign folder, and its manifest, which is written here.
 
     Attributes:
         rehearsed: folder of the rehearsal's own campaigns.
-        digests: cached checksums of archives by name; None to compute them each time.
     """
 
-    root: Path
-    digests: dict[str, str] | None = field(default=None, compare=False, repr=False)
-
-    archives = _Below("archives")
-    cell = _Below("cell.toml")
-    urdf = _Below("robot.urdf")
-    plan = _Below("plan.json")
-    results = _Below("results.json")
-    report = _Below("report.html")
-    rehearsal = _Below("rehearsal.json")
-    rehearsed = _Below("rehearsal")
-    dry_run = _Below("dry_run.json")
-    warmup = _Below("warmup.json")
-    precision = _Below("precision.json")
-    _path = _Below("manifest.json")
+    cell = Below("cell.toml")
+    urdf = Below("robot.urdf")
+    plan = Below("plan.json")
+    results = Below("results.json")
+    report = Below("report.html")
+    rehearsal = Below("rehearsal.json")
+    rehearsed = Below("rehearsal")
+    dry_run = Below("dry_run.json")
+    warmup = Below("warmup.json")
+    precision = Below("precision.json")
 
     @property
     def plan_hash(self) -> str:
@@ -218,11 +133,6 @@ class CampaignFolder:
                 )
         return json_digest(self._checksums(contents))
 
-    @property
-    def sealed(self) -> bool:
-        """Whether there is a manifest."""
-        return path_exists(self._path)
-
     def locked(self) -> AbstractContextManager[None]:
         """Lock the folder against other runs; the lock of a killed run is released.
 
@@ -242,7 +152,7 @@ class CampaignFolder:
 
     def seal(self) -> None:
         """Create the manifest with the checksums of cell, URDF, plan and meshes."""
-        self._save(_Manifest(self._inputs(), []))
+        self._save(Manifest(self._inputs(), []))
 
     def accept_changes(self) -> None:
         """Accept changes of cell, URDF and plan; CampaignFolderError if there are recordings."""
@@ -260,10 +170,6 @@ class CampaignFolder:
             remedy = _RESTORE if self.manifest() else again
             raise NotRehearsedError(self.root, f"was edited: {_ANOTHER.format(changed)}", remedy)
 
-    def manifest(self) -> list[Entry]:
-        """Return the closed archives in order (CampaignFolderError if it cannot be read)."""
-        return self._manifest().archives
-
     def add(self, name: str, outcome: str, reason: str = "") -> None:
         """Enter a closed archive in the manifest, or change the outcome of one."""
         manifest = self._manifest()
@@ -271,22 +177,6 @@ class CampaignFolder:
         entries = [new if one.name == name else one for one in manifest.archives]
         entries += [] if new in entries else [new]
         self._save(replace(manifest, archives=entries))
-
-    def whole(self, kind: str, index: int) -> str | None:
-        """Return the name of the completed archive of this interval, or None."""
-        return self._whole(kind, index).get(index)
-
-    def completed(self, kind: str) -> list[Path]:
-        """Return the completed archives of a kind by index; of several attempts the last one."""
-        return [self.archives / name for _, name in sorted(self._whole(kind).items())]
-
-    def damaged(self) -> list[str]:
-        """Return a sentence for each archive of the manifest that is missing or was changed."""
-        return [
-            f"{entry.name} is missing or is not what was recorded, and was left out"
-            for entry in self.manifest()
-            if not self._unchanged(entry)
-        ]
 
     def next_name(self, kind: str, index: int) -> ArchiveName:
         """Return the name of the next attempt at an interval; no name is used twice."""
@@ -298,21 +188,6 @@ class CampaignFolder:
             attempt += 1
         return ArchiveName(kind, index, attempt)
 
-    def _whole(self, kind: str, index: int | None = None) -> dict[int, str]:
-        """Return the names of the completed archives of a kind by index, the last attempts."""
-        found: dict[int, str] = {}
-        for entry in reversed(self.manifest()):
-            name = ArchiveName.parse(entry.name)
-            if (
-                name is not None
-                and (name.kind, entry.outcome) == (kind, "completed")
-                and index in (None, name.index)
-                and name.index not in found
-                and self._unchanged(entry)
-            ):
-                found[name.index] = entry.name
-        return found
-
     def _changed(self) -> str | None:
         """Return the first file that differs from the manifest."""
         sealed = self._manifest().inputs
@@ -321,19 +196,6 @@ class CampaignFolder:
             if sealed.get(name) != now.get(name):
                 return name
         return None
-
-    def _unchanged(self, entry: Entry) -> bool:
-        digests = {} if self.digests is None else self.digests
-        try:
-            if entry.name not in digests:
-                digests[entry.name] = file_digest(self.archives / entry.name)
-            return digests[entry.name] == entry.sha256
-        except OSError as error:
-            if is_not_a_file(error):
-                return False
-            raise CampaignFolderError(
-                self.root, f"{entry.name} cannot be read ({error.strerror})", "make it readable"
-            ) from error
 
     def _contents(self) -> dict[str, bytes]:
         """Return the contents of cell, plan and URDF by file name."""
@@ -361,11 +223,7 @@ class CampaignFolder:
             sums |= {n: sealed[n] for n, one in sums.items() if one == MISSING and n in sealed}
         return sums
 
-    def _manifest(self) -> _Manifest:
-        found = load_record(_Manifest, self._path, "restore it or start a new folder")
-        return found or _Manifest({}, [])
-
-    def _save(self, manifest: _Manifest) -> None:
+    def _save(self, manifest: Manifest) -> None:
         # One line per archive; `indent` would leave a reference cycle in each call.
         archives = ",\n".join(json.dumps(asdict(one)) for one in manifest.archives)
         text = f'{{"inputs": {json.dumps(manifest.inputs)},\n"archives": [\n{archives}\n]}}\n'

@@ -7,12 +7,12 @@ from typing import Any, Final
 
 from hil.archive import open_archive
 from hil.cell import Cell
-from hil.errors import ArchiveError
+from hil.errors import ArchiveError, CampaignFolderError
 from hil.terminal_text import typed
 
 from .connection import Connection, narrower_limits
 from .dry_run import DryRunRecord, not_accepted, yes_or_no
-from .errors import CampaignFolderError, DryRunError, NotRehearsedError
+from .errors import DryRunError, NotRehearsedError
 from .folder import CampaignFolder
 from .link import MotionLink
 from .rehearsal import Rehearsal

@@ -21,15 +21,15 @@ from hil.design.result import RESULT
 from hil.design.settings import load_settings
 from hil.design.wanted import ReferenceMotions
 from hil.errors import InputError
+from hil.identify.cell_context import torque_scale
 from hil.identify.estimating import Posterior, with_uncertain_scale
 from hil.identify.options import FIXED
 from hil.identify.prepared import samples_of, stated_settings
 from hil.identify.sources import gather_sources
-from hil.identify.torque_scale import torque_scale
 from hil.progress import Reporter
 from identification.excitation import midpoints
 from identification.factor.factor import Factor, inverse_variance
-from identification.selection.inner_prediction import Strength
+from identification.selection.settings import Strength
 
 from .precision_record import IN_A_ROW, Look, PrecisionRecord, Reached
 from .state import CampaignState

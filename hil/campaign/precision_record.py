@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Final, Literal, Self
 
 from hil.design.requirements import Requirement, requirements_from
+from hil.recorded_campaign import load_record
 from hil.terminal_text import plural
 
-from .folder import load_record, save_record
+from .folder import save_record
 
 IN_A_ROW: Final = 2
 """Repetitions after which a requirement must be met one after the other: one interval alone can be

@@ -24,6 +24,7 @@ from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import write_output
 from hil.progress import Reporter
+from hil.recorded_campaign import load_record
 from hil.results import Frozen
 from hil.simulation import (
     controller_settings,
@@ -39,7 +40,7 @@ from identification.text import percentage
 from identification.validation.prediction import pooled_error, prediction_error
 from sim_fixtures import ServoSettings, UnmodelledEffects
 
-from .folder import CampaignFolder, load_record
+from .folder import CampaignFolder
 from .oscillation import growing_oscillation
 from .virtual_link import VirtualLink
 

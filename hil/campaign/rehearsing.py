@@ -7,14 +7,14 @@ from contextlib import suppress
 from typing import Final
 
 from hil.cell import Cell
-from hil.errors import ExecutionError, HilError, OperatorStopError
+from hil.errors import CampaignFolderError, ExecutionError, HilError, OperatorStopError
 from hil.files import make_folder
 from hil.motion_checks import PLANNED_CURRENT
 from hil.progress import Reporter
 from hil.version import software
 from sim_fixtures import SimulationError
 
-from .errors import CampaignFolderError, MotionFailedError, RepetitionsRejectedError
+from .errors import MotionFailedError, RepetitionsRejectedError
 from .intervals import planned_intervals, require_runnable
 from .operator import RunWatch, Stop, Unattended
 from .rehearsal import (

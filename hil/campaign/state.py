@@ -12,13 +12,12 @@ from typing import Self
 
 from hil.cell import Cell
 from hil.design.run import DESIGN_FILES
-from hil.errors import OutputError
+from hil.errors import CampaignFolderError, OutputError
 from hil.files import make_folder, write_atomically
 from hil.motion_checks import MotionChecks
 from hil.reading import path_exists
 from identification.excitation import Excitation
 
-from .errors import CampaignFolderError
 from .folder import CampaignFolder
 from .intervals import Interval, planned_intervals, require_runnable
 from .plan import CampaignPlan, plan_around

@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.cell import Cell
+from hil.recorded_campaign import load_record
 from identification.text import percentage
 from planner import FourierSeries, PiecewiseCubic
 
-from .folder import load_record, save_record
+from .folder import save_record
 
 Array = NDArray[np.float64]
 

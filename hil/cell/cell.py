@@ -104,6 +104,8 @@ class Cell:
 
     def with_friction(self, **changes: Any) -> Cell:
         """Return the cell with changed entries of `[robot.friction]` for all joints."""
+        if not changes:
+            return self
         table = self.file.robot.friction
         joints = {
             name: JointFrictionTable(**one.model_dump(exclude_unset=True, exclude={*changes}))

@@ -20,10 +20,11 @@ from hil.files import make_folder
 from hil.identified_model import read_or_identify
 from hil.identify import Options
 from hil.outcome import REPORT
+from hil.plots.chart_picture import draw_charts
 from hil.plots.plan_picture import save
-from hil.plots.rollout_picture import draw_rollout
 from hil.progress import Reporter, say
 from hil.progress import reporter as make_reporter
+from hil.report.rollout import overview_charts, overview_legends
 from hil.rollout import PICTURE, POLISHED, Rollout, RolloutOptions, roll_out, write_rollout
 from hil.rollout_result import ROLLOUT
 
@@ -103,7 +104,9 @@ def _folder(output: Path | None, archives: list[Path]) -> Path | None:
 def _write(output: Path, simulated: Rollout, reporter: Reporter) -> None:
     """Write all files of a rollout, and report them."""
     missing = write_rollout(output, simulated)
-    save(draw_rollout(simulated.result), output / PICTURE)
+    columns = [[chart] for chart in overview_charts(simulated.result)]
+    legends = overview_legends(simulated.result)
+    save(draw_charts(columns, legends, enlarged=1.4), output / PICTURE)
     polished = [POLISHED] if simulated.polished is not None else []
     reporter.say(f"written to {output}: {', '.join([ROLLOUT, PICTURE, *polished])}")
     reporter.say(missing or f"section of the report: {output / REPORT}")

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.errors import InputError
+from hil.identify.cell_context import TorqueScale, torque_scale
 from hil.identify.estimating import Posterior
 from hil.identify.options import FIXED
 from hil.identify.payload_run import flange_of
 from hil.identify.prepared import samples_of, stated_settings
-from hil.identify.torque_scale import TorqueScale, torque_scale
 from hil.terminal_text import plural
 from identification.estimators.payload import DRIFT, parameter_change
 from identification.excitation import Excitation, LoadQuantities, Objective, midpoints
@@ -29,7 +29,7 @@ from identification.excitation.precision import Precision
 from identification.factor.factor import Factor, inverse_variance
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.selection.inner_prediction import Strength
+from identification.selection.settings import Strength
 from planner import Trajectory
 
 from .given import given_sources

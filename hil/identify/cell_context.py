@@ -1,9 +1,11 @@
-"""Facts about cell and recording that a verdict needs beside the model."""
+"""Facts about cell and recordings that an estimate and its verdict need beside the model."""
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -14,11 +16,12 @@ from hil.cell import Cell
 from hil.cell.text import urdf_limits
 from identification.estimators.prior import without_masses
 from identification.estimators.torque_channel import torque_noiseless_above
+from identification.estimators.torque_scale import DATA_SHEET, described
 from identification.factor.factor import Estimate
 from identification.model.friction import TERMS
 from identification.selection.inner_prediction import LOW_PASS
 from identification.signals.masks import SATURATED
-from identification.signals.recording import UNWRAPPED
+from identification.signals.recording import UNWRAPPED, Recording
 from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.evidence import CellContext
@@ -31,6 +34,7 @@ from identification.validation.plausibility import (
     position_steps,
 )
 from identification.validation.prediction import PredictionError, pooled_error
+from planner.arrays import numbers
 
 from .prepared import Prepared
 from .sources import Source
@@ -300,3 +304,53 @@ def torque_limits(cell: Cell) -> Array | None:
     effort = urdf_limits(cell.urdf, cell.joint_names).effort
     limits = np.where(np.isfinite(effort), effort, np.nan)
     return None if np.isnan(limits).all() else limits
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueScale:
+    """Uncertainty of the scale of torques, common to all recordings of an arm."""
+
+    std: Array  #: relative standard deviation of each joint (n,)
+    of: str  #: what has it: "torque constants", or "the scale of the recorded torques"
+    source: str  #: where it is from
+
+    @property
+    def message(self) -> str:
+        """What is assumed, such as "assuming torque constants to 3 %"."""
+        if not self.std.any():
+            return f"assuming exact torques ({self.source})"
+        return f"assuming {described(self.std, self.of)} (standard deviation; {self.source})"
+
+
+def torque_scale(cell: Cell, recordings: Sequence[Recording], *, simulated: bool) -> TorqueScale:
+    """Return the uncertainty of the torques of recordings, of the worst where they differ.
+
+    That of the column map comes first, then that of the cell. The torques of a simulated arm
+    (`simulated`: only one can have moved) are exact: its currents are made with the torque
+    constants of the cell. A controller's own currents and imported ones have torque constants of a
+    data sheet unless something else is stated, and joint torque sensors are no better
+    (`identification.estimators.torque_scale.DATA_SHEET`).
+    """
+    n = len(cell.joint_names)
+    drives = cell.file.drive_train
+    with_currents = any(one.motor_current is not None for one in recordings)
+    of = "torque constants" if with_currents else "the scale of the recorded torques"
+    mapped = [one.provenance.get("torque_uncertainty") for one in recordings]
+    in_cell = cell.file.robot.torque_uncertainty
+    table = "[robot]"
+    if drives is not None and drives.torque_uncertainty is not None:
+        in_cell = drives.torque_uncertainty
+        table = "[drive_train]"
+    if in_cell is not None:
+        base = np.broadcast_to(np.asarray(in_cell, dtype=np.float64), n)
+        source = f"torque_uncertainty of {table} in the cell file"
+    elif simulated:
+        base = np.zeros(n)
+        source = "a simulated arm"
+    else:
+        base = np.full(n, DATA_SHEET)
+        source = "of a data sheet, as no torque_uncertainty is stated"
+    if any(entry is not None for entry in mapped):
+        stds = [base if text is None else numbers(json.loads(text), 1) for text in mapped]
+        return TorqueScale(np.max(stds, axis=0), of, "torque_uncertainty of the column map")
+    return TorqueScale(np.array(base), of, source)

@@ -57,16 +57,16 @@ from identification.factor.factor import (
     solve,
     total_factor,
 )
-from identification.selection.inner_prediction import Strength
+from identification.selection.settings import Strength
 from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.calibration import Refit
 from identification.validation.finding import joined
 
+from .cell_context import TorqueScale, torque_scale
 from .options import Estimator, Options
 from .prepared import Prepared, known_parameters, samples_of
 from .sources import Sources
-from .torque_scale import TorqueScale, torque_scale
 
 # Hz. A narrower smoother removes part of the motion from the regressor, a bias that instruments
 # cannot correct. On simulated NS 16 logs with 100 to 1000 times the encoder noise, instrumental
@@ -155,16 +155,11 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         total = sum(factors, Factor.zero(model))
         posterior = Posterior.of(cell, total, name, prepared.settings.strength)
         posterior, beside, unsolved = posterior.solved(total)
-        if name == "iv":
-            result, warnings = _instrumental(model, prepared, fitted)
-        elif name in _LOSSES:
-            result, warnings = _robust(model, fitted, name)
-        elif name in OF_PRIOR:
-            pooled = beside.estimate
-            result = _posterior(model, fitted, posterior, pooled, factors)
+        if name in OF_PRIOR:
+            result = _posterior(model, fitted, posterior, beside.estimate, factors)
             warnings = unsolved
         else:
-            result, warnings = _by_factor(model, fitted, name)
+            result, warnings = _without_prior(prepared, fitted, name)
         if prepared.sources.same_motion:
             result = result.with_scatter()
         precision = posterior.precision if name in OF_PRIOR else None
@@ -197,6 +192,18 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         stated=with_uncertain_scale(pooled, result.factor, precision, scale),
         notes=(f"the intervals of the parameters are computed {scale.message}",),
     )
+
+
+def _without_prior(
+    prepared: Prepared, fitted: Sequence[Samples], name: Estimator
+) -> tuple[RepeatedEstimate, list[str]]:
+    """Fit by an estimator that has no prior; return its warnings as well."""
+    model = prepared.sources.cell.model
+    if name == "iv":
+        return _instrumental(model, prepared, fitted)
+    if name in _LOSSES:
+        return _robust(model, fitted, name)
+    return _by_factor(model, fitted, name)
 
 
 def _with_uncertain_delay(

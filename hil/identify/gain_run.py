@@ -19,10 +19,11 @@ from identification.factor.columns import gain_factor
 from identification.factor.factor import FINE_BLOCK, Factor
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
+from identification.selection.settings import Settings
 from identification.signals.recording import RecordingError
 
 from .options import FIXED
-from .prepared import Settings, motor_from_joint, samples_of, stated_settings
+from .prepared import motor_from_joint, samples_of, stated_settings
 from .sources import Source, aligned, cell_of, source_of
 
 

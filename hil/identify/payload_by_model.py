@@ -13,12 +13,12 @@ from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification.estimators.payload import KnownArm, Run
 
+from .cell_context import torque_scale
 from .estimating import estimate_with
 from .options import Options
 from .payload_run import PayloadFound, doubtful_mounting, flange_of, weighed
 from .prepared import Prepared, prepare_sources, samples_of
 from .sources import Source, archives_in, arm_differences, gather_sources, refuse_duplicates
-from .torque_scale import torque_scale
 
 
 def weigh_by_model(

@@ -30,6 +30,7 @@ from identification.signals.samples import Samples
 from identification.validation.evidence import find_gravity
 from identification.validation.finding import Thresholds
 
+from .cell_context import TorqueScale, torque_scale
 from .options import Options
 from .payload_settings import NOT_DETERMINED, Load, controller_settings
 from .prepared import Prepared, prepare_sources, samples_of
@@ -42,7 +43,6 @@ from .sources import (
     gather_sources,
     refuse_duplicates,
 )
-from .torque_scale import TorqueScale, torque_scale
 
 Array = NDArray[np.float64]
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Final, NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
 from hil.cell import Cell
 from hil.cell.robot import ripples
@@ -24,13 +23,11 @@ from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import (
     RATE,
-    CandidateSettings,
-    Choice,
     Known,
     Question,
-    Strength,
     choose_settings,
 )
+from identification.selection.settings import Settings
 from identification.signals.clock import time_base
 from identification.signals.recording import Recording
 from identification.signals.samples import (
@@ -48,51 +45,6 @@ from .options import Options
 from .sources import Source, Sources
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Settings of the preprocessing and estimation of an arm's archives; serialisable."""
-
-    preprocessing: Preprocessing  #: with the delay of the torque
-    #: entries of `[robot.friction]` that replace the cell's
-    friction: Mapping[str, Any] = field(default_factory=dict)
-    #: of the positions (n,) [rad² or m²]; None estimates it in each recording
-    noise_variance: tuple[float, ...] | None = None
-    #: of the torques (n,) [N²·m² or N²]; None estimates it in each recording
-    torque_variance: tuple[float, ...] | None = None
-    stated_delay: float = 0.0  #: of the torque, by cell or options [s]
-    delay_variance: float = 0.0  #: of an estimated delay [s²]; zero for a stated one
-    strength: Strength = Strength()  # noqa: RUF009 - frozen
-    choices: tuple[Choice, ...] = ()  #: made by inner prediction
-    #: parameters (p,) of bodies and drives that load the gears, for friction that grows with it;
-    #: None: it does not, or they are estimated with it
-    loading: tuple[float, ...] | None = None
-
-    def preprocessed(self, **changes: Any) -> Settings:
-        """Return these settings with changes of the preprocessing."""
-        return replace(self, preprocessing=replace(self.preprocessing, **changes))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the settings for JSON, without the choices that led to them."""
-        entries: dict[str, Any] = _SETTINGS.dump_python(replace(self, choices=()), mode="json")
-        return entries
-
-    @classmethod
-    def from_dict(cls, entries: Mapping[str, Any]) -> Settings:
-        """Return the settings of :meth:`to_dict`.
-
-        Raises:
-            ValueError: they are others.
-        """
-        return _SETTINGS.validate_python(dict(entries))
-
-    def with_friction_law(self, cell: Cell) -> Cell:
-        """Return the cell with the friction law of these settings."""
-        return cell.with_friction(**self.friction) if self.friction else cell
-
-
-_SETTINGS: Final = TypeAdapter(Settings)
 
 
 def stated_delay(cell: Cell) -> float:
@@ -201,7 +153,7 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
     """
     sources = replace(sources, training=sources.training[:MAX_RECORDINGS])
     stated = _with_noise_of(stated_settings(sources.cell, options), sources)
-    sources = replace(sources, cell=stated.with_friction_law(sources.cell))
+    sources = replace(sources, cell=sources.cell.with_friction(**stated.friction))
     delay = _DelayChoice.of(_delays(sources, stated, options, reporter), sources, stated, options)
     started = stated.preprocessed(torque_delay=delay.assumed)
     chosen = _chosen(sources, started, delay.suggested, options, reporter)
@@ -358,17 +310,16 @@ def _chosen(
     """Choose the automatic settings by inner prediction; `suggested` delays [s] are candidates."""
     cell = sources.cell
     questions = _questions(sources, options, suggested)
-    settings = stated
     if not questions:
-        return settings
+        return stated
     # One repetition of a motion is enough.
     some = sources.training[:1] if sources.same_motion else sources.training
     read = [averaged_source(source, RATE) for source in some]
-    settings = averaged_noise(settings, some[0], read[0])
+    averaged = averaged_noise(stated, some[0], read[0])
     motions: list[dict[Preprocessing, Smoothed]] = [{} for _ in read]
 
     def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
-        trial = replace(settings, preprocessing=how)
+        trial = replace(averaged, preprocessing=how)
         return [
             samples_of(source, cell, trial, model, smoothed)
             for source, smoothed in zip(read, motions, strict=True)
@@ -378,16 +329,16 @@ def _chosen(
         return possible_low_passes(
             read[0].recording,
             model,
-            noise_variance=_array(settings.noise_variance),
+            noise_variance=_array(averaged.noise_variance),
             options=how,
-            undelayed=settings.preprocessing.torque_delay,
+            undelayed=stated.preprocessing.torque_delay,
         )
 
-    start = CandidateSettings(cell.model, settings.preprocessing)
     with reporter.task("choosing settings by inner prediction", 1) as task:
-        best, choices = choose_settings(
+        chosen = choose_settings(
+            cell.model,
             ready,
-            start,
+            stated,
             questions,
             low_passes,
             suggested,
@@ -395,30 +346,7 @@ def _chosen(
             known_parameters(cell),
         )
         task.advance(1)
-    return replace(
-        stated,
-        preprocessing=best.preprocessing,
-        friction=dict(settings.friction) | _friction_of(best, questions),
-        strength=best.strength,
-        choices=choices,
-    )
-
-
-def _friction_of(best: CandidateSettings, questions: Collection[Question]) -> dict[str, Any]:
-    """Return the friction law that was chosen, as far as it was asked for."""
-    law = best.model.friction.laws[0]
-    friction: dict[str, Any] = {}
-    if "presliding" in questions:
-        friction |= {"presliding": law.presliding}
-    if "friction" in questions:
-        friction |= {
-            "third": law.third or "none",
-            "stribeck": law.stribeck or 0.0,
-            "load": law.load,
-        }
-    if "ripple" in questions and best.ripple:
-        friction |= {"ripple": best.ripple}
-    return friction
+    return chosen
 
 
 def _ripples(cell: Cell) -> list[list[TorqueRipple]]:
@@ -517,7 +445,7 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
         IdentificationError: a delay was requested and no row is usable.
     """
     notes = []
-    stated = stated_settings(sources.cell, options).with_friction_law(sources.cell).model
+    stated = stated_settings(sources.cell, options)
     for source in (*sources.training, *sources.held_out):
         notes += [f"{source.name}: {line}" for line in (source.merged, *source.clock) if line]
         base = time_base(source.recording.time, source.recording.gap_before)
@@ -529,7 +457,7 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
         noise = "the noise of the positions was measured at standstill"
     decided = decide(sources, options, reporter)
     prepared = prepared_with(sources, decided.settings, reporter)
-    _require_slow_rows(stated, prepared.fitted)
+    _require_slow_rows(sources.cell.with_friction(**stated.friction).model, prepared.fitted)
     notes += [noise, *decided.notes, *prepared.notes]
     return replace(prepared, delays=decided.delays, notes=tuple(notes))
 
@@ -540,7 +468,7 @@ def prepared_with(sources: Sources, settings: Settings, reporter: Reporter) -> P
     Raises:
         RecordingError: a recording cannot be prepared.
     """
-    cell = settings.with_friction_law(sources.cell)
+    cell = sources.cell.with_friction(**settings.friction)
     sources = replace(sources, cell=cell)
     unseen = () if sources.in_sample else sources.held_out
     # Parts of one recording share its arrays, and have its motion.

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from drivers.packets import DRIVE_ON
 from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive
 from hil.archive.header import REJECTED
-from hil.campaign.errors import CampaignFolderError
-from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
-from hil.errors import ArchiveError, InputError
+from hil.errors import ArchiveError, CampaignFolderError, InputError
 from hil.files import file_digest
 from hil.reading import path_exists
+from hil.recorded_campaign import RecordedCampaign
 from hil.recordings import recording_of
 from identification.signals.clock import true_times
 from identification.signals.recording import (
@@ -268,7 +267,7 @@ def archives_in(paths: Sequence[Path]) -> Iterator[Path]:
         if not path.is_dir():
             yield path
             continue
-        folder = CampaignFolder(path)
+        folder = RecordedCampaign(path)
         if path_exists(path / "manifest.json"):
             kinds = ("excitation", "validation", "standstill")
             inside = [archive for kind in kinds for archive in folder.completed(kind)]
@@ -307,7 +306,7 @@ def _incomplete(archive: Archive) -> str | None:
 def _not_judged(archive: Archive) -> str | None:
     """Return the warning about an archive that is not in its campaign's manifest."""
     path = archive.path
-    folder = CampaignFolder(path.parent.parent)
+    folder = RecordedCampaign(path.parent.parent)
     if path.parent.name != folder.archives.name or ArchiveName.parse(path) is None:
         return None
     with suppress(CampaignFolderError):

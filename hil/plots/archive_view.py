@@ -19,7 +19,7 @@ from hil.cell import AngleFrame, Cell
 from hil.errors import ArchiveError, HilError, InputError
 from hil.plots import style
 from hil.plots.plan_picture import wrapped
-from hil.report.drawing import thinned
+from hil.report.chart import thinned
 from hil.terminal_text import plural
 from identification.errors import ModelError
 from identification.model.kinematics import chain_from_urdf

@@ -17,7 +17,7 @@ from hil.cell import AngleFrame, Cell
 from hil.design.advice import criteria_text
 from hil.plots import style
 from hil.plots.plan_picture import draw_motion
-from hil.report.drawing import label
+from hil.report.chart import label
 from identification.excitation import (
     CRITERIA,
     Design,

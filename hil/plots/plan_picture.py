@@ -16,7 +16,7 @@ from hil.cell import AngleFrame
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.plots import style
-from hil.report.drawing import label, thinned
+from hil.report.chart import label, thinned
 from identification.text import percentage
 from planner import JointLimits, Trajectory
 from planner.moves import MotionPlan

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import matplotlib as mpl
 
+from hil.report.rendering import template_text
+
 INK, MUTED, RULE = "#1a1a1a", "#666666", "#dddddd"
 LIMIT = "#b3261e"
 POSITION, VELOCITY, ACCELERATION = "#0072b2", "#00795a", "#b0530b"
+"""Colours of what only pictures have; charts have those of the pages, see :func:`colour`."""
 SMALL = 7.5
 TEXT = 9.0
 TITLE = 12.0
@@ -33,6 +38,18 @@ _STYLE = {
     "xtick.labelsize": SMALL,
     "ytick.labelsize": SMALL,
 }
+
+
+@cache
+def _palette() -> dict[str, str]:
+    """Return the colours of the pages on paper, by variable of their style sheet."""
+    root = template_text("report.css").partition("}")[0]
+    return dict(re.findall(r"--([\w-]+): (#[0-9a-f]+);", root))
+
+
+def colour(variable: str) -> str:
+    """Return the colour of a variable of the style sheet, such as ``--ink`` or ``var(--ink)``."""
+    return _palette()[variable.removeprefix("var(").removesuffix(")").removeprefix("--")]
 
 
 _settings = threading.RLock()

@@ -9,13 +9,15 @@ from __future__ import annotations
 import base64
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import NDArray
+
+from hil.report.chart import Caption, Chart, joined, label, one_line, padded, thinned
 
 Array = NDArray[np.float64]
 
@@ -31,21 +33,10 @@ _WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 370.0, 46.0, 10.0, 20.0, 40.0  # of a pan
 _GAP: Final = 24.0  # between plots above each other, px
 _TICK, _PAD, _THIN = 3.0, 6.5, 0.8  # length and distance of text, width of thin lines, px
 _FOOT: Final = 32.0  # from the axis down to the base line of its quantity, px
-_MARGIN: Final = 0.05  # free on both sides of the values, as a share of their range
-_LABEL_LENGTH: Final = 28
 _FEWEST_FOR_A_BOX: Final = 5  # values
 _BINS: Final = 300  # of a line over time, which has up to two points in each, some one per px
 _STEPS: Final = (1.0, 2.0, 5.0, 10.0)  # of round ticks, times a power of ten
 _MOST_DIGITS: Final = 1e6  # Ticks from here on have an exponent
-
-
-class Caption(NamedTuple):
-    """Texts of a panel: `key` makes its ids unique in the page, `what` is the description."""
-
-    key: str
-    title: str
-    note: str
-    what: str
 
 
 @dataclass(frozen=True)
@@ -57,33 +48,6 @@ class Panel:
     svg: Markup
     key: str = ""  #: of its caption
     joint: int | None = None  #: number of the joint of a chart, from 0
-
-
-def one_line(text: str) -> str:
-    """Replace unprintable characters by blanks."""
-    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
-
-
-def label(text: str) -> str:
-    """Shorten a name to one printable line."""
-    line = one_line(text)
-    return line if len(line) <= _LABEL_LENGTH else line[: _LABEL_LENGTH - 1] + "…"
-
-
-def thinned(time: Array, values: Array, bins: int = 500) -> tuple[Array, Array]:
-    """Return minimum and maximum of each of `bins` equal intervals, (m,) -> (<= 2 bins + 2,)."""
-    if time.size <= 2 * bins:
-        return time, values
-    edges = np.linspace(0, time.size, bins + 1).astype(np.intp)
-    starts = edges[:-1, None]
-    ends = edges[1:, None]
-    # Rows of equal length: the last sample of an interval is repeated.
-    rows = np.minimum(starts + np.arange(int(np.max(ends - starts))), ends - 1)
-    parts = values[rows]
-    starts = edges[:-1]
-    extremes = [starts + parts.argmin(axis=1), starts + parts.argmax(axis=1)]
-    chosen = np.unique(np.concatenate([[0, time.size - 1], *extremes]))
-    return time[chosen], values[chosen]
 
 
 def round_ticks(low: float, high: float, most: int) -> tuple[list[float], list[str]]:
@@ -101,21 +65,6 @@ def round_ticks(low: float, high: float, most: int) -> tuple[list[float], list[s
         digits = [math.floor(math.log10(abs(tick))) - place if tick else 0 for tick in ticks]
         texts = [f"{tick:.{max(0, d)}e}" for tick, d in zip(ticks, digits, strict=True)]
     return ticks, [text.replace("-", "−") for text in texts]
-
-
-def padded(values: Array) -> tuple[float, float]:
-    """Return the range of the finite values with a margin; it is never empty."""
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return 0.0, 1.0
-    low = float(finite.min())
-    high = float(finite.max())
-    # Neighbouring floats have no ticks between them.
-    if not high - low > 1e-9 * max(abs(low), abs(high)):
-        room = 0.05 * abs(low) or 1.0
-        return low - room, high + room
-    room = _MARGIN * (high - low)
-    return low - room, high + room
 
 
 @dataclass
@@ -167,8 +116,8 @@ class Axes:
     def svg(self, clip: str) -> str:
         """Return the plot; `clip` is the id of its clipping path."""
         visible = [shape for shape in self._shapes if shape[0] != "bands" or "stroke" in shape[3]]
-        low, high = self.x_limits or padded(_joined(shape[1] for shape in visible))
-        bottom, top = self.y_limits or padded(_joined(shape[2] for shape in visible))
+        low, high = self.x_limits or padded(joined(shape[1] for shape in visible))
+        bottom, top = self.y_limits or padded(joined(shape[2] for shape in visible))
         right = self.left + self.width
         foot = self.top + self.height
 
@@ -212,10 +161,6 @@ class Axes:
         middle = self.left + 0.5 * self.width
         parts.append(_text(self.foot, middle, foot + _FOOT, MUTED, TEXT_SIZE, "middle"))
         return "".join(parts)
-
-
-def _joined(arrays: Iterable[Array]) -> Array:
-    return np.concatenate([np.empty(0), *(np.asarray(a, np.float64).ravel() for a in arrays)])
 
 
 def _path(kind: str, x: Array, y: Array, style: str) -> str:
@@ -272,87 +217,22 @@ def single(height: float, heading: str, foot: str, *, x_ticks: int = 5) -> Axes:
     return Axes(_LEFT, _TOP, _WIDTH - _LEFT - _RIGHT, inner, heading, foot, x_ticks=x_ticks)
 
 
-@dataclass(frozen=True, eq=False)
-class Trace:
-    """One line of a plot, or a set of dots."""
-
-    values: Array  #: (m,)
-    colour: str  #: of the palette
-    width: float  #: of the line, or diameter of a dot [px]
-    dashed: bool = False
-    name: str = ""  #: in the legend, and beside its value
-    x: Array | None = None  #: (m,) if not that of the chart
-    dots: bool = False
-    #: may leave the plot, as the error of a poor model beside that of a good one
-    loose: bool = False
-
-    def over(self, x: Array) -> Trace:
-        """Return the line over other values of x (m,)."""
-        return replace(self, x=x)
-
-
-@dataclass(frozen=True, eq=False)
-class Plot:
-    """Axes of a chart."""
-
-    height: float  #: [px]
-    heading: str  #: quantity and unit
-    traces: Sequence[Trace]  #: its lines, the lowest first
-    #: shaded intervals of x
-    shaded: Sequence[tuple[float, float]] = ()
-    #: largest value of a range about zero; the range of the lines if None
-    reach: float | None = None
-    limits: tuple[float, float] | None = None  #: the range, if neither
-    origin: bool = False  #: whether lines are drawn through x = 0 and y = 0
-
-    @property
-    def y_limits(self) -> tuple[float, float]:
-        """Range of the vertical axis: that of the lines; a loose one adds at most its length."""
-        if self.reach is not None:
-            return -self.reach, self.reach
-        if self.limits is not None:
-            return self.limits
-        low, high = padded(_joined(t.values for t in self.traces if not t.loose))
-        span = high - low
-        loose = _joined(t.values for t in self.traces if t.loose)
-        if not np.isfinite(loose).any():
-            return low, high
-        least, most = padded(loose)
-        return min(low, max(least, low - span)), max(high, min(most, high + span))
-
-
-@dataclass(frozen=True, eq=False)
-class Chart:
-    """Plots over the same quantity, one above the other: drawn as SVG, or by the page's script."""
-
-    caption: Caption
-    x: Array  #: (m,)
-    plots: Sequence[Plot]
-    foot: str = "time [s]"  #: quantity and unit of x
-    joint: int = 0  #: number of the joint, from 0
-    log: bool = False  #: whether both axes are logarithmic
-
-    @property
-    def x_limits(self) -> tuple[float, float]:
-        """Range of the horizontal axis."""
-        if any(trace.x is not None for plot in self.plots for trace in plot.traces):
-            return padded(_joined(t.x for p in self.plots for t in p.traces if t.x is not None))
-        return float(self.x[0]), max(float(self.x[-1]), float(self.x[0]) + 1e-9)
-
-
 def chart_panel(chart: Chart, bins: int = _BINS) -> Panel:
     """Draw a chart; a line has at most two points in each of the `bins` of its x."""
     panels = list[Axes]()
     top = _TOP
     scale = _log10 if chart.log else np.asarray
     low, high = (float(scale(np.array(end))) for end in chart.x_limits)
+    x_names = [(float(scale(np.array(tick))), f"{tick:g}") for tick in chart.ticks]
+    if chart.log and not x_names:
+        x_names = _decades(low, high)
     for k, plot in enumerate(chart.plots):
         last = k == len(chart.plots) - 1
         bottom, upper = (float(scale(np.array(end))) for end in plot.y_limits)
         axes = Axes(
             _LEFT, top, _WIDTH - _LEFT - _RIGHT, plot.height, plot.heading,
             chart.foot if last else "", x_limits=(low, high), x_ticks=6, x_labelled=last,
-            y_limits=(bottom, upper), x_names=_decades(low, high) if chart.log else (),
+            y_limits=(bottom, upper), x_names=x_names,
             y_names=_decades(bottom, upper) if chart.log else (),
         )  # fmt: skip
         if plot.shaded:

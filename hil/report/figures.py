@@ -9,20 +9,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.report.drawing import (
-    BAND,
-    FIRST,
-    MUTED,
-    Caption,
-    Chart,
-    Panel,
-    Plot,
-    Trace,
-    matrix_panel,
-    padded,
-    panel,
-    single,
-)
+from hil.report.chart import Caption, Chart, Legend, Plot, padded
+from hil.report.drawing import BAND, FIRST, MUTED, Panel, matrix_panel, panel, single
 from hil.report.numbers import fixed, percent, significant
 from hil.report.series import ReportSeries
 from hil.results import FittedResult, Results, ValidationResult, by_id
@@ -67,22 +55,6 @@ def joints_of(results: Results) -> list[Joint]:
             zip(results.judgement.joints, errors, strict=True)
         )
     ]
-
-
-class Legend(NamedTuple):
-    """Colour and width of the lines of a chart, by the key and the text of their legend."""
-
-    key: str
-    text: str
-    colour: str
-    width: float
-    dashed: bool = False
-
-    def trace(self, values: Array, *, loose: bool = False, width: float = 0.0) -> Trace:
-        """Return the line of these values."""
-        return Trace(
-            values, f"var({self.colour})", width or self.width, self.dashed, self.key, loose=loose
-        )
 
 
 MEASURED = Legend("measured", "measured", "--wide", 4.0)

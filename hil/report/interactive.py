@@ -18,7 +18,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from hil.report.drawing import Chart, Trace, one_line
+from hil.report.chart import Chart, Trace, one_line
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from hil.report.series import ReportSeries
 from hil.results import ParameterResult, Results, by_id, outside_mark
 from hil.rollout_result import RolloutResult
 from identification.excitation import CRITERIA, METHODS
-from identification.selection.inner_prediction import Choice
+from identification.selection.settings import Choice
 
 _MOST_CANDIDATES: Final = 6
 """Candidates shown of one choice: the first, and the best of the others."""

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.report.drawing import Caption, Chart, Plot, Trace, label
-from hil.report.figures import NOMINAL, PREDICTED, Legend
-from hil.rollout_result import ArmErrors, RolloutResult
+from hil.report.chart import Caption, Chart, Legend, Plot, Trace, label
+from hil.report.figures import NOMINAL, PREDICTED
+from hil.rollout_result import WANTED, ArmErrors, RolloutResult
+from identification.text import percentage
 
 Array = NDArray[np.float64]
 
@@ -26,6 +29,14 @@ ROLLOUT_LEGENDS: Final[Mapping[str, Legend]] = {
     "polished": POLISHED,
 }
 """Lines of the figure by name."""
+
+EXPECTED: Final = Legend(
+    "expected", " to ".join(map(percentage, WANTED)), "--muted", 1.0, dashed=True
+)
+_DOT: Final = 6.0  # px
+_JOINT_COLOURS: Final = (
+    "--first", "--second", "--good", "--route-3", "--outside-3", "--wide", "--warn-line", "--muted",
+)  # fmt: skip
 
 Errors = Callable[[ArmErrors], Array]
 """Errors (h,) of an arm, of one joint or of the tool [mrad or mm]."""
@@ -76,7 +87,48 @@ def _chart(result: RolloutResult, errors: Errors, number: int, title: str, headi
         foot="horizon [s]",
         joint=number,
         log=True,
+        ticks=result.horizons,
     )
+
+
+def overview_charts(result: RolloutResult) -> list[Chart]:
+    """Return the errors of all joints together, and the shares inside the band of each joint."""
+
+    def of_all(arm: ArmErrors) -> Array:
+        return np.array([arm.overall(k) for k in range(len(arm.joints))])
+
+    errors = _chart(result, of_all, 0, "", "position error, rms of all joints [mrad or mm]")
+    note = f"{label(result.cell)}: {result.windows} windows"
+    errors = replace(errors, caption=errors.caption._replace(note=note))
+    horizons = np.array(result.horizons)
+    traces = [EXPECTED.trace(np.full(len(horizons), 100.0 * end)) for end in WANTED]
+    for legend, shares in zip(_band_legends(result), zip(*result.inside, strict=True), strict=True):
+        line = legend.trace(100.0 * np.array(shares))
+        traces += [line, replace(line, dots=True, width=_DOT)]
+    what = "share of measured positions in the 95 % band of the drawn arms over the horizon"
+    plot = Plot(_HEIGHT, "measured positions in the 95 % band [%]", traces, limits=(0.0, 102.0))
+    band = Chart(
+        Caption("rollout-band", "", "", what),
+        horizons,
+        [plot],
+        "horizon [s]",
+        ticks=horizons.tolist(),
+    )
+    return [errors, band]
+
+
+def overview_legends(result: RolloutResult) -> list[Legend]:
+    """Return the legends of :func:`overview_charts`."""
+    return [*ROLLOUT_LEGENDS.values(), *_band_legends(result), EXPECTED]
+
+
+def _band_legends(result: RolloutResult) -> list[Legend]:
+    """Return the legend of each joint in the shares inside the band."""
+    colours = itertools.cycle(_JOINT_COLOURS)
+    return [
+        Legend(name, label(name), colour, 1.4)
+        for name, colour in zip(result.joint_names, colours, strict=False)
+    ]
 
 
 def _limits(traces: Sequence[Trace]) -> tuple[float, float]:

@@ -16,6 +16,7 @@ from hil.design import preset
 from hil.files import digest, write_files
 from hil.progress import Reporter
 from hil.report import drawing
+from hil.report.chart import Caption, Chart, Plot, Trace
 from hil.report.numbers import significant
 from hil.report.rendering import environment, page_bytes
 from hil.simulation import planted_values, simulated_link, simulated_provenance
@@ -157,7 +158,7 @@ def _trajectories(condition: ConditionResult, joint_names: list[str]) -> list[dr
             f" {math.degrees(max(one.position[j])):.0f}°"
             for one in condition.methods
         ]
-        caption = drawing.Caption(f"x{j}", name, "; ".join(spans), "position in each excitation")
+        caption = Caption(f"x{j}", name, "; ".join(spans), "position in each excitation")
         axes = drawing.single(170.0, "position [rad]", "time [s]", x_ticks=6)
         for one, colour in zip(condition.methods, COLOURS, strict=True):
             axes.line(np.array(one.time), np.array(one.position[j]), colour, 1.3)
@@ -178,7 +179,7 @@ def _boxes(condition: ConditionResult, joint_names: list[str]) -> list[drawing.P
         )
         key = f"b{condition.key}{j}"
         what = "mean |e| in N·m"
-        caption = drawing.Caption(key, name, f"medians {medians}", what)
+        caption = Caption(key, name, f"medians {medians}", what)
         panels.append(drawing.box_panel(caption, columns, COLOURS, "mean |e| [N·m]", labels))
     return panels
 
@@ -192,21 +193,21 @@ def _examples(condition: ConditionResult, joint_names: list[str]) -> list[drawin
         measured = np.array(found.measured[j])
         names = [one.label for one in condition.methods]
         lines = [
-            drawing.Trace(np.array(found.predicted[one.key][j]), COLOURS[k], 1.1, dashed=k == 1)
+            Trace(np.array(found.predicted[one.key][j]), COLOURS[k], 1.1, dashed=k == 1)
             for k, one in enumerate(condition.methods)
         ]
         errors = [measured - one.values for one in lines]
         reach = 1.05 * max(float(np.abs(error).max()) for error in errors) or 1.0
-        both = [drawing.Trace(measured, drawing.WIDE, 4.0), *lines]
-        plots = [drawing.Plot(128.0, "torque [N·m]", both)]
+        both = [Trace(measured, drawing.WIDE, 4.0), *lines]
+        plots = [Plot(128.0, "torque [N·m]", both)]
         rms = []
         # A row for each error: where there is noise, one line over another would hide it.
         for which, one, error in zip(names, lines, errors, strict=True):
-            trace = drawing.Trace(error, one.colour, 1.0)
-            plots.append(drawing.Plot(48.0, f"measured − {which} [N·m]", [trace], reach=reach))
+            trace = Trace(error, one.colour, 1.0)
+            plots.append(Plot(48.0, f"measured − {which} [N·m]", [trace], reach=reach))
             rms.append(f"{which} {significant(float(np.sqrt(np.mean(error**2))))}")
         note = f"RMS error {', '.join(rms)} N·m"
         what = "measured and predicted torque"
-        caption = drawing.Caption(f"e{condition.key}{j}", name, note, what)
-        panels.append(drawing.chart_panel(drawing.Chart(caption, time, plots)))
+        caption = Caption(f"e{condition.key}{j}", name, note, what)
+        panels.append(drawing.chart_panel(Chart(caption, time, plots)))
     return panels

@@ -241,8 +241,16 @@ class FrictionLaw:
         Raises:
             ModelError: invalid settings.
         """
-        options: dict[str, Any] = {k: None if v == ABSENT.get(k) else v for k, v in table.items()}
-        return cls(**options)
+        return cls().changed(table)
+
+    def changed(self, entries: Mapping[str, Any]) -> FrictionLaw:
+        """Return the law with other entries of its table `[robot.friction]`.
+
+        Raises:
+            ModelError: invalid settings.
+        """
+        fields: dict[str, Any] = {k: None if v == ABSENT.get(k) else v for k, v in entries.items()}
+        return replace(self, **fields)
 
     def table(self) -> dict[str, Any]:
         """Return the table `[robot.friction]` of the law."""

@@ -213,13 +213,16 @@ class RobotModel:
         )
 
     def with_friction(self, **changes: Any) -> RobotModel:
-        """Return the model with changed fields of the :class:`FrictionLaw` of each joint.
+        """Return the model with changed entries of the table `[robot.friction]` of each joint.
 
         Raises:
             ModelError: an invalid friction law.
         """
-        laws = tuple(replace(law, **changes) for law in self.friction.laws)
-        return self._with(replace(self.friction, laws=laws), self.elements)
+        return self.with_friction_laws([law.changed(changes) for law in self.friction.laws])
+
+    def with_friction_laws(self, laws: Sequence[FrictionLaw]) -> RobotModel:
+        """Return the model with these friction laws of its joints, in their order."""
+        return self._with(replace(self.friction, laws=tuple(laws)), self.elements)
 
     def with_elements(self, more: Sequence[Element]) -> RobotModel:
         """Return the model with more elements, see :meth:`from_urdf`."""

@@ -34,9 +34,10 @@ from identification.factor.factor import (
     equal_runs,
     total_factor,
 )
-from identification.model.elements import Element, TorqueRipple
+from identification.model.elements import TorqueRipple
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
+from identification.selection.settings import Choice, Settings, Strength
 from identification.signals.masks import LeftOut
 from identification.signals.samples import Preprocessing, Samples, VelocitySource
 
@@ -89,10 +90,10 @@ STRENGTHS: Final = (1.0, 4.0, 0.25)
 # Terms beside Coulomb and viscous friction; they correlate, so one at most. The stated law comes
 # first.
 FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
-    {"third": None, "stribeck": None},
-    {"third": "quadratic", "stribeck": None},
-    {"third": "cubic", "stribeck": None},
-    {"third": None, "stribeck": 0.1},
+    {"third": "none", "stribeck": 0.0},
+    {"third": "quadratic", "stribeck": 0.0},
+    {"third": "cubic", "stribeck": 0.0},
+    {"third": "none", "stribeck": 0.1},
 )
 # Improvement required to replace the first, simpler candidate, beside its standard error; more for
 # a low-pass, which correlates with other settings.
@@ -112,84 +113,6 @@ _LARGEST_SHARE: Final = 0.5
 _SHOWN: Final = 0.1  # share of the torque's scatter from which on friction is judged
 _SPEEDS: Final = 20  # points of that test
 _MOST_SWEEPS: Final = 2
-
-
-@dataclass(frozen=True)
-class Strength:
-    """How strongly the prior counts against the data."""
-
-    #: factor of the rows that count as one by the correlation of the residuals
-    weight: float = 1.0
-    consistent: bool = False  #: whether parameters that no bodies have are excluded
-
-    def design_effect(self, of_residuals: float) -> float:
-        """Return how many rows count as one."""
-        return max(1.0, self.weight * of_residuals)
-
-    def describe(self) -> str:
-        """Return the strength as a phrase."""
-        bodies = "physically consistent" if self.consistent else "not restricted to possible bodies"
-        return f"prior weighs {self.weight:g} times as the residuals suggest, {bodies}"
-
-
-@dataclass(frozen=True)
-class CandidateSettings:
-    """Chosen settings."""
-
-    model: RobotModel  # with its friction
-    preprocessing: Preprocessing  # of recordings into samples
-    strength: Strength = Strength()  # of the prior
-
-    @property
-    def key(self) -> tuple[Columns, Preprocessing, Strength]:
-        """Key of the settings of one robot."""
-        return *self.factor_key, self.strength
-
-    @property
-    def factor_key(self) -> tuple[Columns, Preprocessing]:
-        """Key of the settings that change factors."""
-        return (self.model.friction.laws, self.model.elements.elements), self.preprocessing
-
-    @property
-    def ripple(self) -> tuple[int, ...]:
-        """Orders of the estimated torque ripple, periods per motor turn."""
-        elements = self.model.elements.elements
-        return next((part.orders for part in elements if isinstance(part, TorqueRipple)), ())
-
-    def describe(self) -> tuple[str, ...]:
-        """Return descriptions of the settings, one by one."""
-        how = self.preprocessing
-        width = self.preprocessing.torque_bandwidth
-        left_out = {
-            "slow": "slow rows and reversals",
-            "halts": "long halts of each joint",
-            "rests": "rests of the whole arm",
-            "none": "none",
-        }
-        return (
-            f"{how.rigid_bandwidth:g} Hz",
-            "measured velocity" if how.velocity == "measured" else "velocity from positions",
-            *self.model.friction.laws[0].summary(),
-            f"torque ripple, {' and '.join(map(str, self.ripple))} per motor turn"
-            if self.ripple
-            else "no torque ripple",
-            left_out.get(how.left_out or "", "by the friction law"),
-            f"delay of {1e3 * how.torque_delay:.3g} ms",
-            "no low-pass" if width is None else f"low-pass of {width:.3g} Hz, {how.torque_shape}",
-            self.strength.describe(),
-        )
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Decision by inner prediction."""
-
-    name: str  # of the setting
-    candidates: tuple[str, ...]  # descriptions
-    # ``||e|| / ||tau||`` over all joints, of a low-pass their geometric mean by joint; geometric
-    # mean over the segments
-    errors: tuple[float, ...]
-    chosen: int  # index of the candidate
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,8 +212,8 @@ class Folds:
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
 """Prepares the fitted data for a model, averaged to `RATE`."""
 
-Columns = tuple[tuple[FrictionLaw, ...], tuple[Element, ...]]
-"""Friction and elements of a model."""
+Columns = tuple[tuple[FrictionLaw, ...], tuple[int, ...]]
+"""Friction of a model, and periods of its torque ripple per motor turn."""
 
 LowPasses = Callable[[RobotModel, Preprocessing], Sequence[Preprocessing]]
 """Returns settings with candidate low-passes of the torque."""
@@ -300,30 +223,31 @@ Known = Mapping[str, tuple[float, float]]
 
 
 def choose_settings(
+    model: RobotModel,
     ready: Ready,
-    start: CandidateSettings,
+    start: Settings,
     questions: Collection[Question],
     low_passes: LowPasses,
     delays: Sequence[float] = (),
     ripples: Sequence[Sequence[TorqueRipple]] = (),
     known: Known | None = None,
-) -> tuple[CandidateSettings, tuple[Choice, ...]]:
-    """Choose settings one after the other, from data that `ready` prepares.
+) -> Settings:
+    """Choose settings one after the other, from data that `ready` prepares for the arm's `model`.
 
     Significant `delays` of the torque [s] are candidates for "delay" that must predict no worse
-    than that of `start`. Returns settings and decisions; `start` alone if the data are too short,
-    or predict no part of themselves.
+    than that of `start`, and `ripples` those for "ripple". Returns settings with their choices;
+    `start` if the data are too short, or predict no part of themselves.
     """
-    trial = _Trial(ready, known)
+    trial = _Trial(model, ready, known, ripples)
     now = start
     if "bandwidth" in questions:
-        now = _with(now, rigid_bandwidth=BANDWIDTHS[0])
+        now = now.preprocessed(rigid_bandwidth=BANDWIDTHS[0])
     if "velocity" in questions:
-        now = _with(now, velocity=VELOCITIES[0])
+        now = now.preprocessed(velocity=VELOCITIES[0])
     if "rows" in questions:
-        now = _with(now, left_out=LEFT_OUT[0])
+        now = now.preprocessed(left_out=LEFT_OUT[0])
     if "presliding" in questions:
-        now = _friction(now, presliding=PRESLIDING[0])
+        now = now.with_friction(presliding=PRESLIDING[0])
     asked: set[str] = {*questions}
     if "estimator" in asked:
         asked |= {"strength", "consistency"}
@@ -337,29 +261,29 @@ def choose_settings(
     if "low-pass" in asked:
         now, choices = _compare_low_passes(trial, first, now, choices, asked, low_passes)
     if "friction" in asked:
-        had_load = now.model.friction.has_load
+        had_load = trial.model(now).friction.has_load
         for decide in (_friction_terms, _load_friction):
             decision = decide(trial, now)
             now = decision.settings
             choices = [*choices, decision.choice]
-        if "delay" in asked and now.model.friction.has_load and not had_load:
+        if "delay" in asked and trial.model(now).friction.has_load and not had_load:
             now, choices = _confirm_delay(trial, start, now, choices)
     if "ripple" in asked:
-        rippled = [replace(now, model=now.model.with_elements(elements)) for elements in ripples]
+        rippled = [now.with_friction(ripple=orders) for orders in trial.ripples]
         decision = trial.decide("torque ripple", [now, *rippled])
         now = decision.settings
         choices = [*choices, decision.choice]
     trial.weigh(now)
     compared, now, decided = _choose_prior(trial, now, asked)
     if not trial.errors(compared).overall < _MEANINGLESS:
-        return start, ()
+        return start
     choices = [*choices, *decided]
-    return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
+    return replace(now, choices=tuple(choice for choice in choices if len(choice.candidates) > 1))
 
 
 def _choose_prior(
-    trial: _Trial, now: CandidateSettings, asked: Collection[str]
-) -> tuple[CandidateSettings, CandidateSettings, list[Choice]]:
+    trial: _Trial, now: Settings, asked: Collection[str]
+) -> tuple[Settings, Settings, list[Choice]]:
     """Choose the strength of the prior, then whether bodies must be possible.
 
     Returns the settings after each of the two, and the decisions.
@@ -383,30 +307,30 @@ def _choose_prior(
     return compared, now, choices
 
 
-def _friction_terms(trial: _Trial, now: CandidateSettings) -> _Decision:
+def _friction_terms(trial: _Trial, now: Settings) -> _Decision:
     """Choose the terms beside Coulomb and viscous friction, the stated ones first.
 
     A term must also predict fast motion from slower one no worse, and leave friction at all speeds:
     the law is the choice that carries over to another motion least.
     """
-    law = now.model.friction.laws[0]
-    stated = {"third": law.third, "stribeck": law.stribeck}
+    law = trial.model(now).friction.laws[0].table()
+    stated = {"third": law["third"], "stribeck": law["stribeck"]}
     terms = [stated, *(term for term in FRICTION_TERMS if term != stated)]
-    candidates = [_friction(now, **term) for term in terms]
+    candidates = [now.with_friction(**term) for term in terms]
 
-    def possible(term: CandidateSettings) -> bool:
+    def possible(term: Settings) -> bool:
         return trial.fast_error(term) <= trial.fast_error(now) and trial.has_friction(term)
 
     return trial.decide("friction at speed", candidates, TERM_WORTHWHILE, possible=possible)
 
 
-def _load_friction(trial: _Trial, now: CandidateSettings) -> _Decision:
+def _load_friction(trial: _Trial, now: Settings) -> _Decision:
     """Choose whether dry friction grows with the transmitted torque, as in strain-wave gears.
 
     A stated term comes first. Shares that no gear has are refused.
     """
-    law = now.model.friction.laws[0]
-    candidates = [_friction(now, load=load) for load in (law.load, not law.load)]
+    law = trial.model(now).friction.laws[0]
+    candidates = [now.with_friction(load=load) for load in (law.load, not law.load)]
     return trial.decide(
         LOAD,
         candidates,
@@ -417,12 +341,12 @@ def _load_friction(trial: _Trial, now: CandidateSettings) -> _Decision:
 
 def _compare_delays(
     trial: _Trial,
-    first: CandidateSettings,
-    now: CandidateSettings,
+    first: Settings,
+    now: Settings,
     choices: list[Choice],
     questions: Collection[str],
     delays: Sequence[float],
-) -> tuple[CandidateSettings, CandidateSettings, list[Choice]]:
+) -> tuple[Settings, Settings, list[Choice]]:
     """Compensate a significant delay unless it predicts worse, and choose the other settings again.
 
     Compared on sliding rows, as presliding is similar to a delay. Returns the settings before and
@@ -430,30 +354,30 @@ def _compare_delays(
     """
     compared: list[Choice] = []
     for delay in delays:
-        sliding = _with(now, left_out="slow")
-        late = _with(sliding, torque_delay=delay)
+        sliding = now.preprocessed(left_out="slow")
+        late = sliding.preprocessed(torque_delay=delay)
         # A short recording has to show that the delay predicts better.
         short = trial.duration(now) < SHORT
         pair = [sliding, late] if short else [late, sliding]
         decision = trial.decide(DELAY, pair, 0.0, rows="fitted")
         compared.append(decision.choice)
         if decision.settings.preprocessing.torque_delay == delay:
-            first = _with(first, torque_delay=delay)
+            first = first.preprocessed(torque_delay=delay)
             now, choices = _sweep(trial, first, questions)
     return first, now, [*compared, *choices]
 
 
 def _confirm_delay(
-    trial: _Trial, start: CandidateSettings, now: CandidateSettings, choices: list[Choice]
-) -> tuple[CandidateSettings, list[Choice]]:
+    trial: _Trial, start: Settings, now: Settings, choices: list[Choice]
+) -> tuple[Settings, list[Choice]]:
     """Leave out a delay that predicts worse beside friction that grows with load, be it by little.
 
     It was estimated without that friction, whose absence may resemble a delay of some milliseconds.
     """
-    undelayed = _with(now, torque_delay=start.preprocessing.torque_delay)
-    if undelayed.key == now.key:
+    undelayed = now.preprocessed(torque_delay=start.preprocessing.torque_delay)
+    if trial.key(undelayed) == trial.key(now):
         return now, choices
-    pair = [_with(each, left_out="slow") for each in (now, undelayed)]
+    pair = [each.preprocessed(left_out="slow") for each in (now, undelayed)]
     decision = trial.decide(DELAY, pair, 0.0, rows="fitted", certainty=0.0)
     others = [choice for choice in choices if choice.name != DELAY]
     return (now, undelayed)[decision.choice.chosen], [*others, decision.choice]
@@ -461,19 +385,19 @@ def _confirm_delay(
 
 def _compare_low_passes(
     trial: _Trial,
-    first: CandidateSettings,
-    now: CandidateSettings,
+    first: Settings,
+    now: Settings,
     choices: list[Choice],
     questions: Collection[str],
     low_passes: LowPasses,
-) -> tuple[CandidateSettings, list[Choice]]:
+) -> tuple[Settings, list[Choice]]:
     """Add a low-pass of the torque, or its delay alone, if that predicts better.
 
     Starts from the bandwidth of the `first` settings: a narrow one chosen `now` would replace a
     part of it.
     """
-    start = _with(now, rigid_bandwidth=first.preprocessing.rigid_bandwidth)
-    possible = low_passes(start.model, start.preprocessing)
+    start = now.preprocessed(rigid_bandwidth=first.preprocessing.rigid_bandwidth)
+    possible = low_passes(trial.model(start), start.preprocessing)
     if not possible:
         return now, choices
     candidates = [replace(start, preprocessing=how) for how in possible]
@@ -500,7 +424,7 @@ def _compare_low_passes(
 
 
 class _Decision(NamedTuple):
-    settings: CandidateSettings
+    settings: Settings
     choice: Choice
 
 
@@ -514,7 +438,16 @@ class _Reduced(NamedTuple):
 class _Trial:
     """Scores of settings, with cached factors."""
 
-    def __init__(self, ready: Ready, known: Known | None) -> None:
+    def __init__(
+        self,
+        model: RobotModel,
+        ready: Ready,
+        known: Known | None = None,
+        ripples: Sequence[Sequence[TorqueRipple]] = (),
+    ) -> None:
+        self.ripples = {ripple[0].orders: ripple for ripple in ripples if ripple}
+        self._model = model
+        self._models: dict[Columns, RobotModel] = {}
         self._ready = ready
         self._known = known
         self._samples: dict[Preprocessing, list[Samples]] = {}
@@ -524,25 +457,48 @@ class _Trial:
         self._effect = 1.0
         self._weighed: tuple[Columns, Preprocessing] | None = None
 
-    def weigh(self, settings: CandidateSettings) -> None:
+    def model(self, settings: Settings) -> RobotModel:
+        """Return the model of the arm with the friction and the torque ripple of settings."""
+        laws, orders = key = self._columns(settings)
+        if key not in self._models:
+            model = self._model.with_friction_laws(laws)
+            self._models[key] = model.with_elements(self.ripples.get(orders, ()))
+        return self._models[key]
+
+    def _columns(self, settings: Settings) -> Columns:
+        entries = {**settings.friction}
+        orders = tuple(entries.pop("ripple", ()))
+        return tuple(law.changed(entries) for law in self._model.friction.laws), orders
+
+    def factor_key(self, settings: Settings) -> tuple[Columns, Preprocessing]:
+        """Return the key of the settings that change factors."""
+        return self._columns(settings), settings.preprocessing
+
+    def key(self, settings: Settings) -> tuple[Columns, Preprocessing, Strength]:
+        """Return the key of the settings that change predictions."""
+        return *self.factor_key(settings), settings.strength
+
+    def weigh(self, settings: Settings) -> None:
         """Set how many rows count as one by the correlation of the residuals of settings.
 
         It is the same for all that are compared, so that none wins by a weaker prior.
         """
-        if settings.factor_key == self._weighed:
+        key = self.factor_key(settings)
+        if key == self._weighed:
             return
-        self._weighed = settings.factor_key
-        model = settings.model
+        self._weighed = key
+        model = self.model(settings)
         total = total_factor(model, self.samples(settings))
         prior = self._reduced(settings).prior.gaussian
         self._effect = design_effect_of(total, prior) if total.samples.any() else 1.0
         self._errors.clear()
 
-    def duration(self, settings: CandidateSettings) -> float:
+    def duration(self, settings: Settings) -> float:
         """Return the time of motion of the recordings [s], in which at least one joint moves."""
+        model = self.model(settings)
         samples = self.samples(settings)
         return sum(
-            float(np.count_nonzero(settings.model.moving(each.motion.velocity).any(axis=1)))
+            float(np.count_nonzero(model.moving(each.motion.velocity).any(axis=1)))
             * float(np.median(np.diff(each.motion.time)))
             for each in samples
         )
@@ -550,12 +506,12 @@ class _Trial:
     def decide(
         self,
         name: str,
-        candidates: Sequence[CandidateSettings],
+        candidates: Sequence[Settings],
         share: float | None = None,
         *,
         by_joint: bool = False,
         rows: Literal["all", "fitted"] = "all",
-        possible: Callable[[CandidateSettings], bool] | None = None,
+        possible: Callable[[Settings], bool] | None = None,
         certainty: float = 1.0,
     ) -> _Decision:
         """Return the first candidate, or the best one if it is clearly better, and `possible`.
@@ -574,12 +530,10 @@ class _Trial:
             better = _clearly_better(segments[k], segments[0], share, certainty)
             if better and (possible is None or possible(candidates[k])):
                 chosen = k
-        words = _differences(candidates)
-        return _Decision(candidates[chosen], Choice(name, words, tuple(means), chosen))
+        described = _differences([_description(self.model(each), each) for each in candidates])
+        return _Decision(candidates[chosen], Choice(name, described, tuple(means), chosen))
 
-    def walk(
-        self, candidates: Sequence[CandidateSettings], size: Callable[[CandidateSettings], float]
-    ) -> list[int]:
+    def walk(self, candidates: Sequence[Settings], size: Callable[[Settings], float]) -> list[int]:
         """Return the indices of the first candidate and, to both sides by size, of improvements.
 
         And of the next ones, which are worse: no candidate beyond is tried.
@@ -597,20 +551,20 @@ class _Trial:
                 least = error
         return sorted(visited)
 
-    def best(self, candidates: Sequence[CandidateSettings]) -> CandidateSettings:
+    def best(self, candidates: Sequence[Settings]) -> Settings:
         """Return the candidate with the least error by joint."""
         return min(candidates, key=lambda each: _mean(self.errors(each).joints))
 
-    def errors(self, settings: CandidateSettings, rows: Literal["all", "fitted"] = "all") -> Errors:
+    def errors(self, settings: Settings, rows: Literal["all", "fitted"] = "all") -> Errors:
         """Return the errors of predicting these rows of each segment from the others."""
-        key = *settings.key, rows
+        key = *self.key(settings), rows
         if key not in self._errors:
             self._errors[key] = self._predicted(settings, rows)
         return self._errors[key]
 
-    def _predicted(self, settings: CandidateSettings, rows: Literal["all", "fitted"]) -> Errors:
+    def _predicted(self, settings: Settings, rows: Literal["all", "fitted"]) -> Errors:
         reduced = self._reduced(settings)
-        n = settings.model.n_joints
+        n = self.model(settings).n_joints
         unknown = Errors(np.full((FOLDS, n), np.inf), np.ones((FOLDS, n)))
         if not reduced.folds.separable:
             return unknown
@@ -620,22 +574,21 @@ class _Trial:
         except (IdentificationError, np.linalg.LinAlgError):
             return unknown
 
-    def _estimator(
-        self, settings: CandidateSettings, reduced: _Reduced
-    ) -> Callable[[Factor], Array]:
+    def _estimator(self, settings: Settings, reduced: _Reduced) -> Callable[[Factor], Array]:
         effect = settings.strength.design_effect(self._effect)
         prior = reduced.prior
+        model = self.model(settings)
         _, of_all = posterior_values(reduced.folds.fitted, prior.gaussian, effect)
 
         def estimate(factor: Factor) -> Array:
             values, weights = posterior_values(factor, prior.gaussian, effect, of_all)
             if settings.strength.consistent:
-                values = consistent_values(settings.model, factor, weights, values, prior, effect)
+                values = consistent_values(model, factor, weights, values, prior, effect)
             return values
 
         return estimate
 
-    def fitted_error(self, settings: CandidateSettings) -> float:
+    def fitted_error(self, settings: Settings) -> float:
         """Return the error of the fitted rows themselves; infinite if none can be fitted."""
         reduced = self._reduced(settings)
         try:
@@ -644,20 +597,20 @@ class _Trial:
             return math.inf
         return reduced.folds.fitted.relative_error(values)
 
-    def fast_error(self, settings: CandidateSettings) -> float:
+    def fast_error(self, settings: Settings) -> float:
         """Return the error of fast motion predicted from slower one; zero if there is none."""
         samples = self.samples(settings)
         speeds = [np.abs(each.motion.velocity).max(axis=0) for each in samples]
         fast = _FAST * np.max(speeds, axis=0)
-        folds = Folds.of(settings.model, samples, fast)
+        folds = Folds.of(self.model(settings), samples, fast)
         if not (folds.fitted.samples.any() and folds.predicted.samples.any()):
             return 0.0
         estimate = self._estimator(settings, self._reduced(settings))
         return folds.predicted.relative_error(estimate(folds.fitted))
 
-    def has_friction(self, settings: CandidateSettings) -> bool:
+    def has_friction(self, settings: Settings) -> bool:
         """Return whether the fitted friction of every joint stays near Coulomb's at all speeds."""
-        model = settings.model
+        model = self.model(settings)
         reduced = self._reduced(settings)
         values = self._estimator(settings, reduced)(reduced.folds.fitted)
         table = model.friction.table(values[model.friction_part])
@@ -682,7 +635,7 @@ class _Trial:
                 return False
         return True
 
-    def has_load_shares(self, settings: CandidateSettings) -> bool:
+    def has_load_shares(self, settings: Settings) -> bool:
         """Return whether the fitted shares of load that become friction are those of gears.
 
         Weighted by the torque of their joints: that of a joint with hardly any torque is open.
@@ -690,21 +643,21 @@ class _Trial:
         reduced = self._reduced(settings)
         values = self._estimator(settings, reduced)(reduced.folds.fitted)
         power = reduced.folds.fitted.gram[:, -1, -1]
-        terms = settings.model.friction.terms
+        model = self.model(settings)
         shares = [
             (value, power[term.owner])
-            for value, term in zip(values[settings.model.friction_part], terms, strict=True)
+            for value, term in zip(values[model.friction_part], model.friction.terms, strict=True)
             if term.term.of_load
         ]
         share, weight = np.array(shares).T
         return bool(0.0 < np.average(share, weights=weight) < _LARGEST_SHARE)
 
-    def samples(self, settings: CandidateSettings) -> list[Samples]:
+    def samples(self, settings: Settings) -> list[Samples]:
         """Return the samples of settings, with direction of friction and transmitted torque.
 
         The load is that of the estimate without friction that depends on it.
         """
-        model = settings.model
+        model = self.model(settings)
         how = settings.preprocessing
         key = how, tuple(law.presliding for law in model.friction.laws)
         if how not in self._samples:
@@ -714,18 +667,19 @@ class _Trial:
                 each.with_friction_direction(model) for each in self._samples[how]
             ]
         samples = self._directed[key]
-        if not settings.model.friction.has_load:
+        if not model.friction.has_load:
             return samples
-        without = _friction(settings, load=False)
+        without = settings.with_friction(load=False)
         reduced = self._reduced(without)
         values = self._estimator(without, reduced)(reduced.folds.fitted)
-        return [each.with_load(without.model, values) for each in samples]
+        return [each.with_load(self.model(without), values) for each in samples]
 
-    def _reduced(self, settings: CandidateSettings) -> _Reduced:
-        key = settings.factor_key
+    def _reduced(self, settings: Settings) -> _Reduced:
+        key = self.factor_key(settings)
         if key not in self._tables:
-            folds = Folds.of(settings.model, self.samples(settings))
-            prior = body_prior(settings.model, folds.fitted, known=self._known)
+            model = self.model(settings)
+            folds = Folds.of(model, self.samples(settings))
+            prior = body_prior(model, folds.fitted, known=self._known)
             self._tables[key] = _Reduced(folds, prior)
         return self._tables[key]
 
@@ -742,8 +696,8 @@ def _clearly_better(errors: Array, first: Array, share: float, certainty: float)
 
 
 def _sweep(
-    trial: _Trial, now: CandidateSettings, questions: Collection[str]
-) -> tuple[CandidateSettings, list[Choice]]:
+    trial: _Trial, now: Settings, questions: Collection[str]
+) -> tuple[Settings, list[Choice]]:
     """Decide interdependent settings in turn until nothing changes."""
     asked = [swept for swept in _SWEPT if swept.question in questions]
     short = trial.duration(now) < SHORT
@@ -766,7 +720,7 @@ def _sweep(
             decision = trial.decide(swept.name, candidates, certainty=certainty)
             now = decision.settings
             choices = [*choices, decision.choice]
-        if now.key == before.key:
+        if trial.key(now) == trial.key(before):
             break
     return now, choices
 
@@ -776,62 +730,80 @@ class _Swept(NamedTuple):
 
     question: Question
     name: str
-    vary: Callable[[CandidateSettings], list[CandidateSettings]]  # settings with each candidate
-    size: Callable[[CandidateSettings], float] | None = None  # of the setting, if it is a number
+    vary: Callable[[Settings], list[Settings]]  # settings with each candidate
+    size: Callable[[Settings], float] | None = None  # of the setting, if it is a number
 
 
 _SWEPT: Final = (
     _Swept(
         "presliding",
         "presliding displacement",
-        lambda now: [_friction(now, presliding=distance) for distance in PRESLIDING],
-        lambda now: now.model.friction.laws[0].presliding,
+        lambda now: [now.with_friction(presliding=distance) for distance in PRESLIDING],
+        lambda now: float(now.friction["presliding"]),
     ),
     _Swept(
         "rows",
         "rows that are left out",
-        lambda now: [_with(now, left_out=rows) for rows in LEFT_OUT],
+        lambda now: [now.preprocessed(left_out=rows) for rows in LEFT_OUT],
     ),
     _Swept(
         "velocity",
         "velocity",
-        lambda now: [_with(now, velocity=source) for source in VELOCITIES],
+        lambda now: [now.preprocessed(velocity=source) for source in VELOCITIES],
     ),
     _Swept(
         "bandwidth",
         "bandwidth of the motion",
-        lambda now: [_with(now, rigid_bandwidth=width) for width in BANDWIDTHS],
+        lambda now: [now.preprocessed(rigid_bandwidth=width) for width in BANDWIDTHS],
         lambda now: now.preprocessing.rigid_bandwidth,
     ),
 )
 
 
-def _nearby_bandwidths(now: CandidateSettings) -> list[CandidateSettings]:
+def _nearby_bandwidths(now: Settings) -> list[Settings]:
     width = now.preprocessing.torque_bandwidth or math.nan
-    return [_with(now, torque_bandwidth=share * width) for share in NEARBY]
+    return [now.preprocessed(torque_bandwidth=share * width) for share in NEARBY]
 
 
-def _nearby_lags(now: CandidateSettings, filtered: CandidateSettings) -> list[CandidateSettings]:
+def _nearby_lags(now: Settings, filtered: Settings) -> list[Settings]:
     """Return delays near the lag of a causal low-pass, in its place."""
     how = filtered.preprocessing
     width = filtered.preprocessing.torque_bandwidth or math.inf
     lag = how.torque_shape.lag(width)
-    return [_with(now, torque_delay=how.torque_delay + share * lag) for share in NEARBY]
+    return [now.preprocessed(torque_delay=how.torque_delay + share * lag) for share in NEARBY]
 
 
-def _friction(settings: CandidateSettings, **changes: Any) -> CandidateSettings:
-    return replace(settings, model=settings.model.with_friction(**changes))
+def _description(model: RobotModel, settings: Settings) -> tuple[str, ...]:
+    """Return descriptions of the settings of a model, one by one."""
+    how = settings.preprocessing
+    width = how.torque_bandwidth
+    elements = model.elements.elements
+    orders = next((part.orders for part in elements if isinstance(part, TorqueRipple)), ())
+    ripple = "no torque ripple"
+    if orders:
+        ripple = f"torque ripple, {' and '.join(map(str, orders))} per motor turn"
+    left_out = {
+        "slow": "slow rows and reversals",
+        "halts": "long halts of each joint",
+        "rests": "rests of the whole arm",
+        "none": "none",
+    }
+    return (
+        f"{how.rigid_bandwidth:g} Hz",
+        "measured velocity" if how.velocity == "measured" else "velocity from positions",
+        *model.friction.laws[0].summary(),
+        ripple,
+        left_out.get(how.left_out or "", "by the friction law"),
+        f"delay of {1e3 * how.torque_delay:.3g} ms",
+        "no low-pass" if width is None else f"low-pass of {width:.3g} Hz, {how.torque_shape}",
+        settings.strength.describe(),
+    )
 
 
-def _with(settings: CandidateSettings, **changes: Any) -> CandidateSettings:
-    return replace(settings, preprocessing=replace(settings.preprocessing, **changes))
-
-
-def _differences(candidates: Sequence[CandidateSettings]) -> tuple[str, ...]:
-    """Describe candidates by their differences."""
-    parts = [each.describe() for each in candidates]
-    differ = [len(set(column)) > 1 for column in zip(*parts, strict=True)]
+def _differences(descriptions: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
+    """Reduce descriptions of candidates to what differs."""
+    differ = [len(set(column)) > 1 for column in zip(*descriptions, strict=True)]
     return tuple(
-        ", ".join(word for word, apart in zip(words, differ, strict=True) if apart)
-        for words in parts
+        ", ".join(part for part, apart in zip(parts, differ, strict=True) if apart)
+        for parts in descriptions
     )

@@ -47,6 +47,22 @@ def campaign(scratch: Path) -> dict[str, Any]:
     return identify(scratch, *sorted(map(str, FAST.glob("*.mcap"))))
 
 
+def keys_of(content: Any, place: str = "") -> set[str]:
+    """Places of all keys in the content of a JSON file; entries of a list share theirs."""
+    if isinstance(content, list):
+        return set().union(*(keys_of(entry, f"{place}[]") for entry in content))
+    if not isinstance(content, dict):
+        return set()
+    places = {f"{place}.{key}" for key in content}
+    return places.union(*(keys_of(entry, f"{place}.{key}") for key, entry in content.items()))
+
+
+def keys(scratch: Path) -> list[str]:
+    """Keys of `results.json`, which other programs read."""
+    campaign(scratch)
+    return sorted(keys_of(json.loads((scratch / "results.json").read_text(encoding="utf-8"))))
+
+
 def batch(scratch: Path) -> dict[str, Any]:
     """The same archives by a batch."""
     arguments = ["batch", str(FAST), "--json", "--quiet", "--cache", "none", "--workers", "1"]
@@ -74,8 +90,9 @@ def recording(name: str) -> Callable[[Path], dict[str, Any]]:
     return case
 
 
-CASES: Final[dict[str, Callable[[Path], dict[str, Any]]]] = {
+CASES: Final[dict[str, Callable[[Path], Any]]] = {
     "campaign": campaign,
+    "keys": keys,
     "batch": batch,
     "design": quick_design,
 }

@@ -34,10 +34,10 @@ from hil.errors import ArchiveError, InputError
 from hil.identify import Options, identify_campaign
 from hil.identify.estimating import estimate_with, with_transmitted_load
 from hil.identify.options import FIXED
-from hil.identify.prepared import Settings, decide, prepare_sources
+from hil.identify.prepared import decide, prepare_sources
 from hil.identify.sources import gather_sources
 from hil.progress import Silent
-from identification.selection.inner_prediction import Strength
+from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Preprocessing
 
 from .batch_work import NOTHING_OPEN, Deadly, Here

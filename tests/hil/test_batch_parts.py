@@ -30,8 +30,7 @@ from hil.batch.run import PARTITION, BatchResult, _Campaign
 from hil.batch.table import COLUMNS, write_tables
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, TorsionSpringTable
-from hil.identify.prepared import Settings
-from identification.selection.inner_prediction import Choice, Strength
+from identification.selection.settings import Choice, Settings, Strength
 from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
 from sim_fixtures.ns16 import CELL_PATH

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 import hil
 from hil.cli import app
 from hil.errors import InputError, SourceError
+from hil.report.figures import joints_of, torque_charts
 from hil.results import Results
 from tests.hil.browser import OpenedPage, chromium
 from tests.hil.simulated_logs import write_moving_log
@@ -80,10 +81,18 @@ class TestResult:
         torque += np.asarray(model.damping) * v + dry * np.sign(v)
         assert np.allclose(torque, result.predict(q, v, a), rtol=1e-3, atol=0.02)
 
-    def test_a_figure_has_a_panel_for_each_joint(self, result: Any) -> None:
+    def test_a_figure_has_torque_and_error_of_each_joint(self, result: Any) -> None:
+        """As the report has, from the same description."""
         axes = result.plot().axes
-        assert [panel.get_title() for panel in axes] == ["hip", "knee", "ankle"]
-        assert all(len(panel.lines) == 4 for panel in axes)
+        assert [panel.get_title() for panel in axes[::2]] == ["hip", "knee", "ankle"]
+        charts = torque_charts(result.identification.series, joints_of(result.results))
+        described = [
+            trace.values for chart in charts for plot in chart.plots for trace in plot.traces
+        ]
+        drawn = [line.get_ydata() for panel in axes for line in panel.lines]
+        assert len(drawn) == 3 * (3 + 2)  # measured, identified, nominal; two errors
+        for values, line in zip(described, drawn, strict=True):
+            np.testing.assert_array_equal(line, values)
 
     def test_a_notebook_shows_it(self, result: Any, tmp_path: Path) -> None:
         page = tmp_path / "cell.html"

@@ -25,7 +25,7 @@ from hil.identify.prepared import prepare_sources
 from hil.identify.sources import gather_sources
 from hil.identify.summary import _delays
 from hil.importers import Robot
-from hil.outcome import write_outcome
+from hil.outcome import settings_result, write_outcome
 from hil.progress import Silent
 from hil.results import SCHEMA_VERSION, Results
 from hil.simulation import planted_values
@@ -33,7 +33,7 @@ from identification.errors import IdentificationError
 from identification.estimators.consistent import SolverError
 from identification.estimators.delay import DelayEstimate
 from identification.model.friction import FrictionLaw
-from identification.selection.inner_prediction import Strength
+from identification.selection.settings import Strength
 from sim_fixtures.ns16 import URDF_PATH
 
 from .simulated_logs import archive_of, simulate
@@ -165,11 +165,13 @@ class TestOutcome:
         first = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
         assert {"results.json", "report.html", "parameters.csv", "identified.urdf"} <= set(first)
         written = Results.load(tmp_path / "results.json")
-        of_the_command = {
-            name: getattr(written, name) for name in ("exports", "occasion", "settings")
-        }
-        assert None not in of_the_command.values()
-        assert written == found.results.model_copy(update=of_the_command)
+        assert written == found.results.model_copy(
+            update={
+                "exports": written.exports,
+                "occasion": written.occasion,
+                "settings": settings_result(found),
+            }
+        )
         (tmp_path / "report.html").unlink()
         (tmp_path / "report.html").mkdir()
         other = replace(found, results=found.results.model_copy(update={"name": "other"}))

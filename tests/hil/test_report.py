@@ -30,13 +30,14 @@ from hil.report import (
     page,
     report_bytes,
 )
-from hil.report.drawing import _decades, chart_panel, round_ticks, single, thinned
+from hil.report.chart import thinned
+from hil.report.drawing import _decades, chart_panel, round_ticks, single
 from hil.report.interactive import chart_data, encoded
 from hil.report.rendering import environment
 from hil.results import Results
 from identification.excitation import CRITERIA, METHODS
 from identification.excitation.criteria import Criterion
-from identification.selection.inner_prediction import Choice
+from identification.selection.settings import Choice
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2
 
 pytestmark = pytest.mark.long

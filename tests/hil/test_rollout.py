@@ -19,6 +19,8 @@ from hil.campaign import Campaign
 from hil.cli import app
 from hil.errors import HilError, InputError
 from hil.outcome import PARAMETERS_JSON, REPORT
+from hil.plots.chart_picture import draw_charts
+from hil.report.rollout import overview_charts, overview_legends
 from hil.rollout import POLISHED
 from hil.rollout_result import ROLLOUT, ArmErrors, RolloutResult
 from identification.text import percentage
@@ -89,7 +91,23 @@ class TestSectionOfTheReport:
         assert found.message in page
         assert "arms drawn from the posterior" in page
         assert page.count('<div class="panel" data-chart="rollout-') == len(found.joint_names) + 1
-        assert "nan" not in page.split('<section id="rollout">')[1].split("</section>")[0].lower()
+        section = page.split('<section id="rollout">')[1].split("</section>")[0]
+        assert "nan" not in section.lower()
+        assert section.count(">0.2</text>") >= len(found.joint_names)  # ticks at the horizons
+
+    def test_the_picture_has_errors_and_shares(self, folder: Path) -> None:
+        run("rollout", folder, "--samples", "3")
+        found = RolloutResult.load(folder / ROLLOUT)
+        errors, shares = overview_charts(found)
+        of_identified = next(t for t in errors.plots[0].traces if t.name == "predicted")
+        overall = [1e3 * found.identified.overall(k) for k in range(len(found.horizons))]
+        assert of_identified.values == pytest.approx(overall)
+        lines = {trace.name: trace.values for trace in shares.plots[0].traces}
+        assert lines[found.joint_names[1]] == pytest.approx([100.0 * at[1] for at in found.inside])
+        figure = draw_charts([[errors], [shares]], overview_legends(found))
+        texts = [text.get_text() for axes in figure.axes for text in axes.get_legend().texts]
+        assert texts[:3] == ["arms drawn from the posterior", "nominal model", "identified model"]
+        assert texts[3:] == [*found.joint_names, "88 % to 99 %"]
 
     def test_it_counts_an_arm_that_explodes(self, folder: Path) -> None:
         run("rollout", folder, "--samples", "3")

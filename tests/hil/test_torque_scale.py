@@ -10,7 +10,7 @@ import pytest
 from hil.cell import Cell
 from hil.cell.errors import CellError
 from hil.errors import SourceError
-from hil.identify.torque_scale import torque_scale
+from hil.identify.cell_context import torque_scale
 from hil.importers import import_log
 from hil.recordings import open_recording
 from identification.signals.recording import Recording

@@ -27,14 +27,13 @@ from identification.selection.inner_prediction import (
     SHORT,
     STRENGTH,
     WORTHWHILE,
-    CandidateSettings,
     Errors,
     Folds,
     Question,
-    Strength,
     _Trial,
     choose_settings,
 )
+from identification.selection.settings import Settings, Strength
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
 from identification.signals.smoothing import FORWARDS, WITHOUT_PHASE, LowPassShape, low_passed
@@ -251,8 +250,9 @@ def chosen(recording, questions, *, model=MODEL, leaks=False, ripple=(), low_pas
     def possible(model, how):
         return possible_low_passes(fitted, model, options=how) if low_passes is None else low_passes
 
-    start = CandidateSettings(model, Preprocessing())
-    return choose_settings(ready, start, questions, possible, ripples=[ripple])
+    start = Settings(Preprocessing())
+    settings = choose_settings(model, ready, start, questions, possible, ripples=[ripple])
+    return settings, settings.choices
 
 
 class TestChosenSettings:
@@ -260,12 +260,12 @@ class TestChosenSettings:
     def test_the_true_presliding_is_found(self, distance):
         recording = a_recording(MODEL.with_friction(presliding=distance), duration=LONG)
         settings, _ = chosen(recording, {"presliding", "bandwidth"})
-        assert settings.model.friction.laws[0].presliding == distance
+        assert settings.friction["presliding"] == distance
 
     def test_the_true_friction_term_is_found(self):
         cubic = MODEL.with_friction(third="cubic")
         settings, _ = chosen(a_recording(cubic, np.append(truth(), [0.5, 0.3])), {"friction"})
-        assert settings.model.friction.laws[0].third == "cubic"
+        assert settings.friction["third"] == "cubic"
 
     def test_a_stated_stribeck_speed_is_a_candidate(self):
         stated = MODEL.with_friction(stribeck=0.3)
@@ -273,20 +273,20 @@ class TestChosenSettings:
         motion = sine_motion(np.arange(0.0, 30.0, 0.005), 0.4, slow, slow)
         recording = a_recording(stated, np.append(truth(), [5.0, 4.0]), motion=motion)
         settings, _ = chosen(recording, {"friction"}, model=stated)
-        assert settings.model.friction.laws[0].stribeck == 0.3
+        assert settings.friction["stribeck"] == 0.3
 
     def test_no_friction_term_is_added_without_cause(self):
         settings, _ = chosen(a_recording(), {"friction"})
-        assert settings.model.friction.laws[0].third is None
+        assert settings.friction["third"] == "none"
 
     def test_torque_ripple_is_estimated_only_if_present(self):
         ripple = [TorqueRipple(name, ((name, 40.0),), (2,)) for name in MODEL.joint_names]
         rippled = MODEL.with_elements(ripple)
         strong = a_recording(rippled, np.append(truth(), [0.0, 0.4, 0.3, 0.0]))
         settings, _ = chosen(strong, {"ripple"}, ripple=ripple)
-        assert settings.model.parameter_names == rippled.parameter_names
+        assert settings.friction["ripple"] == (2,)
         settings, _ = chosen(a_recording(), {"ripple"}, ripple=ripple)
-        assert settings.model.parameter_names == MODEL.parameter_names
+        assert "ripple" not in settings.friction
 
     @pytest.mark.parametrize(("shape", "name"), [(None, DELAY), (CAUSAL, LOW_PASS)])
     def test_a_delay_is_not_called_a_low_pass(self, shape, name):
@@ -307,7 +307,7 @@ class TestChosenSettings:
         """Friction without a third term, and a statement that there is one."""
         stated = MODEL.with_friction(third="quadratic")
         settings, choices = chosen(a_recording(), {"friction"}, model=stated)
-        assert settings.model.friction.laws[0].third == "quadratic"
+        assert settings.friction["third"] == "quadratic"
         errors = next(one.errors for one in choices if one.name == "friction at speed")
         assert min(errors) > (1.0 - WORTHWHILE) * errors[0]
 
@@ -316,7 +316,7 @@ class TestChosenSettings:
         loaded = MODEL.with_friction(load=True)
         recording = a_recording(loaded, np.append(truth(), shares), duration=LONG)
         settings, choices = chosen(recording, {"friction"})
-        assert settings.model.friction.has_load == any(shares)
+        assert settings.friction["load"] == any(shares)
         assert LOAD in [one.name for one in choices]
 
     def test_a_negative_share_of_load_is_none(self):
@@ -325,7 +325,7 @@ class TestChosenSettings:
         settings, choices = chosen(recording, {"friction"})
         decision = next(one for one in choices if one.name == LOAD)
         assert decision.errors[1] < 0.9 * decision.errors[0]
-        assert not settings.model.friction.has_load
+        assert not settings.friction["load"]
 
     def test_the_prior_keeps_the_strength_of_the_residuals(self):
         """White noise, and a description that is right: no candidate is clearly better."""
@@ -367,15 +367,15 @@ class TestChosenSettings:
 
 def decided(*errors):
     """Index of the candidate that is chosen by its errors in segments (k,) with one joint."""
-    trial = _Trial(lambda *_: [], None)
-    start = CandidateSettings(MODEL, Preprocessing())
+    trial = _Trial(MODEL, lambda *_: [])
+    start = Settings(Preprocessing())
     candidates = [
         replace(start, preprocessing=Preprocessing(rigid_bandwidth=10.0 + k))
         for k in range(len(errors))
     ]
-    scores = dict(zip((one.key for one in candidates), errors, strict=True))
+    scores = dict(zip(map(trial.key, candidates), errors, strict=True))
     trial.errors = lambda settings, _rows: Errors(
-        np.square(scores[settings.key])[:, None], np.ones((len(errors[0]), 1))
+        np.square(scores[trial.key(settings)])[:, None], np.ones((len(errors[0]), 1))
     )
     return trial.decide("", candidates).choice
 
@@ -465,7 +465,7 @@ class TestHeldOutRows:
 
 def held_out_error(recording, settings):
     """Return ||tau - tau_hat|| / ||tau|| of the held-out rows."""
-    model = settings.model
+    model = MODEL.with_friction(**settings.friction)
     # Cut when filtered: a low-pass forwards that starts at the cut would not be that of the torque.
     samples = prepare(recording, model, options=settings.preprocessing)
     edges = 0, cut(recording), recording.n_samples

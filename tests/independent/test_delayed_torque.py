@@ -20,7 +20,8 @@ from identification.estimators.least_squares import fit_least_squares
 from identification.factor.factor import Factor
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
-from identification.selection.inner_prediction import CandidateSettings, choose_settings
+from identification.selection.inner_prediction import choose_settings
+from identification.selection.settings import Settings
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
 
@@ -219,9 +220,10 @@ class TestDelayBesideOtherSettings:
         def ready(model, how):
             return [prepare(recording, model, options=how)]
 
-        best, _ = choose_settings(
+        best = choose_settings(
+            model,
             ready,
-            CandidateSettings(model, Preprocessing()),
+            Settings(Preprocessing()),
             {"delay", "bandwidth", "presliding", "rows"},
             lambda *_: (),
             (found.delay,),

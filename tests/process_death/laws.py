@@ -15,8 +15,8 @@ from drivers.exchange.event_log import NO_ARCHIVE
 from drivers.states import State
 from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
 from hil.campaign import Campaign
-from hil.campaign.folder import Entry
 from hil.errors import ArchiveError
+from hil.recorded_campaign import Entry
 from sim_fixtures import Phase
 from tests.process_death.controller import REST, at_rest
 from tests.process_death.rig import Seen

@@ -32,11 +32,11 @@ from drivers.exchange.control import SharedState
 from drivers.record import RingReader, cycle_dtype
 from drivers.states import State
 from hil.campaign import Campaign, CampaignPlan, stop_on_interrupt
-from hil.campaign.folder import Entry
 from hil.cell import Cell
 from hil.demo_link import LOOPBACK, free_port
 from hil.errors import HilError
 from hil.progress import Silent
+from hil.recorded_campaign import Entry
 from tests.process_death.controller import Page, Rows, at_rest, forked, serve
 from tests.process_death.rounds import Round, Victim
 

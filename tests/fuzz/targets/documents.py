@@ -9,14 +9,14 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 from hil.campaign.dry_run import DryRunRecord
-from hil.campaign.errors import CampaignFolderError, NotRehearsedError
+from hil.campaign.errors import NotRehearsedError
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.plan import CampaignPlan
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.warmup import WarmUpRecord
 from hil.design.result import DesignResult, _seal
 from hil.design.settings import load_settings, preset_text
-from hil.errors import InputError
+from hil.errors import CampaignFolderError, InputError
 from hil.results import Results
 from tests.fuzz.draw import mutate_text
 from tests.fuzz.targets import Target, place_of

@@ -1,0 +1,111 @@
+"""Charts of a report as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import NullFormatter, NullLocator, StrMethodFormatter
+
+from hil.plots import style
+from hil.report.chart import Chart, Legend, Plot
+
+_WIDTH: Final = 9.0  # inch
+_PIXELS: Final = 110.0  # of a page, per inch of height
+_FRAME: Final = 34.0  # above and below a plot, pixels of a page
+_POINTS: Final = 0.75  # per pixel
+
+
+def draw_charts(
+    columns: Sequence[Sequence[Chart]], legends: Sequence[Legend] = (), *, enlarged: float = 1.0
+) -> Figure:
+    """Draw columns of charts side by side, with the legends of the lines that they contain.
+
+    The legend of a single column is above it, those of several are in their charts. Plots are
+    `enlarged` in height over those of a page.
+    """
+    heights = [[plot.height for chart in column for plot in chart.plots] for column in columns]
+    rows = max(map(len, heights))
+    size = _WIDTH, (enlarged * max(map(sum, heights)) + rows * _FRAME + _FRAME) / _PIXELS
+    with style.page():
+        figure = Figure(size, layout="constrained")
+        grid = figure.add_gridspec(1, len(columns))
+        for k, (column, ratios) in enumerate(zip(columns, heights, strict=True)):
+            cells = grid[k].subgridspec(len(ratios), 1, height_ratios=ratios)
+            places = iter(range(len(ratios)))
+            for chart in column:
+                axes = [figure.add_subplot(cells[next(places)]) for _ in chart.plots]
+                _draw(chart, axes, is_last=chart is column[-1])
+                if len(columns) > 1:
+                    axes[0].legend(*_entries([chart], legends), fontsize=style.SMALL)
+        if len(columns) == 1:
+            figure.legend(
+                *_entries(columns[0], legends),
+                loc="outside upper center",
+                ncols=5,
+                fontsize=style.SMALL,
+            )
+    return figure
+
+
+def _entries(charts: Sequence[Chart], legends: Sequence[Legend]) -> tuple[list[Artist], list[str]]:
+    """Return symbols and texts of the legends of what charts contain."""
+    plots = [plot for chart in charts for plot in chart.plots]
+    names = {trace.name for plot in plots for trace in plot.traces}
+    shown = [legend for legend in legends if legend.key in names]
+    lines: list[Artist] = [
+        Line2D(
+            [],
+            [],
+            color=style.colour(legend.colour),
+            linewidth=legend.width * _POINTS,
+            linestyle="--" if legend.dashed else "-",
+        )
+        for legend in shown
+    ]
+    texts = [legend.text for legend in shown]
+    if any(plot.shaded for plot in plots):
+        lines.append(Patch(color=style.colour("--band")))
+        texts.append("not in motion")
+    return lines, texts
+
+
+def _draw(chart: Chart, rows: Sequence[Axes], *, is_last: bool) -> None:
+    """Draw the plots of a chart one above the other; the last of a column has the ticks of x."""
+    rows[0].set_title(chart.caption.title)
+    rows[0].set_title(chart.caption.note, loc="right", fontsize=style.SMALL, color=style.MUTED)
+    for axes, plot in zip(rows, chart.plots, strict=True):
+        _draw_plot(axes, plot, chart)
+        axes.set_title(plot.heading, loc="left", fontsize=style.SMALL, color=style.MUTED)
+        axes.tick_params(labelbottom=is_last and axes is rows[-1])
+    if is_last:
+        rows[-1].set_xlabel(chart.foot)
+
+
+def _draw_plot(axes: Axes, plot: Plot, chart: Chart) -> None:
+    for start, stop in plot.shaded:
+        axes.axvspan(start, stop, color=style.colour("--band"), linewidth=0.0)
+    for trace in plot.traces:
+        x = chart.x if trace.x is None else trace.x
+        size = trace.width * _POINTS
+        colour = style.colour(trace.colour)
+        if trace.dots:
+            axes.plot(x, trace.values, "o", color=colour, markersize=size, markeredgewidth=0.0)
+        else:
+            line = "--" if trace.dashed else "-"
+            axes.plot(x, trace.values, line, color=colour, linewidth=size)
+    if chart.log:
+        axes.loglog()
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        few = plot.y_limits[1] < 20.0 * plot.y_limits[0]
+        axes.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}") if few else NullFormatter())
+    axes.set_xlim(*chart.x_limits)
+    axes.set_ylim(*plot.y_limits)
+    if chart.ticks:
+        axes.set_xticks(chart.ticks, [f"{tick:g}" for tick in chart.ticks])
+        axes.xaxis.set_minor_locator(NullLocator())

@@ -1,0 +1,160 @@
+"""Charts: plots of lines and dots over one quantity, described once for all drawings of them.
+
+A page shows a chart as SVG (:mod:`hil.report.drawing`) and, with its script, for dragging
+(:mod:`hil.report.interactive`); a picture file has it from :mod:`hil.plots.chart_picture`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_MARGIN: Final = 0.05  # free on both sides of the values, as a share of their range
+_LABEL_LENGTH: Final = 28
+
+
+class Caption(NamedTuple):
+    """Texts of a panel: `key` makes its ids unique in the page, `what` is the description."""
+
+    key: str
+    title: str
+    note: str
+    what: str
+
+
+def one_line(text: str) -> str:
+    """Replace unprintable characters by blanks."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
+
+
+def label(text: str) -> str:
+    """Shorten a name to one printable line."""
+    line = one_line(text)
+    return line if len(line) <= _LABEL_LENGTH else line[: _LABEL_LENGTH - 1] + "…"
+
+
+def thinned(time: Array, values: Array, bins: int = 500) -> tuple[Array, Array]:
+    """Return minimum and maximum of each of `bins` equal intervals, (m,) -> (<= 2 bins + 2,)."""
+    if time.size <= 2 * bins:
+        return time, values
+    edges = np.linspace(0, time.size, bins + 1).astype(np.intp)
+    starts = edges[:-1, None]
+    ends = edges[1:, None]
+    # Rows of equal length: the last sample of an interval is repeated.
+    rows = np.minimum(starts + np.arange(int(np.max(ends - starts))), ends - 1)
+    parts = values[rows]
+    starts = edges[:-1]
+    extremes = [starts + parts.argmin(axis=1), starts + parts.argmax(axis=1)]
+    chosen = np.unique(np.concatenate([[0, time.size - 1], *extremes]))
+    return time[chosen], values[chosen]
+
+
+def padded(values: Array) -> tuple[float, float]:
+    """Return the range of the finite values with a margin; it is never empty."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return 0.0, 1.0
+    low = float(finite.min())
+    high = float(finite.max())
+    # Neighbouring floats have no ticks between them.
+    if not high - low > 1e-9 * max(abs(low), abs(high)):
+        room = 0.05 * abs(low) or 1.0
+        return low - room, high + room
+    room = _MARGIN * (high - low)
+    return low - room, high + room
+
+
+def joined(arrays: Iterable[Array]) -> Array:
+    """Return the values of arrays in one (m,)."""
+    return np.concatenate([np.empty(0), *(np.asarray(a, np.float64).ravel() for a in arrays)])
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """One line of a plot, or a set of dots."""
+
+    values: Array  #: (m,)
+    colour: str  #: of the palette
+    width: float  #: of the line, or diameter of a dot [px]
+    dashed: bool = False
+    name: str = ""  #: in the legend, and beside its value
+    x: Array | None = None  #: (m,) if not that of the chart
+    dots: bool = False
+    #: may leave the plot, as the error of a poor model beside that of a good one
+    loose: bool = False
+
+    def over(self, x: Array) -> Trace:
+        """Return the line over other values of x (m,)."""
+        return replace(self, x=x)
+
+
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """Axes of a chart."""
+
+    height: float  #: [px]
+    heading: str  #: quantity and unit
+    traces: Sequence[Trace]  #: its lines, the lowest first
+    #: shaded intervals of x
+    shaded: Sequence[tuple[float, float]] = ()
+    #: largest value of a range about zero; the range of the lines if None
+    reach: float | None = None
+    limits: tuple[float, float] | None = None  #: the range, if neither
+    origin: bool = False  #: whether lines are drawn through x = 0 and y = 0
+
+    @property
+    def y_limits(self) -> tuple[float, float]:
+        """Range of the vertical axis: that of the lines; a loose one adds at most its length."""
+        if self.reach is not None:
+            return -self.reach, self.reach
+        if self.limits is not None:
+            return self.limits
+        low, high = padded(joined(t.values for t in self.traces if not t.loose))
+        span = high - low
+        loose = joined(t.values for t in self.traces if t.loose)
+        if not np.isfinite(loose).any():
+            return low, high
+        least, most = padded(loose)
+        return min(low, max(least, low - span)), max(high, min(most, high + span))
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """Plots over the same quantity, one above the other: drawn as SVG, or by the page's script."""
+
+    caption: Caption
+    x: Array  #: (m,)
+    plots: Sequence[Plot]
+    foot: str = "time [s]"  #: quantity and unit of x
+    joint: int = 0  #: number of the joint, from 0
+    log: bool = False  #: whether both axes are logarithmic
+    ticks: Sequence[float] = ()  #: of x, in place of round ones
+
+    @property
+    def x_limits(self) -> tuple[float, float]:
+        """Range of the horizontal axis."""
+        if any(trace.x is not None for plot in self.plots for trace in plot.traces):
+            return padded(joined(t.x for p in self.plots for t in p.traces if t.x is not None))
+        return float(self.x[0]), max(float(self.x[-1]), float(self.x[0]) + 1e-9)
+
+
+class Legend(NamedTuple):
+    """Colour and width of the lines of a chart, by the key and the text of their legend."""
+
+    key: str
+    text: str
+    colour: str
+    width: float
+    dashed: bool = False
+
+    def trace(self, values: Array, *, loose: bool = False, width: float = 0.0) -> Trace:
+        """Return the line of these values."""
+        return Trace(
+            values, f"var({self.colour})", width or self.width, self.dashed, self.key, loose=loose
+        )

@@ -1,0 +1,70 @@
+"""Settings of an identification: of recordings into samples, and of the estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from identification.signals.samples import Preprocessing
+
+
+@dataclass(frozen=True)
+class Strength:
+    """How strongly the prior counts against the data."""
+
+    #: factor of the rows that count as one by the correlation of the residuals
+    weight: float = 1.0
+    consistent: bool = False  #: whether parameters that no bodies have are excluded
+
+    def design_effect(self, of_residuals: float) -> float:
+        """Return how many rows count as one."""
+        return max(1.0, self.weight * of_residuals)
+
+    def describe(self) -> str:
+        """Return the strength as a phrase."""
+        bodies = "physically consistent" if self.consistent else "not restricted to possible bodies"
+        return f"prior weighs {self.weight:g} times as the residuals suggest, {bodies}"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Decision by inner prediction."""
+
+    name: str  # of the setting
+    candidates: tuple[str, ...]  # descriptions
+    # ``||e|| / ||tau||`` over all joints, of a low-pass their geometric mean by joint; geometric
+    # mean over the segments
+    errors: tuple[float, ...]
+    chosen: int  # index of the candidate
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of the preprocessing and estimation of an arm's archives; serialisable.
+
+    The user's options state some of them, inner prediction chooses the others.
+    """
+
+    preprocessing: Preprocessing  #: with the delay of the torque
+    #: entries of `[robot.friction]` that replace the arm's
+    friction: Mapping[str, Any] = field(default_factory=dict)
+    #: of the positions (n,) [rad² or m²]; None estimates it in each recording
+    noise_variance: tuple[float, ...] | None = None
+    #: of the torques (n,) [N²·m² or N²]; None estimates it in each recording
+    torque_variance: tuple[float, ...] | None = None
+    stated_delay: float = 0.0  #: of the torque, by cell or options [s]
+    delay_variance: float = 0.0  #: of an estimated delay [s²]; zero for a stated one
+    strength: Strength = Strength()
+    choices: tuple[Choice, ...] = ()  #: made by inner prediction
+    #: parameters (p,) of bodies and drives that load the gears, for friction that grows with it;
+    #: None: it does not, or they are estimated with it
+    loading: tuple[float, ...] | None = None
+
+    def preprocessed(self, **changes: Any) -> Settings:
+        """Return these settings with changes of the preprocessing."""
+        return replace(self, preprocessing=replace(self.preprocessing, **changes))
+
+    def with_friction(self, **changes: Any) -> Settings:
+        """Return these settings with changed entries of `[robot.friction]`."""
+        return replace(self, friction={**self.friction, **changes})
