@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -20,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 from scipy.special import gammaincinv
 
+from drivers.child_process import ChildProcess
 from drivers.exchange.realtime import RealTimeReport
 from hil.progress import Reporter
 from hil.terminal_text import printable
@@ -145,32 +143,22 @@ def run_probe(
     arguments: Sequence[str], seconds: float, advance: Callable[[float], None] = lambda _: None
 ) -> dict[str, Any] | None:
     """Return the JSON of `hil.doctor.probe` run for `seconds`; None if it failed or was killed."""
-    probe = subprocess.Popen(
-        [sys.executable, "-m", "hil.doctor.probe", *arguments],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
+    try:
+        probe = ChildProcess(("-m", "hil.doctor.probe", *arguments))
+    except OSError:
+        return None
     began = time.monotonic()
     shown = 0.0
-    output = ""
     try:
-        while not output and (passed := time.monotonic() - began) < seconds + _GRACE:
+        while probe.wait(0.2) is None and (passed := time.monotonic() - began) < seconds + _GRACE:
             advance(min(passed, seconds) - shown)
             shown = min(passed, seconds)
-            with suppress(subprocess.TimeoutExpired):
-                output = probe.communicate(timeout=0.2)[0] or "null"
         advance(seconds - shown)
+        output = probe.output if probe.status == 0 else ""
     finally:
-        probe.kill()
-        with suppress(subprocess.TimeoutExpired):  # one blocked by a dead disk is left behind
-            probe.wait(timeout=1.0)
-        if probe.stdout is not None:
-            probe.stdout.close()
-    answer: dict[str, Any] | None = None
-    if output and not probe.returncode:
-        answer = json.loads(output.splitlines()[-1])
+        probe.kill(1.0)  # one blocked by a dead disk is left behind
+        probe.close()
+    answer: dict[str, Any] | None = json.loads(output.splitlines()[-1]) if output else None
     return answer
 
 
