@@ -197,7 +197,7 @@ class Runner:
 
         Raises:
             MotionFailedError: it ended otherwise than planned, or was not begun after a stop.
-            ControllerFault: it was not accepted, or the link broke.
+            ControllerError: it was not accepted, or the link broke.
         """
         start, end = interval.places(self.campaign.cell.home)
         self._go(start, most)

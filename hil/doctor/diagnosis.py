@@ -22,7 +22,15 @@ from drivers.exchange.realtime import RealTimeReport
 from hil.progress import Reporter
 from hil.terminal_text import printable
 
-from .checks import Check, DiskTrial, Status, System, computer_checks, disk_checks, link_checks
+from .checks import (
+    DiskTrial,
+    DoctorCheck,
+    Status,
+    System,
+    computer_checks,
+    disk_checks,
+    link_checks,
+)
 
 if TYPE_CHECKING:
     from drivers.transports.base import TransportSpec
@@ -166,7 +174,7 @@ def run_probe(
 class Diagnosis:
     """All results: verdicts on 1 and 2 ms and on `cycle_ms`, which has to be fit."""
 
-    checks: tuple[Check, ...]
+    checks: tuple[DoctorCheck, ...]
     latencies: tuple[Latency, ...]
     cycles: tuple[Fitness, ...]
     cycle_ms: int
@@ -228,7 +236,7 @@ def examine(
     measured = {name: measure(name, each, seconds, reporter) for name, each in periods.items()}
     command = ("python -m hil.doctor.probe permissions   # prints the error",)
     checks += [
-        Check(f"{name} latency", Status.BAD, "the probe failed", command)
+        DoctorCheck(f"{name} latency", Status.BAD, "the probe failed", command)
         for name, latency in measured.items()
         if latency is None
     ]
@@ -273,7 +281,7 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
     console.print(Text(printable(diagnosis.line), style=style), soft_wrap=True)
 
 
-def remedies(checks: Sequence[Check]) -> Iterator[str]:
+def remedies(checks: Sequence[DoctorCheck]) -> Iterator[str]:
     """Yield the commands of each check with a remedy, worst first, each command once."""
     given: set[str] = set()
     for status in (Status.BAD, Status.WARN, Status.UNKNOWN):
