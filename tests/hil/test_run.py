@@ -462,7 +462,7 @@ def test_the_link_decides_whether_the_arm_is_simulated(
     with pytest.raises(CampaignFolderError, match=r"holds archives of .*leads to a real one"):
         campaign.run(Real(campaign), dry_run_only=True)  # type: ignore[arg-type]
     hash_ = campaign.folder.plan_hash
-    counts = DryRunRecord.that_counts(campaign.folder, plan_hash=hash_, motions=2, simulated=False)
+    counts = DryRunRecord.load_valid(campaign.folder, plan_hash=hash_, motions=2, simulated=False)
     assert counts is None
 
 
