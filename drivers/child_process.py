@@ -13,22 +13,42 @@ from typing import Final
 
 from drivers.record import create_memory
 
-_LONGEST_OUTPUT: Final = 1 << 20  # bytes of error output that are read
+_LONGEST_TEXT: Final = 1 << 20  # bytes of output that are read
+
+
+class _Text:
+    """What a child writes to a descriptor, kept in memory."""
+
+    def __init__(self, name: str) -> None:
+        self.descriptor = create_memory(name, 0)
+        self._final: str | None = None
+
+    def read(self) -> str:
+        """Return it up to now; after `close`, up to then."""
+        if self._final is not None:
+            return self._final
+        size = min(os.fstat(self.descriptor).st_size, _LONGEST_TEXT)
+        return os.pread(self.descriptor, size, 0).decode(errors="replace")
+
+    def close(self) -> None:
+        """Release the memory; may be called again."""
+        if self._final is None:
+            self._final = self.read()
+            os.close(self.descriptor)
 
 
 class ChildProcess:
     """A Python program as a child; nothing of this process' main module is imported again in it.
 
     It is in its own session, so that the end of the terminal and Ctrl-C reach only the parent, and
-    has no standard input. It imports from the same folders. Its standard error goes to memory.
-    Its death is seen by `alive`; how it detects that of the parent is its own affair (a heartbeat,
-    or the end of a socket).
+    has no standard input. It imports from the same folders. Its standard output and error go to
+    memory. Its death is seen by `alive`; how it detects that of the parent is its own affair (a
+    heartbeat, or the end of a socket).
 
     Args:
         arguments: of the interpreter, such as ``("-m", "package.module")``.
         descriptors: that it inherits, by the same numbers.
         environment: changes of the environment.
-        stdout: a descriptor for its standard output; none by default.
 
     Raises:
         OSError: the system refuses it.
@@ -40,24 +60,23 @@ class ChildProcess:
         *,
         descriptors: Sequence[int] = (),
         environment: Mapping[str, str] | None = None,
-        stdout: int = subprocess.DEVNULL,
     ) -> None:
-        self._errors = create_memory("hil-child-stderr", 0)
+        self._output = _Text("hil-child-stdout")
+        self._errors = _Text("hil-child-stderr")
         try:
             self._process = subprocess.Popen(
                 [sys.executable, *arguments],
                 stdin=subprocess.DEVNULL,
-                stdout=stdout,
-                stderr=self._errors,
+                stdout=self._output.descriptor,
+                stderr=self._errors.descriptor,
                 pass_fds=descriptors,
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": _import_path(), **(environment or {})},
             )
         except BaseException:
-            os.close(self._errors)
+            self.close()
             raise
         self.pid = self._process.pid
-        self._final_errors: str | None = None
 
     @property
     def alive(self) -> bool:
@@ -72,10 +91,12 @@ class ChildProcess:
     @property
     def errors(self) -> str:
         """Its standard error up to now; after `close`, up to then."""
-        if self._final_errors is not None:
-            return self._final_errors
-        size = min(os.fstat(self._errors).st_size, _LONGEST_OUTPUT)
-        return os.pread(self._errors, size, 0).decode(errors="replace")
+        return self._errors.read()
+
+    @property
+    def output(self) -> str:
+        """Its standard output up to now; after `close`, up to then."""
+        return self._output.read()
 
     @property
     def last_error(self) -> str:
@@ -104,10 +125,9 @@ class ChildProcess:
         self.wait(timeout)
 
     def close(self) -> None:
-        """Release the memory of its standard error; may be called again."""
-        if self._final_errors is None:
-            self._final_errors = self.errors
-            os.close(self._errors)
+        """Release the memory of what it wrote; may be called again."""
+        self._output.close()
+        self._errors.close()
 
 
 def _import_path() -> str:

@@ -25,7 +25,7 @@ def cell_link(
     `only_axis`, from 1, is the only one to be open.
 
     Raises:
-        ControllerFault: the link cannot be opened.
+        ControllerError: the link cannot be opened.
         LiveViewError: the live view cannot be served, or time is virtual.
     """
     if cell.controller.transport == "simulated":

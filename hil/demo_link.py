@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
-import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from socket import AF_INET, SOCK_DGRAM, socket
-from typing import IO, Any
+from typing import Any
 
 from drivers.child_process import ChildProcess
 
@@ -24,14 +23,11 @@ class SimulatorProcess:
     """A child process that runs `hil simulate`."""
 
     process: ChildProcess
-    _stdout: IO[bytes] = field(repr=False)
 
     @classmethod
     def start(cls, cell: Path, *options: str) -> SimulatorProcess:
         """Start a controller for a cell file."""
-        stdout = tempfile.TemporaryFile()  # noqa: SIM115 - closed in end
-        arguments = (*_SIMULATE, str(cell), "--json", *options)
-        return cls(ChildProcess(arguments, stdout=stdout.fileno()), stdout)
+        return cls(ChildProcess((*_SIMULATE, str(cell), "--json", *options)))
 
     @property
     def running(self) -> bool:
@@ -55,10 +51,8 @@ class SimulatorProcess:
         """Wait for the end, or kill it; return its summary (`docs/simulate.md`), {} if killed."""
         if self.process.wait(END_TIMEOUT) is None:
             self.process.kill()
-        self._stdout.seek(0)
-        lines = self._stdout.read().decode(errors="replace").splitlines()
         self.process.close()
-        self._stdout.close()
+        lines = self.process.output.splitlines()
         return json.loads(lines[-1]) if lines else {}
 
 

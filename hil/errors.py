@@ -8,7 +8,7 @@ HilError                   exit status 1
 │   ├── NotRehearsedError       the plan did not pass its rehearsal
 │   └── DryRunError             the slow dry run of the plan was not accepted
 ├── ExecutionError         4: a motion did not begin, or ended otherwise than planned
-│   ├── ControllerFault         the controller or the link was not ready, or failed
+│   ├── ControllerError         the controller or the link was not ready, or failed
 │   └── MotionFailedError       stopped, refused by this PC, or lost; with its archive
 ├── RepetitionsRejectedError   5: a motion failed its quality check repeatedly
 ├── OperatorStopError         130: stopped by the operator
@@ -146,5 +146,5 @@ class ExecutionError(HilError):
     exit_code: ClassVar[int] = 4
 
 
-class ControllerFault(ExecutionError):  # noqa: N818 - the controller's own word
+class ControllerError(ExecutionError):
     """The controller, or the link to it, was not ready or failed."""

@@ -164,7 +164,7 @@ def send(
 
     Raises:
         MotionRefusedError: the motion needs more current than the controller's limit.
-        ControllerFault: it was not accepted (nothing moved), or the link failed.
+        ControllerError: it was not accepted (nothing moved), or the link failed.
         ArchiveWriteError: the archive cannot be written; the arm was stopped.
     """
     checks = active_checks(cell, link.connection, planned.checks)

@@ -41,7 +41,7 @@ def record(
     With `durable` each flush waits for the disk.
 
     Raises:
-        ControllerFault: the controller did not start in time, or does not match the cell.
+        ControllerError: the controller did not start in time, or does not match the cell.
         OperatorStopError: stopped before it started.
         ArchiveWriteError: the archive cannot be written.
     """

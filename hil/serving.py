@@ -17,7 +17,7 @@ from typing import Final
 from drivers.errors import DriverError
 from drivers.transports.base import TransportError
 from hil.cell.schema import LINKS, ControllerTable
-from hil.errors import ControllerFault, InputError
+from hil.errors import ControllerError, InputError
 from sim_fixtures import ControllerSettings, Phase, SimulatedController, serve
 from sim_fixtures.settings import PlantDiverged
 
@@ -152,18 +152,18 @@ def serve_session(
     pressed: Buttons,
     *,
     patience: float = serve.PATIENCE,
-    stretch: float = 0.0,
+    cycle_extension: float = 0.0,
     watch: Callable[[SimulatedController, serve.ServeCounts], None] = lambda *_: None,
 ) -> Served:
     """Serve until a session has ended; a start aborted by the PC is repeated after a second.
 
     `build` creates a controller that was just switched on; `patience` is the time for the arm to
-    come to rest at the end, s; `stretch` the longest extension of a cycle to wait for its reply, s;
-    `watch` is called every cycle.
+    come to rest at the end, s; `cycle_extension` the longest extension of a cycle to wait for its
+    reply, s; `watch` is called every cycle.
 
     Raises:
         InputError: the link cannot carry the session.
-        ControllerFault: the state of the simulated arm is not finite.
+        ControllerError: the state of the simulated arm is not finite.
     """
     starts = 0
     while True:
@@ -184,12 +184,12 @@ def serve_session(
         try:
             summary = serve.serve(
                 controller, link, request=pressed.request, watch=observe,
-                patience=patience, stretch=stretch,
+                patience=patience, cycle_extension=cycle_extension,
             )  # fmt: skip
         except DriverError as error:
             raise InputError(None, str(error)) from error
         except PlantDiverged as error:
-            raise ControllerFault(str(error)) from error
+            raise ControllerError(str(error)) from error
         begun = Phase.DRIVE_OFF in phases[1:]
         if begun or not summary.ended or pressed.request() is not serve.Request.CONTINUE:
             opened = phases[1:].count(Phase.OPEN)

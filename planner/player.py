@@ -141,6 +141,8 @@ class TrajectoryPlayer:
             changes, as multiples (> 1) of the limits.
         stop_acceleration, stop_jerk: The same during a stop; not below those of an override.
         start_tolerance: Largest distance of a joint from the start of the trajectory [rad].
+        extendable: Bounds of changes of the rate hold for any motion within `limits`, and `extend`
+            may be called.
 
     Attributes:
         start: First position of the trajectory (n,) [rad].
@@ -161,10 +163,15 @@ class TrajectoryPlayer:
         stop_acceleration: float = 2.0,
         stop_jerk: float = 3.0,
         start_tolerance: float = 1e-3,
+        extendable: bool = False,
     ) -> None:
         self._period = period
         self._tolerance = start_tolerance
-        extrema = trajectory.extrema() if isinstance(trajectory, PiecewiseCubic) else None
+        self._extendable = extendable
+        self._extended = False
+        extrema = None
+        if isinstance(trajectory, PiecewiseCubic) and not extendable:
+            extrema = trajectory.extrema()
         stopping = slowing_bounds(limits, stop_acceleration, stop_jerk, extrema)
         # Rate at which the accelerations of the path are those of a stop.
         self._fastest = sqrt(stop_acceleration)
@@ -178,9 +185,7 @@ class TrajectoryPlayer:
         reach = self._table.position
         self._lower = reach.min(axis=0) if extrema is None else extrema.lower
         self._upper = reach.max(axis=0) if extrema is None else extrema.upper
-        self.duration = trajectory.duration
-        self._end = trajectory.duration - _ROUNDING * period
-        self._path = PathReader(trajectory)
+        self._set_path(trajectory)
         self.start: Array = trajectory.sample(np.zeros(1))[0][0]
         self._rest: Array = np.zeros_like(self.start)
         self._offset = self._rest
@@ -191,6 +196,23 @@ class TrajectoryPlayer:
         self.finished: bool
         self.bounds: Literal["plan", "override", "stop"]
         self._rewind()
+
+    def _set_path(self, trajectory: Trajectory) -> None:
+        self.duration = trajectory.duration
+        self._end = trajectory.duration - _ROUNDING * self._period
+        self._end_position: Array = trajectory.sample(np.array([trajectory.duration]))[0][0]
+        self._path = PathReader(trajectory)
+
+    def extend(self, trajectory: Trajectory) -> None:
+        """Replace the motion by one within `limits` that equals it up to the present motion time.
+
+        Raises:
+            RuntimeError: the player is not `extendable`, or the motion was begun and is finished.
+        """
+        if not self._extendable or (self._begun and self.finished):
+            raise RuntimeError("only a motion that is extendable and not finished is extended")
+        self._set_path(trajectory)
+        self._extended = True
 
     def _rewind(self) -> None:
         self._last = self.start + self._offset
@@ -220,7 +242,10 @@ class TrajectoryPlayer:
         Raises:
             StartMismatch: a joint is farther from the planned start than the tolerance.
             LimitExceeded: with the difference added, a joint would leave its range.
+            RuntimeError: the motion was extended.
         """
+        if self._extended:
+            raise RuntimeError("an extended motion cannot be begun again")
         offset = self._offset_from(self.start, position, self._tolerance)
         self._check_range(offset)
         # Not added to the table, which would take longer than the cycle of the first set-point.
@@ -327,7 +352,7 @@ class TrajectoryPlayer:
         law.advance()
         if law.motion_time >= self._end and not self._across:
             self.finished = True
-            self._last = self._table.position[-1] + self._offset
+            self._last = self._end_position + self._offset
             return self._last, self._rest
         position, velocity = self._path.read(min(law.motion_time, self.duration))
         velocity = velocity * law.rate
@@ -400,7 +425,8 @@ class TrajectoryPlayer:
     def _start_at(self, rate: float) -> None:
         """Set the rate at the start, where the arm is at rest."""
         self._law.restart(0.0, rate)
-        self._tabled = rate == 1.0
+        # A table of a longer motion would take longer than a cycle.
+        self._tabled = rate == 1.0 and not self._extendable
 
 
 def _tabulate(trajectory: Trajectory, period: float) -> _SetPoints:

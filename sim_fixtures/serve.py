@@ -139,17 +139,17 @@ class ServeCounts:
     """
 
     cycles: int = 0  # packets of the controller, the repeated first one counted once
-    knocks: int = 0  # transmissions of the first packet
+    first_packets: int = 0  # transmissions of the first packet
     replies: int = 0  # accepted replies, at most one per cycle
     missed: int = 0  # cycles without a valid reply
     late: int = 0  # replies after their cycle, not accepted
     surplus: int = 0  # further replies in a cycle that had one
     rejected: int = 0  # replies of wrong length, number or content
-    stretched: int = 0  # cycles extended to wait for their reply
+    extended: int = 0  # cycles extended to wait for their reply
     own_late: int = 0
     slips: int = 0
     ended: bool = False  # whether the controller has ended its session (504)
-    stretch_max: float = 0.0  # longest extension of a cycle, s
+    longest_extension: float = 0.0  # longest extension of a cycle, s
     reply: Latencies = field(default_factory=Latencies)  # times from the packet to its reply
     cost: Latencies = field(default_factory=Latencies)  # computing times of a cycle
     _without_reply: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
@@ -227,7 +227,7 @@ def serve(
     watch: Callable[[ServeCounts], None] = lambda _: None,
     clock: Clock = time,
     patience: float = PATIENCE,
-    stretch: float = 0.0,
+    cycle_extension: float = 0.0,
 ) -> ServeCounts:
     """Run a controller on a real link until its session has ended; the link stays open.
 
@@ -238,12 +238,12 @@ def serve(
     stop within `patience` s, its drive is switched off. At `ABORT` it stops at once. `watch` is
     called once per cycle with the counts so far.
 
-    A cycle without a reply is extended by up to `stretch` s. Real controllers do not extend
+    A cycle without a reply is extended by up to `cycle_extension` s. Real controllers do not extend
     cycles; this is for PCs with occasional delays. A PC from which nothing came within an extension
     is gone: it is not waited for again before something comes from it, so that a program that has
     ended costs one extension. After `END`, only a valid reply counts.
     """
-    server = _Server(peer, link, request, watch, clock, patience, stretch)
+    server = _Server(peer, link, request, watch, clock, patience, cycle_extension)
     if server.await_pc():
         server.run()
     return server.counts
@@ -259,7 +259,7 @@ class _Server:
     watch: Callable[[ServeCounts], None]
     clock: Clock
     patience: float
-    stretch: float
+    cycle_extension: float
     counts: ServeCounts = field(default_factory=ServeCounts)
     due: float = 0.0
     finish_by: float | None = None
@@ -275,7 +275,7 @@ class _Server:
         while self.request() is Request.CONTINUE:
             sent = self.clock.monotonic()
             self.link.send(packet)
-            self.counts.knocks += 1
+            self.counts.first_packets += 1
             reply = self._first_reply(packet, sent + KNOCK_INTERVAL)
             if reply is not None:
                 self.counts.cycles += 1
@@ -305,9 +305,9 @@ class _Server:
             if packet is None:
                 self.counts.ended = True
                 return
-            stretched = self.counts.stretched
+            before = self.counts.extended
             replied = self._exchange(packet) if packet else self._stay_silent()
-            late_by_missing = not replied or self.counts.stretched > stretched
+            late_by_missing = not replied or self.counts.extended > before
             self.due += self.peer.period
             self.watch(self.counts)
 
@@ -318,13 +318,18 @@ class _Server:
         self.link.send(packet)
         reply = self._reply(packet, sent + self.peer.period)
         ending = self.finish_by is not None
-        if reply is None and self.stretch and not self.gone and not (self.without_reply and ending):
+        if (
+            reply is None
+            and self.cycle_extension
+            and not self.gone
+            and not (self.without_reply and ending)
+        ):
             until = sent + self.peer.period
             self.gone = True
-            reply = self._reply(packet, until + self.stretch)
-            self.counts.stretched += 1
+            reply = self._reply(packet, until + self.cycle_extension)
+            self.counts.extended += 1
             extended = self.clock.monotonic() - until
-            self.counts.stretch_max = max(self.counts.stretch_max, extended)
+            self.counts.longest_extension = max(self.counts.longest_extension, extended)
         self.without_reply = reply is None
         if reply is not None:
             self.counts.reply.add(self.clock.monotonic() - sent)

@@ -27,7 +27,7 @@ OUTCOMES = ("completed", REJECTED, "stopped", "refused", "lost", "void", "interr
 
 
 @dataclass(frozen=True)
-class Check:
+class ArchiveCheck:
     """Result of a check: a sentence for each fault; samples that can be read.
 
     `repaired` is whether the outcome states a repair with loss.
@@ -45,7 +45,7 @@ class Check:
         return not self.faults
 
 
-def check_archive(path: str | PathLike[str]) -> Check:
+def check_archive(path: str | PathLike[str]) -> ArchiveCheck:
     """Check whether all of a file can be used; ArchiveError if it is no archive or unreadable."""
     path = Path(path)
     found = scan_file(path, all_channels=True)
@@ -56,7 +56,7 @@ def check_archive(path: str | PathLike[str]) -> Check:
         faults += found.faults
     if not faults and not is_intact(path, found):
         faults.append("the message indexes or the summary do not fit the content")
-    return Check(
+    return ArchiveCheck(
         path=path,
         version=(found.metadata or {}).get("format_version", ""),
         faults=tuple(faults),

@@ -145,7 +145,7 @@ class Campaign(CampaignState):
             MotionRefusedError: a motion failed its check; nothing was sent.
             MotionFailedError: a motion ended otherwise than planned; it is archived.
             RepetitionsRejectedError: a motion failed its quality check too often.
-            ControllerFault: the controller was not ready.
+            ControllerError: the controller was not ready.
             OperatorStopError: the operator stopped instead of accepting the dry run.
             CampaignFolderError: the folder was changed, or is in use by another run.
             InputError: a joint to accept is none of the cell.

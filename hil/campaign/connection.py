@@ -24,7 +24,7 @@ from drivers.packets import InitPacket
 from drivers.states import State
 from hil.archive import ArchiveSpec
 from hil.cell import Cell
-from hil.errors import ControllerFault
+from hil.errors import ControllerError
 from hil.motion_checks import MotionChecks
 from hil.terminal_text import plural
 
@@ -97,10 +97,10 @@ class Connection:
         self.started = False
 
     def require_usable(self) -> None:
-        """Raise ControllerFault if the controller is not the cell's."""
+        """Raise ControllerError if the controller is not the cell's."""
         if self.unusable is not None:
             remedy = "; correct the cell file, or the controller" if self.differences else ""
-            raise ControllerFault(f"the controller cannot be used: {self.unusable}{remedy}")
+            raise ControllerError(f"the controller cannot be used: {self.unusable}{remedy}")
 
     def _report(self, event: Refused) -> None:
         text = str(event.error) if self.cell is None else refusal_text(self.cell, event.error)
@@ -125,7 +125,7 @@ class StartTimeout:
         return None
 
 
-def not_ready(state: State, waited: float) -> ControllerFault:
+def not_ready(state: State, waited: float) -> ControllerError:
     """Return the error of a controller that was not ready for a motion after `waited` s."""
     after = f"within {waited:.3g} s"
     restart = "restart the program on the controller"
@@ -140,7 +140,7 @@ def not_ready(state: State, waited: float) -> ControllerFault:
         case _:
             problem = f"did not reach drive-on {after} (state {state.name}); switch the drive on"
             problem += " and try again"
-    return ControllerFault(f"the controller {problem}")
+    return ControllerError(f"the controller {problem}")
 
 
 def described(spec: ArchiveSpec, connection: Connection) -> ArchiveSpec:

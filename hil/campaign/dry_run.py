@@ -46,7 +46,7 @@ def yes_or_no(only_simulated: bool) -> str:
     return "yes" if only_simulated else "no"
 
 
-def made_by(path: Path, only_simulated: bool) -> bool:
+def is_from(path: Path, only_simulated: bool) -> bool:
     """Return whether an archive is of this kind of arm; False for a damaged one."""
     try:
         return open_archive(path, fields=()).header.simulated == yes_or_no(only_simulated)
@@ -142,7 +142,7 @@ class DryRunRecord:
         return found if found is not None and found.plan_hash == now else None
 
     @classmethod
-    def that_counts(
+    def load_valid(
         cls, folder: CampaignFolder, *, plan_hash: str, motions: int, simulated: bool
     ) -> Self | None:
         """Return the dry run of a plan on this kind of arm whose archives are all there, or None.
@@ -155,7 +155,7 @@ class DryRunRecord:
         paths = folder.completed("dryrun")[:motions]
         if len(paths) < motions or [path.name for path in paths] != [*found.archives]:
             return None
-        return found if all(made_by(path, simulated) for path in paths) else None
+        return found if all(is_from(path, simulated) for path in paths) else None
 
     @classmethod
     def of(

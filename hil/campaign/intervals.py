@@ -62,7 +62,7 @@ class Interval:
         start, end = self.trajectory.sample(np.array([0.0, self.trajectory.duration]))[0]
         return start, end
 
-    def leads(self, start: Array, end: Array) -> bool:
+    def connects(self, start: Array, end: Array) -> bool:
         """Return whether it leads from `start` to `end` (n,) [rad]."""
         first, last = self.ends
         apart = max(np.max(np.abs(first - start)), np.max(np.abs(last - end)))
@@ -122,7 +122,7 @@ class StraightMoves:
         """Return the checked motion from `start` to `end` (n,) [rad]; None if they are the same."""
         if np.max(np.abs(end - start)) <= AT_REST_TOLERANCE:
             return None
-        found = next((one for one in self._known if one.leads(start, end)), None)
+        found = next((one for one in self._known if one.connects(start, end)), None)
         if found is None:
             found = replace(straight_move(self._cell, start, end), index=index, from_arm=from_arm)
             require_allowed([found], self._checks)

@@ -28,13 +28,13 @@ from hil.archive import ArchiveSpec
 from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded, describe
 from hil.cell import Cell
-from hil.errors import ArchiveWriteError, ControllerFault, OperatorStopError
+from hil.errors import ArchiveWriteError, ControllerError, OperatorStopError
 
 from .connection import Connection, StartTimeout, active_guard, described, not_ready
 from .errors import refusal_text
 from .operator import MotionWatch, Stop, unwatched_motion
+from .operator_control import REQUEST_PERIOD, OperatorControl
 from .port import ControllerPort
-from .steering import REQUEST_PERIOD, Steering
 
 Array = NDArray[np.float64]
 
@@ -114,14 +114,14 @@ class MotionLink:
         return self.port.live
 
     def close(self) -> None:
-        """End the connection; ControllerFault if it did not end properly."""
+        """End the connection; ControllerError if it did not end properly."""
         self.port.close()
 
     def connect(self, stop: Stop, timeout: float = 60.0) -> Array:
         """Exchange packets until the drive is on; return the target position (n,) [rad].
 
         Raises:
-            ControllerFault: the controller was not ready within `timeout` s of the link's time,
+            ControllerError: the controller was not ready within `timeout` s of the link's time,
                 cannot be used, or a stop was requested.
         """
         port = self.port
@@ -142,7 +142,7 @@ class MotionLink:
         self._poll()
         self.connection.require_usable()
         if stop.requested:
-            raise ControllerFault("stopped by the operator before anything moved")
+            raise ControllerError("stopped by the operator before anything moved")
         if target is None or port.status().state not in READY:
             raise not_ready(port.status().state, port.now - began)
         self._inits = self.connection.inits
@@ -171,23 +171,23 @@ class MotionLink:
             watch: is shown the motion, and may slow, hold and release it; none starts in a hold.
 
         Raises:
-            ControllerFault: the motion was not accepted (nothing moved), or the link broke; or it
+            ControllerError: the motion was not accepted (nothing moved), or the link broke; or it
                 is to be slowed and supports no override.
             ArchiveWriteError: the archive cannot be written; the motion was stopped.
         """
-        steering = Steering(source, watch, self.port, override)
+        control = OperatorControl(source, watch, self.port, override)
         self.connection.refused = None
-        steering.begin(stop, self._poll)  # no archive is open during a hold
+        control.begin(stop, self._poll)  # no archive is open during a hold
         self._poll()
         with self._open_archive(spec, own_motion=False):
             # Opening it may last seconds: the requests are read again.
-            while self._may_start(steering, stop):
+            while self._may_start(control, stop):
                 with self.port.supervision():
                     try:
-                        self._submit(source, spec, lambda: steering.unchanged(stop))
+                        self._submit(source, spec, lambda: control.unchanged(stop))
                     except WithdrawnError:
                         continue  # stopped, held or slowed meanwhile, or a new session began
-                    ended = _Supervision(self, spec, steering, stop).end()
+                    ended = _Supervision(self, spec, control, stop).end()
                 refused = self.connection.refused
                 if refused is not None and ended.reason == str(refused.error):
                     return replace(ended, reason=refusal_text(self.cell, refused.error))
@@ -210,11 +210,11 @@ class MotionLink:
         self.connection.lost = None
         return self.port.open_archive(described(spec, self.connection), own_motion=own_motion)
 
-    def _may_start(self, steering: Steering, stop: Stop) -> bool:
+    def _may_start(self, control: OperatorControl, stop: Stop) -> bool:
         """Wait for the end of a hold; return whether the motion may be requested now."""
         try:
-            return steering.begin(stop, self._poll)
-        except ControllerFault as error:
+            return control.begin(stop, self._poll)
+        except ControllerError as error:
             self.complete("void", str(error))
             raise
         finally:
@@ -225,7 +225,7 @@ class MotionLink:
         if self.connection.inits > self._inits:  # with limits that no motion was checked against
             reason = "the controller began a new session since it was connected"
             self.complete("void", reason)
-            raise ControllerFault(
+            raise ControllerError(
                 f"{reason}; nothing was sent, run again: its limits are checked again"
             )
         self._poll()
@@ -243,14 +243,14 @@ class MotionLink:
             raise
         except RequestError as error:
             self.complete("refused", str(error))
-            raise ControllerFault(f"{error}; see the outcome of {spec.path}") from error
+            raise ControllerError(f"{error}; see the outcome of {spec.path}") from error
         except DriverError as error:
             self.require_archive(spec)
             self.port.stop(str(error))
             self._poll()
             reason = self.port.failure() or str(error)
             recorded = self.complete("void", reason)
-            raise ControllerFault(f"{reason}; {spec.path} is {recorded.outcome}") from error
+            raise ControllerError(f"{reason}; {spec.path} is {recorded.outcome}") from error
 
     @property
     def motion_ended(self) -> bool:
@@ -259,14 +259,14 @@ class MotionLink:
         return ended or self.port.status().ended_count != self._ended_before
 
     def require_archive(self, spec: ArchiveSpec) -> None:
-        """Raise ControllerFault if the archive process is gone or hangs; the arm rests first."""
+        """Raise ControllerError if the archive process is gone or hangs; the arm rests first."""
         if (failure := self.port.archive_failure()) is not None:
             rests = "the arm was brought to rest"
             if not self.come_to_rest():
                 state = self.port.status().state.name
                 rests = f"the arm was asked to stop, but was not seen at rest ({state})"
             readable = f"{spec.path} is readable up to its last part"
-            raise ControllerFault(f"{failure}; {rests}, and {readable}")
+            raise ControllerError(f"{failure}; {rests}, and {readable}")
 
     def come_to_rest(self) -> bool:
         """Stop a motion that is not archived any more; return whether its end was seen."""
@@ -301,7 +301,7 @@ class MotionLink:
         """Reply without commanding anything, in real time until rest; archive every cycle.
 
         Raises:
-            ControllerFault: the controller cannot be read, or began no session within `wait` s.
+            ControllerError: the controller cannot be read, or began no session within `wait` s.
             OperatorStopError: a stop was requested before it began one.
             ArchiveWriteError: the archive cannot be written.
         """
@@ -310,7 +310,7 @@ class MotionLink:
         with self._open_archive(spec, own_motion=True):
             try:
                 recorded = self._record(spec, stop, duration, watch)
-            except (ArchiveWriteError, ControllerFault) as error:
+            except (ArchiveWriteError, ControllerError) as error:
                 self._reply_until_rest(stop, watch, f"the recording failed ({error})")
                 raise
         self._reply_until_rest(stop, watch, "recording complete")
@@ -335,7 +335,7 @@ class MotionLink:
             problem = "the controller did not start a session"
             if math.isfinite(wait):
                 problem = f"no init packet within {wait:g} s; {self._waiting()}"
-            raise ControllerFault(f"{problem}: nothing was recorded")
+            raise ControllerError(f"{problem}: nothing was recorded")
 
     def _record(
         self, spec: ArchiveSpec, stop: Stop, duration: float | None, watch: Watch
@@ -371,7 +371,7 @@ class MotionLink:
             if ending is None:
                 port.archived()
                 if (failure := port.archive_failure()) is not None:
-                    raise ControllerFault(f"{failure}; {spec.path} is readable up to its last part")
+                    raise ControllerError(f"{failure}; {spec.path} is readable up to its last part")
             return ending is not None
 
         if not port.exchange_until(finished):
@@ -457,18 +457,20 @@ class MotionLink:
             return
         self._poll()
         if (failure := self.port.failure()) is not None:
-            raise ControllerFault(f"{failure}; {consequence}")
+            raise ControllerError(f"{failure}; {consequence}")
 
 
 class _Supervision:
     """Waits for the end of a motion that was requested, and of its archive; passes on requests."""
 
-    def __init__(self, link: MotionLink, spec: ArchiveSpec, steering: Steering, stop: Stop) -> None:
+    def __init__(
+        self, link: MotionLink, spec: ArchiveSpec, control: OperatorControl, stop: Stop
+    ) -> None:
         self._link = link
         self._port = link.port
         self._connection = link.connection
         self._spec = spec
-        self._steering = steering
+        self._control = control
         self._stop = stop
         self._start = StartTimeout(link.port.now)
         self._guard = active_guard(link.cell, link.connection.init)
@@ -480,7 +482,7 @@ class _Supervision:
         """Return how the motion ended, once its archive is complete.
 
         Raises:
-            ControllerFault: it did not begin, or the link broke.
+            ControllerError: it did not begin, or the link broke.
             ArchiveWriteError: the archive cannot be written; the arm is at rest.
         """
         if not self._port.exchange_until(self._finished):
@@ -509,13 +511,13 @@ class _Supervision:
         A simulated controller in virtual time waits for its reply: a hold takes no simulated time.
         """
         port = self._port
-        steering = self._steering
+        control = self._control
         while True:
-            if steering.due:
-                steering.show(self._link.cell.drive_train, self._guard, port.status())
+            if control.due:
+                control.show(self._link.cell.drive_train, self._guard, port.status())
             if not self._link.motion_ended:
-                steering.follow()
-            rests = port.is_virtual and steering.held and port.status().rate == 0.0
+                control.follow()
+            rests = port.is_virtual and control.held and port.status().rate == 0.0
             if not rests or self._stop.requested:
                 return
             time.sleep(REQUEST_PERIOD)
@@ -535,7 +537,7 @@ class _Supervision:
             self._due = min(self._due, self._port.now + REST_TIMEOUT)
         if self._port.now > self._due:
             late = f"{self._spec.path} was not completed within {REST_TIMEOUT:g} s"
-            raise ControllerFault(f"the motion has ended, but {late}")
+            raise ControllerError(f"the motion has ended, but {late}")
         return False
 
     def _await_archive(self) -> None:
@@ -552,7 +554,7 @@ class _Supervision:
             ended = MotionEnded(outcome, recorded.reason, recorded.interval, -1)
         if ended is None:
             failure = self._port.failure() or recorded.reason
-            raise ControllerFault(
+            raise ControllerError(
                 f"{failure}; the controller gets no replies and acts by its own watchdog; "
                 f"the archive ({recorded.outcome}) is complete up to then"
             )
@@ -568,7 +570,7 @@ class _Supervision:
         self._link.complete("void" if refused is None else "refused", reason)
         self._port.stop(reason)
         if refused is None:
-            raise ControllerFault(f"{reason}; nothing was sent ({self._spec.path})")
+            raise ControllerError(f"{reason}; nothing was sent ({self._spec.path})")
         return MotionEnded("refused", reason, -1, -1)
 
 

@@ -42,7 +42,7 @@ from hil.archive.supervised import (
     Serving,
 )
 from hil.cell import Cell
-from hil.errors import ArchiveWriteError, ControllerFault
+from hil.errors import ArchiveWriteError, ControllerError
 
 from .link import MotionLink
 from .operator import Stop
@@ -237,10 +237,10 @@ class LivePort:
             if isinstance(answer, Closed | Failed):
                 self._late_path = ""
             elif (failure := self.archive.failure()) is not None:
-                raise ControllerFault(f"{failure}; nothing was sent")
+                raise ControllerError(f"{failure}; nothing was sent")
             elif time.monotonic() > deadline:
                 waits = f"the archive process still waits for the disk to open {self._late_path}"
-                raise ControllerFault(f"{waits}; nothing was sent, check that disk")
+                raise ControllerError(f"{waits}; nothing was sent, check that disk")
         self._restart_reader()
 
     def poll(self) -> list[ExchangeEvent]:
@@ -302,11 +302,11 @@ class LivePort:
         """End the session where the controller can be asked to, then both processes.
 
         Raises:
-            ControllerFault: one of them did not end properly.
+            ControllerError: one of them did not end properly.
         """
         problem = self._shut()
         if problem is not None:
-            raise ControllerFault(problem)
+            raise ControllerError(problem)
 
     def abort(self, error: BaseException) -> None:
         """Stop the arm, end both processes, and note at the error what was wrong with them."""
@@ -364,7 +364,7 @@ class LivePort:
             self.archive.send(Close(self.job, "void", "nothing was sent: it was opened too late"))
             self.open_path, self._late_path = "", str(spec.path)
             late = f"did not open {spec.path} within {OPEN_TIMEOUT:g} s"
-            raise ControllerFault(f"the archive process {late}; nothing was sent")
+            raise ControllerError(f"the archive process {late}; nothing was sent")
         self._late_path = ""  # commands are executed in order
         self._restart_reader()
         yield
@@ -396,14 +396,14 @@ class LivePort:
         incomplete = f"{path} is not complete ({outcome}: {reason})"
         closed = self._request(Close(self.job, outcome, reason), Closed, incomplete)
         if closed is None:
-            raise ControllerFault(f"{path} was not completed within {OPEN_TIMEOUT:g} s")
+            raise ControllerError(f"{path} was not completed within {OPEN_TIMEOUT:g} s")
         self.open_path = ""
         return closed.recorded
 
     def _request(self, command: Command, answer: type[T], consequence: str) -> T | None:
         """Return the answer to a command to the archive process; None after `OPEN_TIMEOUT` s.
 
-        ArchiveWriteError if the disk refuses, ControllerFault if the process is gone or hangs.
+        ArchiveWriteError if the disk refuses, ControllerError if the process is gone or hangs.
         """
         self.archive.send(command)
         deadline = time.monotonic() + OPEN_TIMEOUT
@@ -416,7 +416,7 @@ class LivePort:
                 self._late_path = self.open_path = ""
                 raise write_error(found)
             if (failure := self.archive_failure()) is not None:
-                raise ControllerFault(f"{failure}; {consequence}")
+                raise ControllerError(f"{failure}; {consequence}")
         return None
 
     def _serve(self, view: LiveView) -> None:
@@ -429,7 +429,7 @@ class LivePort:
         except ArchiveWriteError as error:
             raise LiveViewError(None, error.problem, remedy=error.remedy) from error
         if answer is None:
-            raise ControllerFault("the archive process does not answer; nothing was sent")
+            raise ControllerError("the archive process does not answer; nothing was sent")
         self.live = replace(view, port=answer.port)
 
 
@@ -468,7 +468,7 @@ class LiveLink(MotionLink):
         Raises:
             LiveViewError: the live view cannot be served.
             CellError: the cell names no real link.
-            ControllerFault: the link cannot be opened, or the system refuses a process.
+            ControllerError: the link cannot be opened, or the system refuses a process.
         """
         return_large_arrays()
         spec = transport if transport is not None else cell.transport_spec()
@@ -484,9 +484,9 @@ class LiveLink(MotionLink):
         try:
             exchange = ExchangeProcess.start(settings)
         except DriverError as error:
-            raise ControllerFault(str(error)) from error
+            raise ControllerError(str(error)) from error
         except OSError as error:
-            raise ControllerFault(f"the exchange process cannot be started: {error}") from error
+            raise ControllerError(f"the exchange process cannot be started: {error}") from error
         # At once: the archive process may take longer to start than the exchange waits for a beat.
         heart = Heartbeat(exchange.send_heartbeat)
         heart.start()
@@ -497,7 +497,7 @@ class LiveLink(MotionLink):
             exchange.finish()
             exchange.close()
             if isinstance(error, OSError):
-                raise ControllerFault(f"the archive process cannot be started: {error}") from error
+                raise ControllerError(f"the archive process cannot be started: {error}") from error
             raise
         port = LivePort(cell, exchange, archive, heart, finish, only_simulated=spec.is_local)
         if live is not None:

@@ -85,7 +85,7 @@ class ControllerPort(Protocol):
         """Wait for what an earlier failure left, or a stop; read records from now on.
 
         Raises:
-            ControllerFault: the archive process ended, or waits for its disk.
+            ControllerError: the archive process ended, or waits for its disk.
         """
 
     def poll(self) -> Sequence[ExchangeEvent]:
@@ -138,7 +138,7 @@ class ControllerPort(Protocol):
 
         Raises:
             ArchiveWriteError: it cannot be created.
-            ControllerFault: it was not opened in time.
+            ControllerError: it was not opened in time.
         """
 
     def archived(self) -> Recorded | None:
@@ -156,8 +156,8 @@ class ControllerPort(Protocol):
 
         Raises:
             ArchiveWriteError: it cannot be written.
-            ControllerFault: it was not completed in time.
+            ControllerError: it was not completed in time.
         """
 
     def close(self) -> None:
-        """End the session; ControllerFault if it did not end properly."""
+        """End the session; ControllerError if it did not end properly."""

@@ -197,7 +197,7 @@ class Runner:
 
         Raises:
             MotionFailedError: it ended otherwise than planned, or was not begun after a stop.
-            ControllerFault: it was not accepted, or the link broke.
+            ControllerError: it was not accepted, or the link broke.
         """
         start, end = interval.places(self.campaign.cell.home)
         self._go(start, most)
@@ -260,7 +260,7 @@ class Runner:
         """
         if self._seen is None:
             return False
-        return way.from_arm or not any(way.leads(*ends) for ends in self._seen)
+        return way.from_arm or not any(way.connects(*ends) for ends in self._seen)
 
     def _execute(self, interval: Interval, number: int, total: int, most: float) -> str:
         if self._watch.stop.requested:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from hil.errors import OperatorStopError
 from hil.progress import Reporter
 
-from .dry_run import OVERRIDE, DryRunRecord, DryRunState, made_by, not_accepted
+from .dry_run import OVERRIDE, DryRunRecord, DryRunState, is_from, not_accepted
 from .intervals import Interval
 from .operator import RunWatch
 from .quality import Problem
@@ -51,7 +51,7 @@ class DryRunStage:
         archives = self._archives
         if self._options.unrehearsed:
             return None
-        return DryRunRecord.that_counts(
+        return DryRunRecord.load_valid(
             self._folder,
             plan_hash=archives.plan_hash,
             motions=len(self.intervals),
@@ -120,7 +120,7 @@ class DryRunStage:
     def _complete(self, slow: Interval) -> str | None:
         """Return the name of its complete archive, if it is of this kind of arm."""
         name = self._folder.whole(slow.kind, slow.index)
-        made = name is not None and made_by(self._folder.archives / name, self._archives.simulated)
+        made = name is not None and is_from(self._folder.archives / name, self._archives.simulated)
         return name if made else None
 
 

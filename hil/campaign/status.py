@@ -143,7 +143,7 @@ def _rehearsal(folder: CampaignFolder) -> Step:
 
 def _dry_run(campaign: CampaignState) -> Step:
     folder = campaign.folder
-    found = DryRunRecord.that_counts(
+    found = DryRunRecord.load_valid(
         folder,
         plan_hash=folder.plan_hash,
         motions=1 + len(campaign.plan.validation),

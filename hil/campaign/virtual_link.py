@@ -22,7 +22,7 @@ from hil.archive import ArchiveSpec, Recorder
 from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded
 from hil.cell import Cell
-from hil.errors import ControllerFault
+from hil.errors import ControllerError
 
 from .link import MotionLink
 from .operator import Stop
@@ -214,7 +214,7 @@ class VirtualPort:
         A restarted controller was not asked, and continues with closed axes.
 
         Raises:
-            ControllerFault: an axis is still open after that time.
+            ControllerError: an axis is still open after that time.
         """
         self.finish()
         deadline = self.now + END_TIMEOUT
@@ -225,7 +225,7 @@ class VirtualPort:
 
         self.exchange_until(finished)
         if self.session.state in HAS_SET_POINTS:
-            raise ControllerFault(
+            raise ControllerError(
                 f"an axis is still open {END_TIMEOUT:g} s after the controller was asked to end"
             )
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from hil.archive.check import Check, Overview, archive_files, check_archive, read_overview
+from hil.archive.check import ArchiveCheck, Overview, archive_files, check_archive, read_overview
 from hil.archive.repair import repair as repair_archive
 from hil.cli import exit_code_of
 from hil.cli.arguments import JsonOption, print_json
@@ -123,7 +123,7 @@ def _shown(lines: Sequence[str]) -> str:
     return "\n".join(printable(line, keep="") for line in lines)
 
 
-def _check_lines(found: Check) -> list[str]:
+def _check_lines(found: ArchiveCheck) -> list[str]:
     verdict = "conforms to" if found.conforms else "does not conform to"
     lines = [f"{found.path}: {verdict} profile {found.version}, {found.samples} samples"]
     lines += [f"  {fault}" for fault in found.faults]
@@ -132,7 +132,7 @@ def _check_lines(found: Check) -> list[str]:
     return lines
 
 
-def _check_dict(found: Check) -> dict[str, Any]:
+def _check_dict(found: ArchiveCheck) -> dict[str, Any]:
     entries = asdict(found)
     return {"file": str(entries.pop("path")), "archive": True, "keeps": found.conforms, **entries}
 

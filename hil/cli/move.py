@@ -19,7 +19,7 @@ from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell import AngleFrame, Cell
 from hil.cell_link import cell_link
 from hil.cli.arguments import JsonOption
-from hil.errors import ControllerFault, ExecutionError, InputError, OperatorStopError, UnsafeError
+from hil.errors import ControllerError, ExecutionError, InputError, OperatorStopError, UnsafeError
 from hil.files import make_folder
 from hil.move import THERE, CheckedMove, axis_alone, plan_move, posture, send, turned
 from hil.progress import Task, say
@@ -137,7 +137,7 @@ def move(
             typer.echo(printable(message))
         try:
             link.close()
-        except ControllerFault as fault:
+        except ControllerError as fault:
             raise fault.beside(figures) from None
         if json and ended.outcome == "completed":
             _print(message, figures, json=json)

@@ -17,7 +17,7 @@ from hil.campaign import Progress, stop_on_interrupt
 from hil.campaign.live_link import LiveLink
 from hil.cell import AngleFrame, Cell
 from hil.cli.arguments import JsonOption, QuietOption, print_json
-from hil.errors import ControllerFault, HilError, OperatorStopError
+from hil.errors import ControllerError, HilError, OperatorStopError
 from hil.progress import say
 from hil.recording import archive_path
 from hil.recording import record as record_motion
@@ -95,10 +95,10 @@ def _early_end(path: Path, done: Recorded, duration: float | None) -> HilError |
         return None
     if done.outcome == "completed":
         reached = f"after {done.seconds:.1f} s of {duration:g} s"
-        return ControllerFault(f"{done.reason} {reached}; {path} is complete.")
+        return ControllerError(f"{done.reason} {reached}; {path} is complete.")
     if done.outcome == "stopped" and done.reason == "ended by the operator":
         return OperatorStopError(f"the recording was ended early; {path} is complete.")
-    return ControllerFault(f"{done.reason}; {path} is complete up to there.")
+    return ControllerError(f"{done.reason}; {path} is complete up to there.")
 
 
 def _figures(path: Path, done: Recorded, cell: Cell) -> dict[str, object]:

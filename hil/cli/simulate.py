@@ -224,7 +224,7 @@ def simulate(
                     pressed,
                     # The controller's own program stops at the next posture only.
                     patience=OWN_MOVE if own_motion else PATIENCE,
-                    stretch=patience,
+                    cycle_extension=patience,
                     watch=status.watch,
                 )
                 over = pressed.request() is not Request.CONTINUE
@@ -260,15 +260,23 @@ def _postures(cell: Cell) -> tuple[tuple[float, ...], ...]:
     return postures
 
 
+_KEYS: Final = {"first_packets": "knocks", "extended": "stretched"}
+"""Keys of `--json` by the counts that have another name."""
+
+
 def _figures(served: Served) -> dict[str, object]:
     """Return the content of `--json`; times in µs."""
     summary = served.summary
-    times = {"stretch_max_us": summary.stretch_max}
+    times = {"stretch_max_us": summary.longest_extension}
     for name, each in (("answer", summary.reply), ("cost", summary.cost)):
         parts = (f"{name}_{part}_us" for part in ("p50", "p99", "max"))
         times |= zip(parts, _parts(each), strict=True)
     return {
-        **{name: count for name, count in vars(summary).items() if isinstance(count, int)},
+        **{
+            _KEYS.get(name, name): count
+            for name, count in vars(summary).items()
+            if isinstance(count, int)
+        },
         "foreign": served.foreign,
         "intervals": served.intervals,
         "starts": served.starts,
@@ -283,7 +291,7 @@ def _sentences(served: Served) -> list[str]:
     summary = served.summary
     reason = served.controller.reason
     if not summary.cycles:
-        sent = plural(summary.knocks, "time")
+        sent = plural(summary.first_packets, "time")
         return [f"no reply of a PC program; the first packet was sent {sent}"]
     end = "the session has ended (504)" if summary.ended else "the session was aborted"
     because = f": {reason}" if reason else ""
@@ -292,9 +300,9 @@ def _sentences(served: Served) -> list[str]:
         late += f", {summary.slips} of them by a full cycle"
     again = f" after {plural(served.starts, 'start')}" if served.starts > 1 else ""
     extended = (
-        f"; {plural(summary.stretched, 'cycle')} extended by up to "
-        f"{1e3 * summary.stretch_max:.1f} ms to wait for a reply"
-        if summary.stretched
+        f"; {plural(summary.extended, 'cycle')} extended by up to "
+        f"{1e3 * summary.longest_extension:.1f} ms to wait for a reply"
+        if summary.extended
         else ""
     )
     return [

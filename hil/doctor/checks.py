@@ -29,7 +29,7 @@ class Status(StrEnum):
 
 
 @dataclass(frozen=True)
-class Check:
+class DoctorCheck:
     """The result of one check: status, facts, shell commands as remedy."""
 
     name: str
@@ -103,49 +103,53 @@ def _limit_lines(item: str, value: str) -> tuple[str, ...]:
     return (_JOIN, line, _LOG_IN_AGAIN)
 
 
-def scheduling(given: RealTimeReport, limit: int) -> Check:
+def scheduling(given: RealTimeReport, limit: int) -> DoctorCheck:
     """Check the priority of a real-time process, and the limit RLIMIT_RTPRIO of this one."""
     name = "real-time priority"
     limited = "no limit" if limit < 0 else f"rtprio limit {limit}"
     if "FIFO" in given.scheduling.upper():
-        return Check(name, Status.OK, f"{given.scheduling} given ({limited})")
+        return DoctorCheck(name, Status.OK, f"{given.scheduling} given ({limited})")
     found = f"refused, its scheduling is {given.scheduling or 'ordinary'}; {limited}"
     remedy = _limit_lines("rtprio", "98")
     if not 0 <= limit < RealTimeSettings().priority:
         remedy += ("cat /proc/sys/kernel/sched_rt_runtime_us   # 0 forbids real-time programs",)
-    return Check(name, Status.BAD, found, remedy)
+    return DoctorCheck(name, Status.BAD, found, remedy)
 
 
-def memory_lock(given: RealTimeReport, limit: int) -> Check:
+def memory_lock(given: RealTimeReport, limit: int) -> DoctorCheck:
     """Check whether memory can be locked, and the limit RLIMIT_MEMLOCK: page faults cost cycles."""
     limited = "no limit" if limit < 0 else f"memlock limit {limit // 1024} KiB"
     name = "memory lock"
     remedy = _limit_lines("memlock", "unlimited")
     if given.memory_locked:
-        return Check(name, Status.OK, f"given ({limited})")
+        return DoctorCheck(name, Status.OK, f"given ({limited})")
     if any(sentence.startswith("only memory") for sentence in given.refused):
-        return Check(name, Status.WARN, f"only what is in use at the start; {limited}", remedy)
-    return Check(name, Status.BAD, f"refused; {limited}", remedy)
+        return DoctorCheck(
+            name, Status.WARN, f"only what is in use at the start; {limited}", remedy
+        )
+    return DoctorCheck(name, Status.BAD, f"refused; {limited}", remedy)
 
 
 _CPU = "/sys/devices/system/cpu"
 
 
-def governor(system: System) -> Check:
+def governor(system: System) -> DoctorCheck:
     """Check that the processors are not slowed down."""
     name = "frequency governor"
     found = sorted({*system.texts(f"{_CPU}/cpu[0-9]*/cpufreq/scaling_governor").values()} - {""})
     if found in ([], ["performance"]):
-        return Check(name, Status.OK, "".join(found) or "no frequency scaling on this machine")
+        return DoctorCheck(
+            name, Status.OK, "".join(found) or "no frequency scaling on this machine"
+        )
     setting = f"echo performance | sudo tee {_CPU}/cpu*/cpufreq/scaling_governor"
-    return Check(name, Status.WARN, ", ".join(found), (setting,))
+    return DoctorCheck(name, Status.WARN, ", ".join(found), (setting,))
 
 
-def idle_states(*, cpu_awake: bool) -> Check:
+def idle_states(*, cpu_awake: bool) -> DoctorCheck:
     """Check that an exchange can exclude the idle states, by /dev/cpu_dma_latency."""
     name = "idle states"
     if cpu_awake:
-        return Check(name, Status.OK, "not entered during an exchange")
+        return DoctorCheck(name, Status.OK, "not entered during an exchange")
     rule = f'KERNEL=="cpu_dma_latency", GROUP="{GROUP}", MODE="0660"'
     remedy = (
         _JOIN,
@@ -153,14 +157,14 @@ def idle_states(*, cpu_awake: bool) -> Check:
         "sudo udevadm control --reload && sudo udevadm trigger --name-match=cpu_dma_latency",
         "# log out and in again, then: ls -l /dev/cpu_dma_latency; groups",
     )
-    return Check(name, Status.WARN, "/dev/cpu_dma_latency may not be written", remedy)
+    return DoctorCheck(name, Status.WARN, "/dev/cpu_dma_latency may not be written", remedy)
 
 
-def computer_checks(given: RealTimeReport | None, system: System) -> list[Check]:
+def computer_checks(given: RealTimeReport | None, system: System) -> list[DoctorCheck]:
     """Check permissions and processor; `given` is None if the probe failed."""
     if given is None:
         command = ("python -m hil.doctor.probe permissions   # prints the error",)
-        rights = [Check("permissions", Status.BAD, "the probe failed", command)]
+        rights = [DoctorCheck("permissions", Status.BAD, "the probe failed", command)]
     else:
         limits = [
             resource.getrlimit(one)[0] for one in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK)
@@ -188,59 +192,59 @@ class DiskTrial:
     error: str = ""
 
 
-def disk_checks(place: Path, trial: DiskTrial | None) -> list[Check]:
+def disk_checks(place: Path, trial: DiskTrial | None) -> list[DoctorCheck]:
     """Check free space and write time; `trial` is None if the disk did not respond."""
     if trial is None:
         found = f"the disk of {place} does not respond"
-        return [Check("disk write", Status.BAD, found, (f"df -h {place}", _MOVE))]
+        return [DoctorCheck("disk write", Status.BAD, found, (f"df -h {place}", _MOVE))]
     hours = trial.free / (BYTES_PER_CYCLE * 3_600_000)
     status = Status.OK if hours >= 2 else Status.WARN if hours >= 0.5 else Status.BAD
     found = f"{trial.free / 1e9:.1f} GB free at {trial.folder}: {hours:.1f} h of recording at 1 ms"
     remedy = () if hours >= 2 else (f"du -xh {trial.folder} | sort -h | tail",)
-    space = Check("disk space", status, found, remedy)
+    space = DoctorCheck("disk space", status, found, remedy)
     if not trial.seconds:
         refused = f"cannot write to {trial.folder}: {trial.error or 'no result'}"
         look = (f"ls -ld {trial.folder}; id", _MOVE)
-        return [space, Check("disk write", Status.BAD, refused, look)]
+        return [space, DoctorCheck("disk write", Status.BAD, refused, look)]
     worst = max(trial.seconds)
     middle = sorted(trial.seconds)[len(trial.seconds) // 2]
     status = Status.OK if worst < _SLOW else Status.WARN if worst < _TOO_SLOW else Status.BAD
     found = f"64 KiB written in {1e3 * middle:.1f} ms, at most {1e3 * worst:.1f} ms"
-    return [space, Check("disk write", status, found, () if worst < _SLOW else (_MOVE,))]
+    return [space, DoctorCheck("disk write", status, found, () if worst < _SLOW else (_MOVE,))]
 
 
 _ARPHRD_CAN = "280"
 
 
-def can_check(bus: CanBus, system: System) -> Check:
+def can_check(bus: CanBus, system: System) -> DoctorCheck:
     """Check that a CAN interface is up at the bit rate of the cell; another one corrupts frames."""
     # An adapter is not opened here: on the bus it would acknowledge frames.
     name = f"CAN {bus.interface} {bus.channel}"
     if bus.interface != "socketcan":
         found = "not a kernel device; it is opened by the exchange only"
-        return Check(name, Status.UNKNOWN, found)
+        return DoctorCheck(name, Status.UNKNOWN, found)
     folder = f"/sys/class/net/{bus.channel}"
     if system.text(f"{folder}/type") != _ARPHRD_CAN:
         look = ("ip -brief link show type can", "sudo modprobe can_raw   # and the card's driver")
-        return Check(name, Status.BAD, "is not a CAN interface", look)
+        return DoctorCheck(name, Status.BAD, "is not a CAN interface", look)
     rates = f"bitrate {bus.bitrate or 1_000_000} dbitrate {bus.data_bitrate or 5_000_000} fd on"
     bring_up = f"sudo ip link set {bus.channel} up txqueuelen 100 type can {rates}"
     if system.text(f"{folder}/operstate") == "down":
-        return Check(name, Status.BAD, "down", (bring_up,))
+        return DoctorCheck(name, Status.BAD, "down", (bring_up,))
     shown = system.ip("-details", "link", "show", bus.channel) or [{}]
     details = shown[0].get("linkinfo", {})
     if details.get("info_kind") == "vcan":
-        return Check(name, Status.OK, "virtual bus, no bit rate")
+        return DoctorCheck(name, Status.OK, "virtual bus, no bit rate")
     timings = details.get("info_data", {})
     nominal, data = (timings.get(of, {}).get("bitrate") for of in ("bittiming", "data_bittiming"))
     if not nominal:
         remedy = (f"ip -details link show {bus.channel}",)
-        return Check(name, Status.UNKNOWN, "bit rate not stated", remedy)
+        return DoctorCheck(name, Status.UNKNOWN, "bit rate not stated", remedy)
     found = f"up, {nominal} bit/s" + (f", data {data} bit/s" if data else "")
     if nominal == (bus.bitrate or nominal) and data and data == (bus.data_bitrate or data):
-        return Check(name, Status.OK, found)
+        return DoctorCheck(name, Status.OK, found)
     down = f"sudo ip link set {bus.channel} down"
-    return Check(name, Status.BAD, f"{found}; the cell needs {rates}", (down, bring_up))
+    return DoctorCheck(name, Status.BAD, f"{found}; the cell needs {rates}", (down, bring_up))
 
 
 def try_port(wanted: FreePort) -> int:
@@ -254,13 +258,13 @@ def try_port(wanted: FreePort) -> int:
     return 0
 
 
-def port_check(wanted: FreePort, error: int) -> Check:
+def port_check(wanted: FreePort, error: int) -> DoctorCheck:
     """Judge the error number of `try_port`."""
     bind = wanted.bind
     port = wanted.port
     name = f"{wanted.protocol} port {port}"
     if error == 0:
-        return Check(name, Status.OK, f"can be bound on {bind}")
+        return DoctorCheck(name, Status.OK, f"can be bound on {bind}")
     found = f"cannot be bound ({errno.errorcode.get(error, f'error {error}')})"
     remedy: tuple[str, ...] = ()
     if error == errno.EADDRINUSE:
@@ -276,7 +280,7 @@ def port_check(wanted: FreePort, error: int) -> Check:
             f"echo '{setting}' | sudo tee /etc/sysctl.d/90-hil.conf && sudo sysctl --system",
             "# once; hil then needs no privilege for this port",
         )
-    return Check(name, Status.BAD, found, remedy)
+    return DoctorCheck(name, Status.BAD, found, remedy)
 
 
 def _address_of(host: str, system: System) -> str | None:
@@ -290,46 +294,48 @@ def _address_of(host: str, system: System) -> str | None:
     return None
 
 
-def route_check(host: str, system: System) -> Check:
+def route_check(host: str, system: System) -> DoctorCheck:
     """Check that the controller is reached directly: a router adds delay, or loses all packets."""
     name = "route to the controller"
     address = _address_of(host, system)
     if address is None:
         found = f"{host!r} is neither an IPv4 address nor in /etc/hosts"
         remedy = (f"# write an address in the cell file: host = 10.2.12.150, not {host}",)
-        return Check(name, Status.BAD, found, remedy)
+        return DoctorCheck(name, Status.BAD, found, remedy)
     routes = system.ip("route", "get", address)
     if routes is None:
-        return Check(name, Status.UNKNOWN, "ip is not installed", ("sudo apt install iproute2",))
+        return DoctorCheck(
+            name, Status.UNKNOWN, "ip is not installed", ("sudo apt install iproute2",)
+        )
     head, last = address.rsplit(".", 1)
     own = f"{head}.{int(last) - 1 if int(last) > 1 else int(last) + 1}"
     add = f"sudo ip addr add {own}/24 dev CARD   # CARD: the one cabled to the controller"
     if not routes:
-        return Check(name, Status.BAD, f"none to {address}", ("ip -brief link", add))
+        return DoctorCheck(name, Status.BAD, f"none to {address}", ("ip -brief link", add))
     route = routes[0]
     if route.get("type") == "local":
         found = f"{address} is this PC itself (a simulated controller)"
-        return Check(name, Status.OK, found)
+        return DoctorCheck(name, Status.OK, found)
     if "gateway" in route:
         found = f"over gateway {route['gateway']} on {route['dev']}"
-        return Check(name, Status.BAD, found, (add,))
+        return DoctorCheck(name, Status.BAD, found, (add,))
     device = route.get("dev", "")
     if system.text(f"/sys/class/net/{device}/carrier") == "0":
         bring_up = (f"sudo ip link set {device} up", "# check the cable")
-        return Check(name, Status.BAD, f"{device} has no carrier", bring_up)
-    return Check(name, Status.OK, f"{address} directly on {device}")
+        return DoctorCheck(name, Status.BAD, f"{device} has no carrier", bring_up)
+    return DoctorCheck(name, Status.OK, f"{address} directly on {device}")
 
 
-def link_checks(link: TransportSpec | None, system: System) -> list[Check]:
+def link_checks(link: TransportSpec | None, system: System) -> list[DoctorCheck]:
     """Check what a link needs of this PC; None without a cell, or with a simulated one."""
     if link is None:
-        return [Check("controller link", Status.OK, "none: no cell, or a simulated one")]
+        return [DoctorCheck("controller link", Status.OK, "none: no cell, or a simulated one")]
     if not link.needs:
-        return [Check("controller link", Status.UNKNOWN, f"not checked: {link.description}")]
+        return [DoctorCheck("controller link", Status.UNKNOWN, f"not checked: {link.description}")]
     return [_check_of(need, system) for need in link.needs]
 
 
-def _check_of(need: DirectRoute | FreePort | CanBus, system: System) -> Check:
+def _check_of(need: DirectRoute | FreePort | CanBus, system: System) -> DoctorCheck:
     match need:
         case DirectRoute():
             return route_check(need.host, system)

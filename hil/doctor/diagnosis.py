@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -20,11 +17,20 @@ from rich.table import Table
 from rich.text import Text
 from scipy.special import gammaincinv
 
+from drivers.child_process import ChildProcess
 from drivers.exchange.realtime import RealTimeReport
 from hil.progress import Reporter
 from hil.terminal_text import printable
 
-from .checks import Check, DiskTrial, Status, System, computer_checks, disk_checks, link_checks
+from .checks import (
+    DiskTrial,
+    DoctorCheck,
+    Status,
+    System,
+    computer_checks,
+    disk_checks,
+    link_checks,
+)
 
 if TYPE_CHECKING:
     from drivers.transports.base import TransportSpec
@@ -145,32 +151,22 @@ def run_probe(
     arguments: Sequence[str], seconds: float, advance: Callable[[float], None] = lambda _: None
 ) -> dict[str, Any] | None:
     """Return the JSON of `hil.doctor.probe` run for `seconds`; None if it failed or was killed."""
-    probe = subprocess.Popen(
-        [sys.executable, "-m", "hil.doctor.probe", *arguments],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
+    try:
+        probe = ChildProcess(("-m", "hil.doctor.probe", *arguments))
+    except OSError:
+        return None
     began = time.monotonic()
     shown = 0.0
-    output = ""
     try:
-        while not output and (passed := time.monotonic() - began) < seconds + _GRACE:
+        while probe.wait(0.2) is None and (passed := time.monotonic() - began) < seconds + _GRACE:
             advance(min(passed, seconds) - shown)
             shown = min(passed, seconds)
-            with suppress(subprocess.TimeoutExpired):
-                output = probe.communicate(timeout=0.2)[0] or "null"
         advance(seconds - shown)
+        output = probe.output if probe.status == 0 else ""
     finally:
-        probe.kill()
-        with suppress(subprocess.TimeoutExpired):  # one blocked by a dead disk is left behind
-            probe.wait(timeout=1.0)
-        if probe.stdout is not None:
-            probe.stdout.close()
-    answer: dict[str, Any] | None = None
-    if output and not probe.returncode:
-        answer = json.loads(output.splitlines()[-1])
+        probe.kill(1.0)  # one blocked by a dead disk is left behind
+        probe.close()
+    answer: dict[str, Any] | None = json.loads(output.splitlines()[-1]) if output else None
     return answer
 
 
@@ -178,7 +174,7 @@ def run_probe(
 class Diagnosis:
     """All results: verdicts on 1 and 2 ms and on `cycle_ms`, which has to be fit."""
 
-    checks: tuple[Check, ...]
+    checks: tuple[DoctorCheck, ...]
     latencies: tuple[Latency, ...]
     cycles: tuple[Fitness, ...]
     cycle_ms: int
@@ -240,7 +236,7 @@ def examine(
     measured = {name: measure(name, each, seconds, reporter) for name, each in periods.items()}
     command = ("python -m hil.doctor.probe permissions   # prints the error",)
     checks += [
-        Check(f"{name} latency", Status.BAD, "the probe failed", command)
+        DoctorCheck(f"{name} latency", Status.BAD, "the probe failed", command)
         for name, latency in measured.items()
         if latency is None
     ]
@@ -285,7 +281,7 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
     console.print(Text(printable(diagnosis.line), style=style), soft_wrap=True)
 
 
-def remedies(checks: Sequence[Check]) -> Iterator[str]:
+def remedies(checks: Sequence[DoctorCheck]) -> Iterator[str]:
     """Yield the commands of each check with a remedy, worst first, each command once."""
     given: set[str] = set()
     for status in (Status.BAD, Status.WARN, Status.UNKNOWN):

@@ -10,7 +10,6 @@ import json
 import os
 import shutil
 import socket
-import subprocess
 import sys
 import tempfile
 import time
@@ -20,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.child_process import ChildProcess
 from drivers.exchange.realtime import RealTimeSettings, enter
 
 PACKET = 228
@@ -97,15 +97,16 @@ def echo() -> None:
 
 def turnaround(period: float, seconds: float) -> NDArray[np.float32]:
     """Measure round trips between two real-time processes over loopback UDP."""
-    command = [sys.executable, "-m", "hil.doctor.probe", "echo"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL) as peer:
-        try:
-            assert peer.stdout is not None
-            port = json.loads(peer.stdout.readline())["port"]
-            enter(RealTimeSettings())
-            return round_trips(int(port), period, seconds)
-        finally:
-            peer.kill()
+    peer = ChildProcess(("-m", "hil.doctor.probe", "echo"))
+    try:
+        while "\n" not in peer.output and peer.wait(0.05) is None:
+            pass
+        port = json.loads(peer.output)["port"]
+        enter(RealTimeSettings())
+        return round_trips(int(port), period, seconds)
+    finally:
+        peer.kill()
+        peer.close()
 
 
 def disk(place: Path) -> dict[str, object]:

@@ -25,7 +25,7 @@ from hil.campaign.connection import Connection
 from hil.campaign.live_link import END_TIMEOUT, ExchangeMonitor
 from hil.cell.errors import UNKNOWN
 from hil.cell.text import urdf_limits
-from hil.errors import ArchiveError, ControllerFault, OperatorStopError
+from hil.errors import ArchiveError, ControllerError, OperatorStopError
 from hil.reading import parse_toml
 from identification.excitation import CollisionChecker, CollisionModelError, Workspace
 from planner import JointLimits
@@ -265,13 +265,13 @@ def read_init(
     archive. Replies continue until the axes are closed. `arm` counts from 1.
 
     Raises:
-        ControllerFault: the link cannot be opened, or no session started in time.
+        ControllerError: the link cannot be opened, or no session started in time.
         OperatorStopError: stopped before.
     """
     try:
         exchange = ExchangeProcess.start(_nothing_moves(spec, n_joints, arm))
     except (DriverError, OSError) as error:
-        raise ControllerFault(f"the link cannot be opened: {error}") from error
+        raise ControllerError(f"the link cannot be opened: {error}") from error
     try:
         return _waited_for(exchange, wait, stop)
     finally:
@@ -289,7 +289,7 @@ def _waited_for(exchange: ExchangeProcess, wait: float, stop: Stop) -> InitPacke
         for event in monitor.poll():
             connection.update(event)
         if (failure := monitor.failure()) is not None:
-            raise ControllerFault(failure)
+            raise ControllerError(failure)
         if stop.requested:
             raise OperatorStopError(
                 "stopped before a packet of the controller; no file was written."
@@ -302,7 +302,7 @@ def _waited_for(exchange: ExchangeProcess, wait: float, stop: Stop) -> InitPacke
             text += f"; {connection.not_understood}" if connection.not_understood else ""
             text += "; start this command first, then the controller's Open program"
             text += f" ({status.foreign} packets from other addresses)" if status.foreign else ""
-            raise ControllerFault(text)
+            raise ControllerError(text)
         time.sleep(_POLL)
     return connection.init
 

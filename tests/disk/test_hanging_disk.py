@@ -17,7 +17,7 @@ from hil.archive import ArchiveOutcome, open_archive
 from hil.campaign import Campaign
 from hil.cell import Cell
 from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
-from hil.errors import ControllerFault
+from hil.errors import ControllerError
 from hil.progress import Silent
 from tests.disk.disks import CREATE, SYNC, WRITE, Disk, Rule, processes_disk
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
@@ -131,7 +131,7 @@ def test_link_continues_after_an_archive_that_opened_too_late(
         with monkeypatch.context() as short:
             short.setattr("hil.campaign.live_link.OPEN_TIMEOUT", 1.0)
             disk.do_wrong(Rule((CREATE,), "*.mcap", hang=8.0))
-            with pytest.raises(ControllerFault, match=r"did not open .*move_000_a1\.mcap.*nothing"):
+            with pytest.raises(ControllerError, match=r"did not open .*move_000_a1\.mcap.*nothing"):
                 campaign.run(link, None, Silent(), accept_dry_run=True)
         result = campaign.run(link, None, Silent(), accept_dry_run=True)
         disk.do_wrong()

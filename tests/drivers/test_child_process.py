@@ -46,6 +46,17 @@ def test_error_output_is_kept_and_names_the_end(started: list[ChildProcess]) -> 
     assert silent.last_error == "exit status 3"
 
 
+def test_its_output_is_read_while_it_runs_and_after(started: list[ChildProcess]) -> None:
+    code = "import time; print('port 7', flush=True); time.sleep(600)"
+    child = run(started, code)
+    while "\n" not in child.output:
+        assert child.wait(0.05) is None
+    assert (child.output, child.errors, child.alive) == ("port 7\n", "", True)
+    child.kill()
+    child.close()
+    assert child.output == "port 7\n"
+
+
 def test_a_signal_ends_it(started: list[ChildProcess]) -> None:
     sleeping = run(started, "import time; time.sleep(600)")
     assert (sleeping.alive, sleeping.status, sleeping.wait(0.0)) == (True, None, None)

@@ -11,7 +11,7 @@ from hil.archive.live import LiveView
 from hil.campaign.live_link import LiveLink
 from hil.cell import Cell
 from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
-from hil.errors import ControllerFault, ExecutionError
+from hil.errors import ControllerError, ExecutionError
 
 
 @contextmanager
@@ -36,7 +36,7 @@ def loopback_link(
             yield link
     except ExecutionError as fault:
         if (failure := simulator.failure()) is not None:
-            raise ControllerFault(f"the simulated controller failed: {failure}") from fault
+            raise ControllerError(f"the simulated controller failed: {failure}") from fault
         raise
     finally:
         simulator.finish()

@@ -39,7 +39,7 @@ from hil.campaign.intervals import (
     rest,
 )
 from hil.cell import AngleFrame, Cell
-from hil.errors import ArchiveWriteError, ControllerFault, InputError
+from hil.errors import ArchiveWriteError, ControllerError, InputError
 from hil.motion_checks import MotionChecks
 from hil.progress import Silent, Task
 from hil.simulation import simulated_controller, simulated_link
@@ -200,7 +200,7 @@ class TestStop:
         assert [entry.name for entry in arm.campaign.folder.manifest()] == ["move_000_a1.mcap"]
 
     def test_before_the_connection_moves_nothing(self, arm: Arm) -> None:
-        with pytest.raises(ControllerFault, match="before anything moved"):
+        with pytest.raises(ControllerError, match="before anything moved"):
             execute(arm.campaign, arm.link, stop=Stop(requested=True))
         assert not list(arm.campaign.folder.archives.iterdir())
 
@@ -219,7 +219,7 @@ def test_a_controller_of_another_drive_train_is_refused(
     wrong = written(cell, old, new)
     campaign = Campaign.create(tmp_path / "init", wrong, plan)
     link = VirtualLink.over(SimulatedTransport(simulated_controller(cell)), wrong)
-    with pytest.raises(ControllerFault, match=f"cannot be used: .*{named}"):
+    with pytest.raises(ControllerError, match=f"cannot be used: .*{named}"):
         execute(campaign, link)
     assert not list(campaign.folder.archives.iterdir())
 

@@ -28,8 +28,8 @@ from hil.cli import app
 from hil.doctor import checks as system_checks
 from hil.doctor import probe
 from hil.doctor.checks import (
-    Check,
     DiskTrial,
+    DoctorCheck,
     Status,
     System,
     disk_checks,
@@ -94,11 +94,11 @@ def test_cycles_are_judged_by_late_and_by_usual_latency() -> None:
     assert "55 % of the cycle" in slow.reason
 
 
-PORT = Check("UDP port 1000", Status.BAD, "in use [by] a", ("sudo ss -lunp",))
+PORT = DoctorCheck("UDP port 1000", Status.BAD, "in use [by] a", ("sudo ss -lunp",))
 
 
 def diagnosis(
-    *checks: Check, fit: bool = True, fit_at_2: bool = True, seconds: float = 60.0
+    *checks: DoctorCheck, fit: bool = True, fit_at_2: bool = True, seconds: float = 60.0
 ) -> Diagnosis:
     one, two = (
         Fitness(cycle, is_fit, 0, 0.1, 0.0, "for a reason")
@@ -120,7 +120,7 @@ def test_a_cycle_of_2_ms_is_advised_only_where_it_is_fit(one: bool, two: bool) -
 
 
 def test_a_bad_check_makes_a_fast_pc_unfit_and_is_named() -> None:
-    assert diagnosis(*(Check("x", one, "y") for one in Status if one is not Status.BAD)).fit
+    assert diagnosis(*(DoctorCheck("x", one, "y") for one in Status if one is not Status.BAD)).fit
     found = diagnosis(PORT)
     assert not found.fit
     assert "UDP port 1000" in found.line
@@ -141,7 +141,7 @@ def test_the_exit_status_is_0_only_for_a_reliable_fit(
 
 
 def test_page_and_json_agree_and_remedies_come_worst_first() -> None:
-    slow = Check("slow", Status.WARN, "", ("make it fast",))
+    slow = DoctorCheck("slow", Status.WARN, "", ("make it fast",))
     made = diagnosis(slow, PORT, PORT)
     text, found = page(made), json.loads(json.dumps(as_json(made)))
     assert "in use [by] a" in text
@@ -293,7 +293,7 @@ def rates(nominal: int, data: int | None) -> dict[str, str]:
     return ip({"linkinfo": {"info_kind": "can", "info_data": info}})
 
 
-Judge = Callable[[System], Check]
+Judge = Callable[[System], DoctorCheck]
 Case = tuple[Judge, dict[str, str], dict[str, str], Status, str]
 OK, WARN, BAD, UNKNOWN = Status
 

@@ -17,7 +17,7 @@ from hil.archive.supervised import Failed
 from hil.campaign import Campaign
 from hil.campaign.live_link import write_error
 from hil.cli import COMMANDS, app, as_json, exit_code_of, main
-from hil.errors import ArchiveWriteError, ControllerFault, HilError, InputError
+from hil.errors import ArchiveWriteError, ControllerError, HilError, InputError
 from hil.files import convert_write_errors, make_folder
 from planner import PlannerError
 
@@ -89,7 +89,7 @@ def test_json_of_an_error_has_its_parts_and_status() -> None:
         "problem": "is empty",
         "remedy": "fill it",
     }
-    found = [exit_code_of(error) for error in (ControllerFault(""), PlannerError(), OSError())]
+    found = [exit_code_of(error) for error in (ControllerError(""), PlannerError(), OSError())]
     assert found == [4, 2, 1]
 
 

@@ -12,7 +12,7 @@ from drivers import Transport
 from drivers.transports.base import TransportSpec
 from hil.cell import Cell
 from hil.cell.schema import LINKS, CanTable, ControllerTable
-from hil.doctor.checks import Check, Status, System, link_checks
+from hil.doctor.checks import DoctorCheck, Status, System, link_checks
 from hil.errors import InputError
 from hil.serving import open_controller_link
 from hil.simulation import controller_settings
@@ -58,7 +58,7 @@ class TestLinks:
         monkeypatch.setitem(LINKS, "udp", link)
         cell = CELL.with_link(transport="udp", host="127.0.0.1")
         assert not cell.only_simulated
-        unknown = Check("controller link", Status.UNKNOWN, "not checked: the controller")
+        unknown = DoctorCheck("controller link", Status.UNKNOWN, "not checked: the controller")
         assert link_checks(cell.link_spec, System()) == [unknown]
 
     @pytest.mark.parametrize("link", ["no-such:127.0.0.1:1", "", "udp:127.0.0.1", "can:x"])

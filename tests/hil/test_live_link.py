@@ -35,7 +35,7 @@ from hil.campaign.plan import design
 from hil.cell import Cell
 from hil.cli.record import record
 from hil.demo_link import free_port
-from hil.errors import ArchiveWriteError, ControllerFault
+from hil.errors import ArchiveWriteError, ControllerError
 from hil.progress import Silent
 from planner import Move, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
@@ -123,7 +123,7 @@ def test_each_difference_of_the_init_packet_is_named(
     campaign = campaign_of(tmp_path / "init", wrong, plan)
     with (
         loopback_link(campaign.cell, simulated_by=right / "cell.toml", options=PATIENT) as link,
-        pytest.raises(ControllerFault, match=r"k54 of axis 5 .*k65 of axis 6 .*correct the cell"),
+        pytest.raises(ControllerError, match=r"k54 of axis 5 .*k65 of axis 6 .*correct the cell"),
     ):
         campaign.run(link, Stop(), Silent(), provenance={}, unrehearsed=True)
     assert not list(campaign.folder.archives.iterdir())
@@ -144,7 +144,7 @@ def test_an_archive_that_cannot_be_created_moves_nothing(
 def test_a_port_in_use_is_named(cell: Cell) -> None:
     with port_in_use() as port:
         local = on_loopback(cell).with_link(port=port)
-        with pytest.raises(ControllerFault, match=str(port)):
+        with pytest.raises(ControllerError, match=str(port)):
             LiveLink.open(local)
 
 
@@ -308,7 +308,7 @@ def test_a_hold_while_a_motion_is_handed_over_is_applied(
         monkeypatch.undo()
         link.connection.inits += 1  # another init packet, whose limits were not checked
         path = tmp_path / "next.mcap"
-        with pytest.raises(ControllerFault, match=r"new session .* nothing was sent"):
+        with pytest.raises(ControllerError, match=r"new session .* nothing was sent"):
             link.run(player_of(cell, motion), spec_of(cell, path), Stop())
         assert open_archive(path).outcome.outcome == "void"
 

@@ -22,7 +22,7 @@ from hil.campaign.connection import OFF_TIMEOUT, START_TIMEOUT
 from hil.campaign.link import REST_TIMEOUT, MotionLink
 from hil.campaign.port import PortStatus
 from hil.cell import Cell
-from hil.errors import ArchiveWriteError, ControllerFault
+from hil.errors import ArchiveWriteError, ControllerError
 
 TURN = 0.02
 Happens = Callable[["ScriptedPort"], None]
@@ -163,7 +163,7 @@ def test_a_motion_that_does_not_begin_is_dropped(
 ) -> None:
     """First its archive is closed, without which nothing can begin any more; then it is stopped."""
     port = ScriptedPort((TURN, is_set("state", state)))
-    with pytest.raises(ControllerFault, match=f"{words}.*; nothing was sent"):
+    with pytest.raises(ControllerError, match=f"{words}.*; nothing was sent"):
         run(cell, port)
     assert port.diary == ["open", "submit", "void", "stop"]
     assert port.now == pytest.approx(after, abs=3 * TURN)
@@ -175,7 +175,7 @@ def test_a_motion_that_does_not_begin_is_dropped(
         (is_set("broken", ArchiveWriteError(Path("a.mcap"), "cannot be written", remedy="")),
          ArchiveWriteError, "cannot be written"),
         (is_set("archive_gone", "the archive process ended"),
-         ControllerFault, "the archive process ended; the arm was brought to rest"),
+         ControllerError, "the archive process ended; the arm was brought to rest"),
     ],
 )  # fmt: skip
 def test_without_an_archive_the_arm_rests_before_the_error(
@@ -191,20 +191,20 @@ def test_without_an_archive_the_arm_rests_before_the_error(
 
 def test_an_arm_that_is_not_seen_at_rest_is_reported_so(cell: Cell) -> None:
     port = ScriptedPort((0.1, started), (0.5, is_set("archive_gone", "the archive process ended")))
-    with pytest.raises(ControllerFault, match=r"asked to stop, but was not seen at rest \(OPEN\)"):
+    with pytest.raises(ControllerError, match=r"asked to stop, but was not seen at rest \(OPEN\)"):
         run(cell, port)
     assert port.now == pytest.approx(0.5 + REST_TIMEOUT, abs=0.1)
 
 
 def test_an_exchange_that_ended_is_a_fault(cell: Cell) -> None:
     port = ScriptedPort((0.1, started), (0.5, is_set("exchange_gone", "the exchange ended")))
-    with pytest.raises(ControllerFault, match=r"acts by its own watchdog; the archive \(lost\)"):
+    with pytest.raises(ControllerError, match=r"acts by its own watchdog; the archive \(lost\)"):
         run(cell, port)
 
 
 def test_an_archive_that_never_completes_is_reported(cell: Cell) -> None:
     port = ScriptedPort((0.1, started), (1.0, ended()))
-    with pytest.raises(ControllerFault, match=r"the motion has ended, but .* was not completed"):
+    with pytest.raises(ControllerError, match=r"the motion has ended, but .* was not completed"):
         run(cell, port)
     assert port.now == pytest.approx(1.0 + REST_TIMEOUT, abs=0.1)
 
@@ -227,7 +227,7 @@ def test_a_motion_that_is_not_accepted_moves_nothing(
 ) -> None:
     port = ScriptedPort()
     port.refuses = refuses
-    with pytest.raises(ControllerFault, match=words):
+    with pytest.raises(ControllerError, match=words):
         run(cell, port)
     assert [entry for entry in port.diary if entry != "stop"] == ["open", "submit", outcome]
 

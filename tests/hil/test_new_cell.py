@@ -25,7 +25,7 @@ from hil.cell.errors import UnknownFieldsError
 from hil.cell.text import urdf_limits
 from hil.cli import app
 from hil.demo_link import SIMULATE, free_port
-from hil.errors import ArchiveError, ControllerFault, InputError
+from hil.errors import ArchiveError, ControllerError, InputError
 from hil.importers import Robot
 from hil.motion_checks import collision_checker
 from hil.new import cell_of_urdf, from_archive
@@ -235,7 +235,7 @@ def test_without_a_controller_no_file_is_written(tmp_path: Path) -> None:
         "--urdf", URDF_PATH, "-o", tmp_path / "c.toml", "--wait", "0.2",
         "--from-controller", f"127.0.0.1:{free_port()}", "--bind", "127.0.0.1",
     )  # fmt: skip
-    assert isinstance(error, ControllerFault)
+    assert isinstance(error, ControllerError)
     assert "start this command first" in str(error)
     assert not (tmp_path / "c.toml").exists()
 

@@ -28,7 +28,7 @@ from hil.campaign import Progress, Stop, VirtualLink
 from hil.cell import Cell
 from hil.cli.record import record as record_command
 from hil.demo_link import SIMULATE, free_port
-from hil.errors import ArchiveError, ControllerFault, HilError, InputError
+from hil.errors import ArchiveError, ControllerError, HilError, InputError
 from hil.identify import identify_archives
 from hil.progress import Silent
 from hil.recording import archive_path, record
@@ -158,7 +158,7 @@ def test_a_refusal_is_shown_at_once_and_ends_a_recording(tmp_path: Path, cell: C
 def test_a_controller_of_another_arm_is_not_recorded(tmp_path: Path, cell: Cell) -> None:
     wrong = cell.with_values({"drive_train.k65": 0.045})
     link = own_motion_link(cell, stated=wrong)
-    with pytest.raises(ControllerFault, match=r"k65 of axis 6 .*correct the cell file"):
+    with pytest.raises(ControllerError, match=r"k65 of axis 6 .*correct the cell file"):
         record(link, wrong, tmp_path / NAME, kind="excitation", stop=Stop(), durable=False)
     assert not (tmp_path / NAME).exists()
 
@@ -276,7 +276,7 @@ def test_a_session_that_ends_early_is_reported(on_udp: tuple[Path, int]) -> None
     assert recorder.returncode == 4
     result = json.loads(output)  # one object: what was recorded, and why that is not all
     stated = (result["outcome"], result["kind"], result["exit_code"])
-    assert stated == ("completed", "ControllerFault", 4)
+    assert stated == ("completed", "ControllerError", 4)
     assert result["cycles"] > 0
     assert re.search("the controller ended the session after .* of 60 s.*a.mcap", flat(errors))
     assert open_archive(path.parent / "a.mcap").outcome.outcome == "completed"

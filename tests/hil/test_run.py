@@ -56,7 +56,7 @@ from hil.campaign.warmup import (
     change_per_motion,
 )
 from hil.cli import app
-from hil.errors import ControllerFault, HilError, InputError, OperatorStopError, OutputError
+from hil.errors import ControllerError, HilError, InputError, OperatorStopError, OutputError
 from hil.identify.sources import gather_sources
 from hil.motion_checks import MotionChecks
 from hil.move import plan_move, send
@@ -462,7 +462,7 @@ def test_the_link_decides_whether_the_arm_is_simulated(
     with pytest.raises(CampaignFolderError, match=r"holds archives of .*leads to a real one"):
         campaign.run(Real(campaign), dry_run_only=True)  # type: ignore[arg-type]
     hash_ = campaign.folder.plan_hash
-    counts = DryRunRecord.that_counts(campaign.folder, plan_hash=hash_, motions=2, simulated=False)
+    counts = DryRunRecord.load_valid(campaign.folder, plan_hash=hash_, motions=2, simulated=False)
     assert counts is None
 
 
@@ -502,7 +502,7 @@ def link_to_controller_with(campaign: Campaign, **figures: Any) -> VirtualLink:
          r"motor of shoulder: \S+ A, .*controller has 3 A .*cell file 20 A: write"),
         ({"drive_train__following_error": [1.0, 0.01]}, NotRehearsedError,
          r"elbow: 0\.01 motor revolutions in the controller, 1 in the cell file.*rehearse"),
-        ({"controller__cycle_ms": 1}, ControllerFault,
+        ({"controller__cycle_ms": 1}, ControllerError,
          r"cycle is 1 ms in the controller, 2 ms in the cell; correct the cell file, or the c\w+$"),
     ],
 )  # fmt: skip

@@ -390,7 +390,7 @@ class TestClosing:
     @staticmethod
     def lines(foreign: int = 0, **counts: int) -> str:
         controller: Any = SimpleNamespace(reason="")
-        summary = ServeCounts(cycles=1164, knocks=3, replies=1164, ended=True, **counts)
+        summary = ServeCounts(cycles=1164, first_packets=3, replies=1164, ended=True, **counts)
         return "\n".join(_sentences(Served(controller, summary, 1, 1, foreign)))
 
     def test_of_a_session_without_losses(self) -> None:

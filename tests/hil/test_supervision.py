@@ -27,7 +27,7 @@ from hil.campaign.live_link import STALL, Heartbeat
 from hil.campaign.operator import MotionProgress, OperatorRequest, RunStatus, RunWatch
 from hil.campaign.virtual_link import VirtualLink
 from hil.cell import Cell
-from hil.errors import ControllerFault
+from hil.errors import ControllerError
 from hil.simulation import simulated_link
 from hil.testing import faulty_link
 from planner import Move, PiecewiseCubic, plan_moves
@@ -225,7 +225,7 @@ class Stubborn:
 
 def test_a_motion_without_override_is_not_run_slowly(arm: WatchedArm) -> None:
     """And an override is a fraction."""
-    with pytest.raises(ControllerFault, match="supports no override"):
+    with pytest.raises(ControllerError, match="supports no override"):
         arm.link.run(Stubborn(), spec(arm.cell, arm.path), Stop(), override=0.2)  # type: ignore[arg-type]
     assert not arm.path.exists()
     for override in (-0.1, 1.1, float("nan")):

@@ -22,8 +22,8 @@ from planner.interpolator import (
     OutputFormat,
     SpeedCorrection,
     Status,
-    corner,
 )
+from planner.motion_queue import corner
 from planner.moves import Move, Overrides, plan_moves
 from tests.planner.six_axes import SIX_AXES, random_points
 
@@ -434,7 +434,7 @@ def test_a_crash_of_the_planner_does_not_change_the_motion(monkeypatch):
     def crashes(*_):
         raise PlannerCrashed(-9)
 
-    monkeypatch.setattr("planner.interpolator.in_child", crashes)
+    monkeypatch.setattr("planner.motion_queue.in_child", crashes)
     assert interpolator.set_next_target(2, points[2]) == Status.FATAL == -68
     assert "signal 9" in interpolator.refusal
     steps = steps_to_rest(interpolator)
@@ -449,7 +449,7 @@ def test_a_corner_with_a_jump_is_refused(monkeypatch):
         planned = corner(legs, fly)
         return planned._replace(leave=0.9 * planned.leave)
 
-    monkeypatch.setattr("planner.interpolator.corner", careless)
+    monkeypatch.setattr("planner.motion_queue.corner", careless)
     interpolator = ready(SIX_AXES, points[0], fly=50.0, isolated=False)
     queue(interpolator, points[1:2])
     assert interpolator.set_next_target(2, points[2]) == Status.FATAL

@@ -516,3 +516,65 @@ def test_a_motion_that_ends_during_a_hold_has_ended(live_motions):
         arm.ask(request)
         assert (arm.player.rate, arm.player.bounds) == (rate, bounds)
     arm.rest()
+
+
+# -- motions that grow ----------------------------------------------------------------------
+
+
+def test_an_extended_motion_goes_on_without_a_jump():
+    points = random_points(3, 3)
+    plans = [plan(points[:2], SIX_AXES, fly=0.0), plan(points, SIX_AXES, fly=0.0)]
+    player = TrajectoryPlayer(plans[0], PERIOD, SIX_AXES, extendable=True)
+    player.begin(player.start)
+    player.override(0.5)
+    rows = [player.advance()[0] for _ in range(200)]
+    player.extend(plans[1])
+    player.override(1.0)
+    assert player.duration == plans[1].duration
+    while not player.finished:
+        rows.append(player.advance()[0])
+    whole = TrajectoryPlayer(plans[1], PERIOD, SIX_AXES, extendable=True)
+    whole.begin(whole.start)
+    whole.override(0.5)
+    expected = [whole.advance()[0] for _ in range(200)]
+    whole.override(1.0)
+    while not whole.finished:
+        expected.append(whole.advance()[0])
+    np.testing.assert_allclose(rows, expected, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(rows[-1], plans[1].sample(np.array([plans[1].duration]))[0][0])
+
+
+def test_only_a_running_motion_planned_to_grow_is_extended(motions):
+    fixed = TrajectoryPlayer(motions[0], PERIOD, SIX_AXES)
+    fixed.begin(fixed.start)
+    with pytest.raises(RuntimeError, match="extend"):
+        fixed.extend(motions[0])
+    growing = TrajectoryPlayer(motions[0], PERIOD, SIX_AXES, extendable=True)
+    growing.begin(growing.start)
+    play(growing)
+    with pytest.raises(RuntimeError, match="not finished"):
+        growing.extend(motions[0])
+
+
+def test_an_extended_motion_is_not_begun_again(motions):
+    player = TrajectoryPlayer(motions[0], PERIOD, SIX_AXES, extendable=True)
+    player.begin(player.start)
+    player.extend(motions[0])
+    with pytest.raises(RuntimeError, match="begun again"):
+        player.begin(player.start)
+
+
+def test_bounds_of_a_growing_motion_are_those_of_the_limits(motions):
+    """A slow start must not admit a fast change of rate, which the rest could not follow."""
+    slow = plan(random_points(3, 2), SIX_AXES, speed=0.05)
+    player = TrajectoryPlayer(slow, PERIOD, SIX_AXES, extendable=True)
+    player.begin(player.start)
+    for _ in range(100):
+        player.advance()
+    player.hold()
+    cycles = 0
+    while player.rate > 0.0:
+        player.advance()
+        cycles += 1
+    bounds = slowing_bounds(SIX_AXES, 2.0, 3.0)
+    assert cycles == np.ceil(ramp(1.0, 0.0, 0.0, bounds).duration / PERIOD)

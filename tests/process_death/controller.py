@@ -189,7 +189,7 @@ def serve(cell: Cell, played: Round, page: Page) -> None:
             end,
             _PageButtons(page),
             patience=WAIT,
-            stretch=WAIT,
+            cycle_extension=WAIT,
             watch=note,
         )
 

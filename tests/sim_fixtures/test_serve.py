@@ -212,11 +212,11 @@ def test_a_stall_of_the_server_is_not_counted_as_the_pcs(stall: float):
     assert min(gaps(cabinet)[1:]) > (0.5 * T if stall == 30.0 else 0.0)
 
 
-def test_a_stretched_cycle_waits_for_its_reply():
-    summary, cabinet, _ = served(slow({20: 30.0}), stretch=0.5)
+def test_an_extended_cycle_waits_for_its_reply():
+    summary, cabinet, _ = served(slow({20: 30.0}), cycle_extension=0.5)
     assert (summary.replies, summary.missed, summary.late) == (50, 0, 0)
-    assert (summary.stretched, summary.own_late) == (1, 0)
-    assert summary.stretch_max == pytest.approx(29.0 * T)
+    assert (summary.extended, summary.own_late) == (1, 0)
+    assert summary.longest_extension == pytest.approx(29.0 * T)
     waited = gaps(cabinet)
     assert waited[20] >= 30.0 * T - 1e-12
     assert max(waited[:20] + waited[21:]) <= T + 1e-12
@@ -224,7 +224,7 @@ def test_a_stretched_cycle_waits_for_its_reply():
 
 def test_the_first_packet_is_repeated_until_it_is_answered():
     summary, _, link = served(only(lambda k: k >= 3))
-    assert summary.knocks == 4
+    assert summary.first_packets == 4
     assert len({packet for _, packet in link.sent[:4]}) == 1
     times = [moment for moment, _ in link.sent[:4]]
     assert [b - a for a, b in pairwise(times)] == pytest.approx([1.0] * 3)
@@ -253,10 +253,10 @@ class TestRequest:
 
     def test_at_the_end_a_silent_pc_is_waited_for_once(self):
         summary, cabinet, _ = served(
-            only(lambda k: k < 10), request=after(5, Request.END), stretch=0.5, patience=1.0,
-            options={"at_rest": False}, cycles=10_000,
+            only(lambda k: k < 10), request=after(5, Request.END), cycle_extension=0.5,
+            patience=1.0, options={"at_rest": False}, cycles=10_000,
         )  # fmt: skip
-        assert (summary.stretched, summary.missed) == (1, len(cabinet.accepted) - 10)
+        assert (summary.extended, summary.missed) == (1, len(cabinet.accepted) - 10)
         assert len(cabinet.accepted) > 400
 
     def test_an_arm_not_at_rest_after_the_patience_loses_its_drive(self):

@@ -20,7 +20,7 @@ from hil.campaign import VirtualLink, virtual_link
 from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.operator import Stop
 from hil.cell import Cell
-from hil.errors import ControllerFault
+from hil.errors import ControllerError
 from hil.simulation import simulated_controller
 from planner import Move, TrajectoryPlayer, plan_moves
 from sim_fixtures import Phase, SimulatedController
@@ -54,7 +54,7 @@ class TestControllerWithoutInitPacket:
         first.connect(Stop())
         controller.lose_drive("emergency stop")
         second = VirtualLink.over(SimulatedTransport(controller), cell)
-        with pytest.raises(ControllerFault, match=r"did not begin a session.*restart") as raised:
+        with pytest.raises(ControllerError, match=r"did not begin a session.*restart") as raised:
             second.connect(Stop(), timeout=0.5)
         assert "switch the drive on" not in str(raised.value)
 
@@ -63,7 +63,7 @@ class TestControllerWithoutInitPacket:
     ) -> None:
         controller.finish()
         link = VirtualLink.over(SimulatedTransport(controller), cell)
-        with pytest.raises(ControllerFault, match="ended the session within 0") as raised:
+        with pytest.raises(ControllerError, match="ended the session within 0") as raised:
             link.connect(Stop())
         assert "60 s" not in str(raised.value)
 
@@ -89,7 +89,7 @@ def test_a_motion_does_not_wait_for_a_drive_that_went_off(
     packets = iter(range(10))
     exchange(link.port.transport, link.port.session, ends_when=lambda: next(packets, None) is None)
     motion, spec = short_way(cell, where, tmp_path)
-    with pytest.raises(ControllerFault, match="went off before the motion began; nothing was sent"):
+    with pytest.raises(ControllerError, match="went off before the motion began; nothing was sent"):
         link.run(motion, spec, Stop())
     assert (open_archive(spec.path).outcome or ArchiveOutcome()).outcome == "void"
 
@@ -161,7 +161,7 @@ class TestClosedLink:
             link.port.session,
             ends_when=lambda: link.port.session.state is State.OPEN,
         )
-        with pytest.raises(ControllerFault, match=r"an axis is still open 0\.5 s after"):
+        with pytest.raises(ControllerError, match=r"an axis is still open 0\.5 s after"):
             link.close()
 
 

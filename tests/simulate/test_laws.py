@@ -16,7 +16,7 @@ from scipy.stats import norm
 
 from drivers.events import MotionEnded, RepliesLost
 from hil.campaign.errors import MotionFailedError
-from hil.errors import ControllerFault
+from hil.errors import ControllerError
 from tests.drivers import oracle
 from tests.hil.mcap_bytes import chunks
 from tests.simulate.laws.archived import read
@@ -251,7 +251,7 @@ def other_excitation(observed: Observed) -> Observed:
 
 
 def ended(observed: Observed, reason: str) -> Observed:
-    return with_life(observed, len(observed.runs) - 1, result=None, error=ControllerFault(reason))
+    return with_life(observed, len(observed.runs) - 1, result=None, error=ControllerError(reason))
 
 
 def unarchived(observed: Observed) -> Observed:

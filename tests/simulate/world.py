@@ -22,7 +22,7 @@ from drivers import State
 from drivers.errors import Check
 from drivers.events import MotionEnded
 from hil.archive import writer
-from hil.campaign import Campaign, VirtualLink, link, steering
+from hil.campaign import Campaign, VirtualLink, link, operator_control
 from hil.campaign import folder as campaign_folder
 from hil.campaign.dry_run import DryRunRecord
 from hil.campaign.errors import MotionFailedError, RepetitionsRejectedError
@@ -448,7 +448,7 @@ def _when(script: Script) -> int:
 def _no_waiting() -> Iterator[None]:
     """Do not sleep while the operator holds the arm."""
     fake = SimpleNamespace(sleep=lambda seconds: None, monotonic=time.monotonic)
-    with patch.object(link, "time", fake), patch.object(steering, "time", fake):
+    with patch.object(link, "time", fake), patch.object(operator_control, "time", fake):
         yield
 
 

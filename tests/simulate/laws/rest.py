@@ -15,7 +15,7 @@ import numpy as np
 from drivers.events import MotionEnded
 from drivers.states import State
 from hil.campaign.errors import MotionFailedError
-from hil.errors import ControllerFault, HilError
+from hil.errors import ControllerError, HilError
 from sim_fixtures import Phase
 from tests.simulate.observed import Life, Observed
 from tests.simulate.script import DISTURBS_THE_ARM, kind_of
@@ -95,7 +95,7 @@ def _ends_at_rest(life: Life) -> bool:
     if isinstance(error, MotionFailedError):
         return error.outcome == "stopped"
     ends = [event.outcome for _, event in life.events if isinstance(event, MotionEnded)]
-    alone = isinstance(error, ControllerFault) or ends[-1:] in (["refused"], ["lost"])
+    alone = isinstance(error, ControllerError) or ends[-1:] in (["refused"], ["lost"])
     return error is None or (isinstance(error, HilError) and not alone)
 
 

@@ -20,7 +20,7 @@ from .wire import Array
 
 ALLOWED_ERRORS: Final = frozenset(
     (
-        "ControllerFault",  # the drive is off, or the init packet does not match the cell
+        "ControllerError",  # the drive is off, or the init packet does not match the cell
         "MotionFailedError",  # the guard, the link or a stop ended a motion
         "MotionRefusedError",  # the path from the present position is not free: jog the arm
         "RepetitionsRejectedError",  # contact, slip, or a changed arm

@@ -16,7 +16,7 @@ from drivers.errors import RequestError
 from drivers.guard import Guard
 from drivers.motion_source import MotionSource
 from drivers.packets import DRIVE_ON
-from hil.errors import ControllerFault
+from hil.errors import ControllerError
 
 from .operator import MotionProgress, MotionWatch, Stop
 from .port import ControllerPort, PortStatus
@@ -27,7 +27,7 @@ REQUEST_PERIOD: Final = 0.02  # Period of reading the operator's request during 
 SHOW_PERIOD: Final = 0.1  # Period of showing the motion, s
 
 
-class Steering:
+class OperatorControl:
     """Applies the requests of a motion's watch to the motion, and shows the motion to it.
 
     Args:
@@ -63,7 +63,7 @@ class Steering:
         """Set the requested speed and wait while a hold is requested; return False after a stop.
 
         Raises:
-            ControllerFault: it is to be slower than planned and supports no override.
+            ControllerError: it is to be slower than planned and supports no override.
         """
         request = self._watch.request()
         while request.held and not stop.requested:
@@ -77,7 +77,7 @@ class Steering:
         if callable(change):
             change(self.fraction)
         elif self.fraction < 1.0:
-            raise ControllerFault(
+            raise ControllerError(
                 f"a {type(self.source).__name__} supports no override and cannot be run at "
                 f"{100.0 * self.fraction:.0f} %; nothing was sent"
             )
