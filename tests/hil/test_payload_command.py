@@ -70,7 +70,7 @@ def printed(folder: Path) -> dict[str, object]:
     return found
 
 
-SHORTER = {"design": ("--seed", "1")}
+SHORTER = {"design": ("--seed", "1"), "run": ("--accept-dry-run",)}
 """Words that a test adds to a command."""
 
 
