@@ -1,6 +1,6 @@
 """Whether precision to order keeps what it promises: `python -m benchmarks.precision --stops 200`.
 
-Three independent parts, each with its number of seeds:
+Four independent parts, each with its number of seeds:
 
 - ``--campaigns N``: campaigns of the NS 16 with effects in virtual time, by one quick design for
   ``--require``, each of its own simulated arm, run with ``--until-precise``. Figures: outcomes,
@@ -9,6 +9,8 @@ Three independent parts, each with its number of seeds:
 - ``--stops N``: the same rule on simulated torques of the NS 16 with coloured noise and an error
   that every repetition has: coverage of all intervals when the rule has stopped, and after six
   repetitions without looking. Required are 1.1 times the intervals after six repetitions.
+- ``--weighings N``: loads of `benchmarks.payload` weighed by payload campaigns of the NS 16 in
+  virtual time, scaled to 3 to 12 kg, with one design for 12 kg, until ``--require-mass`` is met.
 - ``--payloads N``: loads of `benchmarks.payload` weighed without a bare recording, against the
   model of three bare recordings of other motions. Friction differs by 4 % between recordings.
 """
@@ -30,33 +32,48 @@ from benchmarks import parser_of, show
 from benchmarks.payload import arm_model, load_of, recordings_of, samples_of
 from drivers.transports.simulated import SimulatedTransport
 from hil.campaign import Campaign, Stop
+from hil.campaign.link import MotionLink
 from hil.campaign.plan import CampaignPlan, plan_around, validation_motions
 from hil.campaign.precision import PrecisionMeter
 from hil.campaign.precision_record import IN_A_ROW
 from hil.campaign.virtual_link import VirtualLink
 from hil.cell import Cell
-from hil.design.precision import PrecisionDesign, short_search
+from hil.design.precision import PrecisionDesign, payload_search, short_search
 from hil.design.problem import problem_of
 from hil.design.requirements import Requirement, requirements_from
 from hil.design.run import run_search
 from hil.motion_checks import MotionChecks
+from hil.payload_campaign import (
+    FEWEST,
+    Mounting,
+    PayloadCampaign,
+    Weighed,
+    assumed_payload,
+    loaded_cell,
+)
 from hil.progress import Silent
 from hil.simulation import (
     controller_settings,
+    planted_truth,
     planted_values,
     simulated_controller,
+    simulated_link,
     simulated_provenance,
 )
 from identification.estimators.payload import NAMES, KnownArm, Run, figures_of, identify_payload
 from identification.estimators.prior import body_prior, design_effect_of, fit_posterior
+from identification.excitation import ViaPointMotion
 from identification.factor.factor import Estimate, Factor
+from identification.model.pseudo_inertia import Body
 from identification.model.robot import RobotModel
 from sim_fixtures import SimulatedController
 from sim_fixtures.ns16 import CELL_PATH
+from sim_fixtures.plant import Carried
 
 Array = NDArray[np.float64]
 
 _THIRTY: Final = 30
+_HEAVIEST: Final = 12.0  # kg; heavier loads leave no feasible motion of the cell
 _RATE: Final = 250.0  # Hz
 _MEMORY: Final = 0.02  # s, of the noise
 _NOISE: Final = 0.02  # of the torque's scatter
@@ -70,7 +87,7 @@ def campaigns(count: int, required: str) -> dict[str, Any]:
     requirements = requirements_from([required])
     cell = Cell.load(CELL_PATH).with_campaign(validation_runs=2, repetitions=_THIRTY)
     cell = cell.with_values({"campaign.approach_speed": 1.0})
-    motions = [motion.trajectory for motion in validation_motions(cell, MotionChecks.of(cell))]
+    motions = [motion.trajectory for motion in _validation(cell)]
     promise = PrecisionDesign.of(cell, requirements, motions, ())
     settings = short_search()
     problem = problem_of(cell, settings, None, promise.precision(IN_A_ROW))
@@ -96,12 +113,16 @@ def campaigns(count: int, required: str) -> dict[str, Any]:
         "reached_over_promised": np.quantile(
             reached / promised, (0.05, 0.5, 0.95), axis=0
         ).T.tolist(),
-        "quantities_inside": float(np.mean([campaign.inside for campaign in done])),
+        "quantities_inside": np.mean([campaign.inside for campaign in done], axis=0).tolist(),
         "errors_within_required": float(np.mean([campaign.within for campaign in done])),
         "met_and_all_within": float(
             np.mean([campaign.outcome == "met" and campaign.all_within for campaign in done])
         ),
     }
+
+
+def _validation(cell: Cell) -> tuple[ViaPointMotion, ...]:
+    return validation_motions(cell, MotionChecks.of(cell))
 
 
 @dataclass(frozen=True)
@@ -111,7 +132,7 @@ class _Ended:
     Attributes:
         outcome, repetitions: of its record.
         reached: halves of the intervals, one for each requirement.
-        inside: share of the required quantities whose true value is in its interval.
+        inside: of each requirement, the share of quantities whose true value is in its interval.
         within: share of them whose error is at most what was required.
         all_within: whether that is so for all.
     """
@@ -119,7 +140,7 @@ class _Ended:
     outcome: str
     repetitions: int
     reached: list[float]
-    inside: float
+    inside: list[float]
     within: float
     all_within: bool
 
@@ -176,7 +197,10 @@ def _ended(cell: Cell, plan: CampaignPlan, requirements: Sequence[Requirement]) 
         outcome=record.outcome,
         repetitions=number,
         reached=[one.half for one in record.looks[-1].reached],
-        inside=float(np.mean(error <= measured.half)),
+        inside=[
+            float(np.mean((error <= measured.half)[measured.wanted.owners == k]))
+            for k in range(len(requirements))
+        ],
         within=float(np.mean(within)),
         all_within=bool(within.all()),
     )
@@ -252,6 +276,74 @@ def payloads(count: int) -> dict[str, Any]:
     }
 
 
+def weighings(count: int, required: str) -> dict[str, Any]:
+    """Weigh loads of 3 to 12 kg by payload campaigns of the NS 16 in virtual time, 12 kg assumed.
+
+    The arm is as modelled: its currents have noise, its servo errors, and it has no other effects.
+    """
+    requirements = requirements_from([required])
+    cell = Cell.load(CELL_PATH).with_campaign(repetitions=_MOST)
+    cell = cell.with_values({"campaign.approach_speed": 1.0, "campaign.standstill_s": 1.0})
+    assumed = assumed_payload(cell, _HEAVIEST)
+    settings = payload_search()
+    promise = PrecisionDesign.of(
+        cell, requirements, [motion.trajectory for motion in _validation(cell)], (), _HEAVIEST
+    )
+    problem = problem_of(
+        loaded_cell(cell, "load", assumed), settings, None, promise.precision(FEWEST)
+    )
+    plan = plan_around(cell, run_search(cell, settings, Silent(), problem=problem).excitation)
+    errors, inside, halves, pairs = [], [], [], []
+    for seed in range(1, count + 1):
+        heavy = load_of(seed)  # of up to 16 kg
+        share = _HEAVIEST / 16.0
+        load = Body(share * heavy.mass, heavy.centre, share * heavy.inertia)
+        weighed = _weighed(cell.with_campaign(simulation_seed=seed), plan, load, requirements)
+        truth = figures_of(load)
+        intervals = weighed.found.estimate.intervals
+        inside.append((intervals[:, 0] <= truth) & (truth <= intervals[:, 1]))
+        errors.append(weighed.found.body.mass / load.mass - 1.0)
+        halves.append((intervals[0, 1] - intervals[0, 0]) / 2.0 / load.mass)
+        pairs.append(weighed.pairs)
+        figures = {"seed": seed, "pairs": pairs[-1], "error": errors[-1], "half": halves[-1]}
+        show(figures, only_json=True)
+    error = np.abs(errors)
+    return {
+        "weighings": count,
+        "motion": plan.excitation.trajectory.duration,
+        "motions": 2.0 * float(np.mean(pairs)),
+        "mass_error": float(np.sqrt(np.mean(error**2))),
+        "worst": float(error.max()),
+        "within_one_percent": float(np.mean(error < 0.01)),
+        "half_width": float(np.median(halves)),
+        "covered": dict(zip(NAMES, np.mean(inside, axis=0).tolist(), strict=True)),
+    }
+
+
+def _weighed(
+    cell: Cell, plan: CampaignPlan, load: Body, requirements: Sequence[Requirement]
+) -> Weighed:
+    """Run one payload campaign on an arm that carries a load on its last joint."""
+    carried = Carried(len(cell.joint_names) - 1, *load)
+
+    def link(side: Campaign, session: int) -> MotionLink:
+        is_loaded = side.cell.model.payload is not None
+        truth = replace(planted_truth(cell), carried=carried if is_loaded else None)
+        return simulated_link(side.cell, truth=truth, session=session)
+
+    with tempfile.TemporaryDirectory() as scratch:
+        campaign = Campaign.create(Path(scratch) / "it", cell, plan)
+        weighing = PayloadCampaign.of(campaign, "load", assumed_payload(cell, _HEAVIEST))
+        return weighing.run(
+            lambda side, choices: side.run(**choices),
+            Mounting(weighing, Silent()),
+            Silent(),
+            requirements=requirements,
+            choices={"unrehearsed": True, "durable": False},
+            links=link,
+        )
+
+
 def _posterior(model: RobotModel, factor: Factor) -> tuple[Estimate, Array, float]:
     """Return the posterior of a factor, and information (p, p) and effect of its prior."""
     prior = body_prior(model, factor).gaussian
@@ -278,6 +370,8 @@ def main() -> None:
     parser.add_argument("--campaigns", type=int, default=0)
     parser.add_argument("--require", default="torque 30, friction 10%")
     parser.add_argument("--stops", type=int, default=0)
+    parser.add_argument("--weighings", type=int, default=0)
+    parser.add_argument("--require-mass", default="mass of payload 1 %")
     parser.add_argument("--payloads", type=int, default=0)
     options = parser.parse_args()
     found: dict[str, Any] = {}
@@ -285,6 +379,8 @@ def main() -> None:
         found["campaigns"] = campaigns(options.campaigns, options.require)
     if options.stops:
         found["stops"] = stops(options.stops)
+    if options.weighings:
+        found["weighings"] = weighings(options.weighings, options.require_mass)
     if options.payloads:
         found["payloads"] = payloads(options.payloads)
     show(found, only_json=options.json)
