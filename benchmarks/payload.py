@@ -1,9 +1,9 @@
 """A load on a simulated NS 16 weighed: `python -m benchmarks.payload --seeds 200 --pairs 8`.
 
-Torques are pinocchio's. Every seed has a load of its own (4 to 16 kg), a motion of 16 s that is
-recorded without and with it, in ABBA order until the interval of the mass is narrow enough, and
-noise that is half white and half correlated over 50 ms. The friction of every joint differs by 4 %
-(standard deviation) between any two recordings.
+Torques are pinocchio's. Every seed has a load of its own (4 to 16 kg), a motion of 16 s
+(`--duration`) that is recorded without and with it, in ABBA order until the interval of the mass is
+narrow enough, and noise that is half white and half correlated over 50 ms. The friction of every
+joint differs by 4 % (standard deviation) between any two recordings.
 """
 
 from __future__ import annotations
@@ -91,6 +91,7 @@ def runs_of(
     loads: tuple[Body | None, ...] | None = None,
     drift: float = DRIFT,
     pace: float = 1.0,
+    duration: float = _DURATION,
 ) -> list[Run]:
     """Recordings, reduced.
 
@@ -100,9 +101,12 @@ def runs_of(
         loads: what is carried in each recording; by default nothing and then that of the seed.
         drift: of the friction, its standard deviation.
         pace: of the motion.
+        duration: of it [s].
     """
     loads = (None, load_of(seed)) if loads is None else loads
-    recordings = recordings_of(seed, model.joint_names, loads, drift=drift, pace=pace)
+    recordings = recordings_of(
+        seed, model.joint_names, loads, drift=drift, pace=pace, duration=duration
+    )
     return [
         Run.of(f"run {k}", model, samples_of(recording, model), None, loaded=load is not None)
         for k, (recording, load) in enumerate(zip(recordings, loads, strict=True), 1)
@@ -148,7 +152,7 @@ def recordings_of(
         )
 
 
-def coverage(seeds: range, most_pairs: int = 1) -> Coverage:
+def coverage(seeds: range, most_pairs: int = 1, duration: float = _DURATION) -> Coverage:
     """Weigh the load of every seed by at most so many pairs of recordings."""
     inside, moments, errors, halves, pairs = [], [], [], [], []
     model = arm_model()
@@ -156,7 +160,8 @@ def coverage(seeds: range, most_pairs: int = 1) -> Coverage:
         load = load_of(seed)
         order = tuple(load if k % 4 in (1, 2) else None for k in range(2 * most_pairs))
         for pair in range(1, most_pairs + 1):
-            found = identify_payload(model, runs_of(seed, model, loads=order[: 2 * pair]))
+            runs = runs_of(seed, model, loads=order[: 2 * pair], duration=duration)
+            found = identify_payload(model, runs)
             low, high = found.intervals[0]
             if (high - low) / 2.0 <= ENOUGH * found.parameters[9]:
                 break
@@ -211,8 +216,10 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--pairs", type=int, default=1, help="at most, bare and loaded")
+    parser.add_argument("--duration", type=float, default=_DURATION, help="of a motion [s]")
     options = parser.parse_args()
-    show(asdict(coverage(range(options.seeds), options.pairs)), only_json=options.json)
+    found = coverage(range(options.seeds), options.pairs, options.duration)
+    show(asdict(found), only_json=options.json)
 
 
 if __name__ == "__main__":

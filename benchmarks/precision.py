@@ -1,6 +1,6 @@
 """Whether precision to order keeps what it promises: `python -m benchmarks.precision --stops 200`.
 
-Three independent parts, each with its number of seeds:
+Four independent parts, each with its number of seeds:
 
 - ``--campaigns N``: campaigns of the NS 16 with effects in virtual time, by one quick design for
   ``--require``, each of its own simulated arm, run with ``--until-precise``. Figures: outcomes,
@@ -9,6 +9,8 @@ Three independent parts, each with its number of seeds:
 - ``--stops N``: the same rule on simulated torques of the NS 16 with coloured noise and an error
   that every repetition has: coverage of all intervals when the rule has stopped, and after six
   repetitions without looking. Required are 1.1 times the intervals after six repetitions.
+- ``--weighings N``: loads of `benchmarks.payload` weighed by payload campaigns of the NS 16 in
+  virtual time, scaled to 3 to 12 kg, with one design for 12 kg, until ``--require-mass`` is met.
 - ``--payloads N``: loads of `benchmarks.payload` weighed without a bare recording, against the
   model of three bare recordings of other motions. Friction differs by 4 % between recordings.
 """
@@ -18,7 +20,7 @@ from __future__ import annotations
 import tempfile
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,30 +30,55 @@ from numpy.typing import NDArray
 
 from benchmarks import parser_of, show
 from benchmarks.payload import arm_model, load_of, recordings_of, samples_of
+from drivers.transports.simulated import SimulatedTransport
 from hil.campaign import Campaign, Stop
-from hil.campaign.plan import plan_around, validation_motions
+from hil.campaign.link import MotionLink
+from hil.campaign.plan import CampaignPlan, plan_around, validation_motions
+from hil.campaign.precision import PrecisionMeter
 from hil.campaign.precision_record import IN_A_ROW
+from hil.campaign.virtual_link import VirtualLink
 from hil.cell import Cell
-from hil.design.precision import PrecisionDesign, short_search
+from hil.design.precision import PrecisionDesign, payload_search, short_search
 from hil.design.problem import problem_of
-from hil.design.requirements import requirements_from
+from hil.design.requirements import Requirement, requirements_from
 from hil.design.run import run_search
 from hil.motion_checks import MotionChecks
+from hil.payload_campaign import (
+    FEWEST,
+    Mounting,
+    PayloadCampaign,
+    Weighed,
+    assumed_payload,
+    loaded_cell,
+)
 from hil.progress import Silent
-from hil.simulation import simulated_link, simulated_provenance
+from hil.simulation import (
+    controller_settings,
+    planted_truth,
+    planted_values,
+    simulated_controller,
+    simulated_link,
+    simulated_provenance,
+)
 from identification.estimators.payload import NAMES, KnownArm, Run, figures_of, identify_payload
 from identification.estimators.prior import body_prior, design_effect_of, fit_posterior
+from identification.excitation import ViaPointMotion
 from identification.factor.factor import Estimate, Factor
+from identification.model.pseudo_inertia import Body
 from identification.model.robot import RobotModel
+from sim_fixtures import SimulatedController
 from sim_fixtures.ns16 import CELL_PATH
+from sim_fixtures.plant import Carried
 
 Array = NDArray[np.float64]
 
 _THIRTY: Final = 30
+_HEAVIEST: Final = 12.0  # kg; heavier loads leave no feasible motion of the cell
 _RATE: Final = 250.0  # Hz
 _MEMORY: Final = 0.02  # s, of the noise
 _NOISE: Final = 0.02  # of the torque's scatter
 _REPEATED: Final = 0.003  # likewise, of the error that every repetition has
+_TAILS: Final = (0.05, 0.5, 0.95)
 _MOST: Final = 12  # repetitions of a simulated rule
 
 
@@ -59,60 +86,124 @@ def campaigns(count: int, required: str) -> dict[str, Any]:
     """Run campaigns of the NS 16 with effects until they are precise."""
     requirements = requirements_from([required])
     cell = Cell.load(CELL_PATH).with_campaign(validation_runs=2, repetitions=_THIRTY)
-    motions = [one.trajectory for one in validation_motions(cell, MotionChecks.of(cell))]
+    cell = cell.with_values({"campaign.approach_speed": 1.0})
+    motions = [motion.trajectory for motion in _validation(cell)]
     promise = PrecisionDesign.of(cell, requirements, motions, ())
     settings = short_search()
-    problem = problem_of(cell, settings, None, promise.precision(2.0))
+    problem = problem_of(cell, settings, None, promise.precision(IN_A_ROW))
     excitation = run_search(cell, settings, Silent(), problem=problem).excitation
-    forecasts = promise.forecasts(excitation, 2)
-    outcomes, repetitions, reached = Counter[str](), [], []
-    inside = []
+    plan = plan_around(cell, excitation)
+    done = list[_Ended]()
     for seed in range(1, count + 1):
-        own = cell.with_campaign(simulation_seed=seed)
-        with tempfile.TemporaryDirectory() as scratch:
-            campaign = Campaign.create(Path(scratch) / "it", own, plan_around(own, excitation))
-            campaign.run(
-                simulated_link(own, effects=True),
-                Stop(),
-                Silent(),
-                provenance=simulated_provenance(own, effects=True),
-                durable=False,
-                unrehearsed=True,
-                until_precise=requirements,
-            )
-            record = campaign.precision
-            assert record is not None
-            outcomes[record.outcome] += 1
-            repetitions.append(record.looks[-1].repetitions)
-            reached.append([one.half for one in record.looks[-1].reached])
-            inside.append(_inside(campaign))
+        done.append(_ended(cell.with_campaign(simulation_seed=seed), plan, requirements))
+        show(done[-1].summary() | {"seed": seed}, only_json=True)
+    repetitions = [campaign.repetitions for campaign in done]
+    forecasts = [promise.forecasts(excitation, number) for number in repetitions]
+    promised = np.array([[one.half for one in forecast] for forecast in forecasts])
+    reached = np.array([campaign.reached for campaign in done])
     return {
         "campaigns": count,
-        "outcomes": dict(outcomes),
+        "outcomes": dict(Counter(campaign.outcome for campaign in done)),
         "repetitions": float(np.mean(repetitions)),
         "robot_time_of_thirty": float(np.mean(repetitions)) / _THIRTY,
-        "required": [one.requirement.value for one in forecasts],
-        "promised": [one.half for one in forecasts],
+        "required": [one.value for one in requirements],
+        "promised": np.median(promised, axis=0).tolist(),
+        "promised_repetitions": [one.repetitions for one in forecasts[0]],
         "reached": np.median(reached, axis=0).tolist(),
-        "promise_kept": float(np.mean(np.array(reached) <= [one.half for one in forecasts])),
-        "true_values_inside": float(np.mean(inside)),
+        "reached_over_promised": np.quantile(
+            reached / promised, (0.05, 0.5, 0.95), axis=0
+        ).T.tolist(),
+        "quantities_inside": np.mean([campaign.inside for campaign in done], axis=0).tolist(),
+        "errors_within_required": float(np.mean([campaign.within for campaign in done])),
+        "met_and_all_within": float(
+            np.mean([campaign.outcome == "met" and campaign.all_within for campaign in done])
+        ),
     }
 
 
-def _inside(campaign: Campaign) -> float:
-    """Return the share of inertial parameters whose true value is in its interval."""
-    found = campaign.identify().results
-    simulation = campaign.cell.simulation
-    truth = campaign.cell.parameter_values(
-        rotor_inertia=np.array(simulation.rotor_inertia),
-        coulomb=np.array(simulation.coulomb),
-        viscous=np.array(simulation.viscous),
-        third=np.array(simulation.third),
-        inertia_scale=np.array(simulation.inertia_scale),
+def _validation(cell: Cell) -> tuple[ViaPointMotion, ...]:
+    return validation_motions(cell, MotionChecks.of(cell))
+
+
+@dataclass(frozen=True)
+class _Ended:
+    """A campaign that has ended.
+
+    Attributes:
+        outcome, repetitions: of its record.
+        reached: halves of the intervals, one for each requirement.
+        inside: of each requirement, the share of quantities whose true value is in its interval.
+        within: share of them whose error is at most what was required.
+        all_within: whether that is so for all.
+    """
+
+    outcome: str
+    repetitions: int
+    reached: list[float]
+    inside: list[float]
+    within: float
+    all_within: bool
+
+    def summary(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+class _Warmth(Silent):
+    """Keeps the factor on the friction after each repetition; simulated friction drifts."""
+
+    def __init__(self, controller: SimulatedController) -> None:
+        self._plant = controller.plant
+        self.factors: list[Array] = []
+
+    def say(self, text: str) -> None:
+        if text.startswith("precision after"):
+            self.factors.append(self._plant.friction_scale)
+
+
+def _ended(cell: Cell, plan: CampaignPlan, requirements: Sequence[Requirement]) -> _Ended:
+    """Run one campaign, and compare its estimate with the simulated arm."""
+    controller = simulated_controller(
+        cell, effects=True, settings=controller_settings(cell, effects=True)
     )
-    half = found.uncertainty.interval_factor * np.array([one.std for one in found.parameters])
-    error = np.array([one.estimate for one in found.parameters]) - truth
-    return float(np.mean((np.abs(error) <= half)[: found.n_base]))
+    link = VirtualLink.over(SimulatedTransport(controller), cell, finish=controller.finish)
+    warmth = _Warmth(controller)
+    with tempfile.TemporaryDirectory() as scratch:
+        campaign = Campaign.create(Path(scratch) / "it", cell, plan)
+        campaign.run(
+            link,
+            Stop(),
+            warmth,
+            provenance=simulated_provenance(cell, effects=True),
+            durable=False,
+            unrehearsed=True,
+            until_precise=requirements,
+        )
+        record = campaign.precision
+        assert record is not None
+        number = record.looks[-1].repetitions
+        paths = campaign.folder.completed("excitation")[:number]
+        measured = PrecisionMeter(campaign, requirements).estimate(paths)
+    model = cell.model
+    scale = np.ones(model.n_parameters)
+    drift = np.mean(warmth.factors, axis=0)
+    scale[model.friction_part] = [
+        drift[term.owner] if term.term.is_friction else 1.0 for term in model.friction.terms
+    ]
+    quantities = measured.wanted.quantities
+    truth = quantities.directions @ (scale * planted_values(cell))
+    error = np.abs(measured.values - truth)
+    within = error <= quantities.allowed
+    return _Ended(
+        outcome=record.outcome,
+        repetitions=number,
+        reached=[one.half for one in record.looks[-1].reached],
+        inside=[
+            float(np.mean((error <= measured.half)[measured.wanted.owners == k]))
+            for k in range(len(requirements))
+        ],
+        within=float(np.mean(within)),
+        all_within=bool(within.all()),
+    )
 
 
 def stops(count: int) -> dict[str, Any]:
@@ -185,6 +276,74 @@ def payloads(count: int) -> dict[str, Any]:
     }
 
 
+def weighings(count: int, required: str) -> dict[str, Any]:
+    """Weigh loads of 3 to 12 kg by payload campaigns of the NS 16 in virtual time, 12 kg assumed.
+
+    The arm is as modelled: its currents have noise, its servo errors, and it has no other effects.
+    """
+    requirements = requirements_from([required])
+    cell = Cell.load(CELL_PATH).with_campaign(repetitions=_MOST)
+    cell = cell.with_values({"campaign.approach_speed": 1.0, "campaign.standstill_s": 1.0})
+    assumed = assumed_payload(cell, _HEAVIEST)
+    settings = payload_search()
+    promise = PrecisionDesign.of(
+        cell, requirements, [motion.trajectory for motion in _validation(cell)], (), _HEAVIEST
+    )
+    problem = problem_of(
+        loaded_cell(cell, "load", assumed), settings, None, promise.precision(FEWEST)
+    )
+    plan = plan_around(cell, run_search(cell, settings, Silent(), problem=problem).excitation)
+    errors, inside, halves, pairs = [], [], [], []
+    for seed in range(1, count + 1):
+        heavy = load_of(seed)  # of up to 16 kg
+        share = _HEAVIEST / 16.0
+        load = Body(share * heavy.mass, heavy.centre, share * heavy.inertia)
+        weighed = _weighed(cell.with_campaign(simulation_seed=seed), plan, load, requirements)
+        truth = figures_of(load)
+        intervals = weighed.found.estimate.intervals
+        inside.append((intervals[:, 0] <= truth) & (truth <= intervals[:, 1]))
+        errors.append(weighed.found.body.mass / load.mass - 1.0)
+        halves.append((intervals[0, 1] - intervals[0, 0]) / 2.0 / load.mass)
+        pairs.append(weighed.pairs)
+        figures = {"seed": seed, "pairs": pairs[-1], "error": errors[-1], "half": halves[-1]}
+        show(figures, only_json=True)
+    error = np.abs(errors)
+    return {
+        "weighings": count,
+        "motion": plan.excitation.trajectory.duration,
+        "motions": 2.0 * float(np.mean(pairs)),
+        "mass_error": float(np.sqrt(np.mean(error**2))),
+        "worst": float(error.max()),
+        "within_one_percent": float(np.mean(error < 0.01)),
+        "half_width": float(np.median(halves)),
+        "covered": dict(zip(NAMES, np.mean(inside, axis=0).tolist(), strict=True)),
+    }
+
+
+def _weighed(
+    cell: Cell, plan: CampaignPlan, load: Body, requirements: Sequence[Requirement]
+) -> Weighed:
+    """Run one payload campaign on an arm that carries a load on its last joint."""
+    carried = Carried(len(cell.joint_names) - 1, *load)
+
+    def link(side: Campaign, session: int) -> MotionLink:
+        is_loaded = side.cell.model.payload is not None
+        truth = replace(planted_truth(cell), carried=carried if is_loaded else None)
+        return simulated_link(side.cell, truth=truth, session=session)
+
+    with tempfile.TemporaryDirectory() as scratch:
+        campaign = Campaign.create(Path(scratch) / "it", cell, plan)
+        weighing = PayloadCampaign.of(campaign, "load", assumed_payload(cell, _HEAVIEST))
+        return weighing.run(
+            lambda side, choices: side.run(**choices),
+            Mounting(weighing, Silent()),
+            Silent(),
+            requirements=requirements,
+            choices={"unrehearsed": True, "durable": False},
+            links=link,
+        )
+
+
 def _posterior(model: RobotModel, factor: Factor) -> tuple[Estimate, Array, float]:
     """Return the posterior of a factor, and information (p, p) and effect of its prior."""
     prior = body_prior(model, factor).gaussian
@@ -211,6 +370,8 @@ def main() -> None:
     parser.add_argument("--campaigns", type=int, default=0)
     parser.add_argument("--require", default="torque 30, friction 10%")
     parser.add_argument("--stops", type=int, default=0)
+    parser.add_argument("--weighings", type=int, default=0)
+    parser.add_argument("--require-mass", default="mass of payload 1 %")
     parser.add_argument("--payloads", type=int, default=0)
     options = parser.parse_args()
     found: dict[str, Any] = {}
@@ -218,6 +379,8 @@ def main() -> None:
         found["campaigns"] = campaigns(options.campaigns, options.require)
     if options.stops:
         found["stops"] = stops(options.stops)
+    if options.weighings:
+        found["weighings"] = weighings(options.weighings, options.require_mass)
     if options.payloads:
         found["payloads"] = payloads(options.payloads)
     show(found, only_json=options.json)

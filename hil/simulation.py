@@ -14,6 +14,8 @@ from drivers.transports.simulated import SimulatedTransport
 from hil.campaign.virtual_link import VirtualLink
 from hil.cell import Cell, CellError
 from hil.motion_checks import collision_checker
+from identification.model.payload import Payload
+from identification.model.pseudo_inertia import body
 from identification.text import percentage
 from sim_fixtures import (
     ControllerSettings,
@@ -23,6 +25,7 @@ from sim_fixtures import (
     UnmodelledEffects,
 )
 from sim_fixtures.faults import InjectedFault
+from sim_fixtures.plant import Carried
 from sim_fixtures.servo import loops_per_cycle
 
 Array = NDArray[np.float64]
@@ -43,6 +46,7 @@ def simulated_link(
     truth: PlantTruth | None = None,
     instead_of_hardware: bool = False,
     only_axis: int | None = None,
+    session: int = 0,
 ) -> VirtualLink:
     """Return a link in virtual time to a simulated controller; runs are reproducible by seed.
 
@@ -53,6 +57,7 @@ def simulated_link(
         truth: true parameters, by default those of the cell.
         instead_of_hardware: also simulate a cell with a real link.
         only_axis: number, from 1, of the only axis that is opened; None for all.
+        session: number of earlier sessions of the controller; each has noise of its own.
 
     Raises:
         CellError: the cell is one of real hardware.
@@ -67,7 +72,7 @@ def simulated_link(
         )
     settings = replace(controller_settings(cell, effects=effects), only_axis=only_axis)
     controller = simulated_controller(
-        cell, effects=effects, drive=drive, truth=truth, settings=settings
+        cell, effects=effects, drive=drive, truth=truth, settings=settings, session=session
     )
     transport = SimulatedTransport(controller)
     return VirtualLink.over(transport, cell, finish=controller.finish, only_axis=only_axis)
@@ -81,6 +86,7 @@ def simulated_controller(
     truth: PlantTruth | None = None,
     settings: ControllerSettings | None = None,
     seed: int | None = None,
+    session: int = 0,
     faults: Sequence[InjectedFault] = (),
 ) -> SimulatedController:
     """Return controller and arm of a cell with any link; arguments as for `simulated_link`.
@@ -95,10 +101,12 @@ def simulated_controller(
         truth or planted_truth(cell),
         settings or controller_settings(cell, effects=effects),
         seed=cell.simulation.seed if seed is None else seed,
+        session=session,
         effects=unmodelled_effects(cell) if effects else UnmodelledEffects(),
         initial_position=cell.initial,
         gravity=cell.file.robot.gravity,
         stated=nominal_drive,
+        entered=carried(cell, cell.model.payload),
         faults=faults,
     )
 
@@ -167,7 +175,10 @@ def simulated_drive(cell: Cell) -> SimulatedDrive:
 
 
 def planted_truth(cell: Cell) -> PlantTruth:
-    """Return the true rotor inertias, friction and link inertias, or raise CellError."""
+    """Return the true rotor inertias, friction and link inertias, or raise CellError.
+
+    The simulated arm carries `[robot.payload]`, and its controller knows it.
+    """
     settings = cell.simulation
     return PlantTruth(
         rotor_inertia=np.array(settings.rotor_inertia),
@@ -176,7 +187,16 @@ def planted_truth(cell: Cell) -> PlantTruth:
         third=np.array(settings.third),
         third_law=_third_law(cell),
         inertia_scale=np.array(settings.inertia_scale or [1.0]),
+        carried=carried(cell, cell.model.payload),
     )
+
+
+def carried(cell: Cell, payload: Payload | None) -> Carried | None:
+    """Return a payload as what the simulated arm carries (ModelError: not on a moving link)."""
+    if payload is None or payload.mass == 0.0:
+        return None
+    joint, inertial = payload.carried_by(cell.model.chain)
+    return Carried(joint, *body(inertial))
 
 
 def _third_law(cell: Cell) -> Literal["quadratic", "cubic"]:

@@ -49,7 +49,7 @@ from drivers.packets import (
 from sim_fixtures.arm import DisturbanceKind, SimulatedArm, UnmodelledEffects
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.faults import InjectedFault
-from sim_fixtures.plant import PlantTruth
+from sim_fixtures.plant import Carried, PlantTruth
 from sim_fixtures.servo import CycleDemand, CycleServo, NominalModel
 from sim_fixtures.settings import AXES_PER_ARM, ControllerSettings, SettingError
 
@@ -708,6 +708,7 @@ class SimulatedController:
         initial_position: joint angles [rad]; zero by default.
         gravity: m/s2 in the base frame.
         stated: drive train in the init packet, in place of `drive`.
+        entered: payload that the operator has entered, in the frame of its joint.
         faults: faults of controller and robot, by packet number.
 
     Raises:
@@ -727,6 +728,7 @@ class SimulatedController:
         initial_position: ArrayLike | None = None,
         gravity: ArrayLike = EARTH,
         stated: SimulatedDrive | None = None,
+        entered: Carried | None = None,
         faults: Sequence[InjectedFault] = (),
     ) -> None:
         n = drive.n_axes
@@ -748,7 +750,9 @@ class SimulatedController:
         self.plant = self._arm.plant
         gains = settings.servo
         resolution = settings.current_resolution
-        model = NominalModel(urdf, truth, gravity=gravity, error=gains.model_error, rng=model_rng)
+        model = NominalModel(
+            urdf, truth, gravity=gravity, error=gains.model_error, rng=model_rng, entered=entered
+        )
         self.servo = CycleServo(
             drive, model, gains, period=settings.period, current_resolution=resolution
         )

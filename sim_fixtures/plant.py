@@ -26,13 +26,22 @@ from sim_fixtures.settings import PlantDiverged, SettingError
 Array = NDArray[np.float64]
 
 
+class Carried(NamedTuple):
+    """A body that a joint carries beside its link, in the frame of the joint."""
+
+    joint: int  # from 0
+    mass: float  # kg
+    centre: Array  # (3,) m
+    inertia: Array  # about the centre (3, 3) kg m2
+
+
 @dataclass(frozen=True, eq=False)
 class PlantTruth:
     """True rotor inertias, friction and link inertias; arrays (n,), on the joint side.
 
     Friction torque: coulomb sgn(qd) + viscous qd + third sgn(qd) qd^2 (or third qd^3). The factor
     `inertia_scale` applies to mass, first moment and tensor of each link of the URDF; (1,) for one
-    factor of all.
+    factor of all. The controller does not know what is `carried` unless it is entered.
 
     Raises:
         SettingError: a negative value, except of `third`.
@@ -44,6 +53,7 @@ class PlantTruth:
     third: Array  # N m s2/rad2 ("quadratic") or N m s3/rad3 ("cubic")
     third_law: Literal["quadratic", "cubic"] = "quadratic"
     inertia_scale: Array = field(default_factory=lambda: np.ones(1))
+    carried: Carried | None = None
     _has_third: bool = field(init=False, repr=False, default=False)
 
     def __post_init__(self) -> None:
@@ -151,6 +161,14 @@ def scale_bodies(model: pin.Model, factor: ArrayLike) -> None:
         model.inertias[i] = pin.Inertia(scale * body.mass, body.lever, scale * body.inertia)
 
 
+def carry(model: pin.Model, carried: Carried | None) -> None:
+    """Add a body to a joint of a model in place; None adds nothing."""
+    if carried is not None:
+        joint, mass, centre, inertia = carried
+        load = pin.Inertia(mass, np.asarray(centre), np.asarray(inertia))
+        model.appendBodyToJoint(joint + 1, load, pin.SE3.Identity())
+
+
 def _as_revolute(urdf: str) -> str:
     """Return the URDF with continuous joints as revolute: pinocchio gives those one angle."""
     root = ET.fromstring(urdf)
@@ -203,6 +221,7 @@ class Plant:
         n = truth.n_joints
         self.truth = truth
         self.model = build_model(urdf, gravity, truth.rotor_inertia, truth.inertia_scale)
+        carry(self.model, truth.carried)
         self.data = self.model.createData()
         start = np.zeros(n) if position is None else position
         self.position: Array = np.array(start, dtype=np.float64)
@@ -252,6 +271,12 @@ class Plant:
         """Set the factor on all friction except that of brakes, (n,)."""
         self._scale = factor
         self._set_coulomb()
+
+    @property
+    def friction_scale(self) -> Array:
+        """Present factor on the friction (n,)."""
+        n = self.model.nv
+        return np.ones(n) if self._scale is None else self._scale.copy()
 
     def jam(self, torque: Array | None) -> None:
         """Set additional dry friction, (n,) [N m]; None for none."""

@@ -24,7 +24,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from sim_fixtures.drive import SimulatedDrive
-from sim_fixtures.plant import PlantTruth, build_model, scale_bodies
+from sim_fixtures.plant import Carried, PlantTruth, build_model, carry, scale_bodies
 from sim_fixtures.settings import ServoSettings
 
 Array = NDArray[np.float64]
@@ -38,7 +38,8 @@ class NominalModel:
     """Inverse dynamics with random relative errors of links, rotors and friction.
 
     `error` is the smallest and largest relative error; signs are random. Mass, first moment and
-    tensor of a link have the same error. `gravity` in m/s2 in the base frame.
+    tensor of a link have the same error. `gravity` in m/s2 in the base frame. `entered` is the
+    payload that the operator has entered.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class NominalModel:
         gravity: ArrayLike,
         error: tuple[float, float],
         rng: np.random.Generator,
+        entered: Carried | None = None,
     ) -> None:
         n = truth.n_joints
 
@@ -59,6 +61,7 @@ class NominalModel:
         self.rotor_inertia = truth.rotor_inertia * factors()
         self._model = build_model(urdf, gravity, self.rotor_inertia, truth.inertia_scale)
         scale_bodies(self._model, factors())
+        carry(self._model, entered)
         self._data = self._model.createData()
         self._coulomb = truth.coulomb * factors()
         self._viscous = truth.viscous * factors()

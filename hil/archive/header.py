@@ -158,6 +158,7 @@ class ArchiveHeader(BaseModel):
         use: of an imported recording, the kind that identification uses it as.
         plan_hash: digest of cell, URDF and plan.
         recorded_at: time of day, None in virtual time.
+        payload: name of the payload that the arm carried, empty for none or one without a name.
         effects: effects of a simulated arm that the model does not contain.
         motor_from_joint: motor angles per joint angle, n rows of n numbers.
         planted: true parameters of a simulated arm by name; None where not stated, empty where
@@ -178,6 +179,7 @@ class ArchiveHeader(BaseModel):
     use: str = "excitation"
     plan_hash: str = ""
     recorded_at: str | None = None
+    payload: str = ""
     effects: _Names = ()
     held_joints: _Names = ()
     motor_from_joint: Json[tuple[tuple[_Finite, ...], ...]] | None = None

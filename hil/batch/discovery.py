@@ -44,7 +44,7 @@ USES: Final = ("excitation", "validation", "standstill")
 
 _ARCHIVES: Final = "/archives"  # folder of a campaign's archives
 _REHEARSAL: Final = "/rehearsal/"  # see `hil.campaign.folder`
-_LOADED: Final = re.compile(r"/payload/[^/]+/loaded/")  # campaigns of earlier versions
+_LOADED: Final = re.compile(r"/payload/[^/]+/loaded/")  # see `hil.payload_campaign`
 _COMPLETED: Final = "completed"
 _NEVER_FITTED: Final = frozenset(KINDS) - {*USES, "imported"}
 _UNCHECKED: Final = (
@@ -533,7 +533,7 @@ def _exclusion(ref: ArchiveRef, latest: _Attempts, seen: dict[str, str]) -> str:
     if ref.simulated and _REHEARSAL in ref.location:
         return "belongs to a rehearsal"
     if _LOADED.search(ref.location):
-        return "was recorded with a payload that its cell does not state"
+        return "was recorded with a payload that was to be weighed"
     if ref.outcome != _COMPLETED:
         return f"ended {ref.outcome}"
     last = latest.get((ref.folder, ref.kind, ref.index), ref.attempt)

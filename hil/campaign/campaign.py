@@ -20,6 +20,7 @@ from identification.excitation import Excitation
 from .folder import LOCK, CampaignFolder
 from .link import MotionLink
 from .operator import Operator, RunWatch, Stop, Unattended
+from .plan import CampaignPlan
 from .rehearsal import Rehearsal
 from .rehearsing import SEED, rehearse
 from .run import RunResult, run_motions
@@ -115,6 +116,7 @@ class Campaign(CampaignState):
         accept_torque: Sequence[str] = (),
         live: LiveView | None = None,
         until_precise: Sequence[Requirement] = (),
+        repetitions: int | None = None,
     ) -> RunResult:
         """Run the motions that are missing, in order, and return the arm to its first position.
 
@@ -138,6 +140,8 @@ class Campaign(CampaignState):
                 dry run of an earlier run (`DryRunRecord.against_gravity`).
             live: where viewers may connect, on the cell's own link.
             until_precise: end the repetitions when these are met, or more of them do not help.
+            repetitions: to run the excitation up to this number of complete ones; by default to
+                that of the cell.
 
         Raises:
             NotRehearsedError: the plan did not pass its rehearsal.
@@ -164,6 +168,7 @@ class Campaign(CampaignState):
             accept_torque=tuple(accept_torque),
             live=live,
             until_precise=tuple(until_precise),
+            repetitions=repetitions,
         )
         return run_motions(self, link, watch, reporter or Silent(), options)
 
@@ -181,8 +186,8 @@ def require_replaceable(root: Path) -> None:
         )
 
 
-def campaign_of_design(root: Path, cell: Cell, excitation: Excitation) -> Campaign:
-    """Return the campaign of a designed motion, in the folder of the design.
+def campaign_of_design(root: Path, cell: Cell, excitation: Excitation | CampaignPlan) -> Campaign:
+    """Return the campaign of a designed motion or a plan, in the folder of the design.
 
     An existing campaign of another motion or cell is replaced.
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from hil.archive import open_archive
 from hil.errors import ArchiveError
 from hil.recorded_campaign import load_record
-from hil.terminal_text import typed
 
 from .errors import AgainstGravityError, DryRunError
 from .folder import CampaignFolder, save_record
@@ -231,6 +230,6 @@ class DryRunRecord:
 def not_accepted(folder: CampaignFolder, against: Sequence[str] = ()) -> DryRunError:
     """Return the error of a dry run that is not accepted, or of joints that were not named."""
     if against:
-        return AgainstGravityError(folder.root, against, AGAINST)
-    how = f"if the motions looked right, run `hil run {typed(folder.root)} --accept-dry-run`"
+        return AgainstGravityError(folder.root, against, AGAINST, folder.run_command)
+    how = f"if the motions looked right, run `{folder.run_command} --accept-dry-run`"
     return DryRunError(folder.root, "was done, but is not accepted", how)

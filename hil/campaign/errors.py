@@ -11,7 +11,7 @@ from drivers.errors import Check, GuardError, RefusalError
 from drivers.events import Refused
 from hil.cell import AngleFrame, Cell
 from hil.errors import ExecutionError, HilError, UnsafeError
-from hil.terminal_text import plural, typed
+from hil.terminal_text import plural
 
 
 class MotionRefusedError(UnsafeError):
@@ -106,14 +106,14 @@ class DryRunError(UnsafeError):
 class AgainstGravityError(DryRunError):
     """A dry run with torques against gravity of the model; `joints` must be accepted by name."""
 
-    def __init__(self, campaign: Path, joints: Sequence[str], problem: str) -> None:
+    def __init__(self, campaign: Path, joints: Sequence[str], problem: str, command: str) -> None:
         self.joints = tuple(joints)
         names = " ".join(f"--accept-torque {joint}" for joint in joints)
         super().__init__(
             campaign,
             f"was done, but is not accepted ({', '.join(joints)}: {problem})",
             "correct the cell file and rehearse again, or, if you know that the arm is right and "
-            f"the model is not, run `hil run {typed(campaign)} --accept-dry-run {names}`",
+            f"the model is not, run `{command} --accept-dry-run {names}`",
         )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
@@ -43,6 +44,10 @@ LOCK: Final = "campaign.lock"
 LOCK_PATIENCE: Final = 0.5  # s to wait for a lock
 MESH: Final = "mesh "  # Prefix of the entry of a mesh, by its name in the URDF
 MISSING: Final = "missing"
+PAYLOADS: Final = "payload"
+"""Folder, in that of a campaign, with a folder for each payload that it weighs."""
+SIDES: Final = ("bare", "loaded")
+"""Campaigns in the folder of a payload: the same motion without and with it."""
 _ANOTHER: Final = "{} is not the one this campaign began with"
 _RESTORE: Final = "restore it, or begin a new campaign"
 
@@ -108,6 +113,22 @@ class CampaignFolder(RecordedCampaign):
     dry_run = Below("dry_run.json")
     warmup = Below("warmup.json")
     precision = Below("precision.json")
+
+    @property
+    def weighs(self) -> tuple[Path, str] | None:
+        """Folder of the campaign and name of the payload that this is a side of, if it is one."""
+        *_, payloads, name, side = ("", "", "", *self.root.resolve().parts)
+        if payloads != PAYLOADS or side not in SIDES:
+            return None
+        return self.root / "../../..", name
+
+    @property
+    def run_command(self) -> str:
+        """The command that runs it."""
+        if self.weighs is None:
+            return f"hil run {typed(self.root)}"
+        campaign, name = self.weighs
+        return f"hil run {typed(os.path.normpath(campaign))} --payload {typed(name)}"
 
     @property
     def plan_hash(self) -> str:

@@ -65,7 +65,7 @@ def require_dry_run(
         DryRunError: with the remedy.
     """
     root = folder.root
-    first = f"run `hil run {typed(root)} --dry-run`"
+    first = f"run `{folder.run_command} --dry-run`"
     if found is None and options.accept_dry_run and not simulated:
         remedy = f"{first}, watch the arm, and accept it then"
         raise DryRunError(root, "cannot be accepted before it was done", remedy)

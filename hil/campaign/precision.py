@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hil.design.requirements import Requirement, require_known, requirements_from
 from hil.design.result import RESULT
 from hil.design.settings import load_settings
-from hil.design.wanted import ReferenceMotions
+from hil.design.wanted import ReferenceMotions, Wanted
 from hil.errors import InputError
 from hil.identify.cell_context import torque_scale
 from hil.identify.estimating import Posterior, with_uncertain_scale
@@ -39,6 +39,16 @@ Array = NDArray[np.float64]
 _REFERENCE_PERIOD: Final = 0.04  # s
 
 
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Required quantities (k,) by some repetitions, with halves of their 95 % intervals."""
+
+    wanted: Wanted
+    values: Array  #: (k,)
+    half: Array  #: (k,)
+    noise: Array  #: share of the variance that differs between repetitions (k,)
+
+
 class PrecisionMeter:
     """Measures the precision of the archived repetitions of a campaign."""
 
@@ -49,7 +59,7 @@ class PrecisionMeter:
                 None,
                 "the mass of a payload needs motions with the payload",
                 field="--precision",
-                remedy="weigh it with `hil payload`",
+                remedy="run it with --payload NAME",
             )
         self._cell, self._requirements = campaign.cell, tuple(requirements)
         self._settings = stated_settings(campaign.cell, FIXED)
@@ -61,6 +71,21 @@ class PrecisionMeter:
 
     def measure(self, paths: Sequence[Path]) -> Look:
         """Return the precision that some repetitions give together; archives are read once."""
+        measured = self.estimate(paths)
+        ratios = measured.half / measured.wanted.quantities.allowed
+        reached = []
+        for k, requirement in enumerate(self._requirements):
+            mine = np.flatnonzero(measured.wanted.owners == k)
+            worst = int(mine[np.argmax(ratios[mine])])
+            more = [further(len(paths), ratios[one], measured.noise[one]) for one in mine.tolist()]
+            known = [one for one in more if one is not None]
+            most = max(known) if len(known) == len(more) else None
+            half = float(ratios[worst]) * requirement.value
+            reached.append(Reached(str(requirement), measured.wanted.labels[worst], half, most))
+        return Look(len(paths), tuple(reached))
+
+    def estimate(self, paths: Sequence[Path]) -> Measured:
+        """Return what some repetitions together say of the required quantities."""
         for path in paths:
             if path not in self._factors:
                 (source,) = gather_sources([path], FIXED.split, in_sample=True).training
@@ -79,19 +104,13 @@ class PrecisionMeter:
         )
         directions = wanted.quantities.directions
         variance = np.einsum("kp,pq,kq->k", directions, stated.covariance, directions)
-        ratios = stated.interval_factor * np.sqrt(variance) / wanted.quantities.allowed
         moved = np.asarray(np.linalg.solve(information, directions.T))
-        shares = noise_shares(factors, weights, estimate.values, moved)
-        reached = []
-        for k, requirement in enumerate(self._requirements):
-            mine = np.flatnonzero(wanted.owners == k)
-            worst = int(mine[np.argmax(ratios[mine])])
-            more = [further(len(paths), ratios[one], shares[one]) for one in mine.tolist()]
-            known = [one for one in more if one is not None]
-            most = max(known) if len(known) == len(more) else None
-            half = float(ratios[worst]) * requirement.value
-            reached.append(Reached(str(requirement), wanted.labels[worst], half, most))
-        return Look(len(paths), tuple(reached))
+        return Measured(
+            wanted=wanted,
+            values=directions @ estimate.values,
+            half=stated.interval_factor * np.sqrt(variance),
+            noise=noise_shares(factors, weights, estimate.values, moved),
+        )
 
 
 def noise_shares(factors: Sequence[Factor], weights: Array, values: Array, moved: Array) -> Array:

@@ -55,7 +55,7 @@ class Reached:
         if repetitions == 1:  # what differs between repetitions is not known
             return text
         if self.more is None:
-            return f"{text}, which repetitions of this motion do not improve enough"
+            return f"{text}, which repeating this motion does not improve enough"
         return f"{text}, about {self.more} more"
 
 
@@ -86,12 +86,14 @@ class PrecisionRecord:
         requirements: as typed.
         looks: one for each repetition, in order.
         outcome: "going on"; "met"; "out of reach", if more repetitions do not help; or "limit".
+        unit: a "repetition", or a "pair" of them without and with a payload.
     """
 
     plan_hash: str
     requirements: tuple[str, ...]
     looks: tuple[Look, ...] = ()
     outcome: Literal["going on", "met", "out of reach", "limit"] = "going on"
+    unit: Literal["repetition", "pair"] = "repetition"
 
     @classmethod
     def load(cls, path: Path, plan_hash: str) -> Self | None:
@@ -130,12 +132,20 @@ class PrecisionRecord:
     def message(self) -> str:
         """Its last look as a sentence without full stop."""
         if not self.looks:
-            return "no repetition was measured yet"
+            return f"no {self.unit} was measured yet"
         look = self.looks[-1]
         worst = look.worst.message(look.repetitions)
-        text = f"precision after {plural(look.repetitions, 'repetition')}: {worst}"
+        text = f"precision after {plural(look.repetitions, self.unit)}: {worst}"
         if self.outcome == "met":
-            return f"{text}: all requirements are met, no more repetitions"
+            return f"{text}: all requirements are met, no more {self.unit}s"
+        if self.outcome == "out of reach" and self.unit == "pair":
+            remains = "that is more than repetitions of [campaign]"
+            if look.worst.more is None:
+                remains = (
+                    "what remains is the scale of the torque (weigh a known load with hil "
+                    "torque-constants, or state torque_uncertainty)"
+                )
+            return f"{text}: no more pairs; {remains}"
         if self.outcome == "out of reach":
             return (
                 f"{text}: no more repetitions; another motion adds what this one does not show "

@@ -127,7 +127,7 @@ class _CampaignRun:
         if self._precision is not None:
             self._precision.begin()
         slow = dry_run.missing()
-        full = [] if options.dry_run_only else self._campaign.missing()
+        full = [] if options.dry_run_only else self._missing()
         if not slow:
             dry_run.accept()
         if slow or full:
@@ -196,7 +196,7 @@ class _CampaignRun:
     def _run_missing(self, runner: Runner, kind: str) -> None:
         """Run the missing motions of a kind; repetitions only while the joints are warm."""
         _, total = self._campaign.progress(kind)
-        for interval in self._campaign.missing(kind):
+        for interval in self._missing(kind):
             precision = self._precision if kind == "excitation" else None
             if precision is not None and precision.ended:
                 return
@@ -205,6 +205,15 @@ class _CampaignRun:
                 precision.repeated()
             if kind == "validation":
                 self._warm_up.motion_ended()
+
+    def _missing(self, *kinds: str) -> list[Interval]:
+        """Return what is to be run at full speed, up to a number of repetitions if stated."""
+        most = self._options.repetitions
+        return [
+            motion
+            for motion in self._campaign.missing(*kinds)
+            if most is None or motion.kind != "excitation" or motion.index < most
+        ]
 
     def _result(self) -> RunResult:
         campaign = self._campaign

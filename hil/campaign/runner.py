@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hil.archive import ArchiveHeader, ArchiveSpec, open_archive
 from hil.archive.live import LiveView
+from hil.cell import Cell
 from hil.design.requirements import Requirement
 from hil.errors import ArchiveError
 from hil.progress import Reporter, Task
@@ -50,6 +51,7 @@ class RunOptions:
     accept_torque: tuple[str, ...] = ()
     live: LiveView | None = None
     until_precise: tuple[Requirement, ...] = ()
+    repetitions: int | None = None
 
 
 class RunArchives:
@@ -105,6 +107,7 @@ class RunArchives:
         metadata = {
             **({} if simulated else {"campaign": campaign.folder.root.resolve().name}),
             "plan_hash": self.plan_hash,
+            **_payload_entry(campaign.cell),
             **{f"software.{package}": version for package, version in software().items()},
             **with_present_date(self.provenance),
         }
@@ -118,6 +121,12 @@ class RunArchives:
             plan | moves_to_dict(interval.moves),
             durable=self._durable,
         )
+
+
+def _payload_entry(cell: Cell) -> dict[str, str]:
+    """Return the name of the payload of a cell as metadata, {} without one."""
+    payload = cell.file.robot.payload
+    return {"payload": payload.name} if payload is not None and payload.name else {}
 
 
 class Warmth(Protocol):

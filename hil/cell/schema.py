@@ -92,6 +92,7 @@ class PayloadTable(Table):
     frame: str = field(
         "link of the URDF that defines the frame; nothing for that of the last joint", ""
     )
+    name: str = field("its name, which the header of each archive has", "")
 
 
 class SimulationTable(Table):

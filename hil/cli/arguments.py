@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 from collections.abc import Callable, Sequence
 from functools import wraps
 from pathlib import Path
@@ -16,6 +17,7 @@ from hil.errors import InputError
 ARM = "Arm"
 CHANNELS = "Channels of logs and bags"
 ESTIMATION = "Estimation"
+PAYLOAD = "Payload"
 """Panels of options in help texts."""
 
 CampaignArgument = Annotated[Path, typer.Argument(help="Campaign folder (`hil design -o`).")]
@@ -97,6 +99,18 @@ def exactly_one(remedy: str, /, **given: object) -> None:
 
 def _option(name: str) -> str:
     return "--" + name.replace("_", "-")
+
+
+def numbers(text: str, count: int, option: str) -> list[float]:
+    """Parse numbers separated by commas (InputError if they are not so many, or not finite)."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(map(math.isfinite, values)):
+        problem = f"{text!r} is not {count} numbers"
+        raise InputError(None, problem, field=option, remedy="separate them by commas")
+    return values
 
 
 def print_json(document: object) -> None:

@@ -26,6 +26,7 @@ from hil.design.run import Designed, DesignFolder, run_design
 from hil.design.settings import preset_text
 from hil.errors import HilError, InputError, OperatorStopError
 from hil.motion_checks import MotionChecks
+from hil.payload_campaign import assumed_payload, loaded_cell
 from hil.plots import save
 from hil.progress import Reporter, say
 from hil.progress import reporter as make_reporter
@@ -123,7 +124,8 @@ def design(
             minimises the largest ratio of predicted to required interval.
         purpose: payload: a motion of at most ten seconds that weighs a payload (`hil payload`), on
             an arm that is known, if possible from --given.
-        payload_mass: With --for payload: expected mass. Default: 5 kg.
+        payload_mass: With --for payload: expected mass, with which currents stay within their
+            limits, too. Default: 5 kg.
         repetitions: Number of repetitions of the motion. Default: that of [campaign].
         seed: Seed of the search; the result depends on nothing else. Default: that of the settings.
         workers: Number of processes; the result does not depend on it. Default: one per processor.
@@ -217,6 +219,9 @@ def design(
             stop=lambda: stop.requested,
             given=known,
             precision=None if promise is None else promise.precision(planned),
+            carrying=None
+            if mass is None
+            else loaded_cell(loaded, "payload", assumed_payload(loaded, mass)),
             promised=None
             if promise is None
             else lambda found: [one.to_dict() for one in promise.forecasts(found, planned)],

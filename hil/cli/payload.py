@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as json_module
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +13,7 @@ from hil.cli.identify_options import DelayOption, delay_from
 from hil.cli.verdict import NOT_GOOD
 from hil.identify.options import Options
 from hil.identify.payload_by_model import weigh_by_model
-from hil.identify.payload_run import PayloadFound, find_payload
+from hil.identify.payload_run import find_payload
 from hil.progress import reporter as make_reporter
 
 
@@ -64,28 +63,7 @@ def payload(
     remedies = found.remedy(wanted) if outside else []
     fields = found.as_json() | {"checked": wanted, "outside": outside, "next_steps": remedies}
     text = json_module.dumps(fields, indent=1, ensure_ascii=False)
-    lines = payload_lines(found, wanted, outside)
+    lines = found.lines(wanted, outside)
     typer.echo(text if json else "\n".join(lines))
     if outside or found.mounting is not None:
         raise typer.Exit(NOT_GOOD)
-
-
-def payload_lines(
-    found: PayloadFound, wanted: Mapping[str, float] | None = None, outside: Sequence[str] = ()
-) -> list[str]:
-    """Format the result and its comparison with known values."""
-    lines = [*found.sentences, ""]
-    lines += [
-        f"{name:5} {'not determined':>10}"
-        if value is None
-        else f"{name:5} {value:10.5g}  {low:10.5g} to {high:<10.5g} {unit}"
-        for name, value, low, high, unit in found.table
-    ]
-    for controller, typed in found.controllers.items():
-        lines += ["", f"{controller}:", typed]
-    lines += ["", *(f"warning: {warning}" for warning in found.warnings)]
-    lines += [f"check: {sentence}" for sentence in outside]
-    lines += [f"next: {sentence}" for sentence in (found.remedy(wanted or {}) if outside else [])]
-    if wanted and not outside:
-        lines.append(f"check: {', '.join(wanted)} inside the 95 % interval")
-    return lines

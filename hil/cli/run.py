@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json as json_format
 from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -11,19 +13,27 @@ import typer
 from hil.archive import ArchiveName
 from hil.archive.live import LiveView
 from hil.campaign import Campaign, MotionFailedError, stop_on_interrupt
+from hil.campaign.folder import CampaignFolder
 from hil.campaign.precision import requirements_of
 from hil.campaign.run import RunResult
 from hil.cell_link import require_real_time
-from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, print_json
+from hil.cli.arguments import (
+    CampaignArgument,
+    JsonOption,
+    QuietOption,
+    print_json,
+    with_options,
+)
 from hil.cli.verdict import NOT_GOOD, as_json, finish
+from hil.cli.weigh import Weighing, weigh
 from hil.design.requirements import Requirement
 from hil.errors import ExecutionError, InputError, OperatorStopError
 from hil.progress import reporter as make_reporter
 from hil.progress import say
 from hil.screen import Screen
-from hil.terminal_text import typed
 
 
+@with_options(Weighing, "weighing")
 def run(
     campaign: CampaignArgument,
     rehearse: bool = False,
@@ -33,6 +43,8 @@ def run(
     no_identify: bool = False,
     until_precise: bool = False,
     precision: Annotated[list[str] | None, typer.Option(metavar="REQUIREMENTS")] = None,
+    *,
+    weighing: Weighing,
     live: Annotated[str | None, typer.Option(metavar="[HOST:]PORT")] = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -65,25 +77,49 @@ def run(
         precision: Required, such as "parameters 5 %, torque 10". Default: that of the design.
         live: Stream the run to Foxglove; on 127.0.0.1 unless HOST is given.
     """
+    choices = _choices(dry_run, accept_dry_run, accept_torque or ())
+    opened = _opened(campaign)
+    weighing.check(no_identify=no_identify)
+    states = until_precise or (weighing.payload is not None and precision is not None)
+    required = _required(opened, states, precision or [])
+    execute = partial(_run, quiet=quiet or json, live=live)
+    if weighing.payload is not None:
+        more = {"rehearse": rehearse, "quiet": quiet, "json": json}
+        result = weigh(opened, weighing, execute, choices, required, **more)
+    else:
+        if rehearse:
+            _rehearse(opened, quiet=quiet or json)
+        result = execute(opened, {**choices, "until_precise": required})
+    if result is not None and (dry_run or no_identify):
+        _print(result, json=json)
+    elif result is not None:
+        _identify(opened, result, quiet=quiet, json=json)
+
+
+def _choices(dry_run: bool, accept_dry_run: bool, accept_torque: Sequence[str]) -> dict[str, Any]:
+    """Return what `Campaign.run` is to do about the dry run."""
     if dry_run and accept_dry_run:
         remedy = "run --dry-run first, watch the arm, then --accept-dry-run"
         raise InputError(None, "--dry-run and --accept-dry-run together", remedy=remedy)
-    opened = Campaign.open(campaign)
-    required = _required(opened, until_precise, precision or [])
-    if rehearse:
-        with stop_on_interrupt() as stop:
-            opened.rehearse(reporter=make_reporter(quiet=quiet or json), stop=stop)
-    choices: dict[str, Any] = {
+    return {
         "dry_run_only": dry_run,
         "accept_dry_run": accept_dry_run,
-        "accept_torque": accept_torque or (),
-        "until_precise": required,
+        "accept_torque": accept_torque,
     }
-    result = _run(opened, choices, quiet=quiet or json, live=live)
-    if dry_run or no_identify:
-        _print(result, json=json)
-        return
-    _identify(opened, result, quiet=quiet, json=json)
+
+
+def _rehearse(campaign: Campaign, *, quiet: bool) -> None:
+    with stop_on_interrupt() as stop:
+        campaign.rehearse(reporter=make_reporter(quiet=quiet), stop=stop)
+
+
+def _opened(root: Path) -> Campaign:
+    """Return a campaign that is run by itself (InputError for a side of a payload campaign)."""
+    opened = Campaign.open(root)
+    if opened.folder.weighs is not None:
+        problem = "is one side of a payload campaign"
+        raise InputError(root, problem, remedy=f"run `{opened.folder.run_command}`")
+    return opened
 
 
 def _required(
@@ -102,7 +138,8 @@ def _run(
     campaign: Campaign, choices: Mapping[str, Any], *, quiet: bool, live: str | None
 ) -> RunResult:
     """Run with the screen; Ctrl-C stops the arm, then the program."""
-    name = campaign.folder.root.resolve().name
+    parts = campaign.folder.root.resolve().parts
+    name = parts[-1] if campaign.folder.weighs is None else " ".join(parts[-2:])
     view = None if live is None else LiveView.parse(live)
     require_real_time(campaign.cell, view)  # also where nothing is left to run
     with (
@@ -116,7 +153,7 @@ def _run(
         except (ExecutionError, OSError) as fault:
             failed = isinstance(fault, MotionFailedError) and fault.outcome != "stopped"
             if stop.requested and not failed:  # an OSError: of a terminal that was closed
-                again = f"Resume with `hil run {typed(campaign.folder.root)}`."
+                again = f"Resume with `{campaign.folder.run_command}`."
                 raise OperatorStopError(f"{fault} {again}") from fault
             raise
 
@@ -155,5 +192,6 @@ def _print(result: RunResult, *, json: bool) -> None:
     if result.dry_run == "to be accepted":
         known = "".join(f" --accept-torque {joint}" for joint in result.against_gravity)
         why = "you know why, and " if known else ""
-        command = f"`hil run {typed(result.campaign)} --accept-dry-run{known}`"
+        run_it = CampaignFolder(Path(result.campaign)).run_command
+        command = f"`{run_it} --accept-dry-run{known}`"
         say(f"if {why}the motions looked right, continue with {command}")

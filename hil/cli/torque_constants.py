@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tomlkit
 import typer
 
-from hil.cli.arguments import JsonOption, QuietOption, print_json
+from hil.cli.arguments import JsonOption, QuietOption, numbers, print_json
 from hil.cli.identify_options import delay_from
 from hil.cli.verdict import NOT_GOOD
 from hil.errors import InputError
@@ -79,23 +79,13 @@ def _refusal(field: str, problem: str, remedy: str) -> InputError:
 def _payload(mass: float | None, centre: str, inertia: str, frame: str | None) -> Payload:
     if mass is None or not (math.isfinite(mass) and mass > 0.0):
         raise _refusal("--mass", "the payload needs a mass above 0", "give it in kg")
-    x, y, z = _numbers(centre, 3, "--centre")
-    xx, xy, xz, yy, yz, zz = _numbers(inertia, 6, "--inertia")
+    x, y, z = numbers(centre, 3, "--centre")
+    xx, xy, xz, yy, yz, zz = numbers(inertia, 6, "--inertia")
     payload = Payload(mass, (x, y, z), (xx, xy, xz, yy, yz, zz), frame)
     if not payload.possible:
         remedy = "principal moments are not negative, and none exceeds the sum of the others"
         raise _refusal("--inertia", "no body has this tensor", remedy)
     return payload
-
-
-def _numbers(text: str, count: int, field: str) -> list[float]:
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != count or not all(map(math.isfinite, values)):
-        raise _refusal(field, f"{text!r} is not {count} numbers", "separate them by commas")
-    return values
 
 
 def assumption(frame: str | None) -> str:

@@ -275,7 +275,12 @@ def _load(
 
 def payload_search() -> DesignSettings:
     """Return settings of a search for a motion that weighs a payload: at most ten seconds."""
-    return short_search().replaced(constraints={"max_duration": 10.0}, via_points={"n_via": 4})
+    # A heavy payload leaves fewer motions feasible: slow ones and more of them are tried.
+    return short_search().replaced(
+        search={"population": 60},
+        constraints={"max_duration": 10.0},
+        via_points={"n_via": 4, "slowest": 0.2},
+    )
 
 
 def short_search() -> DesignSettings:

@@ -129,6 +129,7 @@ def run_design(
     given: excitation.Given | None = None,
     precision: excitation.Precision | None = None,
     promised: Callable[[excitation.Excitation], list[dict[str, Any]]] | None = None,
+    carrying: Cell | None = None,
     resume: bool = False,
     force: bool = False,
     then: Callable[[Designed], None] = lambda _: None,
@@ -141,13 +142,15 @@ def run_design(
 
     `given` is the information of the earlier recordings in the settings, `precision` what their
     requirements stand for, and `promised` returns what a motion promises for each, for the file.
+    `carrying` is the cell with a payload that currents and torques must allow for.
 
     Raises:
         InputError: the folder has a design already, is locked, or cannot be written to.
         UnsafeError: the motion does not pass the final check.
         HilError: see :func:`run_search`.
     """
-    problem = problem_of(cell, settings, given, precision)  # before anything is replaced
+    # Before anything is replaced.
+    problem = problem_of(carrying or cell, settings, given, precision)
     if problem.objective.given is not None:
         seconds = problem.objective.given.duration
         reporter.say(f"the criteria count {seconds:.3g} s of motion in the given recordings")

@@ -211,6 +211,27 @@ class PayloadFound:
         with_inertia = self.determines(*NAMES[4:])
         return controller_settings(Load(self.body, with_centre, with_inertia))
 
+    def lines(
+        self, expected: Mapping[str, float] | None = None, outside: Sequence[str] = ()
+    ) -> list[str]:
+        """Return sentences, table and commands, and the comparison with expected values."""
+        lines = [*self.sentences, ""]
+        lines += [
+            f"{name:5} {'not determined':>10}"
+            if value is None
+            else f"{name:5} {value:10.5g}  {low:10.5g} to {high:<10.5g} {unit}"
+            for name, value, low, high, unit in self.table
+        ]
+        for controller, command in self.controllers.items():
+            lines += ["", f"{controller}:", command]
+        lines += ["", *(f"warning: {warning}" for warning in self.warnings)]
+        lines += [f"check: {sentence}" for sentence in outside]
+        if outside:
+            lines += [f"next: {sentence}" for sentence in self.remedy(expected or {})]
+        elif expected:
+            lines.append(f"check: {', '.join(expected)} inside the 95 % interval")
+        return lines
+
     def as_json(self) -> dict[str, Any]:
         """Return all values as JSON data; infinite ends and undetermined values are null."""
         torque = self.wrist_torque

@@ -20,7 +20,7 @@ from .estimating import Estimation, estimate_with, with_transmitted_load
 from .figure_series import report_series
 from .options import Options
 from .prepared import Prepared, prepare_sources
-from .sources import gather_sources
+from .sources import gather_sources, payload_warnings
 from .summary import summary
 from .validation import Validation, validate
 
@@ -87,6 +87,7 @@ def identify_archives(
     prepared = with_transmitted_load(prepare_sources(sources, options, reporter))
     estimation = estimate_with(prepared, options, reporter)
     validation = validate(prepared, estimation, reporter)
+    warnings = (*warnings, *payload_warnings(prepared.sources.cell))
     prepared = prepared.warned(*warnings, *estimation.warnings, *validation.warnings)
     results = summary(name or paths[0].stem, prepared, estimation, validation)
     return Identification((*paths, *predict), prepared, estimation, validation, results)

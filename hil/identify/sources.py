@@ -329,6 +329,16 @@ def known_warnings(cell: Cell, archive: Archive) -> list[str]:
     ]
 
 
+def payload_warnings(cell: Cell) -> list[str]:
+    """Return the warning about a payload that was not weighed before it was recorded."""
+    if "robot.payload" not in cell.file.cell.assumed:
+        return []
+    return [
+        "the arm carried a payload of assumed figures ([robot.payload]): what they are wrong by is "
+        "in the parameters of the last link (weigh it with `hil payload`)"
+    ]
+
+
 def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
     """Return the usable part of an archive's recording.
 

@@ -147,6 +147,8 @@ class PayloadEstimate:
     # of those, moments of inertia whose 95 % interval lies below zero: no body has them
     impossible: tuple[str, ...]
     method: str  # description of the covariance
+    # share of the variance of the mass that the torque scale makes, and no recording reduces
+    scale_share: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +201,7 @@ def identify_payload(
         return PayloadEstimate(
             found.values, None, intervals, found.moment, undetermined, (), found.words
         )
+    total, by_scale = (found.variance_of_mass(part) for part in (found.spread, found.by_scale))
     intervals[1:4] = found.centre_intervals
     open_ended = np.isinf(intervals[:, 1])
     centre = np.where(open_ended[1:4], 0.0, found.values[6:9] / mass)
@@ -227,6 +230,7 @@ def identify_payload(
         undetermined=tuple(np.array(NAMES)[open_ended].tolist()),
         impossible=tuple(np.array(NAMES)[negative].tolist()),
         method=found.words,
+        scale_share=by_scale / total,
     )
 
 
@@ -508,8 +512,14 @@ class _BodyEstimate(NamedTuple):
     values: Array  # (10,)
     determined: Array  # determined combinations (r, 10)
     spread: Array  # covariance of those (r, r)
+    by_scale: Array  # part of it that the torque scale makes (r, r)
     factor: float  # standard deviations in half a 95 % interval
     words: str  # how
+
+    def variance_of_mass(self, spread: Array) -> float:
+        """Return the variance of the mass [kg²] by a part of `spread`."""
+        row = np.linalg.pinv(self.determined)[9]
+        return float(row @ spread @ row)
 
     def covariance(self, rows: Array) -> Array:
         """Return the covariance of functions (k, 10) of the parameters, determined part (k, k)."""
@@ -573,10 +583,12 @@ def _body_estimate(
     factor = fit.clustered.interval_factor
     if scale_std is not None:
         std = scale_std
+    by_scale = scale_covariance(fit.sensitivity, std, factor)
     return _BodyEstimate(
         values=np.linalg.pinv(determined) @ fit.values,
         determined=determined,
-        spread=fit.covariance + scale_covariance(fit.sensitivity, std, factor),
+        spread=fit.covariance + by_scale,
+        by_scale=by_scale,
         factor=factor,
         words=fit.clustered.words,
     )

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from identification.estimators.prior import body_prior, posterior_values
 from identification.factor.columns import every_torque_factor, of_torques
 from identification.factor.factor import Factor
-from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples
@@ -527,7 +526,13 @@ def _reordered(model: RobotModel, samples: Samples, change: Change) -> Samples:
     usable = samples.usable
     if change.meaning != "torque order":
         load = None if motion.load is None else motion.load[:, order]
-        motion = Motion(motion.time, *(part[:, order] for part in motion[1:4]), load=load)
+        motion = motion._replace(
+            position=motion.position[:, order],
+            velocity=motion.velocity[:, order],
+            acceleration=motion.acceleration[:, order],
+            direction=None,
+            load=load,
+        )
         usable = usable[:, order]
     if change.meaning != "position order":
         torque = torque[:, order]

@@ -516,7 +516,7 @@ class TestGroups:
         assert not result.broken
         assert reasons_of(result.skipped) == {
             "b.mcap": f"is a copy of {original}",
-            "y.mcap": "was recorded with a payload that its cell does not state",
+            "y.mcap": "was recorded with a payload that was to be weighed",
             "z.mcap": "belongs to a rehearsal",
         }
 

@@ -1,0 +1,138 @@
+"""`hil run --payload`: weigh a payload by a campaign."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, Final, Literal
+
+import typer
+from rich.console import Console
+
+from hil.campaign import Campaign, stop_on_interrupt
+from hil.campaign.run import RunResult
+from hil.cli.arguments import PAYLOAD, numbers, print_json
+from hil.cli.verdict import NOT_GOOD
+from hil.design.requirements import Requirement
+from hil.errors import InputError
+from hil.payload_campaign import CENTRE, Execute, Mounting, PayloadCampaign, assumed_payload
+from hil.progress import reporter as make_reporter
+from hil.screen import can_read, confirmed
+from identification.model.payload import Payload
+
+_ANSWER: Final = "Type yes when the arm may move; anything else ends the run: "
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """Options of a payload campaign; see `hil.cli.arguments.with_options`."""
+
+    payload: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Weigh a payload with the motion of CAMPAIGN: two pairs of recordings, and with "
+            "--precision as many as it takes. They are in payload/NAME.",
+            rich_help_panel=PAYLOAD,
+        ),
+    ] = None
+    payload_mass: Annotated[
+        float | None,
+        typer.Option(
+            min=0.001,
+            metavar="KG",
+            help="Largest mass that is expected: motion, rehearsal and dry run are checked with "
+            "it. Needed for the first run with a payload.",
+            rich_help_panel=PAYLOAD,
+        ),
+    ] = None
+    payload_centre: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="Its centre of mass as it is expected, m in the frame of the flange. Default: "
+            f"{','.join(f'{part:g}' for part in CENTRE)}.",
+            rich_help_panel=PAYLOAD,
+        ),
+    ] = None
+    mounted: Annotated[
+        Literal["yes", "no"] | None,
+        typer.Option(
+            metavar="yes|no",
+            help="Without a terminal: confirm that the payload is mounted now, or not. The run "
+            "stops where that has to change.",
+            rich_help_panel=PAYLOAD,
+        ),
+    ] = None
+
+    def check(self, *, no_identify: bool) -> None:
+        """Raise InputError for options that do not go with a payload, or only with one."""
+        if self.payload is not None:
+            if no_identify:
+                problem = "--no-identify and --payload together"
+                raise InputError(None, problem, remedy="leave one of them out")
+            return
+        for field in fields(self):
+            if getattr(self, field.name) is not None:
+                option = "--" + field.name.replace("_", "-")
+                remedy = "add --payload NAME"
+                raise InputError(None, "needs a payload", field=option, remedy=remedy)
+
+    def assumed(self, campaign: Campaign) -> Payload | None:
+        """Return the payload that is expected; None if it is not stated again."""
+        if self.payload_mass is None:
+            if self.payload_centre is not None:
+                problem = "needs the mass, too"
+                remedy = "add --payload-mass KG"
+                raise InputError(None, problem, field="--payload-centre", remedy=remedy)
+            return None
+        centre = CENTRE
+        if self.payload_centre is not None:
+            x, y, z = numbers(self.payload_centre, 3, "--payload-centre")
+            centre = (x, y, z)
+        return assumed_payload(campaign.cell, self.payload_mass, centre)
+
+
+def weigh(
+    campaign: Campaign,
+    weighing: Weighing,
+    execute: Execute,
+    choices: Mapping[str, Any],
+    requirements: Sequence[Requirement],
+    *,
+    rehearse: bool,
+    quiet: bool,
+    json: bool,
+) -> RunResult | None:
+    """Run a payload campaign and print what it found; return the result of a dry run alone.
+
+    `choices` are those of `Campaign.run` for both sides.
+    """
+    silent = quiet or json
+    reporter = make_reporter(quiet=silent)
+    weighed = PayloadCampaign.of(campaign, weighing.payload or "", weighing.assumed(campaign))
+    if rehearse:
+        with stop_on_interrupt() as stop:
+            weighed.rehearse(reporter, stop)
+
+    def ask(demand: str) -> bool:
+        with stop_on_interrupt() as stop:
+            return confirmed(Console(), f"{demand} {_ANSWER}", "yes", stop)
+
+    mounting = Mounting(
+        weighed,
+        reporter,
+        ask=ask if can_read(sys.stdin) and not silent else None,
+        mounted={"yes": True, "no": False, None: None}[weighing.mounted],
+    )
+    if choices["dry_run_only"]:
+        return weighed.dry_run(execute, mounting, choices)
+    found = weighed.run(execute, mounting, reporter, requirements=requirements, choices=choices)
+    if json:
+        print_json(found.as_json())
+    else:
+        typer.echo("\n".join(found.lines))
+    if found.found.mounting is not None:
+        raise typer.Exit(NOT_GOOD)
+    return None

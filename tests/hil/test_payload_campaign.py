@@ -1,0 +1,355 @@
+"""`hil run --payload`: a payload weighed by a campaign, bare, loaded, loaded, bare."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from drivers.transports.simulated import SimulatedTransport
+from hil.archive import open_archive
+from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError, NotRehearsedError
+from hil.campaign.errors import MotionFailedError
+from hil.campaign.folder import SIDES, CampaignFolder
+from hil.campaign.operator import OperatorRequest, Stop
+from hil.campaign.run import RunResult
+from hil.campaign.virtual_link import VirtualLink
+from hil.cli import app
+from hil.design.requirements import requirements_from
+from hil.errors import InputError, OperatorStopError
+from hil.payload_campaign import (
+    Mounting,
+    MountingError,
+    PayloadCampaign,
+    Weighed,
+    assumed_payload,
+    loaded_cell,
+)
+from hil.progress import Silent
+from hil.simulation import carried, planted_truth, simulated_controller
+from identification.model.payload import Payload
+from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
+
+pytestmark = pytest.mark.safety
+
+MASS = 2.0
+CENTRE = (0.3, 0.0, 0.05)
+ASSUMED = 2.5
+ORDER = ["bare 1", "loaded 1", "loaded 2", "bare 2"]
+
+
+class Heard(Silent):
+    """Keeps what is said."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.lines.append(text)
+
+
+def campaign_in(folder: Path, repetitions: int = 6) -> Campaign:
+    cell = fast_cell(folder, repetitions=repetitions)
+    # The controller does not know the load: the arm sags a little when it is released.
+    cell = cell.with_values({"simulation.friction_drift": 0.0, "campaign.settle_s": 0.5})
+    return fast_campaign(folder / "weigh", cell)
+
+
+def begun(campaign: Campaign, name: str = "weight") -> PayloadCampaign:
+    assumed = assumed_payload(campaign.cell, ASSUMED, CENTRE)
+    return PayloadCampaign.of(campaign, name, assumed)
+
+
+def true_link(side: Campaign, session: int) -> VirtualLink:
+    """The arm carries another mass than is assumed, in the loaded side only."""
+    cell = side.cell
+    load = Payload(MASS, CENTRE, (0.004, 0.0, 0.0, 0.006, 0.0, 0.005))
+    is_loaded = cell.model.payload is not None
+    truth = replace(planted_truth(cell), carried=carried(cell, load) if is_loaded else None)
+    controller = simulated_controller(cell, truth=truth, session=session)
+    return VirtualLink.over(SimulatedTransport(controller), cell, finish=controller.finish)
+
+
+def execute(side: Campaign, choices: Mapping[str, Any]) -> RunResult:
+    return side.run(**choices)
+
+
+def run(weighed: PayloadCampaign, execute=execute, reporter=None, **more: Any) -> Weighed:
+    reporter = reporter or Silent()
+    mounting = Mounting(weighed, reporter)
+    return weighed.run(
+        execute, mounting, reporter, links=true_link, choices={"unrehearsed": True}, **more
+    )
+
+
+def recorded(weighed: PayloadCampaign) -> list[str]:
+    """Complete repetitions of both sides, such as "bare 1"."""
+    return sorted(
+        f"{side} {index + 1}"
+        for side in SIDES
+        for index in range(9)
+        if CampaignFolder(weighed.root / side).whole("excitation", index) is not None
+    )
+
+
+@pytest.fixture(scope="module")
+def designed(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+    return campaign_in(tmp_path_factory.mktemp("designed"))
+
+
+@pytest.fixture(scope="module")
+def done(designed: Campaign) -> tuple[PayloadCampaign, Weighed, list[str]]:
+    weighed = begun(designed)
+    order: list[str] = []
+
+    def noting(side: Campaign, choices: Mapping[str, Any]) -> RunResult:
+        before = recorded(weighed)
+        result = execute(side, choices)
+        order.extend(one for one in recorded(weighed) if one not in before)
+        return result
+
+    return weighed, run(weighed, noting), order
+
+
+class TestRecording:
+    def test_the_motion_runs_bare_loaded_loaded_bare(self, done) -> None:
+        _, found, order = done
+        assert order == ORDER
+        assert found.pairs == 2
+
+    def test_the_carried_mass_is_found_and_not_the_assumed_one(self, done) -> None:
+        _, found, _ = done
+        low, high = found.found.estimate.intervals[0]
+        assert low < MASS < high < ASSUMED
+        assert high - low < 0.05 * MASS
+
+    def test_headers_say_which_recordings_were_loaded_and_by_what(self, done) -> None:
+        weighed, _, _ = done
+        for side, name in ((weighed.bare, ""), (weighed.loaded, "weight")):
+            paths = [path for path in side.folder.archives.iterdir() if path.suffix == ".mcap"]
+            assert {open_archive(path).header.payload for path in paths} == {name}
+
+    def test_the_result_is_stored_as_hil_payload_prints_it(self, done) -> None:
+        weighed, found, _ = done
+        stored = json.loads((weighed.root / "payload.json").read_text())
+        assert stored["figures"]["mass"]["value"] == pytest.approx(found.found.body.mass)
+        text = (weighed.root / "payload.txt").read_text()
+        assert text == "\n".join(found.lines) + "\n"
+        assert "$TOOL_MASS := 1." in text or "$TOOL_MASS := 2." in text
+        printed = CliRunner().invoke(
+            app,
+            ["payload", str(weighed.bare.folder.root), "--loaded", str(weighed.loaded.folder.root)],
+        )
+        assert printed.stdout == text
+
+    def test_nothing_is_recorded_again(self, designed, done) -> None:
+        _, found, _ = done
+
+        def never(*_: object) -> RunResult:
+            pytest.fail("nothing was missing")
+
+        again = PayloadCampaign.of(designed, "weight", None)
+        assert run(again, never).found.body.mass == found.found.body.mass
+
+    def test_an_identification_of_the_loaded_side_warns(self, done) -> None:
+        """What the assumed payload is wrong by is in the last link."""
+        weighed, _, _ = done
+        warnings = weighed.loaded.identify().results.verdict.warnings
+        assert any("payload of assumed figures" in one for one in warnings)
+
+
+class TestInterrupted:
+    @pytest.mark.parametrize("stage", range(4), ids=ORDER)
+    def test_a_stop_in_each_stage_is_resumed(self, tmp_path, stage: int) -> None:
+        """Ctrl-C brings the arm to rest on its path; complete recordings are kept."""
+        campaign = campaign_in(tmp_path, repetitions=2)
+        weighed = begun(campaign)
+        stop = Stop()
+
+        class Stopping:
+            """Stops in the repetition of a stage."""
+
+            can_answer = False
+            seen = 0
+
+            def show(self, status) -> None:
+                moving = status.motion is not None and status.motion.cycles > 100
+                if status.phase == "repetition" and moving and len(recorded(weighed)) == stage:
+                    stop.requested = True
+
+            def request(self):
+                return OperatorRequest()
+
+        def stopping(side: Campaign, choices: Mapping[str, Any]) -> RunResult:
+            return side.run(stop=stop, operator=Stopping(), **choices)
+
+        with pytest.raises(MotionFailedError, match="stopped"):
+            run(weighed, stopping)
+        kept = recorded(weighed)
+        assert kept == sorted(ORDER[:stage])
+        found = run(PayloadCampaign.of(Campaign.open(campaign.folder.root), "weight", None))
+        assert recorded(weighed) == sorted(ORDER)
+        assert found.found.body.mass == pytest.approx(MASS, rel=0.03)
+        attempts = [path.name for path in weighed.root.glob("*/archives/excitation*")]
+        assert sum("_a2" in name for name in attempts) == 1
+
+    @pytest.mark.parametrize("stage", range(4), ids=ORDER)
+    def test_a_kill_in_each_stage_loses_nothing(self, tmp_path, monkeypatch, stage: int) -> None:
+        """Killed between the end of a recording and its entry in the manifest."""
+        campaign = campaign_in(tmp_path, repetitions=2)
+        weighed = begun(campaign)
+        enter = CampaignFolder.add
+
+        def killed(folder: CampaignFolder, name: str, *rest: str) -> None:
+            if name.startswith("excitation") and len(recorded(weighed)) == stage:
+                raise SystemExit(137)
+            enter(folder, name, *rest)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(CampaignFolder, "add", killed)
+            with pytest.raises(SystemExit):
+                run(weighed)
+        assert recorded(weighed) == sorted(ORDER[:stage])
+        run(PayloadCampaign.of(Campaign.open(campaign.folder.root), "weight", None))
+        assert recorded(weighed) == sorted(ORDER)
+        attempts = [path.name for path in weighed.root.glob("*/archives/excitation*")]
+        assert not any("_a2" in name for name in attempts)
+
+
+class TestPrecision:
+    def test_it_ends_when_the_mass_is_precise(self, designed) -> None:
+        heard = Heard()
+        found = run(
+            begun(designed, "loose"),
+            reporter=heard,
+            requirements=requirements_from(["mass of payload 10 %"]),
+        )
+        assert found.pairs == 2
+        assert found.precision.outcome == "met"
+        assert any("precision after 2 pairs: mass" in line for line in heard.lines)
+        assert "no more pairs" in found.lines[-1]
+
+    def test_it_ends_when_more_pairs_do_not_help(self, designed) -> None:
+        weighed = begun(designed, "strict")
+        found = run(weighed, requirements=requirements_from(["mass of payload 0.01 %"]))
+        assert found.precision.outcome in ("out of reach", "limit")
+        assert found.pairs == 3
+        assert recorded(weighed) == sorted([*ORDER, "bare 3", "loaded 3"])
+
+    def test_other_requirements_are_refused(self, designed) -> None:
+        with pytest.raises(InputError, match="not about the payload"):
+            run(begun(designed, "other"), requirements=requirements_from(["torque 2"]))
+
+
+class TestMounting:
+    @pytest.fixture
+    def real(self, tmp_path) -> PayloadCampaign:
+        """A cell with a real link: nothing mounts by itself."""
+        cell = fast_cell(tmp_path).with_values({"controller.transport": "udp"})
+        return begun(fast_campaign(tmp_path / "weigh", cell))
+
+    def test_without_a_terminal_it_names_the_next_command(self, real) -> None:
+        mounting = Mounting(real, Silent(), mounted=False)
+        mounting.require(False)
+        with pytest.raises(MountingError, match=r"Mount weight.*--payload weight --mounted yes`"):
+            mounting.require(True)
+        assert MountingError.exit_code == 3
+
+    def test_the_operator_is_asked_only_where_it_changes(self, real) -> None:
+        asked: list[str] = []
+
+        def ask(demand: str) -> bool:
+            asked.append(demand)
+            return True
+
+        mounting = Mounting(real, Silent(), ask=ask)
+        for loaded in (False, True, True, False):
+            mounting.require(loaded)
+        assert [one.split()[0] for one in asked] == ["Remove", "Mount", "Remove"]
+
+    def test_another_answer_stops_and_names_the_command(self, real) -> None:
+        mounting = Mounting(real, Silent(), ask=lambda _: False)
+        with pytest.raises(OperatorStopError, match=r"resume with `hil run .* --payload weight`"):
+            mounting.require(True)
+
+
+class TestLimits:
+    def test_a_load_beyond_a_limit_is_refused_at_once(self, designed) -> None:
+        heavy = assumed_payload(designed.cell, 60.0, CENTRE)
+        with pytest.raises(MotionRefusedError, match=r"60 kg.*motor.*--for payload"):
+            PayloadCampaign.of(designed, "heavy", heavy)
+        assert not (designed.folder.root / "payload" / "heavy").exists()
+
+    def test_the_rehearsal_of_the_loaded_side_carries_the_payload(self, tmp_path) -> None:
+        weighed = begun(campaign_in(tmp_path, repetitions=2))
+        weighed.rehearse(Silent(), Stop())
+        for side in (weighed.bare, weighed.loaded):
+            passed = [step for step in side.status().steps if step.name == "rehearse"]
+            assert passed[0].done, passed[0].sentence
+
+    def test_a_tool_of_the_cell_is_carried_as_well(self, tmp_path) -> None:
+        cell = fast_cell(tmp_path).with_values(
+            {"robot.payload.mass": 1.0, "robot.payload.centre": [0.1, 0.0, 0.0]}
+        )
+        both = loaded_cell(cell, "weight", assumed_payload(cell, 3.0, (0.3, 0.0, 0.0)))
+        payload = both.model.payload
+        assert payload.mass == pytest.approx(4.0)
+        assert payload.centre == pytest.approx((0.25, 0.0, 0.0))
+
+    def test_another_assumed_mass_needs_another_name(self, designed, done) -> None:
+        other = assumed_payload(designed.cell, 1.0, CENTRE)
+        with pytest.raises(CampaignFolderError, match="another name"):
+            PayloadCampaign.of(designed, "weight", other)
+
+
+def invoke(root: Path, *words: str):
+    return CliRunner().invoke(app, ["run", str(root), *words], catch_exceptions=False)
+
+
+STATED = ("--payload", "gripper", "--payload-mass", "2", "--payload-centre", "0.3,0,0.05")
+
+
+class TestCommand:
+    def test_each_gate_names_the_next_command_to_the_end(self, tmp_path) -> None:
+        campaign = campaign_in(tmp_path, repetitions=2)
+        root = campaign.folder.root
+        with pytest.raises(NotRehearsedError, match=r"hil rehearse .*payload/gripper/bare"):
+            invoke(root, *STATED)
+        for side in SIDES:
+            pass_rehearsal(CampaignFolder(root / "payload" / "gripper" / side))
+        result = invoke(root, "--payload", "gripper", "--dry-run")
+        assert result.exit_code == 0
+        assert "--payload gripper --accept-dry-run" in result.output.replace("\n", " ")
+        result = invoke(root, "--payload", "gripper", "--accept-dry-run", "--json")
+        assert result.exit_code == 0, result.output
+        found = json.loads(result.stdout)
+        low, high = found["figures"]["mass"]["interval"]
+        assert low < 2.0 < high
+        assert found["pairs"] == 2
+
+    @pytest.mark.parametrize(
+        ("words", "sentence"),
+        [
+            (("--payload", "../x", "--payload-mass", "2"), "not a valid name of a payload"),
+            (("--payload", "new"), "--payload-mass"),
+            (("--payload", "new", "--payload-centre", "0,0,1"), "needs the mass"),
+            (("--payload", "new", "--payload-mass", "2", "--payload-centre", "1"), "not 3 numbers"),
+            (("--mounted", "yes"), "--mounted: needs a payload"),
+            ((*STATED, "--precision", "torque 2"), "not about the payload"),
+            ((*STATED, "--no-identify"), "--no-identify and --payload"),
+        ],
+    )
+    def test_what_cannot_be_run_is_named(self, tmp_path, words, sentence: str) -> None:
+        campaign = campaign_in(tmp_path)
+        with pytest.raises(InputError, match=sentence):
+            invoke(campaign.folder.root, *words)
+
+    def test_a_side_is_not_run_alone(self, designed, done) -> None:
+        weighed, _, _ = done
+        with pytest.raises(InputError, match=r"run `hil run .*weigh --payload weight`"):
+            invoke(weighed.loaded.folder.root)
