@@ -193,7 +193,8 @@ class Factor:
     def _sums(self) -> tuple[Array, ...]:
         """Gram matrices over the columns of each joint (c_j + 1, c_j + 1)."""
         if self.storage == "gram":
-            return tuple(own.sum(axis=0) for own in self.matrices)
+            # That of one block is no copy, which can be large.
+            return tuple(own[0] if len(own) == 1 else own.sum(axis=0) for own in self.matrices)
         return tuple(np.einsum("bki,bkj->ij", own, own) for own in self.matrices)
 
     @property
