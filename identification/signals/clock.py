@@ -303,7 +303,7 @@ def _fitted_lines(values: Array, width: int) -> Array:
         (slice(len(values) - width, len(values)), slice(half + 1, width)),
     ):
         own = values[window]
-        slope = place @ own / max(1, place @ place)
+        slope = float(place @ own) / max(1.0, float(place @ place))
         fitted[window][beside] = own.mean() + slope * place[beside]
     return np.asarray(fitted)
 

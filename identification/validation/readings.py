@@ -527,7 +527,8 @@ def _reordered(model: RobotModel, samples: Samples, change: Change) -> Samples:
     usable = samples.usable
     if change.meaning != "torque order":
         load = None if motion.load is None else motion.load[:, order]
-        motion = Motion(motion.time, *(part[:, order] for part in motion[1:4]), load=load)
+        motion = Motion(motion.time, *(part[:, order] for part in motion[1:4]))
+        motion = motion._replace(load=load)
         usable = usable[:, order]
     if change.meaning != "position order":
         torque = torque[:, order]
