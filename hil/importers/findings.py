@@ -236,18 +236,19 @@ def _velocities(
         return
     factor, correlation = against_position(time, position[:, moving], velocity[:, moving])
     itself = np.diag(correlation)
-    columns = scipy.optimize.linear_sum_assignment(-correlation)[1]
-    best = correlation[np.arange(len(moving)), columns]
-    if itself.min() < _CORRELATED <= best.min():
-        order = list(names)
-        for joint, column in zip(moving, columns, strict=True):
-            order[moving[column]] = names[joint]
-        yield (
-            "the velocities are in another order than the positions: as mapped they deviate from "
-            f"the slopes by {_missed(itself):.0f} %, as those of {', '.join(order)} by "
-            f"{_missed(best):.0f} %: name the columns of both in the same order"
-        )
-        return
+    if itself.min() < _CORRELATED:
+        columns = scipy.optimize.linear_sum_assignment(-correlation)[1]
+        best = correlation[np.arange(len(moving)), columns]
+        if best.min() >= _CORRELATED:
+            order = list(names)
+            for joint, column in zip(moving, columns, strict=True):
+                order[moving[column]] = names[joint]
+            yield (
+                "the velocities are in another order than the positions: as mapped they deviate "
+                f"from the slopes by {_missed(itself):.0f} %, as those of {', '.join(order)} by "
+                f"{_missed(best):.0f} %: name the columns of both in the same order"
+            )
+            return
     off = []
     for k, joint in enumerate(moving):
         if itself[k] < _CORRELATED:

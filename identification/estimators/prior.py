@@ -18,6 +18,7 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
@@ -101,7 +102,7 @@ class GaussianPrior:
         covariance = seen_spread @ seen_spread.T
         scale = np.sqrt(np.diag(covariance))
         lower = np.linalg.cholesky(covariance / np.outer(scale, scale))
-        root = np.linalg.solve(lower, seen.T / scale[:, None]) / size
+        root = scipy.linalg.solve_triangular(lower, seen.T / scale[:, None], lower=True) / size
         return cls(combinations @ mean, np.asarray(root), words)
 
     @cached_property
@@ -524,10 +525,9 @@ def nominal_ratio(model: RobotModel, factor: Factor) -> tuple[float, float]:
     directions[:b, 1 : 1 + rotors.shape[1]] = rotors
     directions[b:-1, 1 + rotors.shape[1] : -1] = np.eye(model.n_parameters - b)
     directions[-1, -1] = 1.0
-    products = factor.products(directions)
-    power = products[:, -1, -1]
+    power = factor.gram[:, -1, -1]
     weights = inverse_variance(np.where(power > 0.0, power, np.nan))
-    total = np.tensordot(weights, products, axes=1)
+    total = directions.T @ factor.weighted_gram(weights) @ directions
     moving = np.diag(total)[:-1] > 0.0
     if not moving[0]:
         return np.nan, np.inf

@@ -193,7 +193,8 @@ class Factor:
     def _sums(self) -> tuple[Array, ...]:
         """Gram matrices over the columns of each joint (c_j + 1, c_j + 1)."""
         if self.storage == "gram":
-            return tuple(own.sum(axis=0) for own in self.matrices)
+            # That of one block is no copy, which can be large.
+            return tuple(own[0] if len(own) == 1 else own.sum(axis=0) for own in self.matrices)
         return tuple(np.einsum("bki,bkj->ij", own, own) for own in self.matrices)
 
     @property
@@ -225,11 +226,16 @@ class Factor:
 
     def weighted(self, weights: Array) -> NormalEquations:
         """Return the normal equations with one weight per joint (n,): 1/variance."""
-        # One product of flat matrices: the general sum takes several times as long.
-        total = (weights @ self.gram.reshape(len(weights), -1)).reshape(self.gram.shape[1:])
+        total = self.weighted_gram(weights)
         return NormalEquations(
             A=total[:-1, :-1], b=total[:-1, -1], yy=float(total[-1, -1]), n=int(self.samples.sum())
         )
+
+    def weighted_gram(self, weights: Array) -> Array:
+        """Return the Gram matrix of [W | y] (p + 1, p + 1) with joint weights (n,)."""
+        # One product of flat matrices: a general sum takes several times as long.
+        total = weights @ self.gram.reshape(len(weights), -1)
+        return np.asarray(total.reshape(self.gram.shape[1:]))
 
     def squared_errors(self, values: Array) -> Array:
         """Return the sum of squared torque errors of parameters (p,) per joint (n,)."""

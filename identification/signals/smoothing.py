@@ -232,9 +232,11 @@ class _Problem:
         lightest = _LIGHTEST * density
         factor = (scipy.linalg.cholesky_banded(gram + lightest * penalty, lower=True), True)
         closest = scipy.linalg.cho_solve_banded(factor, rows.T @ values)
-        refined = rows.T @ (values - rows @ closest) - lightest * _roughness(closest)
+        residual = rows @ closest
+        np.subtract(values, residual, out=residual)
+        refined = rows.T @ residual - lightest * _roughness(closest)
         closest += scipy.linalg.cho_solve_banded(factor, refined)
-        residual = values - rows @ closest
+        np.subtract(values, rows @ closest, out=residual)
         return cls(spacing, density, rows, gram, penalty, closest, residual, _roughness(closest))
 
     def correction(self, channel: int | slice, penalty: float) -> Array:
@@ -313,14 +315,21 @@ def _rows(
     start: float, spacing: float, intervals: int, time: Array, derivative: int = 0
 ) -> scipy.sparse.csr_array:
     """Return the basis functions or derivatives at each time, sparse (m, intervals + 5)."""
-    x = (np.asarray(time, dtype=np.float64) - start) / spacing
-    interval = np.clip(np.floor(x).astype(np.int64), 0, intervals - 1)
     pieces = _pieces(DEGREE, derivative)
-    weights = np.vander(x - interval, len(pieces), increasing=True) @ pieces
-    columns = (interval[:, None] + np.arange(ORDER)).ravel()
-    ends = np.arange(0, ORDER * len(x) + 1, ORDER)
+    m = len(time)
+    weights = np.empty((m, ORDER))
+    columns = np.empty((m, ORDER), dtype=np.int32)
+    # Powers of all times of a long recording would be its largest arrays.
+    for first in range(0, m, _ROWS_AT_ONCE):
+        part = slice(first, first + _ROWS_AT_ONCE)
+        x = (np.asarray(time[part], dtype=np.float64) - start) / spacing
+        interval = np.clip(np.floor(x).astype(np.int32), 0, intervals - 1)
+        powers = np.vander(x - interval, len(pieces), increasing=True)
+        weights[part] = powers @ pieces / spacing**derivative
+        columns[part] = interval[:, None] + np.arange(ORDER)
+    ends = np.arange(0, ORDER * m + 1, ORDER, dtype=np.int32)
     return scipy.sparse.csr_array(
-        ((weights / spacing**derivative).ravel(), columns, ends), shape=(len(x), intervals + DEGREE)
+        (weights.ravel(), columns.ravel(), ends), shape=(m, intervals + DEGREE)
     )
 
 

@@ -319,6 +319,14 @@ def _implausible(
     return implausibilities(model, estimate, unseen, error.rms, speed=speed, added=added)
 
 
+def _gravity_and_load(
+    model: RobotModel, training: Sequence[Samples], held_out: Sequence[Samples]
+) -> tuple[GravityDirection, CarriedLoad]:
+    """Fit gravity and a carried load by sums that are large, and not needed afterwards."""
+    sums = [standard_factor(model, some) for some in (training, held_out)]
+    return find_gravity(model, *sums), find_load(model, training, held_out, *sums)
+
+
 def gather(
     model: RobotModel,
     result: RepeatedEstimate,
@@ -344,7 +352,7 @@ def gather(
     unseen = total_factor(model, held_out) if unseen is None else unseen
     few = training[:_MOST_RECORDINGS]
     few_unseen = held_out[:_MOST_RECORDINGS]
-    standard = [standard_factor(model, some) for some in (few, few_unseen)]
+    gravity, load = _gravity_and_load(model, few, few_unseen)
     repeated = same_motion and len(result.repetitions) > 1
     noise = repetition_noise(model, values, training, SLOW) if repeated else None
     floor = noise_floor(model, values, few, noise)
@@ -365,8 +373,8 @@ def gather(
         causes=find_causes(model, training, values, names, noise=floor),
         changes=find_changes(model, values, training, others) if others else (),
         one_way=_one_way(training),
-        gravity=find_gravity(model, *standard),
-        load=find_load(model, few, few_unseen, *standard),
+        gravity=gravity,
+        load=load,
         nominal=None if nominal is None else _error(model, nominal, held_out),
         implausible=_implausible(model, pooled, unseen, error, speed, context),
         consistency=consistency,

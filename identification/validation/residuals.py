@@ -203,11 +203,14 @@ def _drift_sums(
     model: RobotModel, values: Array, samples: Samples, residual: Array, pieces: int
 ) -> Array:
     """Sum friction times residual (m, n), and friction squared, over P parts (2, P, n)."""
-    friction = samples.predicted_torque(model, values, model.friction_columns)
-    friction = np.where(samples.usable, friction, 0.0)
+    torque = samples.predicted_torque(model, values, model.friction_columns)
     edges = np.linspace(0, len(residual), pieces + 1).astype(np.intp)[:-1]
-    factors = (residual, friction)
-    return np.array([np.add.reduceat(friction * factor, edges, axis=0) for factor in factors])
+    sums = np.empty((2, len(edges), model.n_joints))
+    for joint, usable in enumerate(samples.usable.T):  # one by one, as recordings can be long
+        friction = np.where(usable, torque[:, joint], 0.0)
+        for own, factor in zip(sums, (residual[:, joint], friction), strict=True):
+            own[:, joint] = np.add.reduceat(friction * factor, edges)
+    return sums
 
 
 def _friction_drift(sums: Sequence[Array]) -> FrictionDrift | None:
