@@ -13,6 +13,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import ExitStack
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
@@ -248,15 +249,37 @@ class Cluster:
             since = time.monotonic()
             count -= 1
             if future.cancelled():
-                place = self._scheduler or "of this PC"
-                raise ClusterError(
-                    f"the Dask scheduler {place} does not answer any more; start it and run the"
-                    " command again: what was computed is in the cache"
-                )
+                raise self._without_scheduler()
             if future.status == "error" and not _died(future):
                 raise _unexpected(future.exception())
             yield future
             del future
+
+    def outcome_of(self, future: Future) -> Any:
+        """Return the result of a task that is done, or a `Death`.
+
+        A result that is lost with its worker is computed again, which may end in one, too.
+
+        Raises:
+            ClusterError: the scheduler ended before the result was fetched from it.
+        """
+        from distributed import KilledWorker
+
+        try:
+            return future.result()
+        except KilledWorker:
+            return Death()
+        except HilError:
+            raise
+        except (OSError, RuntimeError, CancelledError) as error:
+            raise self._without_scheduler() from error
+
+    def _without_scheduler(self) -> ClusterError:
+        place = self._scheduler or "of this PC"
+        return ClusterError(
+            f"the Dask scheduler {place} does not answer any more; start it and run the command"
+            " again: what was computed is in the cache"
+        )
 
     def _watch(self, since: float) -> float:
         """Return since when there is a worker, or raise a `ClusterError` after `PATIENCE`."""
@@ -299,7 +322,7 @@ class Cluster:
 
         for future in self.completed(submitted()):
             number = places[future.key]
-            result = outcome_of(future)
+            result = self.outcome_of(future)
             if isinstance(result, Death):
                 deaths.append(number)
             else:
@@ -312,7 +335,7 @@ class Cluster:
 
     def _alone(self, task: Task[T], archives: int) -> T | Unused:
         (future,) = self.completed(iter([self.submit(task, archives=archives)]))
-        result: T | Unused | Death = outcome_of(future)
+        result: T | Unused | Death = self.outcome_of(future)
         if isinstance(result, Death):
             return Unused(task.path, "ended the process that read it, twice")
         return result
@@ -330,19 +353,6 @@ def _unexpected(error: BaseException) -> BaseException:
 
 class Death:
     """In place of a result: the task, or one that it depends on, ended its process repeatedly."""
-
-
-def outcome_of(future: Future) -> Any:
-    """Return the result of a task that is done, or a `Death`.
-
-    A result that is lost with its worker is computed again, which may end in one, too.
-    """
-    from distributed import KilledWorker
-
-    try:
-        return future.result()
-    except KilledWorker:
-        return Death()
 
 
 def _died(future: Future) -> bool:

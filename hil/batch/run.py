@@ -23,7 +23,7 @@ from hil.progress import Reporter, Silent
 from identification.selection.settings import Settings
 
 from .cache import CacheLocation, code_digest
-from .cluster import Cluster, Death, Task, Unused, outcome_of, reason_of
+from .cluster import Cluster, Death, Task, Unused, reason_of
 from .discovery import (
     ArchiveRef,
     CellTexts,
@@ -357,7 +357,7 @@ class _Batch:
                 yield from self._submit(arm, receivers, archives, advance)
 
         for future in self.cluster.completed(submitted()):
-            result = outcome_of(future)
+            result = self.cluster.outcome_of(future)
             if not isinstance(result, Death):
                 receivers[future.key](result)
         for arm in arms:

@@ -58,6 +58,25 @@ class Deadly(WorkerPlugin):
         discovery.open_archive = deadly
 
 
+class Held(WorkerPlugin):
+    """Workers wait at the archive of a name until a file exists, so that a batch cannot end."""
+
+    name = "held archive"
+
+    def __init__(self, archive, until):
+        self.archive, self.until = archive, until
+
+    def setup(self, worker):
+        read = discovery.open_archive
+
+        def held(path, **how):
+            while path.name == self.archive and how["fields"] and not self.until.exists():
+                time.sleep(0.02)
+            return read(path, **how)
+
+        discovery.open_archive = held
+
+
 class Process:
     """A process of Dask's own command line, started until its log says that it is ready."""
 

@@ -9,10 +9,12 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import CancelledError
 from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from unittest.mock import Mock
 
 import fsspec
 import pytest
@@ -36,6 +38,7 @@ from .batch_work import NOTHING_OPEN, HandMade, Here
 pytestmark = pytest.mark.long
 
 UNCACHED = CacheLocation(keep=False)
+HELD = "validation_001_a1.mcap"
 
 
 def batch(*places, cluster=None, cache=UNCACHED):
@@ -75,6 +78,16 @@ def test_tasks_that_fail_or_end_their_process_affect_no_other():
     work.check_unused(results[2], "crash-2.mcap", "ended the process that read it, twice")
     work.check_unused(results[4], "absent-4.mcap", "No such file")
     work.check_unused(results[7], "faulty-7.mcap", "IndexError")
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError("ConnectionPool is closed"), OSError("closed"), CancelledError("key")]
+)
+def test_a_result_that_is_lost_with_its_scheduler_is_reported(error):
+    """It is done, and not fetched yet."""
+    future = Mock(result=Mock(side_effect=error))
+    with pytest.raises(ClusterError, match=r"tcp://x:1 does not answer any more.*in the cache"):
+        Cluster(scheduler="tcp://x:1").outcome_of(future)
 
 
 class Background:
@@ -117,11 +130,14 @@ class TestSchedulersByHand:
         """One while it works; then all of them, until another one starts."""
         monkeypatch.setattr(batch_run, "PARTITION", 1)
         cache = CacheLocation(str(tmp_path))
+        go = tmp_path / "go"
         with HandMade() as processes, Cluster(scheduler=processes.address) as cluster:
+            cluster.client(5).register_plugin(work.Held(HELD, go))
             running = Background(folder, cluster=cluster, cache=cache)
             wait_for_factors(tmp_path, 1)
             for worker in processes.workers:
                 worker.kill()
+            go.touch()
             processes.add_worker()
             result = running.join()
         assert bits(result) == bits(expected)
@@ -134,6 +150,7 @@ class TestSchedulersByHand:
         monkeypatch.setattr(batch_run, "PARTITION", 1)
         cache = CacheLocation(str(tmp_path))
         with HandMade() as processes, Cluster(scheduler=processes.address) as cluster:
+            cluster.client(5).register_plugin(work.Held(HELD, tmp_path / "never"))
             running = Background(folder, cluster=cluster, cache=cache)
             wait_for_factors(tmp_path, 1)
             processes.scheduler.kill()
@@ -172,7 +189,7 @@ class TestSchedulersByHand:
     @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "127.0.0.1:1", "nonsense://x"])
     def test_nobody_at_the_address_is_refused(self, address, folder, monkeypatch):
         monkeypatch.setattr(cluster_module, "CONNECT_TIMEOUT", 0.5)
-        command = ["reidentify", str(folder), "--scheduler", address, *NOTHING_OPEN]
+        command = ["batch", str(folder), "--scheduler", address, *NOTHING_OPEN]
         ran = CliRunner().invoke(app, command)
         assert isinstance(ran.exception, InputError)
         text = str(ran.exception)
@@ -180,7 +197,7 @@ class TestSchedulersByHand:
         assert "dask scheduler" in text
 
     def test_has_its_own_number_of_workers(self, folder):
-        command = ["reidentify", str(folder), "--scheduler", "tcp://x:1", "--workers", "2"]
+        command = ["batch", str(folder), "--scheduler", "tcp://x:1", "--workers", "2"]
         error = CliRunner().invoke(app, command).exception
         assert isinstance(error, InputError)
         assert "omit --workers, or --scheduler" in str(error)
@@ -275,22 +292,25 @@ def alive(group):
 
 @pytest.mark.slow
 def test_interrupts_end_the_command_and_its_workers(folder, tmp_path):
-    """By Ctrl-C, which all processes of the terminal receive."""
-    command = [sys.executable, "-m", "hil", "reidentify", str(folder), "--workers", "2"]
+    """By Ctrl-C, which all processes of the terminal receive, amid work for many seconds."""
+    copies = [shutil.copytree(folder, tmp_path / f"campaign-{k}") for k in range(20)]
+    cache = tmp_path / "cache"
+    command = [sys.executable, "-m", "hil", "batch", *map(str, copies), "--workers", "2"]
     process = subprocess.Popen(
-        [*command, "--cache", str(tmp_path)],
+        [*command, "--cache", str(cache)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
     )
     deadline = time.monotonic() + 120.0
-    while not [*tmp_path.rglob("*.npz")] and time.monotonic() < deadline:
+    while not [*cache.rglob("*.npz")] and time.monotonic() < deadline:
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGINT)
-    _, errors = process.communicate(timeout=60.0)
+    _, errors = process.communicate(timeout=120.0)
     assert process.returncode == 130
     assert errors.strip() == "stopped: interrupted"
+    deadline = time.monotonic() + 60.0
     while alive(process.pid):
         assert time.monotonic() < deadline
         time.sleep(0.05)
