@@ -86,11 +86,9 @@ def identified_campaign(
     """A copy of `short_campaign` with results, exports and report. Read-only."""
     import shutil
 
-    from hil.campaign import Campaign
-
     root = tmp_path_factory.mktemp("hil") / "identified"
     shutil.copytree(short_campaign.folder.root, root)
-    campaign = Campaign.open(root)
+    campaign = type(short_campaign).open(root)
     campaign.identify()
     return campaign
 
