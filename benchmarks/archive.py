@@ -178,8 +178,8 @@ def sizes(path: Path) -> list[dict[str, Any]]:
             for record in container.records(stream, size)
             if record.opcode == container.CHUNK
         ]
-        chunks = [container.chunk_data(*one) for one in packed_chunks]
-    rest = size - sum(len(one.data) for one, _ in packed_chunks)
+        chunks = [container.chunk_data(*entry) for entry in packed_chunks]
+    other_bytes = size - sum(len(packed_chunk.data) for packed_chunk, _ in packed_chunks)
     methods: dict[str, tuple[Callable[[bytes], bytes], Callable[[bytes], bytes]]] = {
         "none": (bytes, bytes),
         "lz4": (lz4.frame.compress, lz4.frame.decompress),
@@ -195,7 +195,7 @@ def sizes(path: Path) -> list[dict[str, Any]]:
         for data in packed:
             unpack(data)
         end = time.process_time()
-        total = sum(len(data) for data in packed) + rest
+        total = sum(len(data) for data in packed) + other_bytes
         table.append(
             {
                 "compression": name,

@@ -57,10 +57,10 @@ def archives_to_estimate(paths: Sequence[Path]) -> float:
     with tempfile.TemporaryDirectory() as cache:
         start = time.process_time()
         with InThisProcess() as cluster:
-            found = _run([str(path) for path in paths], Path(cache), "wls", cluster)
+            result = _run([str(path) for path in paths], Path(cache), "wls", cluster)
         end = time.process_time()
-    if found.broken or found.pooled[0].repetitions != len(paths):
-        raise SystemExit(f"the archives were not all fitted: {found.broken}")
+    if result.broken or result.pooled[0].repetitions != len(paths):
+        raise SystemExit(f"the archives were not all fitted: {result.broken}")
     return end - start
 
 
@@ -106,13 +106,15 @@ def measure_made(
     with tempfile.TemporaryDirectory(prefix="hil-benchmark-") as temporary:
         root = folder or Path(temporary)
         campaigns = _make(root, archives, seconds)
-        size = sum(path.stat().st_size for one in campaigns for path in one.glob("*.mcap"))
+        size = sum(
+            path.stat().st_size for campaign in campaigns for path in campaign.glob("*.mcap")
+        )
         counts = sorted({count for count in (100, 400, 1000, archives) if count <= archives})
         steps = [_measured(campaigns[: -(-count // _CAMPAIGN)], workers) for count in counts]
     return steps[-1] | {
         "seconds_per_archive": seconds,
         "archive_MB": round(size / archives / 1e6, 2),
-        "parent_MB": {str(one["archives"]): one["largest_parent_MB"] for one in steps},
+        "parent_MB": {str(step["archives"]): step["largest_parent_MB"] for step in steps},
         "steps": steps,
     }
 
@@ -138,8 +140,8 @@ def _measured(campaigns: Sequence[Path], workers: int | None) -> dict[str, Any]:
     command = [sys.executable, "-m", "benchmarks.batch", "--json", *map(str, campaigns)]
     command += [] if workers is None else ["--workers", str(workers)]
     ran = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-    found: dict[str, Any] = json.loads(ran.stdout)
-    return found
+    figures: dict[str, Any] = json.loads(ran.stdout)
+    return figures
 
 
 def _run(places: Sequence[str], cache: Path, estimator: Any, cluster: Cluster) -> BatchResult:
@@ -151,8 +153,8 @@ def _timed(
     places: Sequence[str], cache: Path, estimator: Any, cluster: Cluster
 ) -> tuple[BatchResult, float, float]:
     wall, cpu = time.perf_counter(), time.process_time()
-    found = _run(places, cache, estimator, cluster)
-    return found, time.perf_counter() - wall, time.process_time() - cpu
+    result = _run(places, cache, estimator, cluster)
+    return result, time.perf_counter() - wall, time.process_time() - cpu
 
 
 def _children() -> float:

@@ -92,8 +92,8 @@ def cut(split: Split, logs: Mapping[str, JointLog]) -> Parts:
     if split.part == "first":
         return Parts(whole.rows(slice(0, share)), whole.rows(slice(share, None)))
     if split.part == "last":
-        rest = whole.n_rows - share
-        return Parts(whole.rows(slice(rest, None)), whole.rows(slice(0, rest)))
+        begin = whole.n_rows - share
+        return Parts(whole.rows(slice(begin, None)), whole.rows(slice(0, begin)))
     return Parts(whole, whole)
 
 
@@ -103,9 +103,9 @@ def identified(
     """Identify from an archive as `hil identify` does, by default settings."""
     options = Options(split=FITTED_SHARE, in_sample=in_sample)
     results = identify_archives([fitted], Silent(), options, predict=predicted).results
-    one = results.fitted if in_sample else results.validation[0]
-    assert one is not None
-    return Identified(one.all_rows_relative_error, one.all_rows_joint_errors, results)
+    prediction = results.fitted if in_sample else results.validation[0]
+    assert prediction is not None
+    return Identified(prediction.all_rows_relative_error, prediction.all_rows_joint_errors, results)
 
 
 def identified_split(split: Split, archives: Mapping[str, Path], parts: Parts) -> Identified:
@@ -208,15 +208,15 @@ def degraded_rows(name: str, split: Split, logs: Mapping[str, JointLog]) -> Iter
                 parts = parts._replace(fitted=degrade(parts.fitted))
             else:
                 parts = cut(split, {log: degrade(values) for log, values in logs.items()})
-            found: Identified | str
+            outcome: Identified | str
             try:
-                found = identified_parts(parts, folder)
+                outcome = identified_parts(parts, folder)
             except (HilError, IdentificationError) as error:
-                found = f"refused: {error}"
-            yield degraded_row(name, case, whole, found)
+                outcome = f"refused: {error}"
+            yield degraded_row(name, case, whole, outcome)
 
 
-def degraded_row(name: str, case: str, whole: Identified, found: Identified | str) -> Row:
+def degraded_row(name: str, case: str, whole: Identified, outcome: Identified | str) -> Row:
     """What became of a fault, beside the identification without it; words where it was refused.
 
     `named` are checks that the verdict calls wrong or suspicious; of those that it calls so without
@@ -224,14 +224,16 @@ def degraded_row(name: str, case: str, whole: Identified, found: Identified | st
     """
     expected = EXPECTED[case].checks
     error, ratio, named = None, None, list[str]()
-    if isinstance(found, str):
-        words = [found]
+    if isinstance(outcome, str):
+        sentences = [outcome]
     else:
-        before = {one.check for one in suspicious(whole.results)} - expected
-        findings = [one for one in suspicious(found.results) if one.check not in before]
-        error, ratio = found.error, found.error / whole.error
-        named = list(dict.fromkeys(one.check for one in findings))
-        words = [f"{one.check}: {one.words}" for one in findings]
+        before = {finding.check for finding in suspicious(whole.results)} - expected
+        findings = [
+            finding for finding in suspicious(outcome.results) if finding.check not in before
+        ]
+        error, ratio = outcome.error, outcome.error / whole.error
+        named = list(dict.fromkeys(finding.check for finding in findings))
+        sentences = [f"{finding.check}: {finding.words}" for finding in findings]
     return {
         "data": name,
         "case": case,
@@ -239,7 +241,7 @@ def degraded_row(name: str, case: str, whole: Identified, found: Identified | st
         "undegraded": whole.error,
         "ratio": ratio,
         "named": named,
-        "words": words,
+        "words": sentences,
         "expected": sorted(expected),
         "right": ratio is not None and is_right(case, ratio, named),
     }
@@ -247,7 +249,11 @@ def degraded_row(name: str, case: str, whole: Identified, found: Identified | st
 
 def suspicious(results: Results) -> list[Finding]:
     """Findings that are neither good nor mere information."""
-    return [one for one in results.judgement.findings if one.level not in ("good", "information")]
+    return [
+        finding
+        for finding in results.judgement.findings
+        if finding.level not in ("good", "information")
+    ]
 
 
 def is_right(case: str, ratio: float, named: Collection[str]) -> bool:
@@ -279,29 +285,29 @@ def simulated_logs() -> tuple[Split, dict[str, JointLog]]:
     }
     robot = Robot(cell.text, cell.urdf, cell.joint_names)
     logs = {}
-    for name, one in parts.items():
-        assert one.torque is not None
-        logs[name] = JointLog(robot, one.time, one.position, None, one.torque, _RATED_PAYLOAD)
+    for name, part in parts.items():
+        assert part.torque is not None
+        logs[name] = JointLog(robot, part.time, part.position, None, part.torque, _RATED_PAYLOAD)
     return Split(fitted="excitation", predicted="validation"), logs
 
 
 def summary(rows: Sequence[Row], degraded: Sequence[Row]) -> dict[str, Any]:
     """What the line of JSON holds."""
-    found: dict[str, Any] = {"rows": list(rows)}
+    figures: dict[str, Any] = {"rows": list(rows)}
     if rows:
-        ratios = np.array([one["ratio"] for one in rows])
+        ratios = np.array([row["ratio"] for row in rows])
         mean = float(np.exp(np.log(ratios).mean()))
-        found |= {"worst_ratio": float(ratios.max()), "mean_ratio": mean}
-        found["worst_row"] = row_name(rows[int(ratios.argmax())])
-        found["above_plain"] = [row_name(one) for one in rows if one["ratio"] > ABOVE_PLAIN]
-        found["above_nominal_friction"] = [
-            row_name(one)
-            for one in rows
-            if one["nominal + friction"] is not None and one["hil"] > one["nominal + friction"]
+        figures |= {"worst_ratio": float(ratios.max()), "mean_ratio": mean}
+        figures["worst_row"] = row_name(rows[int(ratios.argmax())])
+        figures["above_plain"] = [row_name(row) for row in rows if row["ratio"] > ABOVE_PLAIN]
+        figures["above_nominal_friction"] = [
+            row_name(row)
+            for row in rows
+            if row["nominal + friction"] is not None and row["hil"] > row["nominal + friction"]
         ]
     if degraded:
-        found |= {"degraded": list(degraded), "right": sum(one["right"] for one in degraded)}
-    return found
+        figures |= {"degraded": list(degraded), "right": sum(row["right"] for row in degraded)}
+    return figures
 
 
 def row_name(row: Row) -> str:
@@ -358,15 +364,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows: list[Row] = []
     degraded: list[Row] = []
     for name in wanted:
-        for one in () if name == SIMULATED else rows_of(name, options.data, short=options.short):
-            rows.append(one)
+        for row in () if name == SIMULATED else rows_of(name, options.data, short=options.short):
+            rows.append(row)
             if not options.json:
-                print(_line(one), flush=True)
+                print(_line(row), flush=True)
     for name in wanted if options.degraded else ():
-        for one in degraded_rows(name, *split_logs(name, options.data)):
-            degraded.append(one)
+        for row in degraded_rows(name, *split_logs(name, options.data)):
+            degraded.append(row)
             if not options.json:
-                print(_line(one), flush=True)
+                print(_line(row), flush=True)
     figures = summary(rows, degraded) | {"commit": commit()}
     if not options.json:
         print("\n".join(summary_lines(figures)))

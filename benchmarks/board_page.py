@@ -63,12 +63,12 @@ class Line(BaseModel):
     @property
     def is_loss(self) -> bool:
         """Whether an ordinary fit, or the nominal model with or without friction, was better."""
-        others = [one for one in (self.nominal, self.nominal_friction) if one is not None]
-        return self.ratio > BEHIND or any(self.hil > one for one in others)
+        others = [error for error in (self.nominal, self.nominal_friction) if error is not None]
+        return self.ratio > BEHIND or any(self.hil > error for error in others)
 
     def text(self) -> str:
         """The row in Markdown."""
-        nominal = [_percent(one) for one in (self.nominal, self.nominal_friction) if one]
+        nominal = [_percent(error) for error in (self.nominal, self.nominal_friction) if error]
         mark = "" if self.commit is None else f" (measured elsewhere, {self.commit})"
         inside = _percent(self.inside) if isinstance(self.inside, float) else self.inside
         seconds = f"{self.seconds:.0f}" if isinstance(self.seconds, float) else self.seconds

@@ -155,9 +155,9 @@ def _step(log: JointLog) -> float:
     return float(np.median(np.diff(log.time)))
 
 
-def _at(time: Array, known: Array, values: Array) -> Array:
+def _at(time: Array, stamps: Array, values: Array) -> Array:
     """Values (m, n) at other times, straight lines between rows."""
-    return np.column_stack([np.interp(time, known, column) for column in values.T])
+    return np.column_stack([np.interp(time, stamps, column) for column in values.T])
 
 
 def _low_passed(log: JointLog, values: Array, bandwidth: float) -> Array:

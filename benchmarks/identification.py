@@ -186,10 +186,10 @@ def fit(model: RobotModel, samples: Samples) -> Estimate:
     return with_block_covariance(estimate(model, factor, weights), factor, weights)
 
 
-def prepared_fit(one: Case) -> Estimate:
+def prepared_fit(arm_case: Case) -> Estimate:
     """Smooth, mask, and fit."""
-    variance = np.full(one.model.n_joints, _POSITION_NOISE**2)
-    return fit(one.model, prepare(one.recording, one.model, noise_variance=variance))
+    variance = np.full(arm_case.model.n_joints, _POSITION_NOISE**2)
+    return fit(arm_case.model, prepare(arm_case.recording, arm_case.model, noise_variance=variance))
 
 
 def measured(tasks: dict[str, Callable[[], float]], repetitions: int) -> dict[str, Array]:
@@ -227,14 +227,14 @@ def time_fits(python: Path | None, repetitions: int) -> dict[str, float | int | 
 def time_models(repetitions: int) -> dict[str, float | int]:
     """Time what is done once per arm, and the physically consistent estimate."""
     texts = {name: urdf(where).read_text(encoding="utf-8") for name, where in ARMS.items()}
-    one = case(SAME_PARAMETERS)
-    factor = Factor.from_samples(one.model, one.samples.motion, one.samples.torque)
-    free = estimate(one.model, factor)
+    arm_case = case(SAME_PARAMETERS)
+    factor = Factor.from_samples(arm_case.model, arm_case.samples.motion, arm_case.samples.torque)
+    free = estimate(arm_case.model, factor)
     tasks: dict[str, Callable[[], float]] = {
         f"base_{name}": partial(timed, partial(RobotModel.from_urdf, text))
         for name, text in texts.items()
     }
-    tasks["consistent"] = partial(timed, partial(consistent_estimate, one.model, factor, free))
+    tasks["consistent"] = partial(timed, partial(consistent_estimate, arm_case.model, factor, free))
     result: dict[str, float | int] = {}
     for name, values in measured(tasks, repetitions).items():
         result |= _spread(name, values)
@@ -245,16 +245,16 @@ def time_models(repetitions: int) -> dict[str, float | int]:
 
 def installed(python: Path | None, *, install: bool) -> Path | None:
     """The interpreter that has figaroh: the one named, or that of an environment of its own."""
-    own = ENVIRONMENT / "bin" / "python"
+    interpreter = ENVIRONMENT / "bin" / "python"
     if install:
         venv.create(ENVIRONMENT, with_pip=True)
         # The same numerical libraries on both sides.
         pins = [f"{name}=={importlib.metadata.version(name)}" for name in ("numpy", "scipy", "pin")]
         packages = [f"figaroh=={RIVAL_VERSION}", *pins]
-        subprocess.run([str(own), "-m", "pip", "install", "--quiet", *packages], check=True)
+        subprocess.run([str(interpreter), "-m", "pip", "install", "--quiet", *packages], check=True)
     if python is not None:
         return python
-    return own if own.exists() else None
+    return interpreter if interpreter.exists() else None
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -297,10 +297,10 @@ def _spread(name: str, seconds: Array) -> dict[str, float]:
     }
 
 
-def _difference(one: Case, theirs: Array) -> float:
+def _difference(arm_case: Case, theirs: Array) -> float:
     """Largest difference of the predicted torques as a share of their RMS."""
-    motion: Motion = one.samples.motion
-    ours = one.model.torque(fit(one.model, one.samples).values, *motion[1:])
+    motion: Motion = arm_case.samples.motion
+    ours = arm_case.model.torque(fit(arm_case.model, arm_case.samples).values, *motion[1:])
     apart = np.abs(ours.T.reshape(-1) - theirs).max()
     return float(apart / np.sqrt(np.mean(ours**2)))
 

@@ -77,17 +77,17 @@ def recorded(seed: int, *, validation: bool = False) -> Sources:
 def run(seed: int) -> Covered:
     """Record a seed and fit it."""
     cell, sources = study()[0], recorded(seed)
-    (one,) = sources.training
+    (source,) = sources.training
     samples = prepare(
-        one.recording,
+        source.recording,
         cell.model,
         noise_variance=sources.noise_variance,
         options=Preprocessing(torque_delay=cell.controller.current_delay_cycles * cell.period),
-        origin=one.origin,
+        origin=source.origin,
     )
-    found = estimate_repetitions(cell.model, [samples])
-    half = found.pooled.interval_factor * found.pooled.std
-    return Covered(found.pooled.values, half, 1.96 * found.classical_std)
+    estimate = estimate_repetitions(cell.model, [samples])
+    half = estimate.pooled.interval_factor * estimate.pooled.std
+    return Covered(estimate.pooled.values, half, 1.96 * estimate.classical_std)
 
 
 def coverage(rows: Sequence[Covered], truth: Array, names: Sequence[str]) -> dict[str, Any]:
@@ -132,8 +132,8 @@ def main() -> None:
     rows = []
     with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
         # In the order of the seeds: figures do not depend on which process was faster.
-        for done, one in enumerate(pool.imap(run, range(1, options.seeds + 1)), 1):
-            rows.append(one)
+        for done, covered in enumerate(pool.imap(run, range(1, options.seeds + 1)), 1):
+            rows.append(covered)
             print(f"{done} of {options.seeds}", file=sys.stderr, flush=True)
     cell = study()[0]
     result = coverage(rows, planted_values(cell), cell.model.parameter_names)

@@ -46,27 +46,29 @@ def ratios(name: str, data: Path) -> dict[tuple[str, str], float]:
     split, logs = split_logs(name, data)
     parts = cut(split, logs)
     fit, _ = fit_errors(parts)
-    found = {}
+    errors = {}
     with tempfile.TemporaryDirectory() as scratch:
-        found[PRESENT, ""] = identified_parts(parts, Path(scratch)).error / fit
+        errors[PRESENT, ""] = identified_parts(parts, Path(scratch)).error / fit
         for default, values in ALTERNATIVES.items():
             for value in values:
                 with patch.object(inner_prediction, default, value):
                     error = identified_parts(parts, Path(scratch)).error
-                found[default, str(value)] = error / fit
+                errors[default, str(value)] = error / fit
                 print(f"{name}: {default} = {value}: {error / fit:.3f}", flush=True)
-    return found
+    return errors
 
 
 def chosen_without(robots: Mapping[str, Mapping[tuple[str, str], float]], default: str) -> Any:
     """The value of a default that is best on the others, and the ratio with it, by robot."""
     keys = [(PRESENT, ""), *((default, str(value)) for value in ALTERNATIVES[default])]
-    found = {}
-    for name, own in robots.items():
+    choices = {}
+    for name, robot_ratios in robots.items():
         others = [ratio for other, ratio in robots.items() if other != name]
-        best = min(keys, key=lambda key: np.mean([np.log(one[key]) for one in others]))
-        found[name] = {"value": best[1] or "present", "ratio": own[best]}
-    return found
+        best = min(
+            keys, key=lambda key: np.mean([np.log(other_ratios[key]) for other_ratios in others])
+        )
+        choices[name] = {"value": best[1] or "present", "ratio": robot_ratios[best]}
+    return choices
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -78,10 +80,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if len(set(options.only)) < 2:
         parser.error("--only needs at least two recordings: each is judged by all others")
     robots = {name: ratios(name, options.data) for name in options.only}
-    mean = {PRESENT: _geometric([one[PRESENT, ""] for one in robots.values()])}
+    mean = {PRESENT: _geometric([robot_ratios[PRESENT, ""] for robot_ratios in robots.values()])}
     table = {default: chosen_without(robots, default) for default in ALTERNATIVES}
     for default, by_robot in table.items():
-        mean[default] = _geometric([one["ratio"] for one in by_robot.values()])
+        mean[default] = _geometric([choice["ratio"] for choice in by_robot.values()])
     show({"mean_ratio": mean, "chosen": table}, only_json=options.json)
 
 

@@ -122,9 +122,9 @@ def plants(arm: Arm) -> Iterator[Planted]:
     t, q, v, tau = recording.time, recording.position, recording.velocity, recording.torque
     assert tau is not None
 
-    def of(meaning: str, aspect: str, *words: str, **arrays: Array | None) -> Planted:
+    def of(meaning: str, aspect: str, *expected: str, **arrays: Array | None) -> Planted:
         usual: dict[str, Array | None] = {"time": t, "position": q, "velocity": v, "torque": tau}
-        return Planted(meaning, aspect, words, **{**usual, **arrays})  # type: ignore[arg-type]
+        return Planted(meaning, aspect, expected, **{**usual, **arrays})  # type: ignore[arg-type]
 
     yield of("as it is", "gravity", "with gravity")
     yield of("gravity removed", "gravity", "without gravity", torque=tau - arm.weight)
@@ -169,8 +169,8 @@ def _signs(
     for joint in (1, len(names) - 2):
         sign = np.ones(len(names))
         sign[joint] = -1.0
-        words = f"torque negated: {names[joint]}"
-        yield of(f"torque {joint + 1} negated", "signs", words, torque=tau * sign)
+        expected = f"torque negated: {names[joint]}"
+        yield of(f"torque {joint + 1} negated", "signs", expected, torque=tau * sign)
         yield of(
             f"position {joint + 1} negated", "signs", f"position negated: {names[joint]}",
             position=q * sign, velocity=None if v is None else v * sign,
@@ -200,28 +200,28 @@ def judged(arm: Arm, planted: Planted, folder: Path) -> dict[str, object]:
     begin = time.process_time()
     row: dict[str, object] = {"arm": arm.name, "planted": planted.meaning}
     try:
-        found = look_at(path, arm.robot_of, ImportOptions())
+        look = look_at(path, arm.robot_of, ImportOptions())
     except HilError as error:
         return {**row, "right": False, "wrong": "", "said": f"refused: {error}"}
-    said = _said(found, planted.aspect)
+    said = _said(look, planted.aspect)
     right = all(any(_says(text, word) for text in said) for word in planted.words)
     return {
         **row,
         "right": right,
-        "wrong": _wrong(found, planted),
+        "wrong": _wrong(look, planted),
         "seconds": round(time.process_time() - begin, 1),
         "said": " | ".join(said),
     }
 
 
-def _says(text: str, words: str) -> bool:
+def _says(text: str, phrase: str) -> bool:
     """Return whether a text contains words; the angle of a zero to `_NEAR`.
 
     That the torque does not show the zero of the joint is right as well.
     """
-    angle, _, joint = words.partition(" deg: ")
+    angle, _, joint = phrase.partition(" deg: ")
     if not joint:
-        return words in text
+        return phrase in text
     if joint in text.partition("not shown: ")[2].split(" (")[0].split(", "):
         return True
     said = [
@@ -230,23 +230,23 @@ def _says(text: str, words: str) -> bool:
     return any(abs((size - float(angle) + 180.0) % 360.0 - 180.0) <= _NEAR for size in said)
 
 
-def _said(found: Look, aspect: str) -> list[str]:
+def _said(look: Look, aspect: str) -> list[str]:
     """Return what a look says of an aspect, all readings of a doubt included."""
     rows = [
-        f"{row.reading} ({row.certainty})" for row in found.rows if row.aspect in aspect.split(", ")
+        f"{row.reading} ({row.certainty})" for row in look.rows if row.aspect in aspect.split(", ")
     ]
     return rows + [
         choice.reading
-        for choices in found.questions
+        for choices in look.questions
         for choice in choices
         if choice.aspect == aspect
     ]
 
 
-def _wrong(found: Look, planted: Planted) -> str:
+def _wrong(look: Look, planted: Planted) -> str:
     """Return the aspects of which a sure row says something else than what is there."""
     wrong = []
-    for row in found.rows:
+    for row in look.rows:
         if row.certainty != "sure" or row.aspect not in _EXPECTED:
             continue
         right = [_EXPECTED[row.aspect]]

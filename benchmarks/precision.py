@@ -253,17 +253,19 @@ def payloads(count: int) -> dict[str, Any]:
         load = load_of(seed)
         bare = (None, None, None)
         recordings = recordings_of(seed + 10_000, model.joint_names, bare, other_motions=True)
-        factors = [Factor.by_time(model, samples_of(one, model)) for one in recordings]
+        factors = [Factor.by_time(model, samples_of(recording, model)) for recording in recordings]
         total = sum(factors[1:], factors[0])
         estimate, prior, effect = _posterior(model, total)
-        known = KnownArm.of(total, estimate, prior, effect)
+        known_arm = KnownArm.of(total, estimate, prior, effect)
         loaded = next(iter(recordings_of(seed, model.joint_names, (load,))))
         run = Run.of("loaded", model, samples_of(loaded, model), None, loaded=True)
-        found = identify_payload(model, [run], known=known)
+        load_estimate = identify_payload(model, [run], arm=known_arm)
         truth = figures_of(load)
-        inside.append((found.intervals[:, 0] <= truth) & (truth <= found.intervals[:, 1]))
-        errors.append(float(found.parameters[9]) / load.mass - 1.0)
-        widths.append(float(np.diff(found.intervals[0])[0]) / 2.0 / load.mass)
+        inside.append(
+            (load_estimate.intervals[:, 0] <= truth) & (truth <= load_estimate.intervals[:, 1])
+        )
+        errors.append(float(load_estimate.parameters[9]) / load.mass - 1.0)
+        widths.append(float(np.diff(load_estimate.intervals[0])[0]) / 2.0 / load.mass)
     error = np.array(errors)
     return {
         "payloads": count,
@@ -374,16 +376,16 @@ def main() -> None:
     parser.add_argument("--require-mass", default="mass of payload 1 %")
     parser.add_argument("--payloads", type=int, default=0)
     options = parser.parse_args()
-    found: dict[str, Any] = {}
+    figures: dict[str, Any] = {}
     if options.campaigns:
-        found["campaigns"] = campaigns(options.campaigns, options.require)
+        figures["campaigns"] = campaigns(options.campaigns, options.require)
     if options.stops:
-        found["stops"] = stops(options.stops)
+        figures["stops"] = stops(options.stops)
     if options.weighings:
-        found["weighings"] = weighings(options.weighings, options.require_mass)
+        figures["weighings"] = weighings(options.weighings, options.require_mass)
     if options.payloads:
-        found["payloads"] = payloads(options.payloads)
-    show(found, only_json=options.json)
+        figures["payloads"] = payloads(options.payloads)
+    show(figures, only_json=options.json)
 
 
 if __name__ == "__main__":

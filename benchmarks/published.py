@@ -55,8 +55,8 @@ class Split(_Table):
         if self.part == "all":
             return f"{self.fitted}: in sample"
         other = {"first": "last", "last": "first"}[self.part]
-        mine, rest = round(100 * self.share), round(100 * (1.0 - self.share))
-        return f"{self.fitted}: {self.part} {mine} % to {other} {rest} %"
+        mine, theirs = round(100 * self.share), round(100 * (1.0 - self.share))
+        return f"{self.fitted}: {self.part} {mine} % to {other} {theirs} %"
 
 
 class Source(_Table):
@@ -153,9 +153,9 @@ class Published(_Table):
         return None
 
     def _packaged(self) -> Path:
-        found = self.installed_urdf()
-        if found is not None:
-            return found
+        path = self.installed_urdf()
+        if path is not None:
+            return path
         raise SystemExit(f"{self.urdf} is not in the package {self.urdf_package}; is it installed?")
 
     def imported(self, log: str, folder: Path, output: Path) -> Path:

@@ -116,8 +116,8 @@ class Case:
                 ", with coupling": Coupling(self.motor_from_joint),
             }
         return {
-            f"{law}{words}": RobotModel.from_urdf(self.urdf, friction=friction, coupling=coupling)
-            for words, coupling in couplings.items()
+            f"{law}{suffix}": RobotModel.from_urdf(self.urdf, friction=friction, coupling=coupling)
+            for suffix, coupling in couplings.items()
             for law, friction in LAWS.items()
         }
 
@@ -173,8 +173,8 @@ ESTIMATORS: Final[dict[str, Estimator]] = {
 
 def error(model: RobotModel, values: Array, predicted: Samples) -> float:
     """Relative torque error over all joints and all rows."""
-    (found,) = prediction_error(model, values, [predicted], all_rows=True)
-    return round(found.overall, 5)
+    (prediction,) = prediction_error(model, values, [predicted], all_rows=True)
+    return round(prediction.overall, 5)
 
 
 def model_table(case: Case, splits: dict[str, Split]) -> dict[str, Any]:
@@ -186,11 +186,11 @@ def model_table(case: Case, splits: dict[str, Split]) -> dict[str, Any]:
             fitted, predicted, options = case.prepared(model, split)
             row[kind] = error(model, ESTIMATORS["wls"](model, fitted), predicted)
             if kind == "in_sample":
-                (found,) = prediction_error(
+                (prediction,) = prediction_error(
                     model, ESTIMATORS["ols"](model, fitted), [predicted], all_rows=True
                 )
-                row["in_sample_ols"] = round(found.overall, 5)
-                row["in_sample_ols_by_joint"] = [round(e, 4) for e in found.relative.tolist()]
+                row["in_sample_ols"] = round(prediction.overall, 5)
+                row["in_sample_ols_by_joint"] = [round(e, 4) for e in prediction.relative.tolist()]
             if not options.smooth_torque:
                 row[f"plain_{kind}"] = _without_lowpass(model, split)
                 row[f"{kind}_torque_bandwidth"] = options.torque_bandwidth
@@ -222,8 +222,8 @@ def essential_table(
         part = splits[kind].fitted
         cut = round(_CHOSEN_SHARE * part.n_samples)
         inner = [
-            Factor.by_time(model, prepare(one, model, options=options))
-            for one in (part.between(0, cut), part.between(cut, part.n_samples))
+            Factor.by_time(model, prepare(samples, model, options=options))
+            for samples in (part.between(0, cut), part.between(cut, part.n_samples))
         ]
         essential = eliminate(model, *inner).estimate.names
         table[kind] = {
@@ -242,7 +242,7 @@ def default_errors(folder: Path) -> dict[str, float]:
 
     Of torque that the configuration smooths, the smoothed torque's.
     """
-    published, found = Published.named(folder.name), {}
+    published, errors = Published.named(folder.name), {}
     width = published.smooth_bandwidth
     for kind in ("in_sample", "held_out"):
         options = Options(
@@ -258,8 +258,8 @@ def default_errors(folder: Path) -> dict[str, float]:
         values = estimate_with(prepared, options, Silent()).result.pooled.values
         sources, model = prepared.sources, prepared.sources.cell.model
         predicted = samples_of(sources.held_out[0], sources.cell, prepared.settings, model)
-        found[kind] = error(model, values, predicted)
-    return found
+        errors[kind] = error(model, values, predicted)
+    return errors
 
 
 def load_case(folder: Path) -> Case:

@@ -59,20 +59,20 @@ def pinocchio_gram(model: pin.Model, motion: Motion, stacked: Array) -> Array:
 def common_columns(model: RobotModel) -> tuple[list[int], list[int]]:
     """Return columns of ours, and the columns of pinocchio's that are the same parameters."""
     width = len(LINK_SYMBOLS) + model.layout.rotor_inertia
-    own: list[int] = []
+    columns: list[int] = []
     foreign: list[int] = []
     for column, standard in enumerate(model.base.pivots):
         joint, symbol = divmod(int(standard), width)
         if symbol < len(LINK_SYMBOLS):
-            own.append(column)
+            columns.append(column)
             foreign.append(10 * joint + FROM_PINOCCHIO[symbol])
-    return own, foreign
+    return columns, foreign
 
 
 def _difference(model: RobotModel, ours: Array, theirs: Array) -> float:
     """Return the largest difference of the two Gram matrices, columns scaled to unit length."""
-    own, foreign = common_columns(model)
-    a, b = ours[np.ix_(own, own)], theirs[np.ix_(foreign, foreign)]
+    columns, foreign = common_columns(model)
+    a, b = ours[np.ix_(columns, columns)], theirs[np.ix_(foreign, foreign)]
     length = np.sqrt(np.diag(b))
     return float(np.max(np.abs(a - b) / length / length[:, None]))
 

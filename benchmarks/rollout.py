@@ -96,8 +96,8 @@ def arms(names: Sequence[str], data: Path) -> None:
                 if split.in_sample or split.part == "last":
                     continue
                 predict = [archives[split.predicted]] if split.predicted else []
-                found = identify_paths([archives[split.fitted]], Silent(), predict=predict)
-                result = roll_out(model_of(found), RolloutOptions(), Silent()).result
+                identification = identify_paths([archives[split.fitted]], Silent(), predict=predict)
+                result = roll_out(model_of(identification), RolloutOptions(), Silent()).result
                 missed += _print_arm(f"{name}, {split}", result)
     print(f"missed: {len(missed)}" + "".join(f"\n  {line}" for line in missed))
 

@@ -95,10 +95,10 @@ def picture(shown: Layout) -> Image.Image:
 
 
 def _font(bold: bool) -> ImageFont.FreeTypeFont:
-    found = font_manager.FontProperties(
+    properties = font_manager.FontProperties(
         family="DejaVu Sans Mono", weight="bold" if bold else "normal"
     )
-    return ImageFont.truetype(font_manager.findfont(found), HEIGHT)
+    return ImageFont.truetype(font_manager.findfont(properties), HEIGHT)
 
 
 def _colours(style: Style) -> tuple[Colour, Colour]:

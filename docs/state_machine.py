@@ -44,8 +44,8 @@ def common_inputs(table: Table) -> dict[Input, State]:
     leads_to = {what: {row.get(what) for row in started} for what in Input}
     return {
         what: after
-        for what, found in leads_to.items()
-        if len(found) == 1 and (after := next(iter(found))) is not None
+        for what, targets in leads_to.items()
+        if len(targets) == 1 and (after := next(iter(targets))) is not None
     }
 
 
@@ -69,14 +69,14 @@ def meanings() -> dict[Input, str]:
     """Return the meaning of each input: the docstrings of the members of `Input`."""
     (enum,) = ast.parse(inspect.getsource(Input)).body
     assert isinstance(enum, ast.ClassDef)
-    found: dict[Input, str] = {}
+    meaning_of: dict[Input, str] = {}
     last: Input | None = None
     for statement in enum.body:
         if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
             last = Input[statement.targets[0].id]
         elif isinstance(statement, ast.Expr) and last is not None:
-            found[last] = " ".join(str(ast.literal_eval(statement.value)).split())
-    return found
+            meaning_of[last] = " ".join(str(ast.literal_eval(statement.value)).split())
+    return meaning_of
 
 
 def input_table(table: Table = TRANSITIONS) -> str:
@@ -181,8 +181,8 @@ def svg(table: Table = TRANSITIONS) -> str:
 
 
 def _title(before: str, inputs: tuple[Input, ...], after: State) -> str:
-    words = ", ".join(label(what) for what in inputs)
-    return f"<title>{escape(f'{before} | {words} | {label(after)}')}</title>"
+    labels = ", ".join(label(what) for what in inputs)
+    return f"<title>{escape(f'{before} | {labels} | {label(after)}')}</title>"
 
 
 def _box(state: State, stays: tuple[Input, ...]) -> Iterator[str]:
@@ -193,9 +193,9 @@ def _box(state: State, stays: tuple[Input, ...]) -> Iterator[str]:
     )
     yield f'<text class="name" x="{x}" y="{y - 3 if stays else y + 5}">{label(state)}</text>'
     if stays:
-        words = ", ".join(label(what) for what in stays)
+        labels = ", ".join(label(what) for what in stays)
         yield f"<g>{_title(label(state), stays, state)}"
-        yield f'<text class="stays" x="{x}" y="{y + 15}">↻ {escape(words)}</text></g>'
+        yield f'<text class="stays" x="{x}" y="{y + 15}">↻ {escape(labels)}</text></g>'
 
 
 def _from_any(after: State, inputs: tuple[Input, ...]) -> Iterator[str]:
@@ -224,14 +224,14 @@ def _arrow(before: State, after: State, inputs: tuple[Input, ...]) -> Iterator[s
     (ax, ay), (bx, by) = points[0], points[1]
     share = LABEL_AT.get((before, after), 0.5)
     x, y = ax + share * (bx - ax), ay + share * (by - ay)
-    words = ", ".join(label(what) for what in inputs)
-    size = 6.7 * len(words) + 8
+    labels = ", ".join(label(what) for what in inputs)
+    size = 6.7 * len(labels) + 8
     yield f"<g>{_title(label(before), inputs, after)}"
     yield f'<path class="arrow" d="M{path}" marker-end="url(#head)"/>'
     yield f'<rect class="paper" x="{x - size / 2:.1f}" y="{y - 9:.1f}" ' + (
         f'width="{size:.1f}" height="18"/>'
     )
-    yield f'<text x="{x:.1f}" y="{y + 4:.1f}">{escape(words)}</text></g>'
+    yield f'<text x="{x:.1f}" y="{y + 4:.1f}">{escape(labels)}</text></g>'
 
 
 def _edge_of(middle: Point, towards: Point) -> Point:

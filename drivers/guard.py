@@ -42,17 +42,21 @@ def require_finite(values: Array, where: Joints, cycle: int) -> None:
 
 
 def raise_first(
-    found: Array, allowed: Array, checks: tuple[Check, ...], cycle: int, middle: Array | None = None
+    values: Array,
+    allowed: Array,
+    checks: tuple[Check, ...],
+    cycle: int,
+    middle: Array | None = None,
 ) -> NoReturn:
     """Raise for the first row and joint outside its bound; not finite values come first.
 
-    `found` (k, n) has a row for each of `checks`, with a magnitude of at most `allowed` (k, n).
+    `values` (k, n) has a row for each of `checks`, with a magnitude of at most `allowed` (k, n).
     A position is measured from the `middle` (n,) of its range.
     """
-    not_finite = ~np.isfinite(found)
-    bad = not_finite if not_finite.any() else ~(np.abs(found) <= allowed)
+    not_finite = ~np.isfinite(values)
+    bad = not_finite if not_finite.any() else ~(np.abs(values) <= allowed)
     row, joint = (int(index) for index in np.argwhere(bad)[0])
-    value = float(found[row, joint])
+    value = float(values[row, joint])
     bound = float(allowed[row, joint])
     if checks[row] is Check.POSITION and middle is not None:
         bound = float(middle[joint]) + math.copysign(bound / (1.0 + RELATIVE_TOLERANCE), value)
@@ -323,15 +327,15 @@ class Guard:
             cycle: for the error.
             where: (n,) which joints; None for all.
         """
-        found = self._feedback
-        np.subtract(actual, commanded, out=found[0])
-        np.subtract(actual, target, out=found[1])
-        found[2] = current
-        np.abs(found, out=found)
+        deviations = self._feedback
+        np.subtract(actual, commanded, out=deviations[0])
+        np.subtract(actual, target, out=deviations[1])
+        deviations[2] = current
+        np.abs(deviations, out=deviations)
         if where is not None:
-            found[:, ~where] = 0.0
-        if not (found <= self._feedback_bounds).all():
-            raise_first(found, self._feedback_bounds, _FEEDBACK_CHECKS, cycle)
+            deviations[:, ~where] = 0.0
+        if not (deviations <= self._feedback_bounds).all():
+            raise_first(deviations, self._feedback_bounds, _FEEDBACK_CHECKS, cycle)
 
     def check_after_gap(
         self,
@@ -360,8 +364,8 @@ class Guard:
         standstill = self.limits.standstill
         bound = np.maximum(0.5 * np.abs(step), standstill)
         moving = np.abs(velocity[1]) > standstill
-        for joints, found in ((where, velocity[0]), (where & ~moving, velocity[1])):
-            require(joints, np.abs(found - step), bound, Check.GAP_VELOCITY, cycle)
+        for joints, measured in ((where, velocity[0]), (where & ~moving, velocity[1])):
+            require(joints, np.abs(measured - step), bound, Check.GAP_VELOCITY, cycle)
 
     def check_after_pause(self, velocity: Array, cycle: int, where: Joints) -> None:
         """Check after a late packet that the velocity (n,) rad/s is that of the set-points sent.
@@ -383,9 +387,9 @@ class Guard:
         history[:3] = history[1:4]
         history[3] = q
         history[4] = qd
-        found = self._quantities
-        np.matmul(self._differences, history, out=found)
-        found[0] -= self._middle
+        quantities = self._quantities
+        np.matmul(self._differences, history, out=quantities)
+        quantities[0] -= self._middle
         allowed = self._sets[self._active.update(bounds)]
-        if not (np.abs(found) <= allowed).all():
-            raise_first(found, allowed, _SET_POINT_CHECKS, cycle, self._middle)
+        if not (np.abs(quantities) <= allowed).all():
+            raise_first(quantities, allowed, _SET_POINT_CHECKS, cycle, self._middle)

@@ -142,9 +142,11 @@ class CycleRing(RingReader):
 
     def __init__(self, n_joints: int, capacity: int = 4096, *, fd: int | None = None) -> None:
         if fd is None:
-            own = memoryview(bytearray(_HEADER_BYTES + capacity * cycle_dtype(n_joints).itemsize))
-            _describe(own, n_joints, capacity)
-            self._map(own, n_joints)
+            memory = memoryview(
+                bytearray(_HEADER_BYTES + capacity * cycle_dtype(n_joints).itemsize)
+            )
+            _describe(memory, n_joints, capacity)
+            self._map(memory, n_joints)
             self._readable = capacity
             self._acknowledge = True
             self._read = 0

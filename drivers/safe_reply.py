@@ -214,9 +214,13 @@ class PacketStatus:
     @property
     def fault(self) -> str:
         """Why these modes are refused, by the first unknown one, else the first open one."""
-        known = np.isin(self.modes, list(KNOWN_MODES))
-        joint = int(np.argmax(np.isin(self.modes, list(OPEN_MODES)) if known.all() else ~known))
-        reason = "it was not closed before" if known.all() else "the reply to that mode is unknown"
+        with_reply = np.isin(self.modes, list(KNOWN_MODES))
+        joint = int(
+            np.argmax(np.isin(self.modes, list(OPEN_MODES)) if with_reply.all() else ~with_reply)
+        )
+        reason = (
+            "it was not closed before" if with_reply.all() else "the reply to that mode is unknown"
+        )
         return f"joint {joint + 1} is in mode {self.modes[joint]}: {reason}"
 
     def misplaced(self, in_motion: bool) -> int | None:

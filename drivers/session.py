@@ -260,7 +260,9 @@ class Session:
         """Return the events since the last call, in order; rejected packets last, by kind."""
         events = self._events
         self._events = []
-        events.extend(PacketRejected(kind, *found) for kind, found in self._unreported.items())
+        events.extend(
+            PacketRejected(kind, *rejection) for kind, rejection in self._unreported.items()
+        )
         self._unreported.clear()
         return events
 

@@ -25,12 +25,14 @@ def main(cell_file: Path) -> None:
     with TemporaryDirectory() as folder:
         campaign = Campaign.create(Path(folder) / "campaign", cell, design(cell, Silent()))
         campaign.run(unrehearsed=True)  # a simulated arm only; a real one is rehearsed first
-        found = campaign.identify()
-    print(found.results.verdict.line)
-    for one in found.results.parameters:
-        planted = "" if one.truth is None else f"{one.truth:9.3f}"
-        print(f"{one.name:>40s}  {one.estimate:9.3f} ± {1.96 * one.std:.3f}  planted {planted}")
-    series = found.series
+        identification = campaign.identify()
+    print(identification.results.verdict.line)
+    for entry in identification.results.parameters:
+        planted = "" if entry.truth is None else f"{entry.truth:9.3f}"
+        print(
+            f"{entry.name:>40s}  {entry.estimate:9.3f} ± {1.96 * entry.std:.3f}  planted {planted}"
+        )
+    series = identification.series
     names = cell.joint_names
     figure, rows = plt.subplots(len(names), sharex=True, figsize=(8, 4.5), layout="constrained")
     for joint, (axes, name) in enumerate(zip(rows, names, strict=True)):

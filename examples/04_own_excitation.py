@@ -49,15 +49,17 @@ def main(*, quick: bool) -> None:
     for axes, (name, excitation) in zip(places, both.items(), strict=True):
         gram = Objective(cell.model).information(midpoints(excitation.trajectory, cell.period))
         axes.imshow(np.abs(correlation(gram)), cmap="Greys", vmin=0, vmax=1)
-        found = excitation.criteria
-        axes.set_title(f"{name}: log det {found.log10_det:.1f}, I_c {found.coupling_index:.1f}")
+        criteria = excitation.criteria
+        axes.set_title(
+            f"{name}: log det {criteria.log10_det:.1f}, I_c {criteria.coupling_index:.1f}"
+        )
         with TemporaryDirectory() as folder:
             campaign = Campaign.create(
                 Path(folder) / "campaign", cell, replace(plan, excitation=excitation, moves=None)
             )
             campaign.run(unrehearsed=True)
             results = campaign.identify().results
-        std.append([one.std for one in results.parameters])
+        std.append([parameter.std for parameter in results.parameters])
         print(f"{axes.get_title()}\n  {results.verdict.line}")
     ratio = np.exp(np.mean(np.log(std[0]) - np.log(std[1])))
     print(f"the search makes intervals {ratio:.2f} times narrower (geometric mean over parameters)")

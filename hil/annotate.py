@@ -25,7 +25,7 @@ FOLDER: Final = "annotated"
 _ANNOTATION: Final = "annotation"  # metadata record of an annotated archive
 
 
-def annotate(found: Identification, output: Path) -> list[Path]:
+def annotate(identification: Identification, output: Path) -> list[Path]:
     """Write a copy of each archive with its predicted torque and residual, in a new folder.
 
     The copies are for viewers: they lack the seals of an archive, and `hil identify` refuses them.
@@ -33,19 +33,19 @@ def annotate(found: Identification, output: Path) -> list[Path]:
     Raises:
         ArchiveError: an archive cannot be read again.
     """
-    prepared = found.prepared
-    values = found.estimate.pooled.values
+    prepared = identification.prepared
+    values = identification.estimate.pooled.values
     sources = prepared.sources
-    model = found.cell.model
+    model = identification.cell.model
     held_out = () if sources.in_sample else zip(sources.held_out, prepared.held_out, strict=True)
     pairs = [*zip(sources.training, prepared.training, strict=True), *held_out]
     parts: dict[Path, list[tuple[NDArray[np.int64], Array, Array]]] = {}
     for source, samples in pairs:
-        known = samples.known_torque(model)
-        predicted = samples.predicted_torque(model, values) + known
-        residual = samples.torque + known - predicted
+        known_torque = samples.known_torque(model)
+        predicted = samples.predicted_torque(model, values) + known_torque
+        residual = samples.torque + known_torque - predicted
         parts.setdefault(source.path, []).append(
-            (stamps_of(source, found.cell), predicted, residual)
+            (stamps_of(source, identification.cell), predicted, residual)
         )
     folder = output / FOLDER
     make_folder(folder)
@@ -72,8 +72,14 @@ def _annotated(
     writer.add_metadata(_ANNOTATION, {"source": path.name, "sha256": file_digest(path)})
     with path.open("rb") as stream:
         reader = make_reader(stream)
-        for one in reader.iter_attachments():
-            writer.add_attachment(one.create_time, one.log_time, one.name, one.media_type, one.data)
+        for attachment in reader.iter_attachments():
+            writer.add_attachment(
+                attachment.create_time,
+                attachment.log_time,
+                attachment.name,
+                attachment.media_type,
+                attachment.data,
+            )
         _copy_messages(reader, writer)
     kind = profile(len(names))[MEASURED]
     schema = writer.register_schema(kind.schema, "ros2msg", kind.definition.encode())

@@ -100,12 +100,12 @@ class Comparison:
     @property
     def changed(self) -> tuple[Change, ...]:
         """Significant and relevant changes."""
-        return tuple(one for one in self.changes if one.changed)
+        return tuple(change for change in self.changes if change.changed)
 
     @property
     def document(self) -> dict[str, Any]:
         """JSON data, None for unknown values."""
-        numbers = [asdict(one) for one in self.changes]
+        numbers = [asdict(change) for change in self.changes]
         return {
             "arm": self.arm,
             "simulated": self.simulated,
@@ -113,8 +113,13 @@ class Comparison:
             "verdict": self.verdict,
             "changed": bool(self.changed),
             "campaigns": [
-                {"name": name, "folder": one.campaign, "when": one.when or None, "setup": one.setup}
-                for name, one in zip(self.names, self.campaigns, strict=True)
+                {
+                    "name": name,
+                    "folder": campaign.campaign,
+                    "when": campaign.when or None,
+                    "setup": campaign.setup,
+                }
+                for name, campaign in zip(self.names, self.campaigns, strict=True)
             ],
             "parameters": [
                 {name: None if value != value else value for name, value in row.items()}
@@ -136,52 +141,56 @@ def compare(places: Sequence[str], cluster: Cluster, reporter: Reporter) -> Comp
     roots = [path.parent if path.name == "results.json" else path for path in paths]
     refs: list[ArchiveRef] = []
 
-    def check(found: Sequence[ArchiveRef]) -> None:
-        _require_campaigns_of_one_arm(found)
-        refs.extend(found)
+    def check(archive_refs: Sequence[ArchiveRef]) -> None:
+        _require_campaigns_of_one_arm(archive_refs)
+        refs.extend(archive_refs)
 
     options = Options(estimator="wls")
     result = run.reidentify([str(root) for root in roots], options, cluster, reporter, check=check)
     campaigns = list(result.campaigns)
     if len(campaigns) < 2:
-        reason = "".join(f"; {one.path}: {one.reason}" for one in result.broken[:1])
+        reason = "".join(f"; {unused.path}: {unused.reason}" for unused in result.broken[:1])
         only = campaigns[0].campaign if campaigns else None
         raise InputError(only, f"is the only campaign that can be estimated{reason}", remedy=_TWO)
     given = [root.resolve() for root in roots]
 
-    def order(one: BatchEstimate) -> tuple[str, int, str]:
-        own = Path(one.campaign)
-        inside = [own.is_relative_to(root) for root in given]
-        return (one.when if dated else "", inside.index(True) if any(inside) else 0, one.campaign)
+    def order(campaign: BatchEstimate) -> tuple[str, int, str]:
+        campaign_path = Path(campaign.campaign)
+        inside = [campaign_path.is_relative_to(root) for root in given]
+        return (
+            campaign.when if dated else "",
+            inside.index(True) if any(inside) else 0,
+            campaign.campaign,
+        )
 
-    dated = all(one.when for one in campaigns)
+    dated = all(campaign.when for campaign in campaigns)
     campaigns.sort(key=order)
     repetitions = [
         [
             each
             for each in result.repetitions
-            if (each.campaign, each.setup) == (one.campaign, one.setup)
+            if (each.campaign, each.setup) == (campaign.campaign, campaign.setup)
         ]
-        for one in campaigns
+        for campaign in campaigns
     ]
-    found = compare_campaigns(result.arms[campaigns[0].arm], campaigns, repetitions)
+    comparison = compare_campaigns(result.arms[campaigns[0].arm], campaigns, repetitions)
     lost = [f"{path} could not be used: {reason}" for path, reason in result.broken]
     # All archives of an arm are simulated, or none.
-    return replace(found, simulated=refs[0].simulated, warnings=(*lost, *found.warnings))
+    return replace(comparison, simulated=refs[0].simulated, warnings=(*lost, *comparison.warnings))
 
 
-def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
-    campaigns = {ref.key: ref for ref in found if ref.use == "excitation"}
+def _require_campaigns_of_one_arm(archive_refs: Sequence[ArchiveRef]) -> None:
+    campaigns = {ref.key: ref for ref in archive_refs if ref.use == "excitation"}
     if not campaigns:
         return  # reidentify raises the error
     first = next(iter(campaigns.values()))
-    for one in campaigns.values():
-        if one.arm != first.arm:
-            here, there = (Arm(ref.arm, cell_in(open_ref(ref))) for ref in (one, first))
+    for campaign in campaigns.values():
+        if campaign.arm != first.arm:
+            here, there = (Arm(ref.arm, cell_in(open_ref(ref))) for ref in (campaign, first))
             other = ["simulation or the controller's drive train"]
             differing = arm_differences(here.cell, there.cell) or other
             raise InputError(
-                one.campaign,
+                campaign.campaign,
                 f"is of another arm ({here.name}) than {first.campaign} ({there.name}): they differ"
                 f" in {' and '.join(differing)}",
                 remedy="compare campaigns of one arm",
@@ -203,10 +212,10 @@ def compare_campaigns(
     std = np.sqrt(variance)
     changes = tuple(
         Change(
-            parameter=one.name,
-            axis=one.axis,
-            kind=one.kind,
-            unit=one.unit,
+            parameter=quantity.name,
+            axis=quantity.axis,
+            kind=quantity.kind,
+            unit=quantity.unit,
             campaign=names[c],
             before=float(value[0, k]),
             before_std=float(std[0, k]),
@@ -220,13 +229,13 @@ def compare_campaigns(
             ),
         )
         for c in range(1, len(campaigns))
-        for k, one in enumerate(compared)
+        for k, quantity in enumerate(compared)
     )
     return Comparison(
         arm=arm.name,
         simulated=False,
-        dated=all(one.when for one in campaigns),
-        verdict=_verdict([one for one in changes if one.changed]),
+        dated=all(campaign.when for campaign in campaigns),
+        verdict=_verdict([change for change in changes if change.changed]),
         campaigns=tuple(campaigns),
         names=tuple(names),
         changes=changes,
@@ -243,14 +252,14 @@ def quantities(model: RobotModel, first: BatchEstimate) -> list[Quantity]:
     layout = model.layout
     joints = model.joint_names
     terms = model.friction.terms
-    own = [(*links, *layout.rotors[j : j + 1]) for j, links in enumerate(layout.links)]
-    axes = {layout.names[k]: joints[j] for j, places in enumerate(own) for k in places}
+    columns = [(*links, *layout.rotors[j : j + 1]) for j, links in enumerate(layout.links)]
+    axes = {layout.names[k]: joints[j] for j, places in enumerate(columns) for k in places}
     rank = model.base.rank
     single = np.eye(model.n_parameters)
     rows = [*range(rank), *range(rank + len(terms), model.n_parameters)]
     names = model.parameter_names
     units = model.units
-    found = [
+    compared = [
         Quantity(names[k], axes.get(names[k], ""), "inertia", units[k], single[k]) for k in rows
     ]
     table = np.zeros((len(_SPEEDS), model.n_joints, model.n_parameters))
@@ -267,15 +276,15 @@ def quantities(model: RobotModel, first: BatchEstimate) -> list[Quantity]:
             best = int(np.argmax(np.nan_to_num(np.abs(value) / np.sqrt(variance))))
         unit, speed = ("N·m", "rad/s") if turns else ("N", "m/s")
         name = f"friction of {joint} at {_SPEEDS[best]:.2g} {speed}"
-        found.append(Quantity(name, joint, "friction", unit, table[best, j]))
-    return found
+        compared.append(Quantity(name, joint, "friction", unit, table[best, j]))
+    return compared
 
 
 def _projected(level: BatchEstimate, weights: Array) -> tuple[Array, Array]:
     """Return values and variances (k,) of weighted sums (k, p) of parameters; NaN if unknown."""
     covariance = level.estimate.covariance
-    known = np.isfinite(level.estimate.std)
-    determined = ~weights[:, ~known].any(axis=1)
+    determinable = np.isfinite(level.estimate.std)
+    determined = ~weights[:, ~determinable].any(axis=1)
     finite = np.where(np.isfinite(covariance), covariance, 0.0)
     variance = np.einsum("kp,pq,kq->k", weights, finite, weights)
     value = np.where(determined, weights @ level.estimate.values, np.nan)
@@ -285,20 +294,25 @@ def _projected(level: BatchEstimate, weights: Array) -> tuple[Array, Array]:
 def _verdict(changed: Sequence[Change]) -> str:
     """Return one line: what changed, friction by axis."""
     names = dict.fromkeys(
-        f"friction of {one.axis}" if one.kind == "friction" else one.parameter for one in changed
+        f"friction of {change.axis}" if change.kind == "friction" else change.parameter
+        for change in changed
     )
     return f"Changed: {', '.join(names)}" if names else "No significant change"
 
 
 def _names(campaigns: Sequence[BatchEstimate]) -> list[str]:
     """Return names of campaigns: folder below the common one, setup if ambiguous, and day."""
-    folders = [one.campaign for one in campaigns]
+    folders = [campaign.campaign for campaign in campaigns]
     shared = commonpath([Path(folder).parent for folder in folders])
     names = []
-    for one in campaigns:
-        setup = f", {one.setup or 'nothing stated'}" if folders.count(one.campaign) > 1 else ""
-        day = f" ({one.when[:10]})" if one.when else ""
-        names.append(f"{Path(one.campaign).relative_to(shared)}{setup}{day}")
+    for campaign in campaigns:
+        setup = (
+            f", {campaign.setup or 'nothing stated'}"
+            if folders.count(campaign.campaign) > 1
+            else ""
+        )
+        day = f" ({campaign.when[:10]})" if campaign.when else ""
+        names.append(f"{Path(campaign.campaign).relative_to(shared)}{setup}{day}")
     return names
 
 
@@ -307,19 +321,21 @@ def _warnings(
     campaigns: Sequence[BatchEstimate],
     repetitions: Sequence[Sequence[BatchEstimate]],
 ) -> list[str]:
-    found = []
-    setups = {name: one.setup for name, one in zip(names, campaigns, strict=True)}
+    warnings = []
+    setups = {name: campaign.setup for name, campaign in zip(names, campaigns, strict=True)}
     if len(set(setups.values())) > 1:
         stated = "; ".join(f"{name}: {setup or 'nothing'}" for name, setup in setups.items())
-        found.append(f"the cells state different payloads or delays, compensated ({stated})")
-    for name, own in zip(names, repetitions, strict=True):
-        if len(own) < 2:
-            found.append(
+        warnings.append(f"the cells state different payloads or delays, compensated ({stated})")
+    for name, estimates in zip(names, repetitions, strict=True):
+        if len(estimates) < 2:
+            warnings.append(
                 f"{name}: with one repetition, uncertainty includes noise only, not the scatter of"
                 " repetitions"
             )
     each = zip(names, campaigns, strict=True)
-    return found + [f"{name}: {warning}" for name, one in each for warning in one.warnings]
+    return warnings + [
+        f"{name}: {warning}" for name, campaign in each for warning in campaign.warnings
+    ]
 
 
 # Statistics
@@ -334,30 +350,32 @@ def freedom_of(level: BatchEstimate) -> float:
 
 
 def _figures(
-    compared: Sequence[Quantity], one: BatchEstimate, repetitions: Sequence[BatchEstimate]
+    compared: Sequence[Quantity], campaign: BatchEstimate, repetitions: Sequence[BatchEstimate]
 ) -> list[Figure]:
     """Return the figure of each quantity of a campaign."""
     weights = np.array([each.weights for each in compared])
-    freedom = freedom_of(one)
+    freedom = freedom_of(campaign)
     singles = np.array([_projected(each, weights)[0] for each in repetitions])
     columns = singles.reshape(len(repetitions), len(compared)).T
-    rows = zip(*_projected(one, weights), columns, strict=True)
-    return [figure(float(value), float(variance), freedom, own) for value, variance, own in rows]
+    rows = zip(*_projected(campaign, weights), columns, strict=True)
+    return [
+        figure(float(value), float(variance), freedom, column) for value, variance, column in rows
+    ]
 
 
 def figure(value: float, variance: float, freedom: float, repetitions: Array) -> Figure:
     """Combine a pooled estimate (variance NaN if undetermined) with repetitions (m,)."""
     if not np.isfinite(variance):
         return Figure(math.nan, math.nan, 1.0)
-    own = repetitions[np.isfinite(repetitions)]
-    if len(own) < 2:
+    finite = repetitions[np.isfinite(repetitions)]
+    if len(finite) < 2:
         return Figure(value, variance, freedom)
-    count = effective_count(own)
-    scatter = float(np.var(own, ddof=1)) / count
+    count = effective_count(finite)
+    scatter = float(np.var(finite, ddof=1)) / count
     if scatter <= variance:
         return Figure(value, variance, freedom)
-    few = len(own) < MIN_REPETITIONS
-    return Figure(value, scatter, len(own) - 1.0 if few else max(1.0, count - 1.0))
+    few = len(finite) < MIN_REPETITIONS
+    return Figure(value, scatter, len(finite) - 1.0 if few else max(1.0, count - 1.0))
 
 
 def effective_count(repetitions: Array) -> float:

@@ -52,7 +52,7 @@ class Exported:
         unit = " or ".join(sorted(set(self.units)))
 
         def row(torque: Array) -> str:
-            return f"{', '.join(f'{one:.3g}' for one in torque)} {unit}"
+            return f"{', '.join(f'{component:.3g}' for component in torque)} {unit}"
 
         lines = [*([f"parameters: {self.origin}"] if self.origin else [])]
         lines.append(f"written: {self.path}")
@@ -82,24 +82,26 @@ class Exported:
         }
 
 
-def pinocchio_of(found: Identification) -> pin.Model:
+def pinocchio_of(identification: Identification) -> pin.Model:
     """Return the arm of an identification as pinocchio's model, with armature and friction.
 
     Raises:
         InputError: there are no physically consistent parameters.
     """
-    model = model_of(found)
+    model = model_of(identification)
     return pinocchio_arm(model.arm, model.name)
 
 
-def export_model(found: Identification | IdentifiedModel, output: Path, to: FormatName) -> Exported:
+def export_model(
+    source: Identification | IdentifiedModel, output: Path, to: FormatName
+) -> Exported:
     """Write an identified arm, read it back and compare.
 
     Raises:
         InputError: there are no physically consistent parameters.
         IdentificationError: the arm cannot be written, or reads back with other parameters.
     """
-    model = found if isinstance(found, IdentifiedModel) else model_of(found)
+    model = source if isinstance(source, IdentifiedModel) else model_of(source)
     form = FORMATS[to]
     arm = model.arm
     make_folder(output.parent)
@@ -154,7 +156,9 @@ class ExportedEnsemble:
             "seed": self.seed,
             "moved": int(np.count_nonzero(self.ensemble.moved)),
             "widened": self.ensemble.widened,
-            "spread": [None if np.isnan(one) else float(one) for one in self.ensemble.spread],
+            "spread": [
+                None if np.isnan(spread) else float(spread) for spread in self.ensemble.spread
+            ],
             "read_back": self.difference if read else None,
             "not_read_back": None if read else self.difference,
             "verdict": self.verdict,
@@ -230,7 +234,9 @@ def _motion(held_out: Sequence[Samples]) -> Motion:
     parts = [samples.motion for samples in held_out]
     step = -(-sum(motion.n_samples for motion in parts) // _MOST_ROWS)
     some = [motion.rows(slice(None, None, step)) for motion in parts]
-    columns = [np.concatenate(column) for column in zip(*(one[:4] for one in some), strict=True)]
-    directions = [one.direction for one in some if one.direction is not None]
+    columns = [
+        np.concatenate(column) for column in zip(*(motion[:4] for motion in some), strict=True)
+    ]
+    directions = [motion.direction for motion in some if motion.direction is not None]
     direction = np.concatenate(directions) if len(directions) == len(some) else None
     return Motion(*columns)._replace(direction=direction)

@@ -85,19 +85,19 @@ class IdentifiedArm:
         """
         import pandas  # only for this table
 
-        found = self.results.parameters
+        parameters = self.results.parameters
         factor = self.results.uncertainty.interval_factor
         return pandas.DataFrame(
             {
-                "estimate": [one.estimate for one in found],
-                "lower": [one.estimate - factor * one.std for one in found],
-                "upper": [one.estimate + factor * one.std for one in found],
-                "std": [one.std for one in found],
-                "unit": [one.unit for one in found],
-                "undetermined": [one.undetermined for one in found],
-                "expression": [one.expression for one in found],
+                "estimate": [parameter.estimate for parameter in parameters],
+                "lower": [parameter.estimate - factor * parameter.std for parameter in parameters],
+                "upper": [parameter.estimate + factor * parameter.std for parameter in parameters],
+                "std": [parameter.std for parameter in parameters],
+                "unit": [parameter.unit for parameter in parameters],
+                "undetermined": [parameter.undetermined for parameter in parameters],
+                "expression": [parameter.expression for parameter in parameters],
             },
-            index=pandas.Index([one.name for one in found], name="parameter"),
+            index=pandas.Index([parameter.name for parameter in parameters], name="parameter"),
         )
 
     def predict(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
@@ -165,8 +165,13 @@ class IdentifiedArm:
 
         joints = pandas.DataFrame(
             [
-                (one.joint, f"{one.rms:.3g} {one.unit}", one.relative, one.nominal_relative)
-                for one in self.results.judgement.joints
+                (
+                    joint.joint,
+                    f"{joint.rms:.3g} {joint.unit}",
+                    joint.relative,
+                    joint.nominal_relative,
+                )
+                for joint in self.results.judgement.joints
             ],
             columns=["joint", "RMS error", "relative error", "error of the nominal model"],
         )
@@ -249,14 +254,18 @@ def identify_recordings(
         raise InputError(None, "there is no recording", remedy="name a log, a bag or an archive")
     if robot_of is None:
         _require_archives((*recordings, *predict))
-        found = identify_paths(recordings, reporter, options, predict=predict)
-        return IdentifiedArm(tuple(recordings), tuple(predict), found, ())
+        identification = identify_paths(recordings, reporter, options, predict=predict)
+        return IdentifiedArm(tuple(recordings), tuple(predict), identification, ())
     with ExitStack() as stack:
         staging = stack.enter_context(staged(recordings, predict, robot_of, reading, reporter))
         if output is not None:
             staging.check_places(output)
-        found = identify_paths(staging.fitted, reporter, options, predict=staging.predicted)
-        arm = IdentifiedArm(tuple(recordings), tuple(predict), found, _channels(staging), staging)
+        identification = identify_paths(
+            staging.fitted, reporter, options, predict=staging.predicted
+        )
+        arm = IdentifiedArm(
+            tuple(recordings), tuple(predict), identification, _channels(staging), staging
+        )
         # The imported archives live as long as the result, which may be saved.
         weakref.finalize(arm, stack.pop_all().close)
     return arm
@@ -272,7 +281,7 @@ def write_arm(
     """Write an identified arm, see :meth:`IdentifiedArm.save`; return folder and `results.json`."""
     first = arm.recordings[0]
     staging = arm.staging
-    found = arm.identification
+    identification = arm.identification
     is_folder = first.is_dir() and is_archive(first)
     sources = None if is_folder else sources_text(arm.recordings, arm.predicted)
     if folder is not None:
@@ -284,12 +293,14 @@ def write_arm(
     make_folder(place)
     if staging is not None:
         places = staging.move_to(place)
-        found = replace(found, paths=tuple(places.get(path, path) for path in found.paths))
-    results = write_outcome(place, found, reporter)
+        identification = replace(
+            identification, paths=tuple(places.get(path, path) for path in identification.paths)
+        )
+    results = write_outcome(place, identification, reporter)
     if annotate:
         from hil.annotate import annotate as write_annotated  # only for these copies
 
-        copies = write_annotated(found, place)
+        copies = write_annotated(identification, place)
         reporter.say(f"annotated for viewers: {', '.join(map(str, copies))}")
     if sources is not None:
         write_output(place / SOURCES, sources)

@@ -57,7 +57,7 @@ def identify_campaign(
         problem = "its manifest.json has no completed excitation with an intact archive"
         remedy = "run the campaign, or give the archives instead of the folder"
         raise InputError(root, problem, remedy=remedy)
-    found = identify_archives(
+    identification = identify_archives(
         [*paths, *folder.completed("standstill")],
         reporter,
         options,
@@ -68,4 +68,6 @@ def identify_campaign(
     from hil.campaign.status import conduct_of  # only a campaign needs what executes it
 
     conduct = conduct_of(folder)
-    return replace(found, results=found.results.model_copy(update={"conduct": conduct}))
+    return replace(
+        identification, results=identification.results.model_copy(update={"conduct": conduct})
+    )

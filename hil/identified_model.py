@@ -109,41 +109,41 @@ class IdentifiedModel:
         residuals = [np.empty(samples.torque.shape) for samples in fitted]
         for k in range(FOLDS):
             values = self.posterior.values(total.without(fold == k))
-            for samples, own, residual in zip(fitted, folds, residuals, strict=True):
+            for samples, fold_of_row, residual in zip(fitted, folds, residuals, strict=True):
                 error = samples.torque - samples.predicted_torque(model, values)
-                residual[own == k] = error[own == k]
+                residual[fold_of_row == k] = error[fold_of_row == k]
         return residuals
 
 
-def consistent_of(found: Identification) -> ConsistentEstimate:
+def consistent_of(identification: Identification) -> ConsistentEstimate:
     """Return the physically consistent parameters of an identification, or raise InputError."""
-    if isinstance(found.consistency, str):
+    if isinstance(identification.consistency, str):
         raise InputError(
-            found.paths[0],
-            f"there are no physically consistent parameters: {found.consistency}",
+            identification.paths[0],
+            f"there are no physically consistent parameters: {identification.consistency}",
             remedy="see the verdict of `hil identify`",
         )
-    return found.consistency.consistent
+    return identification.consistency.consistent
 
 
-def model_of(found: Identification) -> IdentifiedModel:
+def model_of(identification: Identification) -> IdentifiedModel:
     """Return the arm of an identification.
 
     Raises:
         InputError: there are no physically consistent parameters.
     """
-    consistent = consistent_of(found)
-    fitted = found.prepared.fitted
+    consistent = consistent_of(identification)
+    fitted = identification.prepared.fitted
     return IdentifiedModel(
-        found.cell,
-        arm_with(found.cell, consistent.standard, consistent.estimate.values, fitted),
-        found.estimation.stated,
-        found.estimation.estimator,
-        found.prepared,
-        found.paths,
-        provenance_of(found.results, found.paths),
-        found.verdict.line,
-        found.verdict.good,
+        identification.cell,
+        arm_with(identification.cell, consistent.standard, consistent.estimate.values, fitted),
+        identification.estimation.stated,
+        identification.estimation.estimator,
+        identification.prepared,
+        identification.paths,
+        provenance_of(identification.results, identification.paths),
+        identification.verdict.line,
+        identification.verdict.good,
     )
 
 
@@ -155,8 +155,10 @@ def arm_with(cell: Cell, standard: Array, values: Array, fitted: Sequence[Sample
     described = urdf_limits(cell.urdf, cell.joint_names)
     efforts = cell.torque_limit
     if efforts is None:
-        found = torque_limits(cell)
-        efforts = described.effort if found is None else np.nan_to_num(found, nan=np.inf)
+        known_limits = torque_limits(cell)
+        efforts = (
+            described.effort if known_limits is None else np.nan_to_num(known_limits, nan=np.inf)
+        )
     limits = described if cell.file.limits is None else cell.joint_limits
     ranges = Ranges(limits.lower, limits.upper, limits.velocity, efforts)
     return Arm(

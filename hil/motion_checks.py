@@ -63,12 +63,12 @@ def always_so(violation: Violation, checker: CollisionChecker) -> str | None:
     nearest, farthest = checker.spread(*pairs[0])
     if farthest - nearest > _UNCHANGED:
         return None
-    found = f"{violation.subject} are {nearest:.3f} to {farthest:.3f} m apart in any posture"
+    message = f"{violation.subject} are {nearest:.3f} to {farthest:.3f} m apart in any posture"
     if nearest >= violation.bound:
-        return f"{found}, closer to contact than can be resolved; narrow [workspace] margin"
+        return f"{message}, closer to contact than can be resolved; narrow [workspace] margin"
     if nearest > 0.0:
-        return f"{found}; [workspace] margin must be below that"
-    return f"{found}: they overlap; correct their collision shapes in the URDF"
+        return f"{message}; [workspace] margin must be below that"
+    return f"{message}: they overlap; correct their collision shapes in the URDF"
 
 
 Array = NDArray[np.float64]

@@ -39,32 +39,36 @@ _LARGEST: Final = 1 << 30
 """Maximum size of series in bytes, a hundred times that of a campaign of 30 repetitions."""
 
 
-def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Results:
+def write_outcome(folder: Path, identification: Identification, reporter: Reporter) -> Results:
     """Write exports, `results.json` and report together; OutputError if impossible."""
-    consistency = found.consistency
-    essential = found.essential
-    occasion = occasion_of(found)
-    origin = provenance_of(found.results, found.paths)
+    consistency = identification.consistency
+    essential = identification.essential
+    occasion = occasion_of(identification)
+    origin = provenance_of(identification.results, identification.paths)
     exports = exports_of(
-        found.cell,
-        found.estimation.stated,
+        identification.cell,
+        identification.estimation.stated,
         consistency if isinstance(consistency, str) else consistency.consistent,
         essential=None if isinstance(essential, str) else essential.estimate.names,
         provenance={**origin, **occasion.entries()},
-        load=median_load(found.cell.model, found.estimate.pooled.values, found.prepared.fitted),
+        load=median_load(
+            identification.cell.model,
+            identification.estimate.pooled.values,
+            identification.prepared.fitted,
+        ),
     )
-    results = found.results.model_copy(
+    results = identification.results.model_copy(
         update={
             "exports": exports.result,
             "occasion": occasion,
-            "settings": settings_result(found),
+            "settings": settings_result(identification),
         }
     )
     files = {
         **exports.contents,
         RESULTS: results.to_json(),
-        SERIES: _series_bytes(found.series),
-        REPORT: report_bytes(results, found.series),
+        SERIES: _series_bytes(identification.series),
+        REPORT: report_bytes(results, identification.series),
     }
     write_files(folder, files)
     for name, reason in exports.withheld.items():
@@ -74,11 +78,11 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
     return results
 
 
-def occasion_of(found: Identification) -> OccasionResult:
+def occasion_of(identification: Identification) -> OccasionResult:
     """Return dates of recording and identification, and the free fields of the cell file."""
-    archives = (open_archive(path, fields=()) for path in found.paths)
+    archives = (open_archive(path, fields=()) for path in identification.paths)
     dates = sorted(filter(None, map(recording_date, archives)))
-    cell = found.cell.file.cell
+    cell = identification.cell.file.cell
     return OccasionResult(
         recorded_from=dates[0] if dates else None,
         recorded_to=dates[-1] if dates else None,
@@ -89,19 +93,19 @@ def occasion_of(found: Identification) -> OccasionResult:
     )
 
 
-def settings_result(found: Identification) -> SettingsResult:
+def settings_result(identification: Identification) -> SettingsResult:
     """Return what the identification used, for exports and rollouts."""
-    sources = found.prepared.sources
-    first = found.prepared.sources.training[0]
+    sources = identification.prepared.sources
+    first = identification.prepared.sources.training[0]
     fitted = {source.path for source in sources.training}
     predicted = {source.path for source in sources.held_out} - fitted
     return SettingsResult(
-        archives=[path.name for path in found.paths],
-        predicted=[path.name for path in found.paths if path in predicted],
+        archives=[path.name for path in identification.paths],
+        predicted=[path.name for path in identification.paths if path in predicted],
         split=first.recording.n_samples / first.whole.n_samples,
         in_sample=sources.in_sample,
-        estimator=found.estimation.estimator,
-        settings=SettingsResult.entries(found.prepared.settings),
+        estimator=identification.estimation.estimator,
+        settings=SettingsResult.entries(identification.prepared.settings),
     )
 
 
@@ -157,8 +161,8 @@ def _load_series(path: Path, n_joints: int) -> ReportSeries:
             if size > _LARGEST:
                 raise ValueError(f"it would take {size} bytes")
             stream.seek(0)
-            with np.load(stream, allow_pickle=False) as found:
-                arrays: dict[str, Any] = {name: found[name] for name in found.files}
+            with np.load(stream, allow_pickle=False) as archive:
+                arrays: dict[str, Any] = {name: archive[name] for name in archive.files}
         arrays["example_archive"] = str(arrays["example_archive"])
         return ReportSeries.from_arrays(arrays).checked_for(n_joints)
     except Exception as error:  # readers of a corrupt file may raise anything

@@ -164,8 +164,8 @@ def similar_path(path: Path) -> Path | None:
         names = [entry.name for entry in islice(folder.iterdir(), _MOST_SIBLINGS)]
     except OSError:
         return None
-    found = get_close_matches(path.name, names, n=1)
-    return folder / found[0] if found else None
+    matches = get_close_matches(path.name, names, n=1)
+    return folder / matches[0] if matches else None
 
 
 def remedy_for_missing(path: Path, otherwise: str) -> str:
@@ -204,10 +204,10 @@ def parse_json(text: str | bytes) -> Any:
 def parse_toml(text: str) -> dict[str, Any]:
     """Return the tables of a TOML text; ValueError if it is invalid, or nested too deep."""
     try:
-        found = tomllib.loads(text)
+        document = tomllib.loads(text)
     except RecursionError as error:
         raise ValueError("it is nested too deep") from error
-    level: list[Any] = [found]
+    level: list[Any] = [document]
     for _ in range(_DEEPEST):  # the parser does not limit dotted keys
         level = [
             inner
@@ -216,5 +216,5 @@ def parse_toml(text: str) -> dict[str, Any]:
             if isinstance(inner, dict | list)
         ]
         if not level:
-            return found
+            return document
     raise ValueError("it is nested too deep")

@@ -48,8 +48,8 @@ def load_record(
         return None
     try:
         text = read_text(path)
-        if version and (found := parse_json(text)["format_version"]) != version:
-            raise ValueError(f"format version {found}, this is {version}")
+        if version and (file_version := parse_json(text)["format_version"]) != version:
+            raise ValueError(f"format version {file_version}, this is {version}")
         return read_back(kind, text, strict=strict)
     except (OSError, ValueError, KeyError, TypeError) as error:
         cause = getattr(error, "strerror", None) or error
@@ -143,18 +143,18 @@ class RecordedCampaign:
 
     def _whole(self, kind: str, index: int | None = None) -> dict[int, str]:
         """Return the names of the completed archives of a kind by index, the last attempts."""
-        found: dict[int, str] = {}
+        names: dict[int, str] = {}
         for entry in reversed(self.manifest()):
             name = ArchiveName.parse(entry.name)
             if (
                 name is not None
                 and (name.kind, entry.outcome) == (kind, "completed")
                 and index in (None, name.index)
-                and name.index not in found
+                and name.index not in names
                 and self._unchanged(entry)
             ):
-                found[name.index] = entry.name
-        return found
+                names[name.index] = entry.name
+        return names
 
     def _unchanged(self, entry: Entry) -> bool:
         digests = {} if self.digests is None else self.digests

@@ -70,7 +70,7 @@ def recording_of(archive: Archive) -> Recording:
         remedy = "record it again, or name a time within the recording"
         raise ArchiveError(archive.path, problem, remedy=remedy)
     imported = archive.kind == "imported"
-    own = archive.header.by_controller_program
+    by_program = archive.header.by_controller_program
     provenance = {"archive": archive.path.name, **archive.header.entries}
     for key, value in (archive.outcome.entries if archive.outcome else {}).items():
         provenance[key if key == "outcome" else f"outcome.{key}"] = value
@@ -85,7 +85,7 @@ def recording_of(archive: Archive) -> Recording:
         velocity=_known(columns.get("velocity")) if imported else None,
         motor_current=columns.get("target_current", columns.get("motor_current")),
         # Commanded by the PC, or by a program of the controller.
-        commanded_position=columns.get("target_position" if own else "commanded_position"),
+        commanded_position=columns.get("target_position" if by_program else "commanded_position"),
         gap_before=_gaps(archive),
         held_joints=archive.header.held_joints,
         provenance=provenance,

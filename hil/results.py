@@ -34,11 +34,13 @@ class Frozen(BaseModel):
     @classmethod
     def of(cls, source: object = None, **others: Any) -> Self:
         """Build a section from the equally named attributes of `source` and from `others`."""
-        own = {name: getattr(source, name) for name in cls.model_fields if hasattr(source, name)}
+        attributes = {
+            name: getattr(source, name) for name in cls.model_fields if hasattr(source, name)
+        }
         return cls.model_validate(
             {
                 name: value.tolist() if isinstance(value, np.ndarray) else value
-                for name, value in (own | others).items()
+                for name, value in (attributes | others).items()
             }
         )
 
@@ -326,7 +328,7 @@ class ParameterResult(Frozen):
 
 def by_id(parameters: Sequence[ParameterResult]) -> list[ParameterResult]:
     """Return parameters in the order of the paper's Table 2, those without a number last."""
-    return sorted(parameters, key=lambda one: one.table2_id or len(parameters) + 1000)
+    return sorted(parameters, key=lambda parameter: parameter.table2_id or len(parameters) + 1000)
 
 
 class ValidationResult(Frozen):
@@ -519,10 +521,10 @@ class Results(Frozen):
 
         try:
             text = read_text(path)
-            found = parse_json(text)
+            document = parse_json(text)
         except (OSError, ValueError) as error:
             raise refusal(f"cannot be read as a result ({error})") from error
-        version = found.get("schema_version") if isinstance(found, dict) else None
+        version = document.get("schema_version") if isinstance(document, dict) else None
         if version != SCHEMA_VERSION:
             problem = f"is of version {version!r}; this program reads version {SCHEMA_VERSION}"
             raise refusal(problem, "schema_version")

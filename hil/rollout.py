@@ -125,7 +125,9 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
         no_nominal=reason,
         samples=len(ensemble),
         seed=options.seed,
-        sample_errors=[ArmErrors.of(errors_of(one, measured_few, tool)) for one in simulated[0]],
+        sample_errors=[
+            ArmErrors.of(errors_of(rollout, measured_few, tool)) for rollout in simulated[0]
+        ],
         widened=ensemble.widened,
         inside=coverage(simulated[1], measured).tolist(),
         leading_joint=arm.model.joint_names[joint],
@@ -150,7 +152,7 @@ def _motion_of(
     stretches, owners = recorded_stretches(arm.model, recordings, STEP)
     try:
         servo, drive = _servo_of(model, options)
-        if servo is not None and any(one.commanded is None for one in stretches):
+        if servo is not None and any(stretch.commanded is None for stretch in stretches):
             raise NoServoError("the held-out recordings have no commanded positions")
         windows = windows_of(stretches, STEP, HORIZONS[-1], _STRIDE).some(MOST_WINDOWS)
     except NoServoError as error:
@@ -190,8 +192,8 @@ def _with_commands(
     sources: Sequence[Source], samples: Sequence[Samples]
 ) -> list[tuple[Samples, Array | None]]:
     return [
-        (one, source.recording.commanded_position)
-        for source, one in zip(sources, samples, strict=True)
+        (recording_samples, source.recording.commanded_position)
+        for source, recording_samples in zip(sources, samples, strict=True)
     ]
 
 
@@ -280,8 +282,8 @@ def _leading_effect(
 ) -> str:
     """Return the effect of which a change lessens the error of a joint most; empty if none does."""
 
-    def square(found: Array) -> float:
-        at = found[:, JUDGED, joint]
+    def square(positions: Array) -> float:
+        at = positions[:, JUDGED, joint]
         error = np.where(np.isfinite(at), at - measured[:, JUDGED, joint], LARGEST_ERROR)
         return float(np.mean(error**2))
 

@@ -244,9 +244,9 @@ def _share(share: float) -> Text:
 
 def clock(seconds: float) -> str:
     """Return a time as h:mm:ss or m:ss."""
-    minutes, rest = divmod(max(0, round(seconds)), 60)
+    minutes, second = divmod(max(0, round(seconds)), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+    return f"{hours}:{minutes:02d}:{second:02d}" if hours else f"{minutes}:{second:02d}"
 
 
 # --- questions
@@ -255,30 +255,30 @@ _POLL: Final = 0.1
 """Period of polling keys and stop requests, s."""
 
 
-def ask(console: Console, title: str, found: DryRunRecord, stop: Stop) -> bool:
+def ask(console: Console, title: str, dry_run: DryRunRecord, stop: Stop) -> bool:
     """Show a dry run and ask for its acceptance: "yes", or the joints that contradict the model."""
-    table = Table(title=Text(printable(f"Dry run of {title}, {clock(found.duration)} long")))
+    table = Table(title=Text(printable(f"Dry run of {title}, {clock(dry_run.duration)} long")))
     for column in ("joint", "largest following error", "largest current", "torque and gravity"):
         table.add_column(column, justify="right" if column.startswith("largest") else "left")
-    agree = {name: Text("not determined") for name in found.gravity_not_seen}
-    agree |= {name: Text("contradict", style="bold red") for name in found.against_gravity}
+    agree = {name: Text("not determined") for name in dry_run.gravity_not_seen}
+    agree |= {name: Text("contradict", style="bold red") for name in dry_run.against_gravity}
     for name, error, share in zip(
-        found.joint_names, found.following_error, found.current_share, strict=True
+        dry_run.joint_names, dry_run.following_error, dry_run.current_share, strict=True
     ):
         current = f"{100.0 * share:.0f} % of its limit"
         weight = agree.get(name, Text("agree"))
         table.add_row(Text(printable(name)), f"{math.degrees(error):.3f}°", current, weight)
-    link = f"{plural(found.missed, 'packet')} missed, {plural(found.late, 'reply')} late"
-    table.caption = Text(printable(f"{link}; {', '.join(found.archives)}"))
+    link = f"{plural(dry_run.missed, 'packet')} missed, {plural(dry_run.late, 'reply')} late"
+    table.caption = Text(printable(f"{link}; {', '.join(dry_run.archives)}"))
     console.print(table)
-    for warning in found.warnings:
+    for warning in dry_run.warnings:
         console.print(warning, style="bold red", markup=False, highlight=False)
-    what = "the simulated arm" if found.simulated else "the arm"
-    word = " ".join(found.against_gravity) or "yes"
-    known = f"If you know the cause, type {word}" if found.against_gravity else "Type yes"
+    what = "the simulated arm" if dry_run.simulated else "the arm"
+    word = " ".join(dry_run.against_gravity) or "yes"
+    instruction = f"If you know the cause, type {word}" if dry_run.against_gravity else "Type yes"
     question = (
-        f"Did {what} move as it should, with nothing in its way at {percentage(found.override)} of "
-        f"full speed? {known} to accept; anything else ends the run: "
+        f"Did {what} move as it should, with nothing in its way at {percentage(dry_run.override)} "
+        f"of full speed? {instruction} to accept; anything else ends the run: "
     )
     return confirmed(console, question, word, stop)
 
@@ -388,14 +388,14 @@ class Screen:
         """Whether the operator can be asked at the terminal."""
         return self._full and can_read(sys.stdin)
 
-    def accept_dry_run(self, found: DryRunRecord) -> bool:
+    def accept_dry_run(self, record: DryRunRecord) -> bool:
         """Ask on the terminal's main page; False without a terminal."""
         if not self.can_answer:
             return False
         self._undo.close()
         try:
             self._print_messages_at_end()
-            return not self._stuck and ask(self._console, self._title, found, self._stop)
+            return not self._stuck and ask(self._console, self._title, record, self._stop)
         finally:
             try:
                 self._open()

@@ -157,8 +157,8 @@ def own_postures(cell: Cell) -> tuple[tuple[float, ...], ...]:
 def simulated_drive(cell: Cell) -> SimulatedDrive:
     """Return the true drive train: `[simulation.drive_train]` over that of the cell."""
     simulation = cell.file.simulation
-    known = {} if simulation is None else simulation.drive_train.model_dump(exclude_none=True)
-    table = cell.drive_table.model_copy(update=known)
+    stated = {} if simulation is None else simulation.drive_train.model_dump(exclude_none=True)
+    table = cell.drive_table.model_copy(update=stated)
     return SimulatedDrive(
         gear_ratio=tuple(table.gear_ratio),
         calibration=tuple(table.calibration),

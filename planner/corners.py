@@ -376,8 +376,8 @@ def round_corners(
             break
         shares = fly[rows] * part
         solutions = solved(rows, shares)
-        found = np.flatnonzero(sum(cuts(rows, shares)) >= solutions.durations)
-        finish(rows[found], shares[found], solutions.take(found))
+        successes = np.flatnonzero(sum(cuts(rows, shares)) >= solutions.durations)
+        finish(rows[successes], shares[successes], solutions.take(successes))
     return corners
 
 
@@ -430,7 +430,7 @@ def solve_many(starts: Array, ends: Array, times: Array, bounds: Allowance) -> S
     problem.max_jerk = [FULL * SOLVER_JERK] * n_joints
     solver = ruckig.Ruckig(n_joints)
     durations = np.full(len(starts), np.inf)
-    found = np.full(len(starts), None, dtype=np.object_)
+    results = np.full(len(starts), None, dtype=np.object_)
     rows = np.flatnonzero(_askable(starts, bounds) & _askable(ends, bounds))
     tasks = zip(
         rows.tolist(),
@@ -447,8 +447,8 @@ def solve_many(starts: Array, ends: Array, times: Array, bounds: Allowance) -> S
             solver.calculate(problem, result)
         except REFUSALS:
             continue
-        durations[row], found[row] = result.duration * time, result
-    return Solutions(starts, ends, times, durations, found)
+        durations[row], results[row] = result.duration * time, result
+    return Solutions(starts, ends, times, durations, results)
 
 
 def _askable(states: Array, bounds: Allowance) -> Mask:
@@ -490,8 +490,8 @@ def finish_many(solutions: Solutions, bounds: Allowance) -> list[PiecewiseCubic 
         ends = solutions.ends[missed]
         groups.append((missed, _closed(tables.take(missed), starts, ends)))
     for rows, block in groups:
-        own = bounds.take(rows)
-        valid = block.satisfies(own) & _meets(block, solutions.ends[rows], own)
+        block_bounds = bounds.take(rows)
+        valid = block.satisfies(block_bounds) & _meets(block, solutions.ends[rows], block_bounds)
         for index in np.flatnonzero(valid).tolist():
             pieces = tuple(block.knots[index]), tuple(block.coefficients[index])
             joined[int(rows[index])] = PiecewiseCubic(*pieces)

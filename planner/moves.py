@@ -162,11 +162,11 @@ class Legs(NamedTuple):
         Raises:
             PlanningError: a motion breaks a limit of its legs, or is not smooth.
         """
-        found = self.checked_motions(corners, count)
-        for motion in found:
+        outcomes = self.checked_motions(corners, count)
+        for motion in outcomes:
             if isinstance(motion, PlanningError):
                 raise motion
-        return [motion for motion in found if isinstance(motion, PiecewiseCubic)]
+        return [motion for motion in outcomes if isinstance(motion, PiecewiseCubic)]
 
     def checked_motions(
         self, corners: Sequence[Corner], count: int
@@ -217,10 +217,10 @@ def _assembled(moves: StraightMoves, corners: Sequence[Corner], count: int) -> B
     for index, (_, _, join, *_) in enumerate(corners):
         if join is not None:
             where = divmod(index, legs - 1)
-            own = len(join.knots[0])
-            rounds[where][:, : own - 1] = join.coefficients
-            knots[where][:, :own] = join.knots
-            knots[where][:, own:] = join.duration
+            n_knots = len(join.knots[0])
+            rounds[where][:, : n_knots - 1] = join.coefficients
+            knots[where][:, :n_knots] = join.knots
+            knots[where][:, n_knots:] = join.duration
 
     spans = np.zeros((count, 2 * legs))
     spans[:, 1::2], spans[:, 2::2] = times[:, :, 0, -1], knots[:, :, 0, -1]

@@ -268,8 +268,8 @@ class Block(NamedTuple):
         ends = np.stack(after(pieces, np.diff(self.knots, axis=-1)), axis=-1)
         starts = self.coefficients[..., :3]
         jumps = np.abs(starts[..., 1:, :] - ends[..., :-1, :]).max(axis=-2, initial=0.0)
-        rest = np.maximum(np.abs(starts[..., 0, 1:]), np.abs(ends[..., -1, 1:]))
-        jumps[..., 1:] = np.maximum(jumps[..., 1:], rest)
+        end_rates = np.maximum(np.abs(starts[..., 0, 1:]), np.abs(ends[..., -1, 1:]))
+        jumps[..., 1:] = np.maximum(jumps[..., 1:], end_rates)
         smooth: Mask = np.all(jumps <= jump_rounding(bounds, self.durations), axis=(1, 2))
         return smooth
 

@@ -189,8 +189,8 @@ def _check_motion(stored: PiecewiseCubic, planned: MotionPlan) -> None:
     end = min(stored.duration, other.duration)
     knots = np.unique(np.minimum(np.concatenate((*stored.knots, *other.knots)), end))
     apart, fast, steep = (
-        np.abs(one - two).max(axis=0)
-        for one, two in zip(stored.sample(knots), other.sample(knots), strict=True)
+        np.abs(stored_rows - other_rows).max(axis=0)
+        for stored_rows, other_rows in zip(stored.sample(knots), other.sample(knots), strict=True)
     )
     apart = float(apart.max())
     rates = float(max(np.max(fast / limits.velocity), np.max(steep / limits.acceleration)))

@@ -116,9 +116,9 @@ class _Pickler(pickle.Pickler):
         if isinstance(obj, Exception):
             return _restored, (type(obj), obj.args, vars(obj))
         if is_dataclass(obj) and not isinstance(obj, type):
-            own = fields(obj)
-            if all(field.init and not field.kw_only for field in own):
-                return type(obj), tuple(getattr(obj, field.name) for field in own)
+            members = fields(obj)
+            if all(field.init and not field.kw_only for field in members):
+                return type(obj), tuple(getattr(obj, field.name) for field in members)
         return NotImplemented
 
 
@@ -297,8 +297,8 @@ def map_in_children(
     done: Callable[[int], None] | None = None,
 ) -> list[Outcome[T]]:
     """Return the results of `stream_in_children` by index."""
-    found = dict(stream_in_children(children, function, chunks, arguments, done=done))
-    return [found[index] for index in range(len(found))]
+    outcomes = dict(stream_in_children(children, function, chunks, arguments, done=done))
+    return [outcomes[index] for index in range(len(outcomes))]
 
 
 def stream_in_children(
@@ -331,27 +331,27 @@ def stream_in_children(
     not_started = 0
     idle = list(children)
     busy: dict[Any, tuple[WorkerProcess, Chunk]] = {}
-    found: list[tuple[int, Outcome[T]]] = []
+    outcomes: list[tuple[int, Outcome[T]]] = []
     try:
         while True:
             while idle and (chunk := again.popleft() if again else next(fresh, None)) is not None:
                 child = idle.pop()
                 child.begin(function, *arguments(chunk))
                 busy[child.connection] = child, chunk
-            if done is not None and found:
-                done(len(found))
-            yield from found  # while children are at work
+            if done is not None and outcomes:
+                done(len(outcomes))
+            yield from outcomes  # while children are at work
             if not busy:
                 return
             nearest = min(child.deadline for child, _ in busy.values()) - monotonic()
             ready = wait(list(busy), max(0.0, nearest))
             late = [link for link, (child, _) in busy.items() if child.deadline <= monotonic()]
-            found = []
+            outcomes = []
             for link in {*ready, *late}:
                 child, chunk = busy.pop(link)
                 idle.append(child)
                 try:
-                    found += zip(chunk, child.receive(), strict=True)
+                    outcomes += zip(chunk, child.receive(), strict=True)
                     not_started = 0
                 except PlannerNotStarted:
                     not_started += 1
@@ -366,7 +366,7 @@ def stream_in_children(
                         crashed.add(first)
                         again.append(chunk)
                     else:
-                        found.append((first, error))
+                        outcomes.append((first, error))
     finally:  # after an exception, or if the generator is closed
         for child in children:
             if child not in idle:

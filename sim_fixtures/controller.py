@@ -416,7 +416,7 @@ class Layout:
         """Return the init packet (1200 bytes)."""
         settings = self._settings
         row = settings.arm - 1
-        own = (row, slice(drive.n_axes))
+        axes = (row, slice(drive.n_axes))
         shape = (N_ARMS, AXES_PER_ARM)
         tables = {name: np.zeros(shape, np.float32) for name in (*_FOREIGN, "kinematic_influence")}
         slots = np.full(shape, NO_SLOT, np.int32)
@@ -426,9 +426,9 @@ class Layout:
             slots[at], modes[at] = slot, Mode.CLOSED
             for name, value in _FOREIGN.items():
                 tables[name][at] = value
-        slots[own], modes[own] = self.own, Mode.CLOSED
+        slots[axes], modes[axes] = self.own, Mode.CLOSED
         for name in _FOREIGN:
-            tables[name][own] = getattr(drive, name)
+            tables[name][axes] = getattr(drive, name)
         tables["kinematic_influence"][row, 3:6] = (drive.k54, drive.k64, drive.k65)
         init = InitPacket.build(
             min(self.n_slots, AXES_PER_ARM), round(period * 1000.0), {},
@@ -934,8 +934,8 @@ class SimulatedController:
         common = program.pause_mode if phase is Phase.PAUSED else _COMMON_MODE.get(phase)
         layout.set_modes(common, program.open_axes)
         zero = [0.0] * self._drive.n_axes
-        known = program.powered or phase is Phase.TRIPPED
-        demanded = (self._targets.own, self._targets.own_delta) if known else (zero, zero)
+        has_target = program.powered or phase is Phase.TRIPPED
+        demanded = (self._targets.own, self._targets.own_delta) if has_target else (zero, zero)
         measured: Sequence[float] = servo.measured
         slip = self._arm.disturbances.slip
         if slip is not None:

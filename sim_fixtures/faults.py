@@ -179,14 +179,14 @@ def _parsed(text: str) -> Fault:
     count = max(1, kind.times) if times is None else int(times)
     if not 1 <= count <= link.MOST_CYCLES or cycle > link.MOST_CYCLES:
         raise ValueError(f"the cycle is at most {link.MOST_CYCLES}, the count 1 to as many")
-    found = _matched(name, kind, options)
+    matches = _matched(name, kind, options)
     to: link.Direction = "to_controller" if "to_controller" in options else "to_pc"
     match name:
         case "lose":
             return link.Lose(cycle, to, count)
         case "delay":
-            value = float(found["time"][1])
-            unit = found["time"][2]
+            value = float(matches["time"][1])
+            unit = matches["time"][2]
             if unit.startswith("cycle"):
                 return link.Delay(cycle, cycles=value, direction=to, count=count)
             return link.Delay(cycle, seconds=value * _SECONDS[unit], direction=to, count=count)
@@ -195,28 +195,28 @@ def _parsed(text: str) -> Fault:
         case "reorder":
             return link.Reorder(cycle, to)
         case "corrupt":
-            mask = int(found["mask"][1], 0) if "mask" in found else 0xFF
-            offset = int(found["offset"][1], 0)
+            mask = int(matches["mask"][1], 0) if "mask" in matches else 0xFF
+            offset = int(matches["offset"][1], 0)
             return link.Corrupt(cycle, to, count, offset=offset, mask=mask)
-    axis = int(found["axis"][1]) if "axis" in found else 1
-    words = (found[option][0] for option in ("start", "how", "mode") if option in found)
-    return InjectedFault(name, cycle, axis, count, next(words, kind.word))
+    axis = int(matches["axis"][1]) if "axis" in matches else 1
+    qualifiers = (matches[option][0] for option in ("start", "how", "mode") if option in matches)
+    return InjectedFault(name, cycle, axis, count, next(qualifiers, kind.word))
 
 
 def _matched(name: str, kind: _Kind, options: Iterable[str]) -> dict[str, re.Match[str]]:
     """Return the options of a fault by their names."""
-    found: dict[str, re.Match[str]] = {}
+    matches: dict[str, re.Match[str]] = {}
     for text in options:
         for option in kind.options:
             match = _OPTIONS[option].fullmatch(text)
-            if match is not None and option not in found:
-                found[option] = match
+            if match is not None and option not in matches:
+                matches[option] = match
                 break
         else:
             raise ValueError(f"{name} has no option {text!r}")
-    if kind.needed and kind.needed not in found:
+    if kind.needed and kind.needed not in matches:
         raise ValueError(f"{name} needs the option {kind.needed}")
-    return found
+    return matches
 
 
 def split_faults(

@@ -28,10 +28,12 @@ def figures(report: dict[str, Any], package: str) -> dict[str, float]:
         ValueError: none of them was measured.
     """
     files = report["files"].items()
-    found = [one["summary"] for path, one in files if Path(path).parts[:1] == (package,)]
-    if not found:
+    summaries = [entry["summary"] for path, entry in files if Path(path).parts[:1] == (package,)]
+    if not summaries:
         raise ValueError(f"no file of {package} was measured")
-    sums = {part: [sum(one[key] for one in found) for key in PARTS[part]] for part in PARTS}
+    sums = {
+        part: [sum(summary[key] for summary in summaries) for key in PARTS[part]] for part in PARTS
+    }
     return {part: 100.0 * reached / max(1, total) for part, (reached, total) in sums.items()}
 
 
@@ -39,11 +41,11 @@ def main(arguments: Sequence[str]) -> int:
     """Print them; returns the exit status."""
     file, *packages = arguments
     report = json.loads(Path(file).read_text("utf-8"))
-    found = {package: figures(report, package) for package in packages}
-    for package, shares in found.items():
+    shares_of = {package: figures(report, package) for package in packages}
+    for package, shares in shares_of.items():
         texts = (f"{share:.1f} % of {part}" for part, share in shares.items())
         sys.stdout.write(f"{package}: {', '.join(texts)}\n")
-    return int(min(min(shares.values()) for shares in found.values()) < LEAST)
+    return int(min(min(shares.values()) for shares in shares_of.values()) < LEAST)
 
 
 if __name__ == "__main__":

@@ -42,12 +42,12 @@ class Sources:
     @classmethod
     def read(cls) -> Sources:
         """Those of this checkout."""
-        found = {}
+        files = {}
         for package in PACKAGES:
             for path in sorted((ROOT / package).rglob("*.py")):
                 name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-                found[name.removesuffix(".__init__")] = path
-        return cls(found)
+                files[name.removesuffix(".__init__")] = path
+        return cls(files)
 
     @cached_property
     def trees(self) -> dict[str, ast.Module]:
@@ -73,9 +73,9 @@ class Sources:
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
-                own = name.split(".")
+                name_parts = name.split(".")
                 package = self.files[name].name == "__init__.py"
-                parents = own[: len(own) - node.level + package]
+                parents = name_parts[: len(name_parts) - node.level + package]
                 base = ".".join([*parents, *([base] if base else [])])
             for alias in node.names:
                 whole = f"{base}.{alias.name}"
@@ -118,7 +118,7 @@ class Sources:
 
     def banned_names(self) -> list[str]:
         """Modules, functions, classes, arguments and variables with an idiom for a name."""
-        found = []
+        banned = []
         for name, tree in self.trees.items():
             names = [(1, name.rpartition(".")[2])]
             for node in ast.walk(tree):
@@ -128,12 +128,12 @@ class Sources:
                     names.append((node.lineno, node.arg))
                 elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
                     names.append((node.lineno, node.id))
-            found += [
-                f"{name}:{line} {one}"
-                for line, one in names
-                if BANNED.intersection(re.findall("[a-z]+", one.lower()))
+            banned += [
+                f"{name}:{line} {identifier}"
+                for line, identifier in names
+                if BANNED.intersection(re.findall("[a-z]+", identifier.lower()))
             ]
-        return found
+        return banned
 
     def long_functions(self) -> list[str]:
         """Functions of more lines than `_LONG`, docstring included."""

@@ -31,14 +31,14 @@ def entries(path: Path, entry: Callable[[Any], Entry], what: str) -> list[Entry]
         content = path.read_bytes() if path.exists() else b""
     except OSError as error:
         raise JournalError(f"{path} cannot be read: {error}; name another --journal") from error
-    found = []
+    complete = []
     for number, line in enumerate(content[: _whole(content)].splitlines(), 1):
         try:
-            found.append(entry(json.loads(line)))
+            complete.append(entry(json.loads(line)))
         except (AttributeError, LookupError, TypeError, ValueError) as error:
             reason = f"{path}, line {number} is no {what}; name another --journal"
             raise JournalError(reason) from error
-    return found
+    return complete
 
 
 def rounds(path: Path | None, *needed: str) -> dict[int, dict[str, Any]]:

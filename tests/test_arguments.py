@@ -83,11 +83,11 @@ def test_only_a_truncated_last_line_is_lost(tmp_path: Path) -> None:
     whole = b'{"n":1}\n{"n":2}\n'
     for size in range(1, len(whole)):
         path.write_bytes(whole[:size])
-        known = [1] if size >= len(whole) // 2 else []
-        assert read(path) == known, size
+        complete = [1] if size >= len(whole) // 2 else []
+        assert read(path) == complete, size
         with Journal(path) as journal:
             journal.add(n=9)
-        assert read(path) == [*known, 9]
+        assert read(path) == [*complete, 9]
 
 
 @pytest.mark.parametrize("line", ["no", "{}", "[]", "7", "null", '{"n":1}{"n":2}'])
@@ -108,7 +108,7 @@ def test_rounds_are_known_by_number_and_the_last_of_one_counts(tmp_path: Path) -
     with Journal(path) as journal:
         for n, text in ((4, "a"), (2, "b"), (4, "c")):
             journal.add(round=n, text=text)
-    assert {n: one["text"] for n, one in rounds(path, "text").items()} == {4: "c", 2: "b"}
+    assert {n: result["text"] for n, result in rounds(path, "text").items()} == {4: "c", 2: "b"}
     with pytest.raises(JournalError, match="line 1 is no result of a round"):
         rounds(path, "harm")
 

@@ -27,7 +27,7 @@ def places(objects: Mapping[str, Any]) -> dict[str, Place]:
     for name, entry in objects.items():
         if entry.objtype in ("class", "exception"):
             short.setdefault(name.rpartition(".")[2], set()).add(full[name])
-    unique = {name: found.pop() for name, found in short.items() if len(found) == 1}
+    unique = {name: candidates.pop() for name, candidates in short.items() if len(candidates) == 1}
     return unique | full
 
 
@@ -38,10 +38,10 @@ class LinkedNames(SphinxPostTransform):
 
     def run(self, **_: Any) -> None:
         """Link every literal of the page that is a documented name."""
-        found = places(self.env.domains.python_domain.objects)
+        place_of = places(self.env.domains.python_domain.objects)
         page = self.env.current_document.docname
         for literal in list(self.document.findall(nodes.literal)):
-            place = found.get(literal.astext().removesuffix("()"))
+            place = place_of.get(literal.astext().removesuffix("()"))
             if place is not None and not isinstance(literal.parent, nodes.reference):
                 link = make_refnode(self.app.builder, page, *place, literal.deepcopy())
                 literal.replace_self(link)

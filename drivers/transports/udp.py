@@ -200,8 +200,8 @@ class UdpTransport:
             # A stray short datagram must not select the port.
             first = self._peer is None and HEADER_LENGTH <= len(packet) <= LONGEST
             if sender[0] != self._host or not first:
-                known = self._peer is None and sender[0] == self._host
-                self._count("malformed" if known else "foreign")
+                from_controller = self._peer is None and sender[0] == self._host
+                self._count("malformed" if from_controller else "foreign")
                 return False
             self._peer = sender
         if len(packet) > LONGEST:

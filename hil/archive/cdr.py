@@ -157,8 +157,8 @@ def fixed_layout(definition: str) -> MessageLayout:
     message, or its type is no number.
     """
     builder = LayoutBuilder()
-    own = _SEPARATOR.split(definition)[0]
-    for line in (line.partition("#")[0].strip() for line in own.splitlines()):
+    fields_text = _SEPARATOR.split(definition)[0]
+    for line in (line.partition("#")[0].strip() for line in fields_text.splitlines()):
         if not line or _CONSTANT.match(line):
             continue
         match = _FIELD.match(" ".join(line.split()[:2]))  # a default value may follow the name

@@ -48,34 +48,34 @@ class ArchiveCheck:
 def check_archive(path: str | PathLike[str]) -> ArchiveCheck:
     """Check whether all of a file can be used; ArchiveError if it is no archive or unreadable."""
     path = Path(path)
-    found = scan_file(path, all_channels=True)
-    if found.metadata is None:
+    scan = scan_file(path, all_channels=True)
+    if scan.metadata is None:
         open_archive(path, fields=())  # raises with the reason
-    faults = [*_entry_faults(path, found)]
-    if found.header is not None:
-        faults += found.faults
-    if not faults and not is_intact(path, found):
+    faults = [*_entry_faults(path, scan)]
+    if scan.header is not None:
+        faults += scan.faults
+    if not faults and not is_intact(path, scan):
         faults.append("the message indexes or the summary do not fit the content")
     return ArchiveCheck(
         path=path,
-        version=(found.metadata or {}).get("format_version", ""),
+        version=(scan.metadata or {}).get("format_version", ""),
         faults=tuple(faults),
-        samples=found.samples,
-        repaired=found.outcome is not None and found.outcome.repaired,
+        samples=scan.samples,
+        repaired=scan.outcome is not None and scan.outcome.repaired,
     )
 
 
-def _entry_faults(path: Path, found: Scan) -> Iterator[str]:
+def _entry_faults(path: Path, scan: Scan) -> Iterator[str]:
     """Yield the faults of the entries of header and outcome."""
-    entries = found.metadata or {}
+    entries = scan.metadata or {}
     if not is_supported(entries):
         yield f"format_version is {entries.get('format_version')!r}, known is '{FORMAT_VERSION}'"
         return
     kind = entries.get("kind", "")
     if kind not in KINDS:
         yield f"kind is {kind!r}, not one of {', '.join(KINDS)}"
-    if found.header_error is not None:
-        problems = found.header_error.problems.items()
+    if scan.header_error is not None:
+        problems = scan.header_error.problems.items()
         yield from (f"{name} {problem}" for name, problem in problems)
     if "period" not in entries and kind != "imported":
         yield "period is missing"
@@ -83,8 +83,8 @@ def _entry_faults(path: Path, found: Scan) -> Iterator[str]:
     for key, value in (name.metadata() if name else {}).items():
         if entries.get(key) != value:
             yield f"{key} is {entries.get(key)!r}, but {value!r} in the file name"
-    if found.outcome is not None and found.outcome.outcome not in OUTCOMES:
-        yield f"outcome is {found.outcome.outcome!r}, not one of {', '.join(OUTCOMES)}"
+    if scan.outcome is not None and scan.outcome.outcome not in OUTCOMES:
+        yield f"outcome is {scan.outcome.outcome!r}, not one of {', '.join(OUTCOMES)}"
 
 
 def archive_files(paths: Sequence[Path]) -> list[Path]:
@@ -159,7 +159,7 @@ class Overview:
 
 def read_overview(path: str | PathLike[str]) -> Overview:
     """Return the overview of an archive; ArchiveError if it cannot be read."""
-    archive, found = scan_archive(path, all_channels=True)
+    archive, scan = scan_archive(path, all_channels=True)
     header = archive.header
     stamp = archive.columns["stamp"]
     outcome = archive.outcome or ArchiveOutcome(outcome="missing")
@@ -186,12 +186,12 @@ def read_overview(path: str | PathLike[str]) -> Overview:
         duration=duration,
         period=archive.period,
         joint_names=archive.joint_names,
-        size=found.size,
-        per_minute=found.size / duration * 60.0 if duration else None,
-        chunks=found.chunks,
+        size=scan.size,
+        per_minute=scan.size / duration * 60.0 if duration else None,
+        chunks=scan.chunks,
         channels=tuple(
-            (topic, getattr(found.parser.schema(topic), "name", ""), count)
-            for topic, count in sorted(found.counts.items())
+            (topic, getattr(scan.parser.schema(topic), "name", ""), count)
+            for topic, count in sorted(scan.counts.items())
         ),
         attachments={name: len(data) for name, data in archive.attachments.items()},
         metadata={
@@ -199,7 +199,9 @@ def read_overview(path: str | PathLike[str]) -> Overview:
             for key, text in entries.items()
             if key.removeprefix("outcome.") not in _SHOWN_ELSEWHERE
         },
-        events=tuple((one.time, one.name, one.text) for one in archive.events[:_MOST_EVENTS]),
+        events=tuple(
+            (event.time, event.name, event.text) for event in archive.events[:_MOST_EVENTS]
+        ),
         damage=archive.damage,
     )
 

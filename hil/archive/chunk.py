@@ -71,8 +71,8 @@ class Messages:
         """Time stamps, shape (k,) [ns]; empty where a message is too short for one."""
         if any(part.shape[1] < _STAMP_AT.stop for part in self.parts):
             return np.zeros(0, np.int64)
-        found = [part[:, _STAMP_AT].view(_STAMP)[:, 0] for part in self.parts]
-        stamps = [stamp["sec"] * np.int64(10**9) + stamp["nanosec"] for stamp in found]
+        raw_stamps = [part[:, _STAMP_AT].view(_STAMP)[:, 0] for part in self.parts]
+        stamps = [stamp["sec"] * np.int64(10**9) + stamp["nanosec"] for stamp in raw_stamps]
         return stamps[0] if len(stamps) == 1 else np.concatenate(stamps)
 
     def all(self) -> list[bytes]:
@@ -106,7 +106,9 @@ class ChunkParser:
 
     def schema(self, topic: str) -> Schema | None:
         """Return the schema of a topic's messages, if it is known."""
-        identity = next(one.schema_id for one in self.channels.values() if one.topic == topic)
+        identity = next(
+            channel.schema_id for channel in self.channels.values() if channel.topic == topic
+        )
         return self.schemas.get(identity)
 
     def define(self, record: Record) -> None:
@@ -123,8 +125,12 @@ class ChunkParser:
             if self.schemas.setdefault(item.id, item) != item:
                 again = f"schema {item.id}"
         else:
-            known = self.channels.values()
-            same = [one for one in known if one.id == item.id or one.topic == item.topic]
+            channels = self.channels.values()
+            same = [
+                channel
+                for channel in channels
+                if channel.id == item.id or channel.topic == item.topic
+            ]
             if same not in ([], [item]):
                 again = f"channel {item.id}"
             self.channels.setdefault(item.id, item)
@@ -136,7 +142,7 @@ class ChunkParser:
 
         `offset` is its place in the file. `Damage` if records are truncated or definitions differ.
         """
-        found: dict[int, Messages] = {}
+        by_channel: dict[int, Messages] = {}
         recent: deque[Content] = deque(maxlen=_LONGEST_PATTERN)
         at = 0
         while at < len(chunk):
@@ -144,7 +150,7 @@ class ChunkParser:
             if len(rows):
                 first = at + rows.shape[1] * np.arange(len(rows))
                 for channel, place in self._round:
-                    messages = found.setdefault(channel, Messages())
+                    messages = by_channel.setdefault(channel, Messages())
                     messages.parts.append(rows[:, place])
                     messages.places.append(first + place.start)
                 at += rows.size
@@ -158,14 +164,14 @@ class ChunkParser:
                     recent.clear()
                     continue
                 recent.append(head)
-                messages = found.setdefault(_FIXED.unpack(head)[2], Messages())
+                messages = by_channel.setdefault(_FIXED.unpack(head)[2], Messages())
                 messages.parts.append(np.frombuffer(chunk, np.uint8, end - at, at)[None])
                 messages.places.append(np.array([at]))
             else:
                 body = bytes(chunk[at + container.RECORD.size : end])
                 self.define(Record(offset, opcode, body))
             at = end
-        return found
+        return by_channel
 
     def _repeated(self, chunk: Content, at: int) -> Bytes:
         """Return the repetitions of the pattern that follow from `at` on, shape (k, size)."""

@@ -109,12 +109,12 @@ class _Body(ReadDataStream):
 def parse(kind: type[_Parsed], record: Record) -> _Parsed:
     """Return a record of this kind; `Damage` if the body does not fit it."""
     try:
-        found: _Parsed = kind.read(_Body(record.body))  # type: ignore[attr-defined]
+        parsed: _Parsed = kind.read(_Body(record.body))  # type: ignore[attr-defined]
     except EndOfFile:
         raise Damage(record.offset, "is shorter than its fields") from None
     except UnicodeDecodeError:
         raise Damage(record.offset, "holds text that is not UTF-8") from None
-    return found
+    return parsed
 
 
 def encode(record: McapRecord) -> bytes:
@@ -229,7 +229,9 @@ def read_summary(stream: BinaryIO, size: int, *kinds: int, start: int | None = N
         return []
     summary = data[: last - start]
     try:
-        return [parse_item(one) for one in split_records(summary, 0) if one.opcode in kinds]
+        return [
+            parse_item(record) for record in split_records(summary, 0) if record.opcode in kinds
+        ]
     except Damage:
         return []
 
@@ -270,10 +272,10 @@ def parse_item(record: Record) -> Any:
 
 def parse_attachment(record: Record) -> Attachment:
     """Return an attachment, its checksum verified."""
-    found = parse(Attachment, record)
+    attachment = parse(Attachment, record)
     if _CRC.unpack(record.body[-_CRC.size :]) != (crc32(record.body[: -_CRC.size]),):
-        raise Damage(record.offset, f"(attachment {found.name!r}) fails its checksum")
-    return found
+        raise Damage(record.offset, f"(attachment {attachment.name!r}) fails its checksum")
+    return attachment
 
 
 def parse_chunk(record: Record) -> Chunk:

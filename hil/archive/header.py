@@ -197,10 +197,10 @@ class ArchiveHeader(BaseModel):
         except ValidationError as error:
             raise HeaderError(
                 {
-                    (name := str(one["loc"][0])): f"cannot be used: {one['msg']}"
+                    (name := str(problem["loc"][0])): f"cannot be used: {problem['msg']}"
                     if name in entries
                     else "is missing"
-                    for one in error.errors(include_url=False)
+                    for problem in error.errors(include_url=False)
                 }
             ) from error
 

@@ -109,8 +109,8 @@ class LivePublisher:
         self.port = int(self._server.port)
         self.drive_train = command.drive_train
         self._names = command.joint_names
-        known = profile(len(command.joint_names))
-        cycles = (known[topic] for topic in (CYCLE, MEASURED, COMMANDED))
+        channels = profile(len(command.joint_names))
+        cycles = (channels[topic] for topic in (CYCLE, MEASURED, COMMANDED))
         self._period = command.period
         self._step = max(1, round(1.0 / (command.view.rate * command.period)))
         self._channels = [_channel(channel, self._context) for channel in cycles]

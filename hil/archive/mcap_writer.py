@@ -51,11 +51,11 @@ Entries = Mapping[int, NDArray[np.void]]
 """Stamps and offsets of the messages of a chunk, by channel in order of first occurrence."""
 
 
-def entries_of(found: Mapping[int, Messages]) -> Entries:
+def entries_of(by_channel: Mapping[int, Messages]) -> Entries:
     """Return the index entries of messages that were read."""
     return {
         number: _entries(messages.of_heads("log_time"), np.concatenate(messages.places))
-        for number, messages in found.items()
+        for number, messages in by_channel.items()
     }
 
 
@@ -221,8 +221,8 @@ class McapWriter:
             channel_message_counts=self._counts,
             chunk_count=len(self._chunks),
             message_count=sum(self._counts.values()),
-            message_end_time=max((one.message_end_time for one in self._chunks), default=0),
-            message_start_time=min((one.message_start_time for one in self._chunks), default=0),
+            message_end_time=max((chunk.message_end_time for chunk in self._chunks), default=0),
+            message_start_time=min((chunk.message_start_time for chunk in self._chunks), default=0),
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )

@@ -68,12 +68,12 @@ class PreTriggerBuffer:
         self._records = []
         self._events = []
         inits = [index for index, event in enumerate(events) if isinstance(event, InitReceived)]
-        own = events[inits[-1] + 1 :] if inits else events
+        session_events = events[inits[-1] + 1 :] if inits else events
         if not parts:
-            return np.zeros(0, np.dtype(np.void)), own
+            return np.zeros(0, np.dtype(np.void)), session_events
         rows = np.concatenate(parts)
         restarts = np.flatnonzero(np.diff(rows["cycle"]) < 1)
-        return (rows[int(restarts[-1]) + 1 :] if restarts.size else rows), own
+        return (rows[int(restarts[-1]) + 1 :] if restarts.size else rows), session_events
 
 
 POLL_PERIOD: Final = 0.02  # Time between two readings of the ring, s

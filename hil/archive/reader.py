@@ -177,11 +177,11 @@ class Scan:
         if outcome is None:
             yield "the outcome is missing"
             return
-        found = {
+        totals = {
             "samples": (outcome.samples, self.samples),
             "events": (outcome.events, self.counts.get(schema.EVENTS, 0)),
         }
-        for key, (stated, count) in found.items():
+        for key, (stated, count) in totals.items():
             if stated != count:
                 yield f"{stated} {key} were written, {count} are there"
 
@@ -341,13 +341,18 @@ class Scan:
                     parser.add(definition, offset)
             if unknown := by_number.keys() - parser.channels.keys():
                 raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
-            found = {parser.channels[number].topic: one for number, one in by_number.items()}
-            wanted = [topic for topic in self.topics if topic in found]
-            numbers = found.keys() & set(NUMBERS)
+            by_topic = {
+                parser.channels[number].topic: channel_messages
+                for number, channel_messages in by_number.items()
+            }
+            wanted = [topic for topic in self.topics if topic in by_topic]
+            numbers = by_topic.keys() & set(NUMBERS)
             new = self._numbers not in (set(), numbers) or numbers.isdisjoint(wanted)
             if numbers and new:
                 raise Damage(offset, "(chunk) has samples in other channels than those before")
-            verified = found if self._all_channels else {topic: found[topic] for topic in wanted}
+            verified = (
+                by_topic if self._all_channels else {topic: by_topic[topic] for topic in wanted}
+            )
             missing = self._missing_messages(verified, offset)
             newest = self._check_times(verified, offset)
             layouts = self._check_layouts(verified, offset)
@@ -364,17 +369,17 @@ class Scan:
             self._next[topic] = int(messages.of_heads("sequence")[-1]) + 1
             self.counts[topic] = self.counts.get(topic, 0) + len(messages)
         self._layouts |= layouts
-        self.events += [one for one in events if self._times[0] <= one.stamp < self._times[1]]
-        self._append({topic: found[topic] for topic in wanted if topic != schema.EVENTS})
+        self.events += [event for event in events if self._times[0] <= event.stamp < self._times[1]]
+        self._append({topic: by_topic[topic] for topic in wanted if topic != schema.EVENTS})
 
     def _check_layouts(
-        self, found: Mapping[str, Messages], offset: int
+        self, by_topic: Mapping[str, Messages], offset: int
     ) -> dict[str, MessageLayout]:
         """Return the layouts of messages of numbers; `Damage` if messages of one differ."""
         assert self.header is not None
         layouts = {}
-        for topic in found.keys() & set(NUMBERS):
-            messages = found[topic]
+        for topic in by_topic.keys() & set(NUMBERS):
+            messages = by_topic[topic]
             layout = self._layouts.get(topic)
             if layout is None:
                 record = self.parser.schema(topic)
@@ -389,20 +394,20 @@ class Scan:
         return layouts
 
     @staticmethod
-    def _decode_events(found: Mapping[str, Messages], offset: int) -> list[ArchivedEvent]:
-        if schema.EVENTS not in found:
+    def _decode_events(by_topic: Mapping[str, Messages], offset: int) -> list[ArchivedEvent]:
+        if schema.EVENTS not in by_topic:
             return []
         try:
-            return [ArchivedEvent.decode(message) for message in found[schema.EVENTS].all()]
+            return [ArchivedEvent.decode(message) for message in by_topic[schema.EVENTS].all()]
         except LayoutError as error:
             problem = f"(chunk) has an event that cannot be read: {error}"
             raise Damage(offset, problem) from error
 
-    def _append(self, found: Mapping[str, Messages]) -> None:
+    def _append(self, by_topic: Mapping[str, Messages]) -> None:
         """Copy verified messages of the wanted channels and times into the columns."""
-        if not found:
+        if not by_topic:
             return
-        stamps = next(iter(found.values())).stamps
+        stamps = next(iter(by_topic.values())).stamps
         chosen = None
         if self._times != ALWAYS:
             chosen = (stamps >= self._times[0]) & (stamps < self._times[1])
@@ -416,7 +421,7 @@ class Scan:
             self._stamps = np.resize(self._stamps, room)
             self._raw = {key: np.resize(raw, room) for key, raw in self._raw.items()}
         self._stamps[begin : self._count] = stamps
-        for topic, messages in found.items():
+        for topic, messages in by_topic.items():
             fields: Mapping[str, Any] = self._layouts[topic].dtype.fields or {}
             columns = []
             for name, (dtype, start, *_) in fields.items():
@@ -436,10 +441,10 @@ class Scan:
                 for raw, start in columns:
                     raw[now] = rows[:, start : start + raw.itemsize].view(raw.dtype)[:, 0]
 
-    def _missing_messages(self, found: Mapping[str, Messages], offset: int) -> dict[str, int]:
+    def _missing_messages(self, by_topic: Mapping[str, Messages], offset: int) -> dict[str, int]:
         """Return how many messages of topics are missing before these; `Damage` if some repeat."""
         missing = {}
-        for topic, messages in found.items():
+        for topic, messages in by_topic.items():
             sequence = messages.of_heads("sequence")
             if (np.diff(sequence) != 1).any():
                 raise Damage(offset, "(chunk) has messages out of order")
@@ -452,21 +457,21 @@ class Scan:
                 missing[topic] = gap
         return missing
 
-    def _check_times(self, found: Mapping[str, Messages], offset: int) -> int:
+    def _check_times(self, by_topic: Mapping[str, Messages], offset: int) -> int:
         """Check that cycles increase, and that all channels have the same times without cycles.
 
         Returns:
             The newest stamp [ns], -1 without cycles.
         """
-        samples = [topic for topic in found if topic in NUMBERS]
+        samples = [topic for topic in by_topic if topic in NUMBERS]
         timed = [schema.CYCLE] if schema.CYCLE in samples else samples
         if not timed:
             return -1
-        stamps = [found[topic].stamps for topic in timed]
+        stamps = [by_topic[topic].stamps for topic in timed]
         stamp = stamps[0]
         if not all(map(len, stamps)):
             raise Damage(offset, "(chunk) has messages without a stamp")
-        if not all(np.array_equal(one, stamp) for one in stamps):
+        if not all(np.array_equal(other_stamp, stamp) for other_stamp in stamps):
             raise Damage(offset, "(chunk) has channels of different times")
         if timed[0] != schema.CYCLE:
             return -1
@@ -600,17 +605,17 @@ class Archive:
     def table(self, name: str) -> dict[str, Any]:
         """Return an attachment that is a JSON object, empty if missing; else ArchiveError."""
         try:
-            found = parse_json(self.attachments.get(name, b"{}"))
+            content = parse_json(self.attachments.get(name, b"{}"))
         except ValueError:
-            found = None
-        if not isinstance(found, dict):
+            content = None
+        if not isinstance(content, dict):
             raise ArchiveError(
                 self.path,
                 "is not a JSON object",
                 field=name,
                 remedy="leave the archive out, or attach that of another one of its campaign",
             )
-        return found
+        return content
 
     def cycles(self) -> Rows:
         """Return the cycle records, of type `drivers.cycle_dtype`; ArchiveError if fields lack."""

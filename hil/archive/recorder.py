@@ -80,7 +80,7 @@ def describe(event: ExchangeEvent) -> str:
         case HoldChanged():
             details = "held" if event.held else "resumed"
         case ExchangeStarted():
-            details = "".join(f"; {one}" for one in (*event.realtime.refused, *event.notes))
+            details = "".join(f"; {note}" for note in (*event.realtime.refused, *event.notes))
         case ExchangeFailed():
             details = event.trace.strip().splitlines()[-1]
     return _TEXTS[type(event)][1].format(event, details=details)
@@ -111,7 +111,7 @@ class ArchiveSpec:
 
     def open(self) -> ArchiveWriter:
         """Create the file; ArchiveWriteError if it exists or cannot be written."""
-        return ArchiveWriter(**{one.name: getattr(self, one.name) for one in fields(self)})
+        return ArchiveWriter(**{field.name: getattr(self, field.name) for field in fields(self)})
 
 
 @dataclass(frozen=True)
@@ -179,10 +179,10 @@ class Recorder:
         packet that begins another session, that one included.
         """
         restarts = [k for k, event in enumerate(events) if isinstance(event, InitReceived)]
-        own = () if self.restarted else events[: restarts[0] + 1] if restarts else events
+        archive_events = () if self.restarted else events[: restarts[0] + 1] if restarts else events
         self.update(events)
         self._write(records)
-        for event in own:
+        for event in archive_events:
             if isinstance(event, EventsLost):
                 self._events_lost += event.count
             elif isinstance(event, RepliesLost):

@@ -69,20 +69,20 @@ def repair(
         ArchiveError: it cannot be read, or nothing of it can be saved.
     """
     path = Path(path)
-    found = scan_archive(path, all_channels=True)[1]
-    if found.mixed:
+    scan = scan_archive(path, all_channels=True)[1]
+    if scan.mixed:
         problem = "its beginning and its end are of two recordings, its samples of either"
         raise ArchiveError(path, problem, remedy="restore it from a copy, or record again")
     target = path.resolve() if in_place else Path(output) if output else repaired_name(path)
     if not in_place and os.path.lexists(target):
         raise ArchiveWriteError(target, "exists already", remedy="choose another name with -o")
-    intact = is_intact(path, found)
+    intact = is_intact(path, scan)
     written = None
     if not intact or (output is not None and not in_place):
-        _rewrite(path, found, target)
+        _rewrite(path, scan, target)
         written = target
-    losses = tuple(found.faults) if found.lost else ()
-    return Repair(path, written, intact, losses, found.samples, _samples_lost(found))
+    losses = tuple(scan.faults) if scan.lost else ()
+    return Repair(path, written, intact, losses, scan.samples, _samples_lost(scan))
 
 
 def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
@@ -93,16 +93,16 @@ def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
         ArchiveWriteError: it cannot be written; the archive is unchanged.
     """
     path = Path(path)
-    found = scan_archive(path, all_channels=True)[1]
-    if not is_intact(path, found):
+    scan = scan_archive(path, all_channels=True)[1]
+    if not is_intact(path, scan):
         remedy = f"repair it with `hil archive repair {typed(path)}`"
         raise ArchiveError(path, "is damaged", remedy=remedy)
-    _rewrite(path, found, path, {"outcome": outcome, "reason": reason})
+    _rewrite(path, scan, path, {"outcome": outcome, "reason": reason})
 
 
-def is_intact(path: Path, found: Scan) -> bool:
+def is_intact(path: Path, scan: Scan) -> bool:
     """Return whether the file has no damage, and its message indexes and summary fit."""
-    if found.faults:
+    if scan.faults:
         return False
     with open_file(path) as stream, open_file(path) as other:
         same = True
@@ -111,12 +111,12 @@ def is_intact(path: Path, found: Scan) -> bool:
             nonlocal same
             same = same and other.read(len(data)) == data
 
-        _copy(found, stream, compare)
+        _copy(scan, stream, compare)
         return same and not other.read(1)
 
 
 def _rewrite(
-    path: Path, found: Scan, target: Path, outcome: Mapping[str, str] | None = None
+    path: Path, scan: Scan, target: Path, outcome: Mapping[str, str] | None = None
 ) -> None:
     """Write the valid content of an archive to `target`, which may be the source.
 
@@ -127,7 +127,7 @@ def _rewrite(
         with path.open("rb") as stream, replace_file(target) as temporary:
             with temporary.open("xb") as output:
                 os.fchmod(output.fileno(), stat.S_IMODE(os.fstat(stream.fileno()).st_mode))
-                _copy(found, stream, output.write, outcome)
+                _copy(scan, stream, output.write, outcome)
                 output.flush()
                 os.fsync(output.fileno())
             back = open_archive(temporary, fields=())
@@ -147,7 +147,7 @@ def _rewrite(
 
 
 def _copy(
-    found: Scan,
+    scan: Scan,
     stream: BinaryIO,
     write: Callable[[bytes], object],
     outcome: Mapping[str, str] | None = None,
@@ -155,9 +155,9 @@ def _copy(
     """Write the valid content of an archive as a new one."""
     writer = McapWriter(write, schema.PROFILE, schema.LIBRARY)
     parser = ChunkParser()
-    described = _description(found)
+    described = _description(scan)
     writer.put(Metadata(METADATA, header.with_checksum(described)))
-    for head in found.heads:
+    for head in scan.heads:
         if head.opcode == container.HEADER:
             continue
         record = container.read_record(stream, head)
@@ -165,7 +165,7 @@ def _copy(
             chunk = container.parse_chunk(record)
             messages = parser.messages(container.chunk_data(chunk, head.offset), head.offset)
             if not messages.keys() <= parser.channels.keys():
-                for definition in found.definitions:
+                for definition in scan.definitions:
                     parser.add(definition, head.offset)
                     writer.put(definition)
             for definition in parser.definitions:
@@ -179,44 +179,44 @@ def _copy(
         item = container.parse_item(record)
         if not isinstance(item, Metadata) or item.name not in (METADATA, OUTCOME):
             writer.put(item)
-    stated = {**_outcome(found, described), **(outcome or {})}
+    stated = {**_outcome(scan, described), **(outcome or {})}
     writer.put(Metadata(OUTCOME, header.with_checksum(stated)))
     writer.finish()
 
 
-def _samples_lost(found: Scan) -> int | None:
+def _samples_lost(scan: Scan) -> int | None:
     """Return the number of lost samples, None where unknown."""
-    if not found.lost:
+    if not scan.lost:
         return 0
-    stated = None if found.outcome is None else found.outcome.samples
-    return None if stated is None else max(0, stated - found.samples)
+    stated = None if scan.outcome is None else scan.outcome.samples
+    return None if stated is None else max(0, stated - scan.samples)
 
 
-def _description(found: Scan) -> dict[str, str]:
+def _description(scan: Scan) -> dict[str, str]:
     """Return the ``hil`` record without the attachments that are lost."""
-    assert found.metadata is not None and found.header is not None
-    names = [name for name in found.header.attachments if name in found.attachments]
-    if len(names) == len(found.header.attachments):
-        return found.metadata
-    return {**found.metadata, "attachments": json.dumps(names)}
+    assert scan.metadata is not None and scan.header is not None
+    names = [name for name in scan.header.attachments if name in scan.attachments]
+    if len(names) == len(scan.header.attachments):
+        return scan.metadata
+    return {**scan.metadata, "attachments": json.dumps(names)}
 
 
-def _outcome(found: Scan, described: Mapping[str, str]) -> dict[str, str]:
+def _outcome(scan: Scan, described: Mapping[str, str]) -> dict[str, str]:
     """Return the ``hil.outcome`` record, unchanged without loss."""
     unknown = ArchiveOutcome.of({"outcome": "unknown", "reason": "the outcome is lost"})
-    before = found.outcome or unknown
-    lost = _samples_lost(found)
-    if not found.lost:
+    before = scan.outcome or unknown
+    lost = _samples_lost(scan)
+    if not scan.lost:
         return dict(before.record)
     earlier = before.samples_lost
     return {
         **{key: text for key, text in before.record.items() if key != header.CHUNKS},
         header.DESCRIPTION: header.checksum(described),
-        "samples": str(found.samples),
-        "events": str(found.counts.get(schema.EVENTS, 0)),
+        "samples": str(scan.samples),
+        "events": str(scan.counts.get(schema.EVENTS, 0)),
         "repaired": "yes",
         "repaired.samples_lost": (
             "unknown" if lost is None or earlier is None else str(lost + earlier)
         ),
-        "repaired.losses": json.dumps([*before.losses, *found.faults]),
+        "repaired.losses": json.dumps([*before.losses, *scan.faults]),
     }

@@ -262,14 +262,14 @@ def message_layout(
     if record is None:
         raise LayoutError("their schema is missing")
     layout = fixed_layout(record.data.decode(errors="replace"))
-    found: Mapping[str, Any] = layout.dtype.fields or {}
+    types: Mapping[str, Any] = layout.dtype.fields or {}
     expected: Mapping[str, Any] = _STAMP_TYPES
     if topic in (CYCLE, MOTOR_CURRENT):
         expected = fixed_layout(profile(n)[topic].definition).dtype.fields or {}
     for name, (kind, *_) in expected.items():
-        if name not in found:
+        if name not in types:
             raise LayoutError(f"they have no {name}")
-        if found[name][0] != kind:
+        if types[name][0] != kind:
             raise LayoutError(f"their {name} is not that of {n} joints")
     return layout
 
@@ -358,8 +358,8 @@ class ArchivedEvent:
         if not isinstance(data, dict):
             text = whole
             data = {}
-        known = max((one for one in Level if one <= level), default=Level.DEBUG)
-        return cls((seconds * 10**9 + nanoseconds) * 1e-9, name, text, known, data)
+        severity = max((defined for defined in Level if defined <= level), default=Level.DEBUG)
+        return cls((seconds * 10**9 + nanoseconds) * 1e-9, name, text, severity, data)
 
 
 def _document(value: Any) -> Any:

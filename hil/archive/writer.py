@@ -102,9 +102,9 @@ class ArchiveFile:
         described["format_version"] = str(FORMAT_VERSION)
         described["attachments"] = json.dumps(sorted(attachments))
         self._description_message = description_message(attachments.get("robot.urdf", b""))
-        known = profile(len(joint_names))
+        by_topic = profile(len(joint_names))
         shown = [] if self._description_message is None else [DESCRIPTION_TOPIC]
-        channels = [known[topic] for topic in (*topics, *shown)]
+        channels = [by_topic[topic] for topic in (*topics, *shown)]
         self.counts = {channel.topic: 0 for channel in channels}
         self.slowest_flush = 0.0
         self.closed = False
@@ -122,7 +122,7 @@ class ArchiveFile:
             self._write()
             if durable:  # at last, so that the file is empty for as short a time as possible
                 sync_folder(path.parent)
-        self._numbers = {one.topic: self._writer.register(one) for one in channels}
+        self._numbers = {channel.topic: self._writer.register(channel) for channel in channels}
 
     def add(self, batch: Batch) -> None:
         """Add messages of several channels to the chunk in progress."""
@@ -410,8 +410,8 @@ class ArchiveWriter:
             batch = cycle_messages(self._joint_names, self.period, part, torque[start:stop])
             self.file.add(batch)
             self.file.flush()
-        rest = cuts[-1]
-        self._pending = [(records[rest:], torque[rest:])] if rest < len(records) else []
+        written = cuts[-1]
+        self._pending = [(records[written:], torque[written:])] if written < len(records) else []
 
 
 @dataclass(frozen=True, eq=False)

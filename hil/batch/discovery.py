@@ -158,7 +158,10 @@ def discover(
     """
     places, refused = find_archives(roots)
     if not places:
-        reasons = ["there is no archive (*.mcap) in it", *(" ".join(one) for one in refused[:1])]
+        reasons = [
+            "there is no archive (*.mcap) in it",
+            *(" ".join(unused) for unused in refused[:1]),
+        ]
         raise InputError(", ".join(roots), "; ".join(reasons), remedy="name others")
     refs: dict[str, ArchiveRef | Unused] = {}
     with reporter.task("reading the metadata of archives", len(places)) as task:
@@ -204,7 +207,7 @@ def find_archives(roots: Sequence[str]) -> tuple[list[str], list[Unused]]:
     Raises:
         InputError: a place does not exist, or a URL cannot be reached.
     """
-    found: set[str] = set()
+    archives: set[str] = set()
     refused: list[Unused] = []
     visited: set[Path] = set()
 
@@ -219,26 +222,26 @@ def find_archives(roots: Sequence[str]) -> tuple[list[str], list[Unused]]:
                 folders.clear()
                 continue
             visited.add(folder)
-            folders[:] = [one for one in folders if one != BESIDE]
+            folders[:] = [subfolder for subfolder in folders if subfolder != BESIDE]
             for path in (folder / file for file in files):
                 if path.suffix != SUFFIX:
                     continue
                 if os.path.isfile(path):  # noqa: PTH113 - False where it cannot be reached
-                    found.add(path.as_posix())
+                    archives.add(path.as_posix())
                 else:
                     refused.append(Unused(path.as_posix(), "is no regular file that can be read"))
 
     for root in roots:
         path = Path(root)
         if is_url(root):
-            found.update(archives_at(root))
+            archives.update(archives_at(root))
         elif path.is_file():
-            found.add(path.resolve().as_posix())
+            archives.add(path.resolve().as_posix())
         elif path.is_dir():
             walk(path.resolve())
         else:
             raise InputError(root, "does not exist", remedy="name a folder with archives below it")
-    return sorted(found), refused
+    return sorted(archives), refused
 
 
 # An archive
@@ -338,12 +341,12 @@ def describe_setup(cell: Cell) -> str:
 
     delay = stated_delay(cell)
     payload = cell.file.robot.payload
-    words = [f"torque lags by {1e3 * delay:.12g} ms"] if delay else []
+    phrases = [f"torque lags by {1e3 * delay:.12g} ms"] if delay else []
     if payload is not None and (payload.mass or any(payload.inertia)):
         frame = f" in {payload.frame}" if payload.frame else ""
-        words.append(f"carries {payload.mass:.12g} kg at {row(payload.centre)} m{frame}")
-        words += [f"{row(payload.inertia)} kg·m²"] if any(payload.inertia) else []
-    return ", ".join(words)
+        phrases.append(f"carries {payload.mass:.12g} kg at {row(payload.centre)} m{frame}")
+        phrases += [f"{row(payload.inertia)} kg·m²"] if any(payload.inertia) else []
+    return ", ".join(phrases)
 
 
 def inspect_archives(places: Sequence[str], cache: CacheLocation) -> list[ArchiveRef | Unused]:
@@ -442,38 +445,38 @@ _Attempts = dict[tuple[str, str, int], int]
 """The last attempt by folder, kind and index."""
 
 
-def _select(found: dict[str, ArchiveRef | Unused]) -> Discovery:
+def _select(inspected: dict[str, ArchiveRef | Unused]) -> Discovery:
     """Separate archives to be fitted from copies, failures and earlier attempts."""
-    manifests, broken = _manifests(found)
+    manifests, broken = _manifests(inspected)
     read = list[ArchiveRef]()
     unusable = list[Unused]()
     skipped = list[Unused]()
-    for place, one in found.items():
+    for place, archive in inspected.items():
         entries = manifests.get(folder_of(place))
         entry = None if entries is None else entries.get(name_of(place))
-        if isinstance(one, Unused):
-            unusable.append(one)
+        if isinstance(archive, Unused):
+            unusable.append(archive)
         elif entry is None:
-            if entries is not None and one.use in USES and ArchiveName.parse(one.name):
+            if entries is not None and archive.use in USES and ArchiveName.parse(archive.name):
                 skipped.append(Unused(place, _UNCHECKED))
             else:
-                read.append(one)
-        elif entry.sha256 != one.sha256:
+                read.append(archive)
+        elif entry.sha256 != archive.sha256:
             reason = "differs from its entry in the campaign's manifest.json"
             unusable.append(Unused(place, reason))
         else:
             refused = entry.outcome not in ("", _COMPLETED)
-            read.append(replace(one, outcome=entry.outcome) if refused else one)
+            read.append(replace(archive, outcome=entry.outcome) if refused else archive)
     latest: _Attempts = {}
     for ref in read:
         if ref.attempt and ref.outcome == _COMPLETED:
             key = (ref.folder, ref.kind, ref.index)
             latest[key] = max(latest.get(key, 0), ref.attempt)
-    for one in unusable:
-        if reason := _not_needed(one.path, latest):
-            skipped.append(Unused(one.path, reason))
+    for archive in unusable:
+        if reason := _not_needed(archive.path, latest):
+            skipped.append(Unused(archive.path, reason))
         else:
-            broken.append(one)
+            broken.append(archive)
     seen: dict[str, str] = {}
     refs: list[ArchiveRef] = []
     for ref in read:
@@ -487,7 +490,7 @@ def _select(found: dict[str, ArchiveRef | Unused]) -> Discovery:
 
 def _manifests(places: Iterable[str]) -> tuple[dict[str, dict[str, Entry]], list[Unused]]:
     """Return the manifest entries by name of each folder of archives, and damaged manifests."""
-    found: dict[str, dict[str, Entry]] = {}
+    by_folder: dict[str, dict[str, Entry]] = {}
     broken = []
     for folder, campaign in {folder_of(place): _campaign_of(place) for place in places}.items():
         if folder == campaign:
@@ -495,11 +498,11 @@ def _manifests(places: Iterable[str]) -> tuple[dict[str, dict[str, Entry]], list
         try:
             with _campaign_records(campaign) as records:
                 if records.sealed:
-                    found[folder] = {entry.name: entry for entry in records.manifest()}
+                    by_folder[folder] = {entry.name: entry for entry in records.manifest()}
         except (CampaignFolderError, ArchiveError) as error:
             reason = f"{error}; the campaign's archives are used without being checked against it"
             broken.append(Unused(f"{campaign}/manifest.json", reason))
-    return found, broken
+    return by_folder, broken
 
 
 @contextmanager

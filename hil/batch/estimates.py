@@ -98,7 +98,7 @@ class Group:
     @classmethod
     def of(cls, reduction: Reduction, settings: Settings) -> Group:
         """Return the group of one campaign, without the estimates from each archive."""
-        fitted = [one for one in reduction.summaries if one.ref.use == "excitation"]
+        fitted = [summary for summary in reduction.summaries if summary.ref.use == "excitation"]
         group = cls(
             refs=tuple(summary.ref for summary in fitted),
             total=reduction.total,
@@ -365,6 +365,6 @@ def relative_error(error: Array, torque: Array, rows: NDArray[np.intp] | None = 
     Both are given per joint (n,), for `rows` (n,) rows or equally many.
     """
     count = np.ones(len(error)) if rows is None else rows.astype(np.float64)
-    known = (count > 0.0) & np.isfinite(error) & np.isfinite(torque)
-    whole = float(count[known] @ torque[known] ** 2)
-    return math.sqrt(float(count[known] @ error[known] ** 2) / whole) if whole > 0.0 else math.nan
+    usable = (count > 0.0) & np.isfinite(error) & np.isfinite(torque)
+    whole = float(count[usable] @ torque[usable] ** 2)
+    return math.sqrt(float(count[usable] @ error[usable] ** 2) / whole) if whole > 0.0 else math.nan

@@ -106,7 +106,7 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, Factor
     scatter = None
     if is_fitted:
         fit = fit_least_squares(model, [samples], factor=factor)
-        prior = body_prior(model, factor, known=known_parameters(cell))
+        prior = body_prior(model, factor, stated=known_parameters(cell))
         scatter = ScoreScatter.of(factor, prior.gaussian)
     warnings = [*known_warnings(cell, archive), *archive.header.findings.warnings]
     if source.merged:
@@ -220,7 +220,9 @@ def _packed(reduction: Reduction) -> tuple[dict[str, Any], Arrays]:
         arrays["sum_counts"] = reduction.total.counts
     for j in range(first.n_joints):
         upper = np.triu_indices(len(first.columns[j]) + 1)
-        arrays[f"total_{j}"] = np.array([one.total.matrices[j][0][upper] for one in summaries])
+        arrays[f"total_{j}"] = np.array(
+            [summary.total.matrices[j][0][upper] for summary in summaries]
+        )
         if reduction.total is not None:
             arrays[f"sum_{j}"] = reduction.total.matrices[j][:, *upper]
     arrays["counts"] = np.array([summary.total.counts[0] for summary in summaries])

@@ -253,44 +253,52 @@ class _Batch:
         arms: dict[str, Settings] = {}
         waiting = list(campaigns)
         while waiting:
-            first = {one.key.arm: one for one in reversed(waiting) if one.key.arm not in arms}
+            first = {
+                campaign.key.arm: campaign
+                for campaign in reversed(waiting)
+                if campaign.key.arm not in arms
+            }
             asked = list(first.values()) or waiting
-            waiting = [one for one in waiting if one not in asked]
+            waiting = [campaign for campaign in waiting if campaign not in asked]
             while asked:
                 asked = self._decide(asked, arms)
-            arms |= {arm: one.settings for arm, one in first.items() if one.settings is not None}
-        return [one for one in campaigns if one.settings is not None]
+            arms |= {
+                arm: campaign.settings
+                for arm, campaign in first.items()
+                if campaign.settings is not None
+            }
+        return [campaign for campaign in campaigns if campaign.settings is not None]
 
     def _decide(self, campaigns: Sequence[_Campaign], arms: dict[str, Settings]) -> list[_Campaign]:
         """Decide settings; return the campaigns to repeat without archives that are unusable."""
         asked = []
-        for one in campaigns:
-            own = arms.get(one.key.arm)
-            refs = archives_for_settings(one.refs, own)
-            one.settings = cached_settings(refs, self.options, own, self.cache)
-            if one.settings is None:
-                asked.append((one, (refs, self.options, own, self.cache)))
-        tasks = [Task(c.key.campaign, decide_settings, own) for c, own in asked]
+        for campaign in campaigns:
+            arm_settings = arms.get(campaign.key.arm)
+            refs = archives_for_settings(campaign.refs, arm_settings)
+            campaign.settings = cached_settings(refs, self.options, arm_settings, self.cache)
+            if campaign.settings is None:
+                asked.append((campaign, (refs, self.options, arm_settings, self.cache)))
+        tasks = [Task(c.key.campaign, decide_settings, arguments) for c, arguments in asked]
         again = []
         archives = sum(len(refs) for _, (refs, *_) in asked)
         results = self._results(tasks, "deciding settings", archives)
-        for (one, (refs, *_)), found in zip(asked, results, strict=True):
-            if isinstance(found, Unused):  # perhaps an archive ends its process
+        for (campaign, (refs, *_)), decision in zip(asked, results, strict=True):
+            if isinstance(decision, Unused):  # perhaps an archive ends its process
                 alone = [Task(ref.location, open_only, (ref,)) for ref in refs]
                 opened = self._results(alone, "opening archives one by one", len(alone))
                 broken = [other for other in opened if other is not None]
-                reason = found.reason
+                reason = decision.reason
             else:
-                one.settings, broken = found
+                campaign.settings, broken = decision
                 some = any(ref.use == "excitation" for ref in refs)
                 reason = "" if some else "it holds no excitation"
             self.broken += broken
             paths = {other.path for other in broken}
-            one.refs = [ref for ref in one.refs if ref.location not in paths]
-            if one.settings is None and broken and one.refs:
-                again.append(one)
-            elif one.settings is None and reason:
-                self.broken.append(Unused(one.key.campaign, reason))
+            campaign.refs = [ref for ref in campaign.refs if ref.location not in paths]
+            if campaign.settings is None and broken and campaign.refs:
+                again.append(campaign)
+            elif campaign.settings is None and reason:
+                self.broken.append(Unused(campaign.key.campaign, reason))
         return again
 
     def _results(self, tasks: Sequence[Task[Any]], title: str, archives: int) -> list[Any]:
@@ -307,7 +315,7 @@ class _Batch:
             _ArmWork(self._model(digest, members), members, {})
             for digest, members in _by_arm(campaigns)
         ]
-        archives = sum(len(part) for one in campaigns for part in one.partitions)
+        archives = sum(len(part) for campaign in campaigns for part in campaign.partitions)
         with self.reporter.task("reading archives and estimating", archives) as progress:
             waiting = arms
             while waiting:
@@ -321,7 +329,7 @@ class _Batch:
             Unused(path, text.removeprefix(f"{path}: ")) for path, text in [*self.broken, *lost]
         )
         broken = tuple(dict.fromkeys(reasons))
-        repetitions = tuple(one for one in estimates if one.level == "repetition")
+        repetitions = tuple(estimate for estimate in estimates if estimate.level == "repetition")
         if not repetitions:
             problem = "there is no excitation and no imported recording that can be fitted"
             first = [f"{path} could not be used: {reason}" for path, reason in broken[:1]]
@@ -330,7 +338,7 @@ class _Batch:
             estimator=self.options.estimator,
             arms={arm.model.digest: _arm_of(arm.model) for arm in arms},
             repetitions=repetitions,
-            campaigns=tuple(one for one in estimates if one.level == "campaign"),
+            campaigns=tuple(estimate for estimate in estimates if estimate.level == "campaign"),
             pooled=tuple(pooled),
             broken=broken,
             skipped=skipped,

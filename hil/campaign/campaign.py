@@ -81,8 +81,10 @@ class Campaign(CampaignState):
         from hil.outcome import write_outcome
 
         reporter = reporter or Silent()
-        found = identify_campaign(self.folder.root, reporter, options or Options())
-        return replace(found, results=write_outcome(self.folder.root, found, reporter))
+        identification = identify_campaign(self.folder.root, reporter, options or Options())
+        return replace(
+            identification, results=write_outcome(self.folder.root, identification, reporter)
+        )
 
     def report(self, *, reporter: Reporter | None = None) -> Path:
         """Write the report again from the results, or from the archives if there are newer ones.
@@ -155,7 +157,7 @@ class Campaign(CampaignState):
             InputError: a joint to accept is none of the cell.
             OutputError: a result cannot be written.
         """
-        if unknown := [one for one in accept_torque if one not in self.cell.joint_names]:
+        if unknown := [joint for joint in accept_torque if joint not in self.cell.joint_names]:
             remedy = f"the joints are {', '.join(self.cell.joint_names)}"
             raise InputError(None, f"no joint {', '.join(unknown)} to accept", remedy=remedy)
         watch = RunWatch(operator or Unattended(), stop or Stop())

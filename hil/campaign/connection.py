@@ -184,12 +184,12 @@ def narrower_limits(cell: Cell, connection: Connection, limit: Limit) -> tuple[s
     if connection.init is None:
         return ()
     stated = _stated(cell, connection.init, limit)
-    own = getattr(cell.drive_table, limit)
+    cell_limit = getattr(cell.drive_table, limit)
     unit = "A" if limit == "current_limit" else "motor revolutions"
     return tuple(
         f"{cell.joint_names[joint]}: {float32_text(stated[joint])} {unit} in the controller, "
-        f"{own[joint]:.9g} in the cell file"
-        for joint in np.flatnonzero(is_narrower(stated, np.array(own)))
+        f"{cell_limit[joint]:.9g} in the cell file"
+        for joint in np.flatnonzero(is_narrower(stated, np.array(cell_limit)))
     )
 
 

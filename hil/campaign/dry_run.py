@@ -69,8 +69,8 @@ def agreement(gravity: Array, torque: Array, velocity: Array, moving: NDArray[np
     Returns:
         NaN for a joint that moves too little, or with too little gravity.
     """
-    found = np.full(gravity.shape[1], np.nan)
-    for joint in range(len(found)):
+    correlation = np.full(gravity.shape[1], np.nan)
+    for joint in range(len(correlation)):
         rows = moving[:, joint]
         if rows.sum() < _LEAST_SAMPLES:
             continue
@@ -78,11 +78,11 @@ def agreement(gravity: Array, torque: Array, velocity: Array, moving: NDArray[np
         both = np.column_stack([gravity[rows, joint], torque[rows, joint]])
         size = np.sqrt(np.mean(both[:, 1] ** 2))
         friction = np.column_stack([np.sign(speed), speed])
-        rest = both - friction @ np.linalg.lstsq(friction, both, rcond=None)[0]
-        weight, measured = np.linalg.norm(rest, axis=0)
+        residual = both - friction @ np.linalg.lstsq(friction, both, rcond=None)[0]
+        weight, measured = np.linalg.norm(residual, axis=0)
         if weight > _LEAST_SHARE * size * np.sqrt(rows.sum()) and measured > 0.0:
-            found[joint] = rest[:, 0] @ rest[:, 1] / (weight * measured)
-    return found
+            correlation[joint] = residual[:, 0] @ residual[:, 1] / (weight * measured)
+    return correlation
 
 
 @dataclass(frozen=True)
@@ -136,9 +136,9 @@ class DryRunRecord:
             CampaignFolderError: the file cannot be read, or is of another version.
         """
         remedy = "remove it; its archives are evaluated again, or the dry run is repeated"
-        found = load_record(cls, folder.dry_run, remedy, version=FORMAT_VERSION)
-        now = folder.plan_hash if plan_hash is None and found is not None else plan_hash
-        return found if found is not None and found.plan_hash == now else None
+        record = load_record(cls, folder.dry_run, remedy, version=FORMAT_VERSION)
+        now = folder.plan_hash if plan_hash is None and record is not None else plan_hash
+        return record if record is not None and record.plan_hash == now else None
 
     @classmethod
     def load_valid(
@@ -148,13 +148,13 @@ class DryRunRecord:
 
         A dry run of a simulated arm does not cover the surroundings of a real one.
         """
-        found = cls.load(folder, plan_hash)
-        if found is None or found.simulated is not simulated:
+        record = cls.load(folder, plan_hash)
+        if record is None or record.simulated is not simulated:
             return None
         paths = folder.completed("dryrun")[:motions]
-        if len(paths) < motions or [path.name for path in paths] != [*found.archives]:
+        if len(paths) < motions or [path.name for path in paths] != [*record.archives]:
             return None
-        return found if all(is_from(path, simulated) for path in paths) else None
+        return record if all(is_from(path, simulated) for path in paths) else None
 
     @classmethod
     def of(

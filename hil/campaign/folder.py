@@ -67,8 +67,8 @@ def checksums(contents: Mapping[str, bytes], root: Path) -> dict[str, str]:
     sums = {name: digest(content) for name, content in contents.items()}
     try:
         urdf = urdf_tree(as_text(contents.get("robot.urdf", b"")))
-        found = urdf.iterfind("./link/collision/geometry/mesh")
-        meshes = sorted({name for mesh in found if (name := mesh.get("filename"))})
+        mesh_elements = urdf.iterfind("./link/collision/geometry/mesh")
+        meshes = sorted({name for mesh in mesh_elements if (name := mesh.get("filename"))})
     except (ModelError, UnicodeDecodeError):  # reported by whoever loads it
         return sums
     try:
@@ -195,7 +195,7 @@ class CampaignFolder(RecordedCampaign):
         """Enter a closed archive in the manifest, or change the outcome of one."""
         manifest = self._manifest()
         new = Entry(name, outcome, file_digest(self.archives / name), reason)
-        entries = [new if one.name == name else one for one in manifest.archives]
+        entries = [new if entry.name == name else entry for entry in manifest.archives]
         entries += [] if new in entries else [new]
         self._save(replace(manifest, archives=entries))
 
@@ -241,12 +241,14 @@ class CampaignFolder(RecordedCampaign):
         sums = checksums(contents, self.root)
         if MISSING in sums.values():
             sealed = self._manifest().inputs
-            sums |= {n: sealed[n] for n, one in sums.items() if one == MISSING and n in sealed}
+            sums |= {
+                n: sealed[n] for n, checksum in sums.items() if checksum == MISSING and n in sealed
+            }
         return sums
 
     def _save(self, manifest: Manifest) -> None:
         # One line per archive; `indent` would leave a reference cycle in each call.
-        archives = ",\n".join(json.dumps(asdict(one)) for one in manifest.archives)
+        archives = ",\n".join(json.dumps(asdict(entry)) for entry in manifest.archives)
         text = f'{{"inputs": {json.dumps(manifest.inputs)},\n"archives": [\n{archives}\n]}}\n'
         try:
             write_atomically(self._path, text)

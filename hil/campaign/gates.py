@@ -53,7 +53,7 @@ def require_gates(
 
 def require_dry_run(
     folder: CampaignFolder,
-    found: DryRunRecord | None,
+    dry_run: DryRunRecord | None,
     options: RunOptions,
     *,
     simulated: bool,
@@ -66,16 +66,16 @@ def require_dry_run(
     """
     root = folder.root
     first = f"run `{folder.run_command} --dry-run`"
-    if found is None and options.accept_dry_run and not simulated:
+    if dry_run is None and options.accept_dry_run and not simulated:
         remedy = f"{first}, watch the arm, and accept it then"
         raise DryRunError(root, "cannot be accepted before it was done", remedy)
     if can_answer or options.dry_run_only or options.accept_dry_run:
         return
-    if found is None:
+    if dry_run is None:
         remedy = f"{first} and watch the arm"
         raise DryRunError(root, "was not done, and there is no operator to accept it", remedy)
-    if found.accepted is None:
-        raise not_accepted(folder, found.against_gravity)
+    if dry_run.accepted is None:
+        raise not_accepted(folder, dry_run.against_gravity)
 
 
 def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> Rehearsal:
@@ -85,18 +85,18 @@ def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> R
         NotRehearsedError: there was none of this cell, URDF and plan, or it failed.
         CampaignFolderError: its file cannot be read.
     """
-    found = Rehearsal.load(folder)
+    rehearsal = Rehearsal.load(folder)
     rehearse = f"run `hil rehearse {typed(folder.root)}`"
-    if found is None:
+    if rehearsal is None:
         raise NotRehearsedError(folder.root, "was not rehearsed", rehearse)
-    if found.plan_hash != (plan_hash or folder.plan_hash):
+    if rehearsal.plan_hash != (plan_hash or folder.plan_hash):
         what = "was rehearsed with another cell, URDF or plan than it has now"
         raise NotRehearsedError(folder.root, what, f"{rehearse} again")
-    if not found.passed:
-        failed = "; ".join(found.failures) or "a criterion was not met"
+    if not rehearsal.passed:
+        failed = "; ".join(rehearsal.failures) or "a criterion was not met"
         remedy = f"correct the cell or design another motion, then {rehearse}"
         raise NotRehearsedError(folder.root, f"failed its rehearsal ({failed})", remedy)
-    return found
+    return rehearsal
 
 
 def _require_one_kind_of_arm(folder: CampaignFolder, simulated: bool) -> None:
@@ -105,14 +105,14 @@ def _require_one_kind_of_arm(folder: CampaignFolder, simulated: bool) -> None:
     A dry run of a simulated arm does not cover the surroundings of a real one, and their archives
     must not be pooled.
     """
-    own = yes_or_no(simulated)
+    arm_kind = yes_or_no(simulated)
     for entry in folder.manifest():
         path = folder.archives / entry.name
-        made_by = own
+        made_by = arm_kind
         with suppress(ArchiveError):
             if path.is_file():
                 made_by = open_archive(path, fields=()).header.simulated or ""
-        if made_by != own:
+        if made_by != arm_kind:
             kinds = {"yes": "a simulated arm", "no": "a real arm"}
             whose = kinds.get(made_by, "an unknown kind of arm")
             link = "a simulated one" if simulated else "a real one"
@@ -129,8 +129,8 @@ def _require_own_link(campaign: CampaignState, link: MotionLink | None) -> None:
     if not isinstance(other, Cell) or other is campaign.cell:
         return
     wanted = _sent_by(campaign.cell)
-    found = _sent_by(other)
-    if differ := [name for name in wanted if wanted[name] != found[name]]:
+    present = _sent_by(other)
+    if differ := [name for name in wanted if wanted[name] != present[name]]:
         raise CampaignFolderError(
             campaign.folder.root,
             f"its link was opened with another cell ({', '.join(differ)} differ)",

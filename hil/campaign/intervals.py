@@ -70,8 +70,10 @@ class Interval:
 
     def places(self, home: Array) -> tuple[Array, Array]:
         """Return the position of the arm before and after it (n,) [rad]: home, or its own ends."""
-        own = self.kind in (*REPEATED, "dryrun") or isinstance(self.trajectory, FourierSeries)
-        return self.ends if own else (home, home)
+        at_own_ends = self.kind in (*REPEATED, "dryrun") or isinstance(
+            self.trajectory, FourierSeries
+        )
+        return self.ends if at_own_ends else (home, home)
 
 
 def at_limit(posture: Array, limits: JointLimits) -> Array:
@@ -122,12 +124,14 @@ class StraightMoves:
         """Return the checked motion from `start` to `end` (n,) [rad]; None if they are the same."""
         if np.max(np.abs(end - start)) <= AT_REST_TOLERANCE:
             return None
-        found = next((one for one in self._known if one.connects(start, end)), None)
-        if found is None:
-            found = replace(straight_move(self._cell, start, end), index=index, from_arm=from_arm)
-            require_allowed([found], self._checks)
-            self._known.append(found)
-        return replace(found, index=index)
+        interval = next((earlier for earlier in self._known if earlier.connects(start, end)), None)
+        if interval is None:
+            interval = replace(
+                straight_move(self._cell, start, end), index=index, from_arm=from_arm
+            )
+            require_allowed([interval], self._checks)
+            self._known.append(interval)
+        return replace(interval, index=index)
 
     def joining(self, intervals: Sequence[Interval], where: Array) -> list[Interval]:
         """Return these motions with the moves between them, from `where` (n,) [rad] and back.
@@ -141,7 +145,7 @@ class StraightMoves:
 
         def go(target: Array) -> None:
             nonlocal at
-            index = sum(one.kind == "move" for one in joined)
+            index = sum(interval.kind == "move" for interval in joined)
             from_arm = at is where or target is where
             if (move := self.between(at, target, index, from_arm=from_arm)) is not None:
                 joined.append(move)
@@ -162,10 +166,10 @@ class StraightMoves:
 def require_allowed(intervals: Sequence[Interval], checks: MotionChecks) -> None:
     """Check motions, each once; raise MotionRefusedError for one that must not be sent."""
     different: dict[int, Interval] = {}
-    for one in intervals:
-        different.setdefault(id(one.trajectory), one)
-    for one in different.values():
-        _require(one, checks.refusal(one.trajectory))
+    for interval in intervals:
+        different.setdefault(id(interval.trajectory), interval)
+    for interval in different.values():
+        _require(interval, checks.refusal(interval.trajectory))
 
 
 def require_runnable(cell: Cell, plan: CampaignPlan, checks: MotionChecks | None = None) -> None:

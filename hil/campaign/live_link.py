@@ -408,13 +408,13 @@ class LivePort:
         self.archive.send(command)
         deadline = time.monotonic() + OPEN_TIMEOUT
         while time.monotonic() < deadline:
-            found = self._answer or self.archive.answer(POLL, self.job)
+            message = self._answer or self.archive.answer(POLL, self.job)
             self._answer = None
-            if isinstance(found, answer):
-                return found
-            if isinstance(found, Failed):
+            if isinstance(message, answer):
+                return message
+            if isinstance(message, Failed):
                 self._late_path = self.open_path = ""
-                raise write_error(found)
+                raise write_error(message)
             if (failure := self.archive_failure()) is not None:
                 raise ControllerError(f"{failure}; {consequence}")
         return None

@@ -164,7 +164,7 @@ class Operator(Protocol):
         """Return the present request."""
         ...
 
-    def accept_dry_run(self, found: DryRunRecord) -> bool:
+    def accept_dry_run(self, record: DryRunRecord) -> bool:
         """Ask whether the slow motion was right; False where he cannot be asked."""
         ...
 
@@ -182,9 +182,9 @@ class Unattended:
         """Return full speed."""
         return OperatorRequest()
 
-    def accept_dry_run(self, found: object) -> bool:
+    def accept_dry_run(self, record: object) -> bool:
         """Return False."""
-        del found
+        del record
         return False
 
 

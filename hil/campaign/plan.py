@@ -90,9 +90,9 @@ class CampaignPlan:
 
     def is_of(self, text: str) -> bool:
         """Return whether a text is this plan, in any layout."""
-        own = self.to_text()
+        plan_text = self.to_text()
         try:
-            return text == own or CampaignPlan.from_text(text).to_text() == own
+            return text == plan_text or CampaignPlan.from_text(text).to_text() == plan_text
         except (ValueError, KeyError, TypeError, AttributeError):
             return False
 

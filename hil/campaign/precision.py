@@ -54,7 +54,7 @@ class PrecisionMeter:
 
     def __init__(self, campaign: CampaignState, requirements: Sequence[Requirement]) -> None:
         require_known(requirements, campaign.cell.model)
-        if any(one.kind == "mass" for one in requirements):
+        if any(requirement.kind == "mass" for requirement in requirements):
             raise InputError(
                 None,
                 "the mass of a payload needs motions with the payload",
@@ -77,9 +77,12 @@ class PrecisionMeter:
         for k, requirement in enumerate(self._requirements):
             mine = np.flatnonzero(measured.wanted.owners == k)
             worst = int(mine[np.argmax(ratios[mine])])
-            more = [further(len(paths), ratios[one], measured.noise[one]) for one in mine.tolist()]
-            known = [one for one in more if one is not None]
-            most = max(known) if len(known) == len(more) else None
+            more = [
+                further(len(paths), ratios[direction], measured.noise[direction])
+                for direction in mine.tolist()
+            ]
+            counts = [count for count in more if count is not None]
+            most = max(counts) if len(counts) == len(more) else None
             half = float(ratios[worst]) * requirement.value
             reached.append(Reached(str(requirement), measured.wanted.labels[worst], half, most))
         return Look(len(paths), tuple(reached))
@@ -157,11 +160,11 @@ class PrecisionStage:
         self._path = campaign.folder.precision
         self._limit = campaign.cell.campaign.repetitions
         self._meter = PrecisionMeter(campaign, requirements)
-        texts = tuple(str(one) for one in requirements)
+        texts = tuple(str(requirement) for requirement in requirements)
         self._record = PrecisionRecord(plan_hash, texts)
-        found = PrecisionRecord.load(self._path, plan_hash)
-        if found is not None and found.requirements == texts:
-            self._record = found
+        record = PrecisionRecord.load(self._path, plan_hash)
+        if record is not None and record.requirements == texts:
+            self._record = record
 
     def begin(self) -> None:
         """Measure the repetitions of earlier runs; a new requirement may need more of them."""
@@ -197,9 +200,9 @@ def requirements_of(campaign: CampaignState, texts: Sequence[str]) -> tuple[Requ
     folder = campaign.folder
     if texts:
         return requirements_from(texts)
-    found = PrecisionRecord.load(folder.precision, folder.plan_hash)
-    if found is not None:
-        return requirements_from(found.requirements)
+    record = PrecisionRecord.load(folder.precision, folder.plan_hash)
+    if record is not None:
+        return requirements_from(record.requirements)
     if (folder.root / RESULT).exists():
         stated = load_settings(folder.root / RESULT).objective.precision
         if stated:

@@ -69,7 +69,7 @@ class Look:
     @property
     def worst(self) -> Reached:
         """The requirement that is missed most."""
-        return max(self.reached, key=lambda one: one.ratio)
+        return max(self.reached, key=lambda reached: reached.ratio)
 
     @property
     def met(self) -> bool:
@@ -98,8 +98,8 @@ class PrecisionRecord:
     @classmethod
     def load(cls, path: Path, plan_hash: str) -> Self | None:
         """Read the file; None without one for this plan (CampaignFolderError if damaged)."""
-        found = load_record(cls, path, "remove that file")
-        return found if found is not None and found.plan_hash == plan_hash else None
+        record = load_record(cls, path, "remove that file")
+        return record if record is not None and record.plan_hash == plan_hash else None
 
     def save(self, path: Path) -> None:
         """Write the file (OutputError if the disk refuses)."""
@@ -107,18 +107,22 @@ class PrecisionRecord:
 
     def with_look(self, look: Look, limit: int) -> PrecisionRecord:
         """Return the record after another repetition, of at most `limit`."""
-        looks = (*(one for one in self.looks if one.repetitions < look.repetitions), look)
+        looks = (
+            *(earlier for earlier in self.looks if earlier.repetitions < look.repetitions),
+            look,
+        )
         longer = replace(self, looks=looks)
         last = looks[-IN_A_ROW:]
-        if len(last) == IN_A_ROW and all(one.met for one in last):
+        if len(last) == IN_A_ROW and all(recent.met for recent in last):
             return replace(longer, outcome="met")
         if look.repetitions >= limit:
             return replace(longer, outcome="limit")
         unreachable = [
-            one.ratio > 1.0 and (one.more is None or look.repetitions + one.more > limit)
-            for one in look.reached
+            reached.ratio > 1.0
+            and (reached.more is None or look.repetitions + reached.more > limit)
+            for reached in look.reached
         ]
-        promising = [one.ratio > 1.0 for one in look.reached]
+        promising = [reached.ratio > 1.0 for reached in look.reached]
         if look.repetitions >= FEWEST and any(unreachable) and unreachable == promising:
             return replace(longer, outcome="out of reach")
         return replace(longer, outcome="going on")

@@ -123,9 +123,9 @@ def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> Problem | 
         )
     high = np.abs(executed.current) >= SATURATED * cell.drive_train.current_limit
     for joint, name in enumerate(cell.joint_names):
-        found = stuck(executed.position[:, joint], executed.commanded[:, joint])
-        if found is not None:
-            start, travel = found
+        standstill = stuck(executed.position[:, joint], executed.commanded[:, joint])
+        if standstill is not None:
+            start, travel = standstill
             return Problem(
                 f"{name} is stuck: its position stays the same from {start * cell.period:.2f} s "
                 f"after the start on while it is commanded to move by {travel:.3g} rad"
@@ -203,9 +203,9 @@ class RepetitionCheck:
 
     def problem(self, executed: Executed) -> Problem | None:
         """Return the problem of a repetition, None for none."""
-        found = problem_of(executed, self._trajectory, self._cell)
-        if found is not None or not self._earlier:
-            return found
+        problem = problem_of(executed, self._trajectory, self._cell)
+        if problem is not None or not self._earlier:
+            return problem
         new = self._difference(executed)
         past = np.array(self._differences)
         for row, (what, scale, first, least) in enumerate(_CHANNELS):
@@ -230,9 +230,11 @@ class RepetitionCheck:
 
         Positions relative to the following-error thresholds, currents to the motion's rms current.
         """
-        rows = min(len(executed.position), *(len(one.position) for one in self._earlier))
-        usual = np.median([one.position[:rows] for one in self._earlier], axis=0)
-        currents = np.median([one.current[:rows] for one in self._earlier], axis=0)
+        rows = min(
+            len(executed.position), *(len(repetition.position) for repetition in self._earlier)
+        )
+        usual = np.median([repetition.position[:rows] for repetition in self._earlier], axis=0)
+        currents = np.median([repetition.current[:rows] for repetition in self._earlier], axis=0)
         size = np.maximum(_rms(currents), 1e-3 * self._cell.drive_train.current_limit)
         apart = _rms(executed.position[:rows] - usual) / following_threshold(self._cell)
         return np.array([apart, _rms(executed.current[:rows] - currents) / size])
@@ -277,9 +279,11 @@ class ArchiveReview:
         self.adopted: list[str] = []
         self.notes: list[str] = []
 
-    def enter(self, interval: Interval, name: str, known: Problem | None = None) -> Problem | None:
+    def enter(
+        self, interval: Interval, name: str, stated_problem: Problem | None = None
+    ) -> Problem | None:
         """Judge the complete archive of an interval and enter it; return its problem or None."""
-        problem = known
+        problem = stated_problem
         executed = None
         if problem is None and interval.kind == "excitation":
             executed = self._executed(name)
@@ -296,10 +300,10 @@ class ArchiveReview:
 
     def adopt(self, intervals: Sequence[Interval], made: Callable[[ArchiveHeader], bool]) -> None:
         """Enter archives of an earlier run that was killed before it entered them."""
-        sought = {(one.kind, one.index): one for one in intervals}
+        sought = {(interval.kind, interval.index): interval for interval in intervals}
         entered = {entry.name for entry in self._folder.manifest()}
-        found = {path.name for path in self._folder.archives.glob("*.mcap")}
-        for name in sorted(found - entered):
+        archive_names = {path.name for path in self._folder.archives.glob("*.mcap")}
+        for name in sorted(archive_names - entered):
             parsed = ArchiveName.parse(name)
             interval = None if parsed is None else sought.get((parsed.kind, parsed.index))
             if interval is None or self._folder.whole(interval.kind, interval.index) is not None:
@@ -357,14 +361,14 @@ class ArchiveReview:
         alike = list[str]()
         with_accepted = 0
         check.accept(executed)
-        for one in rejected:
+        for attempt in rejected:
             with suppress(ArchiveError):
-                other = self._executed(one)
+                other = self._executed(attempt)
                 if problem_of(other, self._motion, self._cell) is None:
                     with_accepted += self._check.problem(other) is None
                     if check.problem(other) is None:
                         check.accept(other)
-                        alike.append(one)
+                        alike.append(attempt)
         return alike, with_accepted
 
     def _executed(self, name: str) -> Executed:

@@ -95,7 +95,7 @@ class Rehearsal(Frozen):
     @model_validator(mode="after")
     def _judged_by_its_criteria(self) -> Self:
         """Require that it passed if and only if it met every criterion."""
-        met = [one.name for one in self.criteria if one.passed]
+        met = [criterion.name for criterion in self.criteria if criterion.passed]
         if self.passed != (len(met) == len(self.criteria) and set(met) == {*CRITERIA}):
             raise ValueError("passed is not what its criteria say")
         return self
@@ -117,7 +117,7 @@ class Rehearsal(Frozen):
     @property
     def failures(self) -> tuple[str, ...]:
         """Criteria that were not met, in sentences."""
-        return tuple(one.sentence for one in self.criteria if not one.passed)
+        return tuple(criterion.sentence for criterion in self.criteria if not criterion.passed)
 
     @property
     def line(self) -> str:
@@ -336,8 +336,8 @@ def _ordinary_effects(cell: Cell, rotors: Array) -> UnmodelledEffects:
         if soft.any():
             whole = inertia(posture) + np.diag(np.where(soft, 0.0, rotors))
             mobility = np.linalg.inv(whole)[np.ix_(soft, soft)] + np.diag(1.0 / rotors[soft])
-            found = float(np.linalg.eigvalsh(root[:, None] * mobility * root)[-1])
-            fastest = max(fastest, found)
+            frequency = float(np.linalg.eigvalsh(root[:, None] * mobility * root)[-1])
+            fastest = max(fastest, frequency)
     compliance *= max(1.0, float(np.sqrt(fastest)) / FASTEST) ** 2
     return replace(UnmodelledEffects.default_sizes(n), elasticity=tuple(compliance.tolist()))
 
@@ -484,15 +484,15 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
             criterion(name, None, bound, f"{name}: {problem}") for name, bound in bounds.items()
         ]
     model = twin.cell.model
-    found = estimation.result.pooled
-    undetermined = found.undetermined
-    deviation = found.interval_factor / normal_limit(0.025) * found.std
-    apart = np.abs(found.values - twin.truth) / deviation
-    known = np.isfinite(apart)
-    farthest = int(np.argmax(np.where(known, apart, 0.0)))
+    estimate = estimation.result.pooled
+    undetermined = estimate.undetermined
+    deviation = estimate.interval_factor / normal_limit(0.025) * estimate.std
+    apart = np.abs(estimate.values - twin.truth) / deviation
+    finite = np.isfinite(apart)
+    farthest = int(np.argmax(np.where(finite, apart, 0.0)))
     ours, theirs = (
         pooled_error(prediction_error(model, values, prepared.held_out)).rms
-        for values in (found.values, twin.truth)
+        for values in (estimate.values, twin.truth)
     )
     ratio = ours / np.maximum(theirs, np.finfo(np.float64).tiny)
     joint = int(np.argmax(np.where(np.isfinite(ratio), ratio, np.inf)))
@@ -508,8 +508,8 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
             "parameters",
             float(apart[farthest]),
             MOST_SIGMA,
-            f"the errors of {known.sum()} parameters are at most {apart[farthest]:.3g} standard "
-            f"deviations ({found.names[farthest]}), {MOST_SIGMA:g} are allowed",
+            f"the errors of {finite.sum()} parameters are at most {apart[farthest]:.3g} standard "
+            f"deviations ({estimate.names[farthest]}), {MOST_SIGMA:g} are allowed",
             "the drive train or the model of the cell file is not that of the arm",
         ),
         criterion(

@@ -61,13 +61,13 @@ def rehearse(
             return before
         shutil.rmtree(folder.rehearsed, ignore_errors=True)
         make_folder(folder.rehearsed)
-        found = _rehearsed(campaign, plan_hash, reporter, seed, stop)
+        rehearsal = _rehearsed(campaign, plan_hash, reporter, seed, stop)
         if folder.hash_of(campaign.cell, campaign.plan) != plan_hash:
             raise CampaignFolderError(
                 folder.root, "a mesh was changed during the rehearsal", "rehearse again"
             )
-        found.save(folder.rehearsal)
-        return found
+        rehearsal.save(folder.rehearsal)
+        return rehearsal
 
 
 def _rehearsed(
@@ -85,7 +85,7 @@ def _rehearsed(
         rehearsal = CampaignState.create(campaign.folder.rehearsed / where, cell, campaign.plan)
         reporter.say(f"rehearsing on a simulated arm, {name}")
         motions = planned_intervals(rehearsal.cell, rehearsal.plan)
-        planned = sum(one.trajectory.duration for one in motions)
+        planned = sum(motion.trajectory.duration for motion in motions)
         link = twin.link(planned, effects=effects)
         failure = _failure(rehearsal, link, twin, reporter, stop)
         seconds += link.cycles * cell.period
@@ -97,11 +97,11 @@ def _rehearsed(
             break  # the other criteria would fail for the same reason
         if not effects:
             criteria += of_estimate(twin, rehearsal.folder, reporter)
-    names = {one.name for one in criteria}
+    names = {criterion.name for criterion in criteria}
     return Rehearsal(
         plan_hash=plan_hash,
         seed=seed,
-        passed=names == {*CRITERIA} and all(one.passed for one in criteria),
+        passed=names == {*CRITERIA} and all(criterion.passed for criterion in criteria),
         criteria=criteria,
         assumed=[*twin.assumed],
         not_seen=_not_seen(campaign.cell),
@@ -129,8 +129,8 @@ def _failure(
 
 def _not_seen(cell: Cell) -> list[str]:
     """Return what no simulation of this cell file can detect."""
-    known = cell.file.simulation
-    given = set() if known is None else known.drive_train.model_fields_set
+    simulation = cell.file.simulation
+    given = set() if simulation is None else simulation.drive_train.model_fields_set
     unknown = [
         name for name in ("gear_ratio", "joint_sign", "joint_offset_deg") if name not in given
     ]

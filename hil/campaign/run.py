@@ -153,8 +153,8 @@ class _CampaignRun:
         # What is wrong with a motion itself is reported before anything is connected.
         require_allowed(sent, checks)
         live = self._options.live
-        own = cell_link(cell, live=live) if self._link is None else nullcontext(self._link)
-        with own as link:
+        link_context = cell_link(cell, live=live) if self._link is None else nullcontext(self._link)
+        with link_context as link:
             link.connection.report = reporter.say
             for note in link.notes():
                 reporter.say(f"note: {note}")
@@ -185,7 +185,7 @@ class _CampaignRun:
             )
             before = link.cycles
             times = runner.times(joined, len(slow))
-            if any(one.kind != "standstill" for one in full):
+            if any(interval.kind != "standstill" for interval in full):
                 times += self._warm_up.expected()
             self._watch.expect(times)
             with reporter.task("running the campaign (s of motion)", sum(times)) as runner.task:
@@ -218,7 +218,7 @@ class _CampaignRun:
     def _result(self) -> RunResult:
         campaign = self._campaign
         archives = self._archives
-        found = self._dry_run.found()
+        dry_run = self._dry_run.found()
         precision = campaign.precision
         return RunResult(
             campaign=str(campaign.folder.root),
@@ -228,7 +228,7 @@ class _CampaignRun:
             rejected=tuple(archives.review.rejected),
             adopted=tuple(archives.review.adopted),
             dry_run=self._dry_run.state,
-            against_gravity=() if found is None else found.against_gravity,
+            against_gravity=() if dry_run is None else dry_run.against_gravity,
             warm_up=self._warm_up.outcome,
             repetitions=campaign.progress("excitation"),
             validations=campaign.progress("validation"),
@@ -237,7 +237,7 @@ class _CampaignRun:
             precision="" if precision is None else precision.message,
             notes=(
                 *archives.notes,
-                *(f"dry run: {text}" for text in (() if found is None else found.warnings)),
+                *(f"dry run: {text}" for text in (() if dry_run is None else dry_run.warnings)),
                 *self._warm_up.notes,
                 *archives.review.notes,
                 *self._watch.problems,

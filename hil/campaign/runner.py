@@ -79,12 +79,12 @@ class RunArchives:
         virtual = in_file or (link is not None and link.is_virtual)
         self._durable = not virtual if options.durable is None else options.durable
         # The caller knows what a link simulates; the link decides whether a real arm can move.
-        own: Mapping[str, str] = {}
+        origin: Mapping[str, str] = {}
         if not virtual:
-            own = origin_of(campaign.cell, only_simulated=self.simulated, virtual=False)
+            origin = origin_of(campaign.cell, only_simulated=self.simulated, virtual=False)
         elif given is None:
-            own = simulated_provenance(campaign.cell, effects=False)
-        self.provenance = {**own, **(given or {}), SIMULATED: yes_or_no(self.simulated)}
+            origin = simulated_provenance(campaign.cell, effects=False)
+        self.provenance = {**origin, **(given or {}), SIMULATED: yes_or_no(self.simulated)}
         trajectory = campaign.plan.excitation.trajectory
         self.review = ArchiveReview(campaign.folder, campaign.cell, trajectory)
 
@@ -191,14 +191,14 @@ class Runner:
         """Return the seconds of each motion and way; the first `slow` motions are run slowly."""
         times = []
         watched = slow > 0
-        for one in joined:
+        for interval in joined:
             share = OVERRIDE if slow else 1.0
-            if one.kind == "move":
-                unseen = one.from_arm if watched else self._unseen(one)
+            if interval.kind == "move":
+                unseen = interval.from_arm if watched else self._unseen(interval)
                 share = self._approach(OVERRIDE) if slow or unseen else 1.0
             else:
                 slow = max(0, slow - 1)
-            times.append(one.trajectory.duration / share)
+            times.append(interval.trajectory.duration / share)
         return times
 
     def run_motion(self, interval: Interval, number: int, total: int, most: float = 1.0) -> str:
@@ -293,13 +293,13 @@ class Runner:
 
 def seen_in_dry_run(folder: CampaignFolder) -> list[tuple[Array, Array]]:
     """Return start and end (n,) [rad] of the moves of a dry run, by its archives."""
-    entries = [one for one in folder.manifest() if one.outcome == "completed"]
-    last = max((k for k, one in enumerate(entries) if one.kind == "dryrun"), default=0)
-    found = []
+    entries = [entry for entry in folder.manifest() if entry.outcome == "completed"]
+    last = max((k for k, entry in enumerate(entries) if entry.kind == "dryrun"), default=0)
+    ends = []
     for entry in entries[:last]:
         if entry.kind == "move":
             with suppress(ArchiveError, ValueError, KeyError, TypeError):  # then it is not seen
                 archive = open_archive(folder.archives / entry.name, fields=())
                 motion = trajectory_from_dict(parse_json(archive.text("plan.json"))["trajectory"])
-                found.append(Interval("move", 0, motion).ends)
-    return found
+                ends.append(Interval("move", 0, motion).ends)
+    return ends

@@ -38,10 +38,12 @@ class DryRunStage:
         self._watch = watch
         self.state: DryRunState = "left out" if options.unrehearsed else "to be accepted"
         motions = [
-            one for one in campaign.motions
-            if one.kind == "validation" or (one.kind, one.index) == ("excitation", 0)
+            motion for motion in campaign.motions
+            if motion.kind == "validation" or (motion.kind, motion.index) == ("excitation", 0)
         ]  # fmt: skip
-        self.intervals = [replace(one, kind="dryrun", index=k) for k, one in enumerate(motions)]
+        self.intervals = [
+            replace(motion, kind="dryrun", index=k) for k, motion in enumerate(motions)
+        ]
         # Only what an earlier run measured can be accepted, not what this one is going to.
         named = options.accept_torque
         self._known = named if named and self.found() else ()
@@ -61,7 +63,7 @@ class DryRunStage:
     def missing(self) -> list[Interval]:
         """Return the motions that were not run slowly yet."""
         intervals = [] if self._options.unrehearsed else self.intervals
-        return [one for one in intervals if self._complete(one) is None]
+        return [interval for interval in intervals if self._complete(interval) is None]
 
     def run(self, runner: Runner) -> None:
         """Run what is missing slowly, and have it accepted; see `accept`."""
@@ -80,36 +82,36 @@ class DryRunStage:
             OperatorStopError: the operator stopped instead of answering.
         """
         archives = self._archives
-        found = self.found()
+        record = self.found()
         if self._options.unrehearsed:
             return
-        if found is None:
+        if record is None:
             names = [name for slow in self.intervals if (name := self._complete(slow)) is not None]
             if len(names) < len(self.intervals):
                 return
-            found = DryRunRecord.of(
+            record = DryRunRecord.of(
                 self._campaign,
                 names,
                 plan_hash=archives.plan_hash,
                 simulated=archives.simulated,
             )
-            found.save(self._folder.dry_run)
-        if found.accepted is None:
-            unknown = [joint for joint in found.against_gravity if joint not in self._known]
-            if not self._agreed(found, unknown):
+            record.save(self._folder.dry_run)
+        if record.accepted is None:
+            unknown = [joint for joint in record.against_gravity if joint not in self._known]
+            if not self._agreed(record, unknown):
                 if not self._options.dry_run_only:
                     raise not_accepted(self._folder, unknown)
                 return
-            found.accepted_now().save(self._folder.dry_run)
+            record.accepted_now().save(self._folder.dry_run)
         self.state = "accepted"
 
-    def _agreed(self, found: DryRunRecord, unknown: Sequence[str]) -> bool:
+    def _agreed(self, record: DryRunRecord, unknown: Sequence[str]) -> bool:
         """Return whether caller or operator accepts it; unknown joints only the operator can."""
         operator = self._watch.operator
         stop = self._watch.stop
         if self._options.accept_dry_run and not unknown:
             return True
-        agreed = operator.can_answer and operator.accept_dry_run(found)
+        agreed = operator.can_answer and operator.accept_dry_run(record)
         if operator.can_answer and not agreed and stop.requested:
             raise OperatorStopError(
                 f"{self._folder.root}: stopped by the operator; its dry run was done, and is not "
@@ -146,16 +148,16 @@ class WarmUpStage:
     @property
     def outcome(self) -> str:
         """State of the warm-up: "none", "going on", "warm" or "not warm"."""
-        found = self._found()
-        return "none" if found is None else found.outcome
+        record = self._found()
+        return "none" if record is None else record.outcome
 
     @property
     def notes(self) -> list[str]:
         """What a reader of the results must know."""
-        found = self._found()
-        if found is None or found.outcome != "not warm":
+        record = self._found()
+        if record is None or record.outcome != "not warm":
             return self._pauses
-        cold = f"the arm was not warm when the repetitions began ({found.sentence})"
+        cold = f"the arm was not warm when the repetitions began ({record.sentence})"
         return [cold, *self._pauses]
 
     def next_motion(self) -> list[Interval]:
@@ -197,16 +199,16 @@ class WarmUpStage:
 
     def cold_start(self, began: float) -> Problem | None:
         """Return the problem of a repetition that began cold [s since 1970], as after a hold."""
-        found = self._cold(began)
-        if found is None:
+        record = self._cold(began)
+        if record is None:
             return None
-        return Problem(f"{found.rested(began)} when it began and was assumed to be cold")
+        return Problem(f"{record.rested(began)} when it began and was assumed to be cold")
 
     def motion_ended(self) -> None:
         """Record that a motion that warms the joints has ended."""
-        found = self._found()
-        if found is not None:
-            replace(found, moved_at=time.time()).save(self._path)
+        record = self._found()
+        if record is not None:
+            replace(record, moved_at=time.time()).save(self._path)
 
     def _found(self) -> WarmUpRecord | None:
         return WarmUpRecord.load(self._path, self._archives.plan_hash)
@@ -218,8 +220,8 @@ class WarmUpStage:
 
     def _cold(self, when: float) -> WarmUpRecord | None:
         """Return a warm-up after which the arm has cooled down by `when` [s since 1970]."""
-        found = self._found() if self._threshold else None
-        return found if found is not None and found.motions and found.cold(when) else None
+        record = self._found() if self._threshold else None
+        return record if record is not None and record.motions and record.cold(when) else None
 
     def _interval(self, state: WarmUpRecord) -> Interval:
         plan = self._campaign.plan

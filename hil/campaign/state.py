@@ -70,8 +70,8 @@ class CampaignState:
         if any(path.name not in DESIGN_FILES for path in root.iterdir()):
             raise CampaignFolderError(root, "is not empty", "name a new folder")
         made = CampaignFolder(root)
-        own = cell.with_urdf(made.cell, made.urdf.name)
-        files = {made.urdf: own.urdf, made.cell: own.text, made.plan: plan.to_text()}
+        own_cell = cell.with_urdf(made.cell, made.urdf.name)
+        files = {made.urdf: own_cell.urdf, made.cell: own_cell.text, made.plan: plan.to_text()}
         try:
             make_folder(made.archives)
             for path, text in files.items():
@@ -85,7 +85,7 @@ class CampaignState:
             if isinstance(error, CampaignFolderError):  # of the manifest
                 raise OutputError(root, error.problem) from error
             raise OutputError(root, f"cannot be written to ({error.strerror})") from error
-        return cls(made, own, plan)
+        return cls(made, own_cell, plan)
 
     @classmethod
     def open(cls, folder: Path | str) -> Self:
@@ -104,8 +104,8 @@ class CampaignState:
 
     def _require_same(self, cell: Cell, wanted: Excitation | CampaignPlan) -> Self:
         """Return this campaign if it has this cell and excitation (CampaignFolderError if not)."""
-        own = cell.with_urdf(self.folder.cell, self.folder.urdf.name)
-        same = (own.text, own.urdf) == (self.cell.text, self.cell.urdf)
+        own_cell = cell.with_urdf(self.folder.cell, self.folder.urdf.name)
+        same = (own_cell.text, own_cell.urdf) == (self.cell.text, self.cell.urdf)
         if isinstance(wanted, CampaignPlan):
             fits = self.plan.to_text() == wanted.to_text()
         else:
@@ -138,11 +138,11 @@ class CampaignState:
         precision = self.precision
         ended = ("excitation",) if precision is not None and precision.ended else ()
         return [
-            one
-            for one in self.motions
-            if one.kind in (kinds or (one.kind,))
-            and one.kind not in ended
-            and self.folder.whole(one.kind, one.index) is None
+            interval
+            for interval in self.motions
+            if interval.kind in (kinds or (interval.kind,))
+            and interval.kind not in ended
+            and self.folder.whole(interval.kind, interval.index) is None
         ]
 
     def progress(self, kind: str) -> tuple[int, int]:
@@ -151,4 +151,4 @@ class CampaignState:
         precision = self.precision if kind == "excitation" else None
         if precision is not None and precision.ended:
             return done, done
-        return done, sum(one.kind == kind for one in self.motions)
+        return done, sum(interval.kind == kind for interval in self.motions)

@@ -124,19 +124,19 @@ def _design(campaign: CampaignState) -> Step:
 
 
 def _rehearsal(folder: CampaignFolder) -> Step:
-    found = Rehearsal.load(folder)
-    if found is None:
+    rehearsal = Rehearsal.load(folder)
+    if rehearsal is None:
         return Step("next", "not rehearsed on the simulated arm", "rehearse {}")
-    if found.plan_hash != folder.plan_hash:
-        words = "rehearsed with another cell, URDF or plan than it has now"
-        return Step("next", words, "rehearse {}")
+    if rehearsal.plan_hash != folder.plan_hash:
+        message = "rehearsed with another cell, URDF or plan than it has now"
+        return Step("next", message, "rehearse {}")
     return Step(
-        "done" if found.passed else "next",
-        found.line,
+        "done" if rehearsal.passed else "next",
+        rehearsal.line,
         "rehearse {}",
         (
-            *(one.sentence for one in found.criteria),
-            *(f"not detectable by it: {sentence}" for sentence in found.not_seen),
+            *(criterion.sentence for criterion in rehearsal.criteria),
+            *(f"not detectable by it: {sentence}" for sentence in rehearsal.not_seen),
         ),
     )
 
@@ -155,36 +155,36 @@ def _dry_run(campaign: CampaignState) -> Step:
     return _accepted(found)
 
 
-def _accepted(found: DryRunRecord | None) -> Step:
-    if found is None:
+def _accepted(record: DryRunRecord | None) -> Step:
+    if record is None:
         return Step("next", "not done: every motion at 20 % of its speed", "run {} --dry-run")
-    if found.accepted is None:
-        names = "".join(f" --accept-torque {joint}" for joint in found.against_gravity)
-        but = "".join(f"; {warning}" for warning in found.warnings)
-        words = f"done ({found.duration:.0f} s), but not accepted{but}"
-        return Step("next", words, f"run {{}} --accept-dry-run{names}")
-    shares = zip(found.joint_names, found.current_share, strict=True)
+    if record.accepted is None:
+        names = "".join(f" --accept-torque {joint}" for joint in record.against_gravity)
+        but = "".join(f"; {warning}" for warning in record.warnings)
+        message = f"done ({record.duration:.0f} s), but not accepted{but}"
+        return Step("next", message, f"run {{}} --accept-dry-run{names}")
+    shares = zip(record.joint_names, record.current_share, strict=True)
     currents = ", ".join(f"{joint} {percentage(share)}" for joint, share in shares)
     return Step(
         "done",
-        f"accepted by {found.accepted.by} at {found.accepted.at}",
+        f"accepted by {record.accepted.by} at {record.accepted.at}",
         details=(
             f"largest current, of its limit: {currents}",
-            f"{plural(len(found.archives), 'motion')} at {percentage(found.override)} of their "
+            f"{plural(len(record.archives), 'motion')} at {percentage(record.override)} of their "
             "speed",
-            f"{plural(found.missed, 'packet')} missed, {plural(found.late, 'reply')} late",
-            *(f"{warning}; it was accepted by name" for warning in found.warnings),
+            f"{plural(record.missed, 'packet')} missed, {plural(record.late, 'reply')} late",
+            *(f"{warning}; it was accepted by name" for warning in record.warnings),
         ),
     )
 
 
-def _gate(campaign: CampaignState, found: Step, record: Path) -> Step:
+def _gate(campaign: CampaignState, step: Step, record: Path) -> Step:
     """Return a step, done if a simulated arm has left it out and run everything at full speed."""
-    if found.done or record.exists() or not campaign.cell.only_simulated:
-        return found
+    if step.done or record.exists() or not campaign.cell.only_simulated:
+        return step
     if all(_motions(campaign, kind, kind).done for kind in ("excitation", "validation")):
         return Step("done", "left out, as a simulated arm allows")
-    return found
+    return step
 
 
 def _warmed(campaign: CampaignState) -> Step:
@@ -197,14 +197,14 @@ def _warmed(campaign: CampaignState) -> Step:
     return replace(_warm_up(warm), state="done" if over else "next")
 
 
-def _warm_up(found: WarmUpRecord | None) -> Step:
+def _warm_up(record: WarmUpRecord | None) -> Step:
     """Return the step for the report: done if the arm was warm."""
-    if found is None:
+    if record is None:
         return Step("next", "not done", "run {}")
-    words = f"{found.outcome} after {plural(len(found.motions), 'motion')}"
-    cold = found.outcome == "not warm" and bool(found.motions)
-    state: State = "done" if found.outcome == "warm" else "next"
-    return Step(state, words, "run {}", (found.sentence,) if cold else ())
+    message = f"{record.outcome} after {plural(len(record.motions), 'motion')}"
+    cold = record.outcome == "not warm" and bool(record.motions)
+    state: State = "done" if record.outcome == "warm" else "next"
+    return Step(state, message, "run {}", (record.sentence,) if cold else ())
 
 
 def _conducted_warm_up(folder: CampaignFolder) -> Step:
@@ -215,24 +215,24 @@ def _conducted_warm_up(folder: CampaignFolder) -> Step:
     return _warm_up(warm)
 
 
-def _motions(campaign: CampaignState, kind: str, words: str) -> Step:
+def _motions(campaign: CampaignState, kind: str, plural_kind: str) -> Step:
     whole, total = campaign.progress(kind)
     state: State = "done" if whole >= total else "next"
     precision = campaign.precision if kind == "excitation" else None
     details = () if precision is None else (precision.message,)
-    return Step(state, f"{whole} of {total} {words} complete", "run {}", details)
+    return Step(state, f"{whole} of {total} {plural_kind} complete", "run {}", details)
 
 
 def _identified(folder: CampaignFolder) -> Step:
     if not path_exists(folder.results):
         return Step("next", "not identified yet", "identify {}")
     results = Results.load(folder.results)
-    used = {*results.repetitions, *(one.archive for one in results.validation)}
+    used = {*results.repetitions, *(prediction.archive for prediction in results.validation)}
     kinds = ("excitation", "validation")
     new = [path.name for kind in kinds for path in folder.completed(kind) if path.name not in used]
     if new:
-        words = f"identified without {len(new)} of the archives ({new[0]})"
-        return Step("next", words, "identify {}")
+        message = f"identified without {len(new)} of the archives ({new[0]})"
+        return Step("next", message, "identify {}")
     return Step("done", results.verdict.line)
 
 
@@ -265,8 +265,8 @@ def conduct_of(folder: CampaignFolder) -> ConductResult:
         steps["repetitions"] = replace(repeated, details=details)
     return ConductResult(
         steps=[
-            StepResult(step=name, done=found.done, words=found.sentence, details=[*found.details])
-            for name, found in steps.items()
+            StepResult(step=name, done=step.done, words=step.sentence, details=[*step.details])
+            for name, step in steps.items()
         ],
         precision=[] if record is None else _over_repetitions(folder, record),
     )
@@ -275,16 +275,16 @@ def conduct_of(folder: CampaignFolder) -> ConductResult:
 def _precision(folder: CampaignFolder) -> PrecisionRecord | None:
     if not path_exists(folder.precision):
         return None
-    found = PrecisionRecord.load(folder.precision, folder.plan_hash)
-    return found if found is not None and found.looks else None
+    record = PrecisionRecord.load(folder.precision, folder.plan_hash)
+    return record if record is not None and record.looks else None
 
 
 def _over_repetitions(folder: CampaignFolder, record: PrecisionRecord) -> list[PrecisionResult]:
     """Return each requirement over the repetitions, with what the design in the folder promised."""
     promised: dict[str, float] = {}
     if path_exists(folder.root / RESULT):
-        for one in DesignResult.load(folder.root).data.get("precision", ()):
-            promised[one["requirement"]] = one["half"] / one["wanted"]
+        for forecast in DesignResult.load(folder.root).data.get("precision", ()):
+            promised[forecast["requirement"]] = forecast["half"] / forecast["wanted"]
     return [
         PrecisionResult(
             requirement=text,
@@ -299,10 +299,10 @@ def _over_repetitions(folder: CampaignFolder, record: PrecisionRecord) -> list[P
 
 def _recorded(folder: CampaignFolder, kind: str) -> Step:
     """Return how many motions of a kind are complete, with the reasons of the others."""
-    own = [one for one in folder.manifest() if one.kind == kind]
-    bad = tuple(f"{e.name} {e.outcome}: {e.reason}" for e in own if e.outcome != "completed")
-    good = len(own) - len(bad)
-    entered = {entry.name for entry in own}
+    entries = [entry for entry in folder.manifest() if entry.kind == kind]
+    bad = tuple(f"{e.name} {e.outcome}: {e.reason}" for e in entries if e.outcome != "completed")
+    good = len(entries) - len(bad)
+    entered = {entry.name for entry in entries}
     names = sorted(path.name for path in folder.archives.glob("*.mcap") if path.name not in entered)
     for name in names:
         parsed = ArchiveName.parse(name)

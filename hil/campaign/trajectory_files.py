@@ -80,7 +80,9 @@ def write_trajectories(root: Path, cell: Cell, excitation: Excitation) -> tuple[
 def trajectory_files(cell: Cell, plan: CampaignPlan) -> dict[str, str]:
     """Return the texts of all motions of a plan by file name."""
     motions = {"excitation": plan.excitation.trajectory}
-    motions |= {f"validation_{k:03d}": one.trajectory for k, one in enumerate(plan.validation)}
+    motions |= {
+        f"validation_{k:03d}": validation.trajectory for k, validation in enumerate(plan.validation)
+    }
     scripted = len(cell.joint_names) == UR_JOINTS and bool(cell.model.chain.revolute.all())
     files = {}
     described = []

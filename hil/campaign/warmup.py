@@ -83,14 +83,14 @@ class WarmUpRecord:
     moved_at: float | None = None
 
     def __post_init__(self) -> None:
-        if any(len(one.friction) != len(self.joint_names) for one in self.motions):
+        if any(len(motion.friction) != len(self.joint_names) for motion in self.motions):
             raise ValueError("a motion has not one friction for each joint")
 
     @classmethod
     def load(cls, path: Path, plan_hash: str) -> Self | None:
         """Read the file; return None without one for this plan (CampaignFolderError if damaged)."""
-        found = load_record(cls, path, "remove that file")
-        return found if found is not None and found.plan_hash == plan_hash else None
+        record = load_record(cls, path, "remove that file")
+        return record if record is not None and record.plan_hash == plan_hash else None
 
     def save(self, path: Path) -> None:
         """Write the file (OutputError if the disk refuses)."""
@@ -106,14 +106,14 @@ class WarmUpRecord:
     @property
     def changes(self) -> list[float]:
         """Largest change of any joint's friction up to each motion, as a share; NaN if unknown."""
-        friction = np.array([one.friction for one in self.motions], dtype=np.float64)
+        friction = np.array([motion.friction for motion in self.motions], dtype=np.float64)
         friction = friction.reshape(len(self.motions), len(self.joint_names))
         return [change_per_motion(friction[: k + 1]) for k in range(len(friction))]
 
     def with_motion(self, archive: str, friction: Array, least: int, most: int) -> WarmUpRecord:
         """Return this warm-up after another motion of friction (n,) [N·m], with its new outcome."""
-        known = tuple(float(f) if np.isfinite(f) else None for f in friction)
-        longer = replace(self, motions=(*self.motions, WarmMotion(archive, known)))
+        joint_friction = tuple(float(f) if np.isfinite(f) else None for f in friction)
+        longer = replace(self, motions=(*self.motions, WarmMotion(archive, joint_friction)))
         done = len(longer.motions)
         change = longer.changes[-1]
         if done >= max(least, WINDOW) and change <= self.threshold:
@@ -154,9 +154,11 @@ def change_per_motion(friction: Sequence[Array] | Array) -> float:
         return float("nan")
     # Theil-Sen slope: one disturbed motion does not change it.
     first, second = np.triu_indices(len(last), k=1)
-    known = last[:, moves]
-    slopes = np.median((known[second] - known[first]) / (second - first)[:, None], axis=0)
-    return float(np.max(np.abs(slopes) / np.abs(np.median(known, axis=0))))
+    moving_joints = last[:, moves]
+    slopes = np.median(
+        (moving_joints[second] - moving_joints[first]) / (second - first)[:, None], axis=0
+    )
+    return float(np.max(np.abs(slopes) / np.abs(np.median(moving_joints, axis=0))))
 
 
 class FrictionMeter:
@@ -184,5 +186,5 @@ class FrictionMeter:
         with np.errstate(divide="ignore", invalid="ignore"):
             friction = (work - self._rigid_work) / self._way
         size = np.sqrt(np.mean(torque**2, axis=0))
-        known = (self._way > _LEAST_WAY) & (np.abs(friction) > _LEAST_SHARE * size)
-        return np.where(known, friction, np.nan)
+        measurable = (self._way > _LEAST_WAY) & (np.abs(friction) > _LEAST_SHARE * size)
+        return np.where(measurable, friction, np.nan)

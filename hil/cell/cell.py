@@ -108,8 +108,10 @@ class Cell:
             return self
         table = self.file.robot.friction
         joints = {
-            name: JointFrictionTable(**one.model_dump(exclude_unset=True, exclude={*changes}))
-            for name, one in table.joints.items()
+            name: JointFrictionTable(
+                **joint_table.model_dump(exclude_unset=True, exclude={*changes})
+            )
+            for name, joint_table in table.joints.items()
         }
         changed = self._with_robot(friction=table.model_copy(update={**changes, "joints": joints}))
         _ = changed.model
@@ -371,9 +373,9 @@ class Cell:
             standard[model.layout.links] *= inertia_scale[:, None]
         if model.layout.rotor_inertia:
             standard[model.layout.rotors] = rotor_inertia
-        known = {"coulomb": coulomb, "viscous": viscous, "third": third}
+        joint_values = {"coulomb": coulomb, "viscous": viscous, "third": third}
         friction = [
-            0.0 if motor or term.option not in known else known[term.option][owner]
+            0.0 if motor or term.option not in joint_values else joint_values[term.option][owner]
             for _, term, owner, motor, _ in model.friction.terms
         ]
         return np.concatenate([model.base.grouping @ standard, friction, model.elements.nominal])
@@ -585,9 +587,9 @@ def _check_limits(cell: Cell) -> None:
     ):
         wider = beyond * (values - bounds) > URDF_ROUNDING * np.maximum(1.0, np.abs(bounds))
         for joint in np.flatnonzero(wider):
-            own, theirs = np.degrees([values[joint], bounds[joint]])
+            cell_limit, theirs = np.degrees([values[joint], bounds[joint]])
             problem = (
-                f"{own:.6g}° of {cell.joint_names[joint]} (URDF angle or speed) exceeds the "
+                f"{cell_limit:.6g}° of {cell.joint_names[joint]} (URDF angle or speed) exceeds the "
                 f"{theirs:.6g}° of the URDF"
             )
             raise cell.error(f"limits.{field}", None, problem, "narrow it, or correct the URDF")

@@ -16,8 +16,8 @@ class CellError(InputError):
 
     def __init__(self, path: Path, field: str, value: object, problem: str, remedy: str) -> None:
         self.value = value
-        found = "" if value is None else f" = {_short(value)}"
-        super().__init__(path, problem, field=f"{field}{found}", remedy=remedy)
+        given = "" if value is None else f" = {_short(value)}"
+        super().__init__(path, problem, field=f"{field}{given}", remedy=remedy)
         self.field = field
 
 

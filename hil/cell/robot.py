@@ -63,8 +63,8 @@ def robot_model(
     if friction.ripple:
         elements += ripples(chain.joint_names, drive_train(), friction.ripple)
     laws = {}
-    for name, own in friction.joints.items():
-        table = friction.model_copy(update=own.model_dump(exclude_unset=True))
+    for name, joint_table in friction.joints.items():
+        table = friction.model_copy(update=joint_table.model_dump(exclude_unset=True))
         laws[name] = _law(path, f"robot.friction.joints.{name}", table)
     common = _law(path, "robot.friction", friction)
     with (
@@ -144,8 +144,8 @@ def _element(path: Path, place: int, table: ElementTable, chain: Chain) -> Eleme
 def _built(table: ElementTable) -> Element:
     """Create the element of a table (ModelError if invalid)."""
     if isinstance(table, TorsionSpringTable):
-        rest = math.radians(table.rest_deg)
-        return TorsionSpring(table.joint, rest, table.stiffness, table.identified)
+        rest_angle = math.radians(table.rest_deg)
+        return TorsionSpring(table.joint, rest_angle, table.stiffness, table.identified)
     anchors = Anchors(table.base_distance, table.link_distance, math.radians(table.angle_deg))
     if isinstance(table, ExtensionSpringTable):
         return ExtensionSpring(

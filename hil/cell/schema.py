@@ -462,8 +462,8 @@ def _can(table: ControllerTable, n_axes: int) -> TransportSpec:
 
 
 def _can_address(text: str) -> dict[str, Any] | None:
-    interface, _, rest = text.partition(":")
-    channel, _, profile = rest.rpartition(":") if ":" in rest else (rest, "", "fd")
+    interface, _, address = text.partition(":")
+    channel, _, profile = address.rpartition(":") if ":" in address else (address, "", "fd")
     if profile == "classic":
         remedy = "leave :classic out if the adapter has CAN FD, else use --udp"
         raise ValueError(f"{_NO_CLASSIC}; {remedy}")

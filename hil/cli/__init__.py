@@ -119,17 +119,17 @@ class LazyCommands(UserDict[str, Any]):
 
     def __getitem__(self, name: str) -> Any:
         """Return the command, importing it on first use."""
-        known = super().__getitem__(name)
-        if known is None:
+        command = super().__getitem__(name)
+        if command is None:
             # Modules leave nothing to collect: looking for it takes a tenth of their time now, and
             # would again during the command and at its end.
             gc.disable()
             try:
-                known = self[name] = _command(name)
+                command = self[name] = _command(name)
             finally:
                 gc.freeze()
                 gc.enable()
-        return known
+        return command
 
     def purpose(self, name: str) -> str:
         """Read the purpose of a command from its docstring, without importing it."""
@@ -152,12 +152,12 @@ def _module(name: str) -> str:
 
 def _command(name: str) -> Any:
     with leave_if_interrupted():
-        found = import_module(f"{__name__}.{_module(name)}")
+        module = import_module(f"{__name__}.{_module(name)}")
     alone = typer.Typer(callback=lambda: None, rich_markup_mode="markdown", add_completion=False)
-    if hasattr(found, "app"):
-        alone.add_typer(found.app, name=name)
+    if hasattr(module, "app"):
+        alone.add_typer(module.app, name=name)
     else:
-        alone.command(name)(getattr(found, _module(name)))
+        alone.command(name)(getattr(module, _module(name)))
     group = typer.main.get_command(alone)
     assert isinstance(group, TyperGroup)
     return presented(group.commands[name])
@@ -167,8 +167,8 @@ def presented(command: Any) -> Any:
     """Return the command with the help of its options from `Options:` in its docstring."""
     if isinstance(commands := getattr(command, "commands", {}), LazyCommands):
         commands = {}
-    for one in commands.values():
-        presented(one)
+    for subcommand in commands.values():
+        presented(subcommand)
     text, _, options = (command.help or "").partition("\n\nOptions:\n")
     command.help = text
     entries = re.split(r"^    (?=\w)", options, flags=re.MULTILINE)[1:]

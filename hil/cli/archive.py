@@ -35,12 +35,12 @@ def info(files: Files, as_json: JsonOption = False) -> None:
     failed = 0
     for path in archive_files(files):
         try:
-            found = read_overview(path)
+            overview = read_overview(path)
         except ArchiveError as error:
             failed = exit_code_of(error)
             _print_error(path, error, as_json=as_json)
             continue
-        typer.echo(json.dumps(found.to_dict()) if as_json else _shown(_info_lines(found)))
+        typer.echo(json.dumps(overview.to_dict()) if as_json else _shown(_info_lines(overview)))
     raise typer.Exit(failed)
 
 
@@ -53,14 +53,14 @@ def check(files: Files, as_json: JsonOption = False) -> None:
     status = 0
     for path in archive_files(files):
         try:
-            found = check_archive(path)
+            result = check_archive(path)
         except ArchiveError as error:
             status = NO_ARCHIVE
             _print_error(path, error, as_json=as_json)
             continue
-        if not found.conforms and not status:
+        if not result.conforms and not status:
             status = NOT_CONFORMING
-        typer.echo(json.dumps(_check_dict(found)) if as_json else _shown(_check_lines(found)))
+        typer.echo(json.dumps(_check_dict(result)) if as_json else _shown(_check_lines(result)))
     raise typer.Exit(status)
 
 
@@ -123,18 +123,18 @@ def _shown(lines: Sequence[str]) -> str:
     return "\n".join(printable(line, keep="") for line in lines)
 
 
-def _check_lines(found: ArchiveCheck) -> list[str]:
-    verdict = "conforms to" if found.conforms else "does not conform to"
-    lines = [f"{found.path}: {verdict} profile {found.version}, {found.samples} samples"]
-    lines += [f"  {fault}" for fault in found.faults]
-    if not found.conforms:
-        lines.append(f"  to repair it: hil archive repair {typed(found.path)}")
+def _check_lines(result: ArchiveCheck) -> list[str]:
+    verdict = "conforms to" if result.conforms else "does not conform to"
+    lines = [f"{result.path}: {verdict} profile {result.version}, {result.samples} samples"]
+    lines += [f"  {fault}" for fault in result.faults]
+    if not result.conforms:
+        lines.append(f"  to repair it: hil archive repair {typed(result.path)}")
     return lines
 
 
-def _check_dict(found: ArchiveCheck) -> dict[str, Any]:
-    entries = asdict(found)
-    return {"file": str(entries.pop("path")), "archive": True, "keeps": found.conforms, **entries}
+def _check_dict(result: ArchiveCheck) -> dict[str, Any]:
+    entries = asdict(result)
+    return {"file": str(entries.pop("path")), "archive": True, "keeps": result.conforms, **entries}
 
 
 _UNITS: Final[Mapping[str, str | Mapping[str, str]]] = {
@@ -161,10 +161,10 @@ _UNITS: Final[Mapping[str, str | Mapping[str, str]]] = {
 """Units of the entries of an overview: of a row, or by the name of a table's row."""
 
 
-def _info_lines(found: Overview) -> list[str]:
+def _info_lines(overview: Overview) -> list[str]:
     """Return the entries of the overview with their units, tables row by row."""
-    lines = [str(found.path)]
-    for key, value in found.to_dict().items():
+    lines = [str(overview.path)]
+    for key, value in overview.to_dict().items():
         if key in ("file", "archive"):
             continue
         unit = _UNITS.get(key, "")
@@ -178,8 +178,8 @@ def _info_lines(found: Overview) -> list[str]:
         else:
             shown = _cell(value)
             lines.append(f"  {key:<12} {shown}{f' {unit}' if value and unit else ''}")
-    if found.damage:
-        lines.append(f"  to repair it: hil archive repair {typed(found.path)}")
+    if overview.damage:
+        lines.append(f"  to repair it: hil archive repair {typed(overview.path)}")
     return lines
 
 

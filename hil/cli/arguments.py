@@ -62,17 +62,19 @@ def with_options(
 
     def decorate(command: Command) -> Command:
         parameters: dict[str, inspect.Parameter] = {}
-        for name, one in inspect.signature(command, eval_str=True).parameters.items():
-            parameters |= options if name == to else {name: one}
+        for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
+            parameters |= options if name == to else {name: parameter}
 
         @wraps(command)
-        def run(*own: Any, **given: Any) -> None:
+        def run(*positional: Any, **given: Any) -> None:
             typed = {name: given.pop(name) for name in [*given] if name in options}
-            command(*own, **given, **{to: group(**typed)})
+            command(*positional, **given, **{to: group(**typed)})
 
-        keyword = [one.replace(kind=one.KEYWORD_ONLY) for one in parameters.values()]
+        keyword = [
+            parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in parameters.values()
+        ]
         run.__signature__ = inspect.Signature(keyword)  # type: ignore[attr-defined]
-        run.__annotations__ = {name: one.annotation for name, one in parameters.items()}
+        run.__annotations__ = {name: parameter.annotation for name, parameter in parameters.items()}
         return run
 
     return decorate
@@ -122,13 +124,13 @@ def figures(
     texts: Sequence[str], option: str, example: str, *, bare: bool = True
 ) -> dict[str, float]:
     """Parse NAME=NUMBER values of an option (else InputError); with `bare`, NAME alone is 0."""
-    found = {}
+    numbers = {}
     for text in texts:
         name, equals, number = text.partition("=")
         try:
-            found[name] = float(number) if equals or not bare else 0.0
+            numbers[name] = float(number) if equals or not bare else 0.0
         except ValueError as error:
             raise InputError(
                 None, f"{text!r} is not NAME=NUMBER", field=option, remedy=f"write {example}"
             ) from error
-    return found
+    return numbers

@@ -103,21 +103,25 @@ def _tables(folder: Path | None, result: BatchResult) -> list[Path]:
 def result_lines(result: BatchResult) -> Iterator[str]:
     """Format each arm: its campaigns and warnings."""
     for digest, arm in result.arms.items():
-        campaigns = [one for one in result.campaigns if one.arm == digest]
+        campaigns = [estimate for estimate in result.campaigns if estimate.arm == digest]
         yield f"{arm.name}: {plural(len(campaigns), 'campaign')}"
-        yield from _last([_line(one) for one in campaigns])
-        pooled = [one for one in result.pooled if one.arm == digest]
-        for warning in dict.fromkeys(text for one in pooled for text in one.warnings):
+        yield from _last([_line(estimate) for estimate in campaigns])
+        pooled = [estimate for estimate in result.pooled if estimate.arm == digest]
+        for warning in dict.fromkeys(text for estimate in pooled for text in estimate.warnings):
             yield f"  note: {warning}"
 
 
-def _line(one: BatchEstimate) -> str:
+def _line(campaign: BatchEstimate) -> str:
     """Format a campaign."""
-    named = ", ".join(text for text in (one.campaign, one.setup, one.when[:10]) if text)
-    error = relative_error(one.estimate.noise_std, one.torque_rms, one.estimate.samples)
-    unseen = relative_error(one.unseen_rms, one.unseen_torque_rms)
+    named = ", ".join(
+        text for text in (campaign.campaign, campaign.setup, campaign.when[:10]) if text
+    )
+    error = relative_error(
+        campaign.estimate.noise_std, campaign.torque_rms, campaign.estimate.samples
+    )
+    unseen = relative_error(campaign.unseen_rms, campaign.unseen_torque_rms)
     held_out = "" if math.isnan(unseen) else f", held out {percentage(unseen, 1)}"
-    repetitions = plural(one.repetitions, "repetition")
+    repetitions = plural(campaign.repetitions, "repetition")
     return f"  {named}: {repetitions}, torque error {percentage(error, 1)}{held_out}"
 
 
@@ -130,23 +134,25 @@ def _last(lines: Sequence[str]) -> Iterator[str]:
 
 def skipped_line(skipped: Sequence[Unused]) -> str:
     """Count the skipped archives by reason, without the name of another archive in it."""
-    counts = Counter(re.sub(r"\S*(/|\.mcap)\S*", "another", one.reason) for one in skipped)
+    counts = Counter(re.sub(r"\S*(/|\.mcap)\S*", "another", unused.reason) for unused in skipped)
     reasons = "; ".join(f"{count} {reason}" for reason, count in counts.most_common())
     return f"skipped, not for fitting: {reasons}"
 
 
 def as_dict(result: BatchResult, written: Sequence[Path]) -> dict[str, Any]:
     """Return the content of `--json`; campaigns by folder, and by setup if one has several."""
-    folders = Counter((one.arm, one.campaign) for one in result.campaigns)
+    folders = Counter((estimate.arm, estimate.campaign) for estimate in result.campaigns)
     return {
         "estimator": result.estimator,
         "arms": {
             arm.name: {
                 "campaigns": {
-                    one.campaign
-                    + (f" ({one.setup})" if folders[digest, one.campaign] > 1 else ""): _level(one)
-                    for one in result.campaigns
-                    if one.arm == digest
+                    estimate.campaign
+                    + (
+                        f" ({estimate.setup})" if folders[digest, estimate.campaign] > 1 else ""
+                    ): _level(estimate)
+                    for estimate in result.campaigns
+                    if estimate.arm == digest
                 },
                 "pooled": next((_level(o) for o in result.pooled if o.arm == digest), None),
             }
@@ -154,23 +160,23 @@ def as_dict(result: BatchResult, written: Sequence[Path]) -> dict[str, Any]:
         },
         "read": result.read,
         "cached": result.cached,
-        "broken": [one._asdict() for one in result.broken],
-        "skipped": [one._asdict() for one in result.skipped],
+        "broken": [unused._asdict() for unused in result.broken],
+        "skipped": [unused._asdict() for unused in result.skipped],
         "written": [str(path) for path in written],
     }
 
 
-def _level(one: BatchEstimate) -> dict[str, Any]:
+def _level(level: BatchEstimate) -> dict[str, Any]:
     return {
-        "when": one.when or None,
-        "setup": one.setup,
-        "repetitions": one.repetitions,
-        "method": one.estimate.method,
+        "when": level.when or None,
+        "setup": level.setup,
+        "repetitions": level.repetitions,
+        "method": level.estimate.method,
         "parameters": {
             name: {"value": float(value), "std": float(std) if math.isfinite(std) else None}
             for name, value, std in zip(
-                one.estimate.names, one.estimate.values, one.estimate.std, strict=True
+                level.estimate.names, level.estimate.values, level.estimate.std, strict=True
             )
         },
-        "warnings": list(one.warnings),
+        "warnings": list(level.warnings),
     }

@@ -39,26 +39,27 @@ def compare(
     """
     reporter = make_reporter(quiet=quiet or json)
     with Cluster(reporter=reporter) as cluster:
-        found = comparing.compare(campaigns, cluster, reporter)
+        comparison = comparing.compare(campaigns, cluster, reporter)
     if output is not None:
         from hil.report.changes import comparison_page  # figures are slow to import
 
         make_folder(output.parent)
-        write_files(output.parent, {output.name: comparison_page(found)})
+        write_files(output.parent, {output.name: comparison_page(comparison)})
         reporter.say(f"report: {output}")
     if json:
-        print_json(found.document)
+        print_json(comparison.document)
     else:
         if not quiet:
-            for one in found.changed:
+            for change in comparison.changed:
                 line = (
-                    f"{one.parameter} in {one.campaign}:"
-                    f" {one.after:.4g} instead of {one.before:.4g} {unit_text(one.unit)}, change"
-                    f" {one.change:+.3g} ± {one.half:.2g} (95 %), p {one.p_value:.1g}"
+                    f"{change.parameter} in {change.campaign}:"
+                    f" {change.after:.4g} instead of {change.before:.4g} {unit_text(change.unit)}, "
+                    f"change"
+                    f" {change.change:+.3g} ± {change.half:.2g} (95 %), p {change.p_value:.1g}"
                 )
                 typer.echo(printable(line), err=True)
-            for warning in found.warnings:
+            for warning in comparison.warnings:
                 typer.echo(printable(f"note: {warning}"), err=True)
-        typer.echo(printable(f"{found.verdict}."))
-    if fail_on_change and found.changed:
+        typer.echo(printable(f"{comparison.verdict}."))
+    if fail_on_change and comparison.changed:
         raise typer.Exit(CHANGED)

@@ -140,14 +140,14 @@ def _require_replaceable(output: Path, *, force: bool) -> None:
         return
     if output.is_symlink() or not output.is_dir():
         raise CampaignFolderError(output, "is not a folder", "name a folder")
-    found = {path.name for path in output.iterdir()}
-    if found and not force:
+    entries = {path.name for path in output.iterdir()}
+    if entries and not force:
         remedy = (
             "name another folder (--output), or add --resume to continue or --force to replace it"
         )
         raise CampaignFolderError(output, "is not empty", remedy)
-    foreign = sorted(found - _OURS)
-    if foreign or (found and "manifest.json" not in found):
+    foreign = sorted(entries - _OURS)
+    if foreign or (entries and "manifest.json" not in entries):
         what = f"contains {foreign[0]}" if foreign else "is not a campaign"
         problem = f"{what}, so --force will not remove it"
         raise CampaignFolderError(output, problem, "name another folder")

@@ -167,7 +167,7 @@ def design(
         asked = asked.kinematic()
 
     recordings = [Path(name) for name in asked.objective.given]
-    known = given_of(loaded, recordings) if recordings else None
+    prior_knowledge = given_of(loaded, recordings) if recordings else None
     mass = payload_mass if purpose is not None else None
     promise = _promise(loaded, asked.objective.precision, recordings, reporter, mass)
     planned = 1 if promise is None else 2 if purpose else loaded.campaign.repetitions
@@ -192,21 +192,21 @@ def design(
             reporter.say(f"{folder.root} is now a campaign; next: {command}")
         else:
             reporter.say(f"note: no campaign was created: {lacking}")
-        found = design_summary(done, folder) | {
+        summary = design_summary(done, folder) | {
             "campaign": str(folder.root) if lacking is None and not files else None,
             "no_campaign": lacking,
             "trajectories": [*files],
         }
         if json:
-            print_json(found)
+            print_json(summary)
         else:
             p = done.problem.objective.n_parameters
             figures = criteria_text(excitation.criteria.measures, p)
             duration = excitation.trajectory.duration
             typer.echo(printable(f"{figures}, {duration:.2f} s: {folder.result}"))
         if promise is not None and not json:
-            for one in promise.forecasts(excitation, planned):
-                typer.echo(printable(one.message(planned, promise.scale)))
+            for forecast in promise.forecasts(excitation, planned):
+                typer.echo(printable(forecast.message(planned, promise.scale)))
         _draw(folder, done, loaded)
 
     with stop_on_interrupt() as stop:
@@ -217,14 +217,16 @@ def design(
             reporter,
             workers=workers or len(os.sched_getaffinity(0)),
             stop=lambda: stop.requested,
-            given=known,
+            given=prior_knowledge,
             precision=None if promise is None else promise.precision(planned),
             carrying=None
             if mass is None
             else loaded_cell(loaded, "payload", assumed_payload(loaded, mass)),
             promised=None
             if promise is None
-            else lambda found: [one.to_dict() for one in promise.forecasts(found, planned)],
+            else lambda excitation: [
+                forecast.to_dict() for forecast in promise.forecasts(excitation, planned)
+            ],
             resume=resume,
             force=force,
             then=finish,

@@ -66,15 +66,15 @@ def export(
     reporter = make_reporter(quiet=quiet or json)
     options = how.options(estimator=estimator)
     as_usual = options == Options() and not again
-    found = read_or_identify(archives, options, reporter, reuse=as_usual)
+    arm = read_or_identify(archives, options, reporter, reuse=as_usual)
     target = output or default_output(archives, to, ensemble=ensemble is not None)
     exported = (
-        export_model(found, target, to)
+        export_model(arm, target, to)
         if ensemble is None
-        else export_ensemble(found, target, to, ensemble, seed)
+        else export_ensemble(arm, target, to, ensemble, seed)
     )
     print_export(exported, json=json, quiet=quiet)
-    if not found.good:
+    if not arm.good:
         raise typer.Exit(NOT_GOOD)
 
 

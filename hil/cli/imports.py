@@ -374,20 +374,20 @@ def maps(
     elif name is not None:
         typer.echo(ready_map(name), nl=False)
     else:
-        for known, purpose in purposes.items():
-            say(f"{known:<18} {purpose}")
+        for map_name, purpose in purposes.items():
+            say(f"{map_name:<18} {purpose}")
 
 
 def _print(path: Path, concluded: Sequence[str] = (), *, json: bool) -> None:
     """Print what was concluded of the channels, and the findings in the new archive."""
-    found = open_archive(path).header.findings
-    lines = [*concluded, *found.lines]
+    findings = open_archive(path).header.findings
+    lines = [*concluded, *findings.lines]
     if json:
-        print_json({"archive": str(path), "found": lines, "warnings": found.warnings})
+        print_json({"archive": str(path), "found": lines, "warnings": findings.warnings})
         return
     for line in lines:
         say(line)
-    for warning in found.warnings:
+    for warning in findings.warnings:
         typer.secho(printable(f"warning: {warning}"), fg=typer.colors.YELLOW)
     say(f"wrote {path}")
 

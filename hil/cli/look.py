@@ -44,15 +44,15 @@ def look(
     Options:
         output: Write the column map with the sure conclusions, for `hil identify --map`.
     """
-    found = look_at(recording, arm.robot if arm.is_given else None, reading.options)
+    result = look_at(recording, arm.robot if arm.is_given else None, reading.options)
     asks = sys.stdin.isatty() and sys.stdout.isatty() and not json
     if json:
-        print_json(found.as_json())
+        print_json(result.as_json())
     else:
-        _print(found)
-    text = found.map_text
+        _print(result)
+    text = result.map_text
     is_open = False
-    for choices in found.questions:
+    for choices in result.questions:
         chosen = _ask(choices) if asks else None
         if chosen is None:
             is_open = True
@@ -66,20 +66,20 @@ def look(
         raise typer.Exit(IN_DOUBT)
 
 
-def _print(found: Look) -> None:
-    for line in table(found.rows):
+def _print(result: Look) -> None:
+    for line in table(result.rows):
         typer.echo(printable(line))
-    if found.groups:
+    if result.groups:
         typer.echo("\nthe recording determines (parameters):")
-        for line in groups_table(found.groups):
+        for line in groups_table(result.groups):
             typer.echo(printable(line))
-    for choices in found.questions:
+    for choices in result.questions:
         typer.echo(f"\n{choices[0].aspect}: two readings fit alike; choose one line for the map:")
         for number, choice in enumerate(choices, 1):
             error = "" if choice.error is None else f" (error {percentage(choice.error, 2)})"
             typer.echo(printable(f"  {number}  {choice.line or choice.reading}"))
             typer.echo(printable(f"     {choice.reading}{error}"))
-    for option in found.options:
+    for option in result.options:
         say(f"for `hil identify`: {option}")
 
 

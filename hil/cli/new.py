@@ -105,15 +105,17 @@ def new(
         assert dh is not None
         made = cell_of_dh(dh, convention_of(convention), fixed)
     if made.urdf is not None:
-        _require_free(made.urdf_beside(output), force=force, own=made.urdf_path)
-    known = made.known
+        _require_free(made.urdf_beside(output), force=force, urdf_read=made.urdf_path)
+    known_values = made.known
     if from_controller is not None:
-        known |= _asked(from_controller, bind, len(made.joint_names), arm, wait, quiet=json)
+        known_values |= _asked(from_controller, bind, len(made.joint_names), arm, wait, quiet=json)
     if from_archive_file is not None:
         stated = from_archive(from_archive_file, made.joint_names)
         # Limits belong together, with their frame.
-        known = (known.without("limits") if "limits.frame" in stated.values else known) | stated
-    made = replace(made, known=known)
+        known_values = (
+            known_values.without("limits") if "limits.frame" in stated.values else known_values
+        ) | stated
+    made = replace(made, known=known_values)
     made = made.for_design() if design_only else made
     text, unknown = made.text(output)
     with convert_write_errors(output):
@@ -122,8 +124,8 @@ def new(
             write_atomically(made.urdf_beside(output), made.urdf)
         write_atomically(output, text)
     if json:
-        found = {"joints": made.joint_names, "unknown": unknown, "notes": made.known.notes}
-        print_json({"cell": str(output), **found})
+        summary = {"joints": made.joint_names, "unknown": unknown, "notes": made.known.notes}
+        print_json({"cell": str(output), **summary})
         return
     for note in made.known.notes:
         say(f"note: {note}")
@@ -160,9 +162,9 @@ def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, qui
     return from_init(init, n_joints, arm) | Known.of_origin("as given to hil new", link)
 
 
-def _require_free(path: Path, *, force: bool, own: Path | None = None) -> None:
+def _require_free(path: Path, *, force: bool, urdf_read: Path | None = None) -> None:
     """Refuse to replace a file without --force, and the URDF that is read."""
-    if own is not None and path.resolve() == own.resolve():
+    if urdf_read is not None and path.resolve() == urdf_read.resolve():
         problem = "is the URDF to read"
         raise InputError(path, problem, remedy="name another --output")
     if path.exists() and not force:

@@ -55,15 +55,15 @@ def payload(
     if model:
         automatic = Options(delay=delay_from(delay))
         weighed = [*bare, *(loaded or [])]
-        found = weigh_by_model(model, weighed, reporter, frame=frame, options=automatic)
+        result = weigh_by_model(model, weighed, reporter, frame=frame, options=automatic)
     else:
         options = Options(estimator="wls", delay=delay_from(delay))
-        found = find_payload(bare, loaded or [], reporter, frame=frame, options=options)
-    outside = found.outside(wanted)
-    remedies = found.remedy(wanted) if outside else []
-    fields = found.as_json() | {"checked": wanted, "outside": outside, "next_steps": remedies}
+        result = find_payload(bare, loaded or [], reporter, frame=frame, options=options)
+    outside = result.outside(wanted)
+    remedies = result.remedy(wanted) if outside else []
+    fields = result.as_json() | {"checked": wanted, "outside": outside, "next_steps": remedies}
     text = json_module.dumps(fields, indent=1, ensure_ascii=False)
-    lines = found.lines(wanted, outside)
+    lines = result.lines(wanted, outside)
     typer.echo(text if json else "\n".join(lines))
-    if outside or found.mounting is not None:
+    if outside or result.mounting is not None:
         raise typer.Exit(NOT_GOOD)

@@ -100,7 +100,7 @@ def plan(
         if via is None
         else read_via_points(via, frame)
     )
-    moves = [Move(target=one, speed=speed / 100, fly_percent=fly) for one in points[1:]]
+    moves = [Move(target=point, speed=speed / 100, fly_percent=fly) for point in points[1:]]
     # The solver can crash its process.
     planned = in_child(plan_moves, points[0], moves, loaded.joint_limits)
     names = loaded.joint_names

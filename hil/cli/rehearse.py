@@ -38,19 +38,22 @@ def rehearse(
     """
     reporter = make_reporter(quiet=quiet or json)
     with stop_on_interrupt() as stop:
-        found = Campaign.open(campaign).rehearse(
+        rehearsal = Campaign.open(campaign).rehearse(
             reporter=reporter, seed=seed, stop=stop, again=again
         )
     if json:
-        typer.echo(found.model_dump_json())
+        typer.echo(rehearsal.model_dump_json())
     else:
-        for line in [] if quiet else _lines(found):
+        for line in [] if quiet else _lines(rehearsal):
             say(line)
-        say(found.line)
-    if not found.passed:
+        say(rehearsal.line)
+    if not rehearsal.passed:
         raise typer.Exit(NOT_GOOD)
 
 
-def _lines(found: Rehearsal) -> list[str]:
-    criteria = [f"{'ok' if one.passed else 'FAILED'}: {one.sentence}" for one in found.criteria]
-    return [*criteria, *(f"not covered: {sentence}" for sentence in found.not_seen)]
+def _lines(rehearsal: Rehearsal) -> list[str]:
+    criteria = [
+        f"{'ok' if criterion.passed else 'FAILED'}: {criterion.sentence}"
+        for criterion in rehearsal.criteria
+    ]
+    return [*criteria, *(f"not covered: {sentence}" for sentence in rehearsal.not_seen)]

@@ -79,8 +79,8 @@ def rollout(
     options = how.options(split=split, estimator=estimator)
     output = _folder(output, archives)
     as_usual = options == Options() and not again
-    found = read_or_identify(archives, options, reporter, reuse=as_usual, predict=predict or ())
-    simulated = roll_out(found, asked, reporter)
+    arm = read_or_identify(archives, options, reporter, reuse=as_usual, predict=predict or ())
+    simulated = roll_out(arm, asked, reporter)
     if output is not None:
         _write(output, simulated, reporter)
     if json:
@@ -88,7 +88,7 @@ def rollout(
     else:
         for line in simulated.result.lines()[-1 if quiet else 0 :]:
             say(line)
-    if not found.good:
+    if not arm.good:
         raise typer.Exit(NOT_GOOD)
 
 

@@ -160,13 +160,13 @@ def _run(
 
 def _identify(campaign: Campaign, result: RunResult, *, quiet: bool, json: bool) -> None:
     """Identify from all complete archives, report, and end with the verdict."""
-    found = campaign.identify(reporter=make_reporter(quiet=quiet or json))
+    identification = campaign.identify(reporter=make_reporter(quiet=quiet or json))
     if not json:
-        finish(found.results, json=False, quiet=quiet)
+        finish(identification.results, json=False, quiet=quiet)
         return
-    verdict = json_format.loads(as_json(found.results))
+    verdict = json_format.loads(as_json(identification.results))
     print_json({**result.to_dict(), "verdict": verdict})
-    if not found.verdict.good:
+    if not identification.verdict.good:
         raise typer.Exit(NOT_GOOD)
 
 
@@ -185,13 +185,13 @@ def _print(result: RunResult, *, json: bool) -> None:
         say(result.precision)
     for note in result.notes:
         say(note)
-    for one in result.rejected:
-        name = ArchiveName.parse(one.archive)
-        what = one.archive if name is None else f"{name.motion} ({one.archive})"
-        say(f"{what}: {one.reason}")
+    for rejection in result.rejected:
+        name = ArchiveName.parse(rejection.archive)
+        what = rejection.archive if name is None else f"{name.motion} ({rejection.archive})"
+        say(f"{what}: {rejection.reason}")
     if result.dry_run == "to be accepted":
-        known = "".join(f" --accept-torque {joint}" for joint in result.against_gravity)
-        why = "you know why, and " if known else ""
+        accept_options = "".join(f" --accept-torque {joint}" for joint in result.against_gravity)
+        why = "you know why, and " if accept_options else ""
         run_it = CampaignFolder(Path(result.campaign)).run_command
-        command = f"`{run_it} --accept-dry-run{known}`"
+        command = f"`{run_it} --accept-dry-run{accept_options}`"
         say(f"if {why}the motions looked right, continue with {command}")

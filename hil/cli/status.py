@@ -23,31 +23,33 @@ def status(
 
     Changes nothing, and can be used while the campaign runs.
     """
-    found = Campaign.open(campaign).status()
+    progress = Campaign.open(campaign).status()
     if json:
-        print_json(found.to_dict())
+        print_json(progress.to_dict())
         return
     console = Console()
-    console.print(_table(found))
-    put(console, _last(found))
+    console.print(_table(progress))
+    put(console, _last(progress))
 
 
-def _last(found: CampaignStatus) -> str:
+def _last(progress: CampaignStatus) -> str:
     """Return the line with the next command."""
-    if found.complete:
+    if progress.complete:
         return "all steps are done"
-    if found.next_command:
-        return f"next: {found.next_command}"
-    stuck = next(step for step in found.steps if step.state == "next")
+    if progress.next_command:
+        return f"next: {progress.next_command}"
+    stuck = next(step for step in progress.steps if step.state == "next")
     return f"next: {stuck.sentence}"
 
 
-def _table(found: CampaignStatus) -> Table:
-    table = Table(title=Text(printable(found.root)), title_justify="left", box=None, pad_edge=False)
+def _table(progress: CampaignStatus) -> Table:
+    table = Table(
+        title=Text(printable(progress.root)), title_justify="left", box=None, pad_edge=False
+    )
     table.add_column("step", no_wrap=True)
     table.add_column("", no_wrap=True)
     table.add_column("detail", overflow="fold")
-    for step in found.steps:
+    for step in progress.steps:
         word, style = _MARKS[step.state]
         table.add_row(step.name, Text(word, style=style), Text(printable(step.sentence)))
     return table

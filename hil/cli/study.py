@@ -54,12 +54,12 @@ def study(
             quick=quick, repetitions=repetitions, motions=motions, seed=seed, effects=effects
         )
         arm = None if cell is None else Cell.load(cell)
-        found = run_study(output, settings, reporter, workers=count, cell=arm)
+        result = run_study(output, settings, reporter, workers=count, cell=arm)
     except KeyboardInterrupt:
         raise OperatorStopError(
             f"stopped; the same command resumes the study in {output}"
         ) from None
     if json:
-        print_json(found.summary)
+        print_json(result.summary)
     else:
-        typer.echo("\n".join(found.conclusion))
+        typer.echo("\n".join(result.conclusion))

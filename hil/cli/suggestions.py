@@ -117,5 +117,5 @@ def _nearest(error: Any, command: Any) -> str:
 
 def examples(command: Any) -> list[str]:
     """Return the examples in the help of a command, each in one line."""
-    found = _EXAMPLES.search(command.help or "")
-    return [" ".join(line.split()) for line in _COMMAND.findall(found[1])] if found else []
+    section = _EXAMPLES.search(command.help or "")
+    return [" ".join(line.split()) for line in _COMMAND.findall(section[1])] if section else []

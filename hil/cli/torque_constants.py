@@ -62,13 +62,13 @@ def torque_constants(
     lag = delay_from(delay)
     if lag == "auto":
         raise _refusal("--delay", "cannot be estimated from currents", "give seconds")
-    found = find_gains(bare, carried, make_reporter(quiet=quiet or json), delay=lag)
+    result = find_gains(bare, carried, make_reporter(quiet=quiet or json), delay=lag)
     assumed = None if centre or not loaded else assumption(frame)
     if json:
-        print_json(as_dict(found) | {"assumed": assumed})
+        print_json(as_dict(result) | {"assumed": assumed})
     else:
-        typer.echo(_as_toml(found, assumed))
-    if not found.gains.determined.all():
+        typer.echo(_as_toml(result, assumed))
+    if not result.gains.determined.all():
         raise typer.Exit(NOT_GOOD)
 
 
@@ -97,11 +97,11 @@ def assumption(frame: str | None) -> str:
     )
 
 
-def _as_toml(found: GainsFound, assumed: str | None) -> str:
+def _as_toml(result: GainsFound, assumed: str | None) -> str:
     """Format constants and their uncertainty as TOML; what is not determined is nan."""
-    side = "motor side" if found.motor_side else "joint side, gears included"
+    side = "motor side" if result.motor_side else "joint side, gears included"
     constants = tomlkit.array()
-    for motor in _motors(found):
+    for motor in _motors(result):
         if motor["not_determined"] is None:
             value = float(f"{motor['torque_constant']:.6g}")
             comment = f"{motor['name']} ± {motor['half_interval']:.2g}"
@@ -110,7 +110,7 @@ def _as_toml(found: GainsFound, assumed: str | None) -> str:
             comment = f"{motor['name']}: not determined; {motor['not_determined']}"
         constants.add_line(value, comment=comment)
     constants.add_line(indent="")
-    uncertainty = inline([float(f"{share:.2g}") for share in found.gains.relative_std])
+    uncertainty = inline([float(f"{share:.2g}") for share in result.gains.relative_std])
     uncertainty.comment("relative standard deviations")
     document = tomlkit.document()
     heads = ([assumed] if assumed else []) + [f"N·m/A ({side}), 95 % intervals"]
@@ -121,9 +121,9 @@ def _as_toml(found: GainsFound, assumed: str | None) -> str:
     return tomlkit.dumps(document).rstrip("\n")
 
 
-def _motors(found: GainsFound) -> list[dict[str, Any]]:
+def _motors(result: GainsFound) -> list[dict[str, Any]]:
     """Name, constant, standard deviation and half interval [N·m/A], or why there are none."""
-    gains = found.gains
+    gains = result.gains
     columns = (gains.motor_names, gains.values, gains.std, gains.determined, gains.reasons)
     return [
         {
@@ -137,12 +137,12 @@ def _motors(found: GainsFound) -> list[dict[str, Any]]:
     ]
 
 
-def as_dict(found: GainsFound) -> dict[str, object]:
+def as_dict(result: GainsFound) -> dict[str, object]:
     """Return the content of `--json`."""
-    loads = {name: None if load is None else load.mass for name, load in found.loads.items()}
+    loads = {name: None if load is None else load.mass for name, load in result.loads.items()}
     return {
-        "motors": _motors(found),
+        "motors": _motors(result),
         "unit": "N·m/A",
-        "side": "motor" if found.motor_side else "joint",
+        "side": "motor" if result.motor_side else "joint",
         "payload_kg": loads,
     }

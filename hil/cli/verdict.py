@@ -55,10 +55,12 @@ def as_json(results: Results) -> str:
     """Return the verdict, its findings and the errors per joint as JSON."""
     fields = results.model_dump(mode="json")
     keys = ("next_steps", "findings", "joints", "in_sample")
-    found = fields["verdict"] | {key: fields["judgement"][key] for key in keys}
-    found["undetermined"] = [one.name for one in results.parameters if one.undetermined]
-    found |= {key: fields[key] for key in ("delays", "fitted", "calibration", "exports")}
-    return json_module.dumps(found)
+    document = fields["verdict"] | {key: fields["judgement"][key] for key in keys}
+    document["undetermined"] = [
+        parameter.name for parameter in results.parameters if parameter.undetermined
+    ]
+    document |= {key: fields[key] for key in ("delays", "fitted", "calibration", "exports")}
+    return json_module.dumps(document)
 
 
 def table(results: Results) -> list[str]:

@@ -18,10 +18,10 @@ from .settings import DesignSettings
 def criteria_text(measures: Iterable[float], n_parameters: int | None = None) -> str:
     """Return values of `CRITERIA` as text, with the largest ones for a number of parameters."""
     parts = []
-    for one, value in zip(excitation.CRITERIA.values(), measures, strict=True):
-        text = f"{one.label} {value:.{one.decimals}f}"
-        if n_parameters is not None and one.largest is not None:
-            text += f" of {one.largest(n_parameters):.0f}"
+    for criterion, value in zip(excitation.CRITERIA.values(), measures, strict=True):
+        text = f"{criterion.label} {value:.{criterion.decimals}f}"
+        if n_parameters is not None and criterion.largest is not None:
+            text += f" of {criterion.largest(n_parameters):.0f}"
         parts.append(text)
     return ", ".join(parts)
 

@@ -140,7 +140,7 @@ class PrecisionDesign:
             CellError: the cell lacks `[nominal]`.
         """
         require_known(requirements, cell.model)
-        if any((one.kind == "mass") == (payload is None) for one in requirements):
+        if any((requirement.kind == "mass") == (payload is None) for requirement in requirements):
             raise InputError(
                 None,
                 "the mass of a payload and the arm itself need different motions",
@@ -169,13 +169,13 @@ class PrecisionDesign:
         if given:
             values, prior, error = _posterior(cell, given)
             source = "of the given recordings"
-        known = prior + reference.information(error)
+        information = prior + reference.information(error)
         subject = values
         if payload is None:
-            wanted = reference.wanted(requirements, values, known)
+            wanted = reference.wanted(requirements, values, information)
         else:
-            known = prior if given else prior + _ARM_TIME * reference.information(error)
-            wanted, subject = _load(cell.model, requirements[0], payload, values, known)
+            information = prior if given else prior + _ARM_TIME * reference.information(error)
+            wanted, subject = _load(cell.model, requirements[0], payload, values, information)
         made = cls(cell, wanted, subject, prior, error, noise, reference, scale, source)
         made._require_possible()
         return made
@@ -194,13 +194,13 @@ class PrecisionDesign:
         limits = np.zeros(len(self.wanted.labels))
         if self.scale.std.any():
             limits = self._ratios(grams, repetitions, _ENDLESS)
-        found = []
+        forecasts = []
         worst = self.wanted.worst(self._ratios(grams, repetitions, 1.0))
         for k, (requirement, label, ratio) in enumerate(worst):
             mine = self.wanted.owners == k
             repeated = partial(self._meets, grams, mine, motions=1.0)
             various = partial(self._meets, grams, mine, repetitions)
-            found.append(
+            forecasts.append(
                 Forecast(
                     requirement=requirement,
                     worst=label,
@@ -210,7 +210,7 @@ class PrecisionDesign:
                     limit=float(limits[mine].max()) * requirement.value,
                 )
             )
-        return found
+        return forecasts
 
     def _meets(
         self, grams: Array, which: NDArray[np.bool_], repetitions: float, motions: float
@@ -252,16 +252,16 @@ class PrecisionDesign:
 
 
 def _load(
-    model: RobotModel, requirement: Requirement, mass: float, values: Array, known: Array
+    model: RobotModel, requirement: Requirement, mass: float, values: Array, arm_information: Array
 ) -> tuple[Wanted, Array]:
     """Return a mass at the flange as what is wanted, and the change of parameters (p,) by it.
 
-    The arm is known with the information `known` (p, p); its friction may drift.
+    The arm is known with the information `arm_information` (p, p); its friction may drift.
     """
     change = parameter_change(model, flange_of(model))
     drift = np.where(model.friction_columns, DRIFT * values, 0.0)
-    scale = 1.0 / np.sqrt(np.diag(known))
-    unit = np.linalg.inv(known * scale[:, None] * scale)
+    scale = 1.0 / np.sqrt(np.diag(arm_information))
+    unit = np.linalg.inv(arm_information * scale[:, None] * scale)
     covariance = unit * scale[:, None] * scale + np.diag(drift**2)
     size = np.sqrt(np.diag(covariance))
     root = size[:, None] * np.linalg.cholesky(covariance / size[:, None] / size)

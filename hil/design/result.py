@@ -181,9 +181,9 @@ class DesignResult:
             raise InputError(path, f"cannot be read ({reason})", remedy=remedy) from error
         try:
             data = from_text(text)
-            for key, known in (("format", RESULT_FORMAT), ("version", VERSION)):
-                if data.get(key) != known:
-                    raise ValueError(f"{key} is {data.get(key)!r:.60}, this reads {known!r}")
+            for key, expected in (("format", RESULT_FORMAT), ("version", VERSION)):
+                if data.get(key) != expected:
+                    raise ValueError(f"{key} is {data.get(key)!r:.60}, this reads {expected!r}")
             seal = data.pop("seal")
             positions = numbers(seal["positions"], 2)
             if seal["sha256"] != _seal(text):

@@ -202,7 +202,7 @@ def _searched(
         }
     if (wanted := problem.objective.precision) is not None:
         arrays = (wanted.quantities.directions, wanted.quantities.allowed, wanted.density)
-        identity["precision"] = {"digest": json_digest([one.tolist() for one in arrays])}
+        identity["precision"] = {"digest": json_digest([array.tolist() for array in arrays])}
     with folder.opened_journal() as file:
         journal = _journal(file, identity, reporter)
         design = run_search(

@@ -304,11 +304,11 @@ def _validated(path: Path | None, raw: Mapping[str, Any]) -> DesignSettings:
         return DesignSettings.model_validate(raw)
     except ValidationError as error:
         first = first_error(path or Path(), error, DesignSettings)
-        found = "" if first.value is None else f" = {first.value!r:.60}"
+        given = "" if first.value is None else f" = {first.value!r:.60}"
         not_table = error.errors(include_url=False)[0]["type"] == "model_type"
         raise SettingsError(
             path,
             "is not a table" if not_table else first.problem,
-            field=f"{first.field}{found}",
+            field=f"{first.field}{given}",
             remedy=first.remedy,
         ) from error

@@ -35,12 +35,12 @@ class Wanted:
 
     def worst(self, ratios: Array) -> list[tuple[Requirement, str, float]]:
         """Return for each requirement the quantity with the largest ratio (k,), and that ratio."""
-        found = []
+        worst = []
         for k, requirement in enumerate(self.requirements):
             index = np.flatnonzero(self.owners == k)
             top = int(index[np.argmax(ratios[index])])
-            found.append((requirement, self.labels[top], float(ratios[top])))
-        return found
+            worst.append((requirement, self.labels[top], float(ratios[top])))
+        return worst
 
 
 class ReferenceMotions:
@@ -80,9 +80,9 @@ class ReferenceMotions:
         rows = []
         owners = []
         for k, requirement in enumerate(requirements):
-            found = list(self._quantities(requirement, values, information))
-            rows += found
-            owners += [k] * len(found)
+            quantity_rows = list(self._quantities(requirement, values, information))
+            rows += quantity_rows
+            owners += [k] * len(quantity_rows)
         labels, directions, allowed = zip(*rows, strict=True)
         quantities = Quantities(np.array(directions), np.array(allowed))
         return Wanted(tuple(requirements), quantities, labels, np.array(owners, dtype=np.intp))

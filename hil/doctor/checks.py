@@ -80,12 +80,12 @@ class System:
 
     def texts(self, pattern: str) -> dict[Path, str]:
         """Return the texts of the files that match a pattern, by path."""
-        found = sorted(self.root.glob(pattern.lstrip("/")))
-        return {path: self.text(str(path.relative_to(self.root))) for path in found}
+        paths = sorted(self.root.glob(pattern.lstrip("/")))
+        return {path: self.text(str(path.relative_to(self.root))) for path in paths}
 
-    def ip(self, *words: str) -> list[dict[str, Any]] | None:
+    def ip(self, *arguments: str) -> list[dict[str, Any]] | None:
         """Return the output of `ip`; empty if it fails, None if it is not installed."""
-        output = self.run("ip", "-json", *words)
+        output = self.run("ip", "-json", *arguments)
         try:
             return None if output is None else [*json.loads(output)]
         except ValueError:
@@ -109,11 +109,11 @@ def scheduling(given: RealTimeReport, limit: int) -> DoctorCheck:
     limited = "no limit" if limit < 0 else f"rtprio limit {limit}"
     if "FIFO" in given.scheduling.upper():
         return DoctorCheck(name, Status.OK, f"{given.scheduling} given ({limited})")
-    found = f"refused, its scheduling is {given.scheduling or 'ordinary'}; {limited}"
+    message = f"refused, its scheduling is {given.scheduling or 'ordinary'}; {limited}"
     remedy = _limit_lines("rtprio", "98")
     if not 0 <= limit < RealTimeSettings().priority:
         remedy += ("cat /proc/sys/kernel/sched_rt_runtime_us   # 0 forbids real-time programs",)
-    return DoctorCheck(name, Status.BAD, found, remedy)
+    return DoctorCheck(name, Status.BAD, message, remedy)
 
 
 def memory_lock(given: RealTimeReport, limit: int) -> DoctorCheck:
@@ -136,13 +136,15 @@ _CPU = "/sys/devices/system/cpu"
 def governor(system: System) -> DoctorCheck:
     """Check that the processors are not slowed down."""
     name = "frequency governor"
-    found = sorted({*system.texts(f"{_CPU}/cpu[0-9]*/cpufreq/scaling_governor").values()} - {""})
-    if found in ([], ["performance"]):
+    governors = sorted(
+        {*system.texts(f"{_CPU}/cpu[0-9]*/cpufreq/scaling_governor").values()} - {""}
+    )
+    if governors in ([], ["performance"]):
         return DoctorCheck(
-            name, Status.OK, "".join(found) or "no frequency scaling on this machine"
+            name, Status.OK, "".join(governors) or "no frequency scaling on this machine"
         )
     setting = f"echo performance | sudo tee {_CPU}/cpu*/cpufreq/scaling_governor"
-    return DoctorCheck(name, Status.WARN, ", ".join(found), (setting,))
+    return DoctorCheck(name, Status.WARN, ", ".join(governors), (setting,))
 
 
 def idle_states(*, cpu_awake: bool) -> DoctorCheck:
@@ -167,7 +169,8 @@ def computer_checks(given: RealTimeReport | None, system: System) -> list[Doctor
         rights = [DoctorCheck("permissions", Status.BAD, "the probe failed", command)]
     else:
         limits = [
-            resource.getrlimit(one)[0] for one in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK)
+            resource.getrlimit(limit)[0]
+            for limit in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK)
         ]
         rights = [scheduling(given, limits[0]), memory_lock(given, limits[1])]
     awake = given is not None and given.cpu_awake
@@ -195,13 +198,15 @@ class DiskTrial:
 def disk_checks(place: Path, trial: DiskTrial | None) -> list[DoctorCheck]:
     """Check free space and write time; `trial` is None if the disk did not respond."""
     if trial is None:
-        found = f"the disk of {place} does not respond"
-        return [DoctorCheck("disk write", Status.BAD, found, (f"df -h {place}", _MOVE))]
+        message = f"the disk of {place} does not respond"
+        return [DoctorCheck("disk write", Status.BAD, message, (f"df -h {place}", _MOVE))]
     hours = trial.free / (BYTES_PER_CYCLE * 3_600_000)
     status = Status.OK if hours >= 2 else Status.WARN if hours >= 0.5 else Status.BAD
-    found = f"{trial.free / 1e9:.1f} GB free at {trial.folder}: {hours:.1f} h of recording at 1 ms"
+    message = (
+        f"{trial.free / 1e9:.1f} GB free at {trial.folder}: {hours:.1f} h of recording at 1 ms"
+    )
     remedy = () if hours >= 2 else (f"du -xh {trial.folder} | sort -h | tail",)
-    space = DoctorCheck("disk space", status, found, remedy)
+    space = DoctorCheck("disk space", status, message, remedy)
     if not trial.seconds:
         refused = f"cannot write to {trial.folder}: {trial.error or 'no result'}"
         look = (f"ls -ld {trial.folder}; id", _MOVE)
@@ -209,8 +214,8 @@ def disk_checks(place: Path, trial: DiskTrial | None) -> list[DoctorCheck]:
     worst = max(trial.seconds)
     middle = sorted(trial.seconds)[len(trial.seconds) // 2]
     status = Status.OK if worst < _SLOW else Status.WARN if worst < _TOO_SLOW else Status.BAD
-    found = f"64 KiB written in {1e3 * middle:.1f} ms, at most {1e3 * worst:.1f} ms"
-    return [space, DoctorCheck("disk write", status, found, () if worst < _SLOW else (_MOVE,))]
+    message = f"64 KiB written in {1e3 * middle:.1f} ms, at most {1e3 * worst:.1f} ms"
+    return [space, DoctorCheck("disk write", status, message, () if worst < _SLOW else (_MOVE,))]
 
 
 _ARPHRD_CAN = "280"
@@ -221,8 +226,8 @@ def can_check(bus: CanBus, system: System) -> DoctorCheck:
     # An adapter is not opened here: on the bus it would acknowledge frames.
     name = f"CAN {bus.interface} {bus.channel}"
     if bus.interface != "socketcan":
-        found = "not a kernel device; it is opened by the exchange only"
-        return DoctorCheck(name, Status.UNKNOWN, found)
+        message = "not a kernel device; it is opened by the exchange only"
+        return DoctorCheck(name, Status.UNKNOWN, message)
     folder = f"/sys/class/net/{bus.channel}"
     if system.text(f"{folder}/type") != _ARPHRD_CAN:
         look = ("ip -brief link show type can", "sudo modprobe can_raw   # and the card's driver")
@@ -240,11 +245,11 @@ def can_check(bus: CanBus, system: System) -> DoctorCheck:
     if not nominal:
         remedy = (f"ip -details link show {bus.channel}",)
         return DoctorCheck(name, Status.UNKNOWN, "bit rate not stated", remedy)
-    found = f"up, {nominal} bit/s" + (f", data {data} bit/s" if data else "")
+    message = f"up, {nominal} bit/s" + (f", data {data} bit/s" if data else "")
     if nominal == (bus.bitrate or nominal) and data and data == (bus.data_bitrate or data):
-        return DoctorCheck(name, Status.OK, found)
+        return DoctorCheck(name, Status.OK, message)
     down = f"sudo ip link set {bus.channel} down"
-    return DoctorCheck(name, Status.BAD, f"{found}; the cell needs {rates}", (down, bring_up))
+    return DoctorCheck(name, Status.BAD, f"{message}; the cell needs {rates}", (down, bring_up))
 
 
 def try_port(wanted: FreePort) -> int:
@@ -265,28 +270,28 @@ def port_check(wanted: FreePort, error: int) -> DoctorCheck:
     name = f"{wanted.protocol} port {port}"
     if error == 0:
         return DoctorCheck(name, Status.OK, f"can be bound on {bind}")
-    found = f"cannot be bound ({errno.errorcode.get(error, f'error {error}')})"
+    message = f"cannot be bound ({errno.errorcode.get(error, f'error {error}')})"
     remedy: tuple[str, ...] = ()
     if error == errno.EADDRINUSE:
-        found = "in use by another program"
+        message = "in use by another program"
         remedy = (f"sudo ss -l{wanted.protocol[0].lower()}np sport = :{port}   # names it",)
     elif error == errno.EADDRNOTAVAIL:
-        found = f"{bind} is not an address of this PC"
+        message = f"{bind} is not an address of this PC"
         remedy = ("ip -brief addr   # then set controller.bind in the cell file, or 0.0.0.0",)
     elif error in (errno.EACCES, errno.EPERM):
-        found = "needs a privilege"
+        message = "needs a privilege"
         setting = f"net.ipv4.ip_unprivileged_port_start={port}"
         remedy = (
             f"echo '{setting}' | sudo tee /etc/sysctl.d/90-hil.conf && sudo sysctl --system",
             "# once; hil then needs no privilege for this port",
         )
-    return DoctorCheck(name, Status.BAD, found, remedy)
+    return DoctorCheck(name, Status.BAD, message, remedy)
 
 
 def _address_of(host: str, system: System) -> str | None:
     """Return an IPv4 address, or that of a name in /etc/hosts; None otherwise. No DNS."""
     lines = [line.split("#")[0].split() for line in system.text("/etc/hosts").splitlines()]
-    for text in (host, *(words[0] for words in lines if host in words[1:])):
+    for text in (host, *(fields[0] for fields in lines if host in fields[1:])):
         try:
             return str(ipaddress.IPv4Address(text))
         except ValueError:
@@ -299,26 +304,26 @@ def route_check(host: str, system: System) -> DoctorCheck:
     name = "route to the controller"
     address = _address_of(host, system)
     if address is None:
-        found = f"{host!r} is neither an IPv4 address nor in /etc/hosts"
+        message = f"{host!r} is neither an IPv4 address nor in /etc/hosts"
         remedy = (f"# write an address in the cell file: host = 10.2.12.150, not {host}",)
-        return DoctorCheck(name, Status.BAD, found, remedy)
+        return DoctorCheck(name, Status.BAD, message, remedy)
     routes = system.ip("route", "get", address)
     if routes is None:
         return DoctorCheck(
             name, Status.UNKNOWN, "ip is not installed", ("sudo apt install iproute2",)
         )
     head, last = address.rsplit(".", 1)
-    own = f"{head}.{int(last) - 1 if int(last) > 1 else int(last) + 1}"
-    add = f"sudo ip addr add {own}/24 dev CARD   # CARD: the one cabled to the controller"
+    pc_address = f"{head}.{int(last) - 1 if int(last) > 1 else int(last) + 1}"
+    add = f"sudo ip addr add {pc_address}/24 dev CARD   # CARD: the one cabled to the controller"
     if not routes:
         return DoctorCheck(name, Status.BAD, f"none to {address}", ("ip -brief link", add))
     route = routes[0]
     if route.get("type") == "local":
-        found = f"{address} is this PC itself (a simulated controller)"
-        return DoctorCheck(name, Status.OK, found)
+        message = f"{address} is this PC itself (a simulated controller)"
+        return DoctorCheck(name, Status.OK, message)
     if "gateway" in route:
-        found = f"over gateway {route['gateway']} on {route['dev']}"
-        return DoctorCheck(name, Status.BAD, found, (add,))
+        message = f"over gateway {route['gateway']} on {route['dev']}"
+        return DoctorCheck(name, Status.BAD, message, (add,))
     device = route.get("dev", "")
     if system.text(f"/sys/class/net/{device}/carrier") == "0":
         bring_up = (f"sudo ip link set {device} up", "# check the cable")

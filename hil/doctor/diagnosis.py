@@ -202,9 +202,9 @@ class Diagnosis:
     @property
     def line(self) -> str:
         """The verdict in one or two sentences."""
-        one, two = (verdict.fit for verdict in self.cycles[:2])
-        text = "2 ms is fit; 1 ms is not." if two else "Neither 1 ms nor 2 ms is fit."
-        if one:  # and then 2 ms is
+        fit_at_1_ms, fit_at_2_ms = (verdict.fit for verdict in self.cycles[:2])
+        text = "2 ms is fit; 1 ms is not." if fit_at_2_ms else "Neither 1 ms nor 2 ms is fit."
+        if fit_at_1_ms:  # and then 2 ms is
             text = "1 ms is fit, and so is 2 ms."
         if self.fit:
             text += f" This PC can answer a controller at {self.cycle_ms} ms."

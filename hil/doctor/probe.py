@@ -141,21 +141,21 @@ def _print_json(answer: object) -> None:
     sys.stdout.flush()
 
 
-def main(words: list[str]) -> None:
+def main(arguments: list[str]) -> None:
     """Run one probe."""
-    kind, *rest = words
+    kind, *values = arguments
     if kind == "permissions":
         _print_json(asdict(enter(RealTimeSettings())))
     elif kind == "disk":
-        _print_json(disk(Path(rest[0])))
+        _print_json(disk(Path(values[0])))
     elif kind == "echo":
         echo()
     else:
         measure = {"wake-up": wake_ups, "turnaround": turnaround}[kind]
         if kind == "wake-up":
             enter(RealTimeSettings())
-        np.save(rest[2], measure(float(rest[0]), float(rest[1])))
-        _print_json({"file": rest[2]})
+        np.save(values[2], measure(float(values[0]), float(values[1])))
+        _print_json({"file": values[2]})
 
 
 if __name__ == "__main__":

@@ -68,16 +68,16 @@ def controller_inertia(
     """Return the controller's diagonal inertia over the identified one; None if not sent."""
     if cell.file.drive_train is None or estimate.undetermined:
         return None
-    found = []
+    received = []
     for source in sources:
         recording = source.recording
         few = slice(None, None, max(1, recording.n_samples // _POSTURES))
         inertia = _column_at(source, "diagonal_inertia", recording.time[few])
         if inertia is not None:
-            found.append((recording.position[few], inertia))
-    if not found:
+            received.append((recording.position[few], inertia))
+    if not received:
         return None
-    positions, inertia = map(np.concatenate, zip(*found, strict=True))
+    positions, inertia = map(np.concatenate, zip(*received, strict=True))
     return inertia_ratio(cell.model, estimate.values, positions, inertia)
 
 
@@ -115,7 +115,7 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
     driven = cell.file.drive_train is not None
     saturated = prepared.masked.get(SATURATED)
     nominal = nominal_of(cell)
-    steps = [position_steps(one.recording, one.name) for one in recorded]
+    steps = [position_steps(source.recording, source.name) for source in recorded]
     return CellContext(
         torque_limit=torque_limits(cell),
         saturated=None if saturated is None else saturated / max(prepared.rows, 1),
@@ -130,7 +130,7 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
             rotors_known=nominal.rotors_known,
             share=nominal.share,
         ),
-        jumps=tuple(jump for one in steps for jump in one.jumps),
+        jumps=tuple(jump for source_steps in steps for jump in source_steps.jumps),
         controller_inertia=controller_inertia(
             cell, estimate, (*sources.training, *sources.held_out)
         ),
@@ -138,7 +138,7 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
         assumed_delay=prepared.assumed_delay,
         corrections=(
             *_clock(prepared),
-            *_log([jump for one in steps for jump in one.logged]),
+            *_log([jump for source_steps in steps for jump in source_steps.logged]),
             *_wrapped(recorded),
             *_torque_channel(prepared),
             *_resolution(prepared),
@@ -154,7 +154,7 @@ def _condition(check: str, text: str, advice: str) -> Finding:
 def _clock(prepared: Prepared) -> Iterator[Finding]:
     retimed = [source for source in prepared.sources.training if source.retimed]
     if retimed:
-        text = f"{joined([one.name for one in retimed])}: {'; '.join(retimed[0].clock)}"
+        text = f"{joined([source.name for source in retimed])}: {'; '.join(retimed[0].clock)}"
         yield _condition("clock", text, "log the controller's time with each sample")
 
 
@@ -174,7 +174,7 @@ def _log(steps: Sequence[PositionJump]) -> Iterator[Finding]:
 
 def _wrapped(sources: Sequence[Source]) -> Iterator[Finding]:
     """Yield a finding about angles that were unwrapped."""
-    joints = {one.name: one.recording.provenance.get(UNWRAPPED) for one in sources}
+    joints = {source.name: source.recording.provenance.get(UNWRAPPED) for source in sources}
     each = [f"{names} of {name}" for name, names in joints.items() if names]
     if each:
         text = f"angles that wrap at a whole turn were unwrapped: {joined(each)}"
@@ -199,7 +199,7 @@ def _added_friction(prepared: Prepared) -> tuple[str, ...]:
 
 def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
     """Yield findings about a delay or low-pass of the torque chosen by inner prediction."""
-    chosen = [one.name for one in prepared.settings.choices if one.chosen]
+    chosen = [choice.name for choice in prepared.settings.choices if choice.chosen]
     how = prepared.settings.preprocessing
     if prepared.delays is None and how.torque_delay != prepared.settings.stated_delay:
         yield _condition(
@@ -283,8 +283,8 @@ def nominal_of(cell: Cell) -> Nominal | None:
     table = cell.file.nominal
     model = cell.model
     if table is not None:
-        known = bool(np.any(table.rotor_inertia))
-        return Nominal(cell.nominal_values(), "the nominal values", known, table.uncertainty)
+        has_rotors = bool(np.any(table.rotor_inertia))
+        return Nominal(cell.nominal_values(), "the nominal values", has_rotors, table.uncertainty)
     standard = model.nominal
     if without_masses(model):
         return None
@@ -333,9 +333,9 @@ def torque_scale(cell: Cell, recordings: Sequence[Recording], *, simulated: bool
     """
     n = len(cell.joint_names)
     drives = cell.file.drive_train
-    with_currents = any(one.motor_current is not None for one in recordings)
+    with_currents = any(recording.motor_current is not None for recording in recordings)
     of = "torque constants" if with_currents else "the scale of the recorded torques"
-    mapped = [one.provenance.get("torque_uncertainty") for one in recordings]
+    mapped = [recording.provenance.get("torque_uncertainty") for recording in recordings]
     in_cell = cell.file.robot.torque_uncertainty
     table = "[robot]"
     if drives is not None and drives.torque_uncertainty is not None:

@@ -394,16 +394,17 @@ def _robust(
         fits.append(robust_estimate(model, some, _LOSSES[name], total=total))
         return fits[-1].estimate
 
-    result, found = estimate_repetitions(model, fitted, fit), fits[-1]  # the last: all samples
+    result, robust_fit = estimate_repetitions(model, fitted, fit), fits[-1]  # the last: all samples
     warnings = [
-        f"{percentage(found.outlying[joint])} of the rows of {model.joint_names[joint]} deviate by "
+        f"{percentage(robust_fit.outlying[joint])} of the rows of {model.joint_names[joint]} "
+        f"deviate by "
         "more "
         "than four standard deviations: an unmodelled effect rather than outliers, which a robust "
         "loss would hide; use --estimator wls"
-        for joint in np.flatnonzero(found.doubtful)
+        for joint in np.flatnonzero(robust_fit.doubtful)
     ]
-    if not found.converged:
-        warnings.append(f"the reweighting did not converge in {found.iterations} iterations")
+    if not robust_fit.converged:
+        warnings.append(f"the reweighting did not converge in {robust_fit.iterations} iterations")
     return result, warnings
 
 
@@ -445,7 +446,9 @@ def _instrumental(
             if commanded is None:
                 raise IdentificationError("the recordings hold no commanded positions")
             plan = samples.motion.time - samples.origin, commanded
-            lag = next((known for one, known in plans if same_plan(one, plan)), None)
+            lag = next(
+                (known_lag for known_plan, known_lag in plans if same_plan(known_plan, plan)), None
+            )
             planned = planned_motion(samples, commanded, lag=lag)
             if lag is None:
                 plans.append((plan, planned.lag))

@@ -91,13 +91,16 @@ def _friction_data(
 ) -> tuple[Array, Array]:
     """Speed and friction torque of fitted rows, each (FRICTION_POINTS, n), padded with NaN."""
     some = [_fewer_rows(samples) for samples in fitted[:: -(-len(fitted) // _RECORDINGS)]]
-    parts = [(one.motion.velocity, friction_torque(model, values, one), one.usable) for one in some]
+    parts = [
+        (samples.motion.velocity, friction_torque(model, values, samples), samples.usable)
+        for samples in some
+    ]
     speed, torque, usable = (np.concatenate(column) for column in zip(*parts, strict=True))
-    found = np.full((2, FRICTION_POINTS, model.n_joints), np.nan)
+    points = np.full((2, FRICTION_POINTS, model.n_joints), np.nan)
     for joint in range(model.n_joints):
         rows = np.flatnonzero(usable[:, joint])
         count = min(len(rows), FRICTION_POINTS)
         if count:
             chosen = rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
-            found[:, :count, joint] = speed[chosen, joint], torque[chosen, joint]
-    return found[0], found[1]
+            points[:, :count, joint] = speed[chosen, joint], torque[chosen, joint]
+    return points[0], points[1]

@@ -69,15 +69,15 @@ def find_gains(
                 problem = "holds no motor currents"
                 remedy = "import them as motor_current"
                 raise ArchiveError(path, problem, remedy=remedy)
-            own = motor_from_joint(source.recording)
+            source_turns = motor_from_joint(source.recording)
             if cell.file.drive_train is not None:
-                own = np.asarray(cell.drive_train.motor_from_joint)
+                source_turns = np.asarray(cell.drive_train.motor_from_joint)
             if first is None:
                 first = cell
-                turns = own
+                turns = source_turns
                 model = replace(cell.model, payload=None)
             # One robot with one drive train; only the payload may differ.
-            same = cell.urdf == first.urdf and np.array_equal(turns, own)
+            same = cell.urdf == first.urdf and np.array_equal(turns, source_turns)
             if not same or cell.model.parameter_names != model.parameter_names:
                 problem = f"has another robot, friction law or drive train than {first.path}"
                 remedy = "identify the gains of each robot separately"
@@ -107,7 +107,7 @@ def _reduced(
     """Return the factor of each recording, in equal blocks of time."""
     # Repetitions of a motion begin together: errors of the model repeat at equal times.
     together, _ = aligned(tuple(source for source, *_ in recorded))
-    longest = max(one.recording.time[-1] - one.recording.time[0] for one in together)
+    longest = max(source.recording.time[-1] - source.recording.time[0] for source in together)
     block = max(FINE_BLOCK, float(longest) / MOST_BLOCKS)
     factors: list[Factor] = []
     with reporter.task("reducing recordings", len(together)) as task:

@@ -59,9 +59,9 @@ class Options:
     in_sample: bool = False  #: fit all recordings and hold out none
 
     def __post_init__(self) -> None:
-        for name, known in (("method", get_args(Method)), ("estimator", tuple(ESTIMATORS))):
-            if (value := getattr(self, name)) not in known:
-                remedy = f"use {', '.join(known)}"
+        for name, choices in (("method", get_args(Method)), ("estimator", tuple(ESTIMATORS))):
+            if (value := getattr(self, name)) not in choices:
+                remedy = f"use {', '.join(choices)}"
                 raise InputError(None, f"unknown {name} {value!r}", field=name, remedy=remedy)
 
 
@@ -78,12 +78,12 @@ def friction_from(text: str) -> Mapping[str, Any]:
     Raises:
         InputError: a term is unknown, repeats or excludes another, or has an invalid value.
     """
-    known = {kind.label.lower(): kind for kind in TERMS}
+    kinds = {kind.label.lower(): kind for kind in TERMS}
     absent = {kind.option: ABSENT.get(kind.option, False) for kind in TERMS} | {"presliding": 0.0}
     entries: dict[str, Any] = dict(absent)
     for term in text.split(","):
         name, equals, figure = term.strip().partition("=")
-        kind = known.get(name)
+        kind = kinds.get(name)
         option = kind.option if kind else "presliding"
         unknown = kind is None and name != "presliding"
         if unknown or entries[option] != absent[option]:

@@ -54,10 +54,10 @@ def weigh_by_model(
     prepared = prepare_sources(sources, options, reporter)
     cell = prepared.sources.cell
     _require_usable(cell.model.friction.has_load, "has friction that grows with the load", arm[0])
-    found = estimate_with(prepared, options, reporter)
-    prior = found.posterior.prior.gaussian.information
-    effect = found.posterior.design_effect
-    known = KnownArm.of(found.result.factor, found.result.pooled, prior, effect)
+    estimation = estimate_with(prepared, options, reporter)
+    prior = estimation.posterior.prior.gaussian.information
+    effect = estimation.posterior.design_effect
+    known_arm = KnownArm.of(estimation.result.factor, estimation.result.pooled, prior, effect)
     frame = frame or flange_of(cell.model)
     runs = _reduced(others.training, prepared, frame, reporter)
     recordings = [source.recording for source in (*prepared.sources.training, *others.training)]
@@ -66,7 +66,7 @@ def weigh_by_model(
     sides = {False: of_arm, True: paths}
     mounting = doubtful_mounting(cell.model, prepared.fitted)
     estimate, body = weighed(
-        cell.model, runs, scale, frame, sides, others.training, mounting, known
+        cell.model, runs, scale, frame, sides, others.training, mounting, known_arm
     )
     return PayloadFound(
         estimate=replace(estimate, method=f"{estimate.method}, against the model of the arm"),
@@ -78,7 +78,7 @@ def weigh_by_model(
         scale=scale,
         mounting=mounting,
         typed=((), tuple(loaded)),
-        with_currents=all(one.motor_current is not None for one in recordings),
+        with_currents=all(recording.motor_current is not None for recording in recordings),
         warnings=tuple(dict.fromkeys((*prepared.sources.warnings, *others.warnings))),
     )
 

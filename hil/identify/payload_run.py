@@ -87,7 +87,7 @@ class PayloadFound:
         Raises:
             InputError: a name is unknown.
         """
-        found = []
+        sentences = []
         for name, value in expected.items():
             if name not in NAMES:
                 problem = f"{name!r} is not a property of a payload"
@@ -96,11 +96,11 @@ class PayloadFound:
             low, high = self.estimate.intervals[NAMES.index(name)]
             if not low <= value <= high:
                 unit = _UNITS[name]
-                found.append(
+                sentences.append(
                     f"{name} {value:g} {unit} is outside the 95 % interval {low:.4g} to"
                     f" {high:.4g} {unit}"
                 )
-        return found
+        return sentences
 
     def remedy(self, expected: Mapping[str, float]) -> list[str]:
         """Return what to do if an expected value is outside its interval."""
@@ -141,15 +141,15 @@ class PayloadFound:
             for name, factor, value in zip(NAMES, factors, self.figures, strict=True)
         }
         centre = ",".join(f"{figures[name]:.4f}" for name in NAMES[1:4])
-        words = ["hil", "torque-constants", *map(str, bare)]
+        arguments = ["hil", "torque-constants", *map(str, bare)]
         for path in loaded:
-            words += ["--loaded", str(path)]
-        words += ["--mass", f"{figures['mass']:g}", f"--centre={centre}", "--frame", self.frame]
+            arguments += ["--loaded", str(path)]
+        arguments += ["--mass", f"{figures['mass']:g}", f"--centre={centre}", "--frame", self.frame]
         if self.determines(*NAMES[4:]):
             order = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
             tensor = ",".join(f"{figures[name]:.5f}" for name in order)
-            words.append(f"--inertia={tensor}")
-        return shlex.join(words)
+            arguments.append(f"--inertia={tensor}")
+        return shlex.join(arguments)
 
     def determines(self, *names: str) -> bool:
         """Return whether all figures are determined."""
@@ -283,19 +283,19 @@ def find_payload(
         IdentificationError: the recordings do not determine the mass.
     """
     sides = _sides(bare, loaded)
-    found = _sources_of(sides)
-    training = (*found[False].training, *found[True].training)
-    cell = found[False].cell.without_payload()
-    if found[False].plan is None and found[True].plan is None:
+    by_side = _sources_of(sides)
+    training = (*by_side[False].training, *by_side[True].training)
+    cell = by_side[False].cell.without_payload()
+    if by_side[False].plan is None and by_side[True].plan is None:
         training, _ = aligned(training)
-    first = training[: len(found[False].training)]
-    last = training[len(found[False].training) :]
-    sources = replace(found[False], cell=cell, training=first, held_out=first)
+    first = training[: len(by_side[False].training)]
+    last = training[len(by_side[False].training) :]
+    sources = replace(by_side[False], cell=cell, training=first, held_out=first)
     prepared = prepare_sources(sources, options, reporter)
     cell = prepared.sources.cell
     frame = frame or flange_of(cell.model)
     runs = _runs(prepared, last, frame, reporter)
-    simulated = all(side.header.only_simulated for side in found.values())
+    simulated = all(side.header.only_simulated for side in by_side.values())
     recordings = [source.recording for source in training]
     scale = torque_scale(cell, recordings, simulated=simulated)
     with reporter.task("weighing", 2) as task:
@@ -303,7 +303,7 @@ def find_payload(
         task.advance(1)
         estimate, body = weighed(cell.model, runs, scale, frame, sides, training, mounting)
         task.advance(1)
-    warnings = (*prepared.sources.warnings, *found[True].warnings)
+    warnings = (*prepared.sources.warnings, *by_side[True].warnings)
     return PayloadFound(
         estimate=estimate,
         body=body,
@@ -314,7 +314,7 @@ def find_payload(
         scale=scale,
         mounting=mounting,
         typed=(tuple(bare), tuple(loaded)),
-        with_currents=all(one.motor_current is not None for one in recordings),
+        with_currents=all(recording.motor_current is not None for recording in recordings),
         warnings=tuple(dict.fromkeys(warnings)),
     )
 
@@ -387,7 +387,7 @@ def weighed(
     sides: Mapping[bool, Sequence[Path]],
     training: Sequence[Source],
     mounting: str | None,
-    known: KnownArm | None = None,
+    arm: KnownArm | None = None,
 ) -> tuple[PayloadEstimate, Body]:
     """Return the payload of reduced recordings; `sides` are the bare and the loaded archives.
 
@@ -398,10 +398,10 @@ def weighed(
             what was found.
         IdentificationError: the recordings do not determine the mass.
     """
-    estimate = identify_payload(model, runs, scale.std, known)
+    estimate = identify_payload(model, runs, scale.std, arm)
     if estimate.body is None:
         raise _no_payload(estimate, mounting)
-    _require_agreement(model, runs, estimate, frame, sides, training, known)
+    _require_agreement(model, runs, estimate, frame, sides, training, arm)
     positions = [np.abs(source.recording.position).max(axis=0) for source in training]
     travel = np.max(positions, axis=0)
     _require_within_reach(estimate, reach(model, frame, travel), frame)
@@ -421,17 +421,18 @@ def doubtful_mounting(model: RobotModel, bare: Sequence[Samples]) -> str | None:
         cut = round(_FITTED * count)
         first.append(samples.between(0, cut))
         last.append(samples.between(cut, count))
-    found = find_gravity(model, standard_factor(model, first), standard_factor(model, last))
+    gravity = find_gravity(model, standard_factor(model, first), standard_factor(model, last))
     limits = Thresholds()
-    angle = float(np.degrees(found.angle))
-    if not (found.ratio < limits.gravity and angle > limits.gravity_angle):
+    angle = float(np.degrees(gravity.angle))
+    if not (gravity.ratio < limits.gravity and angle > limits.gravity_angle):
         return None
     declared, best = (
-        ", ".join(f"{part:.2f}" for part in vector) for vector in (found.declared, found.best)
+        ", ".join(f"{part:.2f}" for part in vector) for vector in (gravity.declared, gravity.best)
     )
     return (
         f"with gravity ({best}) m/s² in base axes, {angle:.0f}° from the declared ({declared})"
-        f" m/s², the bare recordings are predicted with {np.sqrt(found.ratio):.2f} times the error;"
+        f" m/s², the bare recordings are predicted with {np.sqrt(gravity.ratio):.2f} times the "
+        f"error;"
         " set gravity of [robot] in the cell file to the mounting of the arm and import the"
         " recordings with that cell; if it is right, check the zero positions of the joints"
     )
@@ -444,13 +445,13 @@ def _require_agreement(
     frame: str,
     sides: Mapping[bool, Sequence[Path]],
     training: Sequence[Source],
-    known: KnownArm | None,
+    arm: KnownArm | None,
 ) -> None:
     """Raise InputError if two recordings carried different bodies."""
-    found = contradiction(model, runs, estimate, known)
-    if found is None:
+    weighings = contradiction(model, runs, estimate, arm)
+    if weighings is None:
         return
-    first, second = found
+    first, second = weighings
     loaded = next(run.loaded for run in runs if run.name == second.name)
     if not loaded:
         mass, low, high = second.mass
@@ -462,13 +463,13 @@ def _require_agreement(
             f" {abs(mass):.3g} kg ({low:.3g} to {high:.3g} kg) more than {lighter.name}",
             remedy="give bare recordings with one tool, or none, on the flange",
         )
-    words = []
-    for weighing in found:
+    phrases = []
+    for weighing in weighings:
         mass, low, high = weighing.mass
         centre = ", ".join(
             f"{1e3 * part:.0f}" if np.isfinite(part) else "?" for part in weighing.centre
         )
-        words.append(
+        phrases.append(
             f"{weighing.name} weighs {mass:.4g} kg ({low:.4g} to {high:.4g} kg) with its centre at"
             f" ({centre}) mm in {frame}"
         )
@@ -476,7 +477,7 @@ def _require_agreement(
     command = ["hil", "payload", *map(str, sides[False]), "--loaded", str(other)]
     raise InputError(
         None,
-        f"the loaded recordings contradict each other: {words[0]}, {words[1]}",
+        f"the loaded recordings contradict each other: {phrases[0]}, {phrases[1]}",
         field="--loaded",
         remedy="a load that was turned, moved or changed is another payload; weigh each by itself:"
         f" {shlex.join(command)}",

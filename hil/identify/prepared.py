@@ -188,8 +188,8 @@ class _DelayChoice:
         # A controller's delay is known; the estimate replaces it only if well determined and
         # different by more than its bias in closed loop.
         far = abs(estimate.delay - estimate.assumed) > Thresholds().delay * estimate.cycle
-        known = sources.cell.file.controller is not None
-        if options.delay is not None or (known and not (far and estimate.determined)):
+        has_controller = sources.cell.file.controller is not None
+        if options.delay is not None or (has_controller and not (far and estimate.determined)):
             return unused
         suggested = (estimate.delay,) if estimate.significant else ()
         return replace(unused, suggested=suggested, notes=described)
@@ -242,7 +242,7 @@ def _questions(sources: Sources, options: Options, suggested: Sequence[float]) -
         "delay": bool(suggested),
         "bandwidth": options.bandwidth == "auto",
         "velocity": options.velocity == "auto"
-        and all(one.velocity is not None for one in recorded),
+        and all(recording.velocity is not None for recording in recorded),
         "presliding": options.friction == "auto",
         "rows": options.standstill == "auto",
         # A cell file with a drive train states the friction terms.
@@ -290,14 +290,16 @@ def known_parameters(cell: Cell) -> Known:
         return {}
     model = cell.model
     share = table.uncertainty or FRICTION_SHARE
-    known = {f"I{j}m": (value, share * value) for j, value in enumerate(table.rotor_inertia, 1)}
+    parameters = {
+        f"I{j}m": (value, share * value) for j, value in enumerate(table.rotor_inertia, 1)
+    }
     for term in model.friction.terms:
         values = getattr(table, term.term.option, None)
         if values and not term.motor:
             value = values[term.owner]
-            known[term.name] = value, FRICTION_SHARE * abs(value)
+            parameters[term.name] = value, FRICTION_SHARE * abs(value)
     names = {*model.layout.names, *model.friction.names}
-    return {name: pair for name, pair in known.items() if pair[0] != 0.0 and name in names}
+    return {name: pair for name, pair in parameters.items() if pair[0] != 0.0 and name in names}
 
 
 def _chosen(
@@ -371,7 +373,7 @@ def _delays(
     mean = averaged_source(source, _DELAY_RATE)
     with reporter.task("estimating the delay", 1) as task:
         try:
-            found = estimate_delay(
+            estimate = estimate_delay(
                 mean.recording,
                 sources.cell.model,
                 noise_variance=_array(averaged_noise(stated, source, mean).noise_variance),
@@ -382,7 +384,7 @@ def _delays(
                 raise
             return None
         task.advance(1)
-    return replace(found, cycle=float(np.median(np.diff(source.recording.time))))
+    return replace(estimate, cycle=float(np.median(np.diff(source.recording.time))))
 
 
 def _described(estimate: DelayEstimate) -> tuple[str, ...]:
@@ -490,7 +492,7 @@ def prepared_with(sources: Sources, settings: Settings, reporter: Reporter) -> P
     for mask in (samples.mask for samples in fitted if samples.mask is not None):
         for reason, counts in mask.counts.items():
             masked[reason] = masked.get(reason, 0) + counts
-    rows = sum(len(one.torque) for one in fitted)
+    rows = sum(len(samples.torque) for samples in fitted)
     return Prepared(
         sources=sources,
         fitted=tuple(fitted),
@@ -526,7 +528,7 @@ def motor_from_joint(recording: Recording) -> Array:
 
 def _require_torques(sources: Sources) -> None:
     """Raise ArchiveError if a recording has currents only."""
-    if any(one.recording.torque is None for one in (*sources.training, *sources.held_out)):
+    if any(source.recording.torque is None for source in (*sources.training, *sources.held_out)):
         raise ArchiveError(
             None,
             "the recordings contain no torques",
@@ -544,7 +546,9 @@ def _require_slow_rows(stated: RobotModel, fitted: Sequence[Samples]) -> None:
     """
     sliding = [samples.moving() for samples in fitted]
     for joint, law in enumerate(stated.friction.laws):
-        speeds = [np.abs(one.motion.velocity[one.usable[:, joint], joint]) for one in sliding]
+        speeds = [
+            np.abs(samples.motion.velocity[samples.usable[:, joint], joint]) for samples in sliding
+        ]
         slow = np.concatenate(speeds) < 2.0 * (law.stribeck or math.inf)
         if slow.size and slow.mean() < 0.01:
             problem = (

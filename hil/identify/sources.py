@@ -89,7 +89,7 @@ def cell_of(archive: Archive) -> Cell:
     return Cell.from_texts(archive.text("cell.toml"), archive.text("robot.urdf"), archive.path)
 
 
-def arm_differences(one: Cell, other: Cell) -> list[str]:
+def arm_differences(cell: Cell, other: Cell) -> list[str]:
     """Return the parts in which two cells describe different arms.
 
     Payloads and how well torques are known aside.
@@ -102,7 +102,7 @@ def arm_differences(one: Cell, other: Cell) -> list[str]:
             "[drive_train]": cell.file.drive_train
             and cell.file.drive_train.model_copy(update=unstated),
         }
-        for cell in (one, other)
+        for cell in (cell, other)
     )
     first, second = parts
     return [name for name in first if first[name] != second[name]]
@@ -143,9 +143,11 @@ def gather_sources(
         )
     cell = cell_of(fitted[0])
     _require_one_cell(archives)
-    rest = [source_of(archive, cell, to_fit=False).recording for archive in by_use["standstill"]]
+    standstills = [
+        source_of(archive, cell, to_fit=False).recording for archive in by_use["standstill"]
+    ]
     sources = [(archive, source_of(archive, cell)) for archive in fitted]
-    every = all_fitted(cell, sources, rest[0] if rest else None)
+    every = all_fitted(cell, sources, standstills[0] if standstills else None)
     held_out = tuple(source_of(archive, cell) for archive in predicted)
     warnings = (
         *known_warnings(cell, fitted[0]),
@@ -212,15 +214,15 @@ def _with_held_out(every: Sources, held_out: tuple[Source, ...], split: float) -
 
 
 def all_fitted(
-    cell: Cell, fitted: Sequence[tuple[Archive, Source]], rest: Recording | None
+    cell: Cell, fitted: Sequence[tuple[Archive, Source]], standstill: Recording | None
 ) -> Sources:
-    """Return sources without held-out recordings; `rest` is a recording at standstill.
+    """Return sources without held-out recordings; `standstill` is a recording at standstill.
 
     Raises:
         ArchiveError: the plan in the first archive is not valid.
     """
-    archives, found = zip(*fitted, strict=True)
-    training = tuple(found)
+    archives, fitted_sources = zip(*fitted, strict=True)
+    training = tuple(fitted_sources)
     plan = None
     same_motion = False
     if "plan.json" in archives[0].attachments:
@@ -229,9 +231,13 @@ def all_fitted(
     else:
         training, same_motion = aligned(training)
     noise = torque = None
-    if rest is not None:
-        noise = position_noise(cell, rest)
-        torque = None if rest.torque is None else standstill_variance(rest.time, rest.torque)
+    if standstill is not None:
+        noise = position_noise(cell, standstill)
+        torque = (
+            None
+            if standstill.torque is None
+            else standstill_variance(standstill.time, standstill.torque)
+        )
     return Sources(
         cell=cell,
         header=archives[0].header,
@@ -254,7 +260,7 @@ def aligned(sources: tuple[Source, ...]) -> tuple[tuple[Source, ...], bool]:
         return sources, False
     both = list(zip(sources, offsets, strict=True))
     latest = max(source.recording.time[0] - offset for source, offset in both)
-    return tuple(replace(one, origin=float(latest + offset)) for one, offset in both), True
+    return tuple(replace(source, origin=float(latest + offset)) for source, offset in both), True
 
 
 def archives_in(paths: Sequence[Path]) -> Iterator[Path]:
@@ -424,17 +430,17 @@ def _split(whole: Source, share: float) -> tuple[tuple[Source, ...], tuple[Sourc
     recording = whole.recording
     count = recording.n_samples
     cut = round(share * count)
-    known = (np.arange(count) < cut)[:, None]
+    before_cut = (np.arange(count) < cut)[:, None]
     torque, current = (
-        None if values is None else np.where(known, values, 0.0)
+        None if values is None else np.where(before_cut, values, 0.0)
         for values in (recording.torque, recording.motor_current)
     )
     context = replace(recording, torque=torque, motor_current=current)
 
-    def part(words: str, context: Recording, start: int, stop: int) -> Source:
+    def part(part_name: str, context: Recording, start: int, stop: int) -> Source:
         return replace(
             whole,
-            name=f"{whole.name} ({words})",
+            name=f"{whole.name} ({part_name})",
             recording=recording.between(start, stop),
             origin=float(recording.time[min(start, count - 1)]),
             context=(context, start),
@@ -444,17 +450,21 @@ def _split(whole: Source, share: float) -> tuple[tuple[Source, ...], tuple[Sourc
     return (first,), (part("last part", recording, cut, count),)
 
 
-def position_noise(cell: Cell, rest: Recording) -> Array:
+def position_noise(cell: Cell, standstill: Recording) -> Array:
     """Return the variance of positions at standstill (n,), at least that of their resolution."""
-    measured = standstill_variance(rest.time, rest.position)
+    measured = standstill_variance(standstill.time, standstill.position)
     if cell.file.drive_train is None:
         # Smallest difference between two positions of a joint, 0 if all are equal.
-        steps = [np.diff(np.unique(channel)).min(initial=np.inf) for channel in rest.position.T]
+        steps = [
+            np.diff(np.unique(channel)).min(initial=np.inf) for channel in standstill.position.T
+        ]
         least = np.where(np.isfinite(steps), steps, 0.0)
         return np.asarray(np.maximum(measured, least**2 / 12.0))
     drives = cell.drive_train
     count = 1.0 / cell.drive_table.encoder_counts_per_revolution
-    rounding = 2.0 * FLOAT32_STEP * np.abs(drives.motor_revolutions(rest.position)).max(axis=0)
+    rounding = (
+        2.0 * FLOAT32_STEP * np.abs(drives.motor_revolutions(standstill.position)).max(axis=0)
+    )
     joint_step = np.abs(drives.joint_from_motor) * (2.0 * np.pi * np.maximum(count, rounding))
     resolution = (joint_step**2).sum(axis=1) / 12.0
     return np.asarray(np.maximum(measured, resolution))

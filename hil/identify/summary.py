@@ -153,9 +153,9 @@ def true_values(cell: Cell, header: ArchiveHeader) -> Array | None:
     from hil.simulation import planted_values  # only for a simulated arm
 
     values = planted_values(cell)
-    for one in model.elements.identified:
-        if isinstance(one.element, TorqueRipple):
-            values[model.element_part][one.part] = np.nan
+    for ripple in model.elements.identified:
+        if isinstance(ripple.element, TorqueRipple):
+            values[model.element_part][ripple.part] = np.nan
     return values
 
 
@@ -282,14 +282,14 @@ def _fitted(prepared: Prepared, values: Array) -> results.FittedResult:
 
 
 def _delays(prepared: Prepared) -> results.DelaysResult | None:
-    found = prepared.delays
+    estimate = prepared.delays
     applied = prepared.assumed_delay
     every = np.ones(len(prepared.sources.cell.joint_names))
-    if found is not None:
+    if estimate is not None:
         # A delay with a wide interval is applied, too, where it predicts better.
-        known = 1.0 if found.determined or found.delay == applied else np.nan
-        delay = known * found.delay
-        interval = known * found.half_interval
+        mask = 1.0 if estimate.determined or estimate.delay == applied else np.nan
+        delay = mask * estimate.delay
+        interval = mask * estimate.half_interval
     elif applied != prepared.settings.stated_delay:
         # The lag of a low-pass that predicts as well as the low-pass.
         delay = applied
@@ -313,9 +313,11 @@ def _coverage(values: Array, std: Array, truth: Array) -> results.CoverageResult
 def _judgement(joint_names: Sequence[str], validation: Validation) -> results.JudgementResult:
     """Return the verdict with the numbers behind it."""
 
-    def profile(one: Profile) -> list[results.ProfileResult]:
-        bins = one.bins
-        return results.ProfileResult.rows(centre=one.centres, mean=bins.mean, std=bins.std)
+    def profile(error_profile: Profile) -> list[results.ProfileResult]:
+        bins = error_profile.bins
+        return results.ProfileResult.rows(
+            centre=error_profile.centres, mean=bins.mean, std=bins.std
+        )
 
     evidence = validation.evidence
     verdict = validation.verdict

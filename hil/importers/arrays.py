@@ -50,10 +50,10 @@ class ArrayFile:
         self.path = path
         with _readable(path):
             open_file(path).close()  # raises for a pipe, which would block
-            found = READERS[path.suffix.lower()](path)
+            arrays = READERS[path.suffix.lower()](path)
         self._stored = {
             name: array
-            for name, array in found.items()
+            for name, array in arrays.items()
             if len(array.shape) in (1, 2) and math.prod(array.shape) > 0
         }
         if not self._stored:
@@ -89,12 +89,12 @@ class ArrayFile:
         Raises:
             SourceError: no such array or column, or arrays of different lengths.
         """
-        found = [self._column(one, field, array, rows=rows).astype(np.float64) for one in columns]
-        if len({len(one) for one in found}) > 1:
-            lengths = ", ".join(f"{c} {len(one)}" for c, one in zip(columns, found, strict=True))
+        parts = [self._column(name, field, array, rows=rows).astype(np.float64) for name in columns]
+        if len({len(part) for part in parts}) > 1:
+            lengths = ", ".join(f"{c} {len(part)}" for c, part in zip(columns, parts, strict=True))
             problem = f"its arrays differ in length: {lengths}"
             raise SourceError(self.path, problem, field=field, remedy="cut them")
-        return np.column_stack(found)
+        return np.column_stack(parts)
 
     def matrix(self, name: str | None, field: str) -> Array:
         """Return an array as a matrix; without a name the only one there is, else SourceError."""
@@ -118,28 +118,28 @@ class ArrayFile:
             kind = "datetime64[ns]" if times.dtype.kind == "M" else "timedelta64[ns]"
             stamps = times.astype(kind).astype(np.int64)
             missing = np.isnat(times)
-            return [None if no else int(one) for one, no in zip(stamps, missing, strict=True)]
+            return [None if no else int(stamp) for stamp, no in zip(stamps, missing, strict=True)]
         if times.dtype.kind in "iu":
-            return [int(one) * factor for one in times.tolist()]
+            return [int(time) * factor for time in times.tolist()]
         values = times.astype(np.float64)
-        known = np.isfinite(values)
+        finite = np.isfinite(values)
         # Separately, since an epoch in nanoseconds has more digits than a float.
-        whole = np.floor(np.where(known, values, 0.0))
-        part = np.rint((np.where(known, values, 0.0) - whole) * float(factor))
-        found = zip(known, whole, part, strict=True)
-        return [int(w) * factor + int(p) if there else None for there, w, p in found]
+        whole = np.floor(np.where(finite, values, 0.0))
+        part = np.rint((np.where(finite, values, 0.0) - whole) * float(factor))
+        triples = zip(finite, whole, part, strict=True)
+        return [int(w) * factor + int(p) if there else None for there, w, p in triples]
 
     def _column(
         self, column: Column, field: str, array: str | None, *, rows: bool = False
     ) -> NDArray[Any]:
         """Return one column or row (m,), in its own type."""
         if array is None and isinstance(column, str):
-            found = self._array(column, field)
-            if found.ndim == 2 and 1 not in found.shape:
-                problem = f"array {column!r} has the shape {found.shape}"
+            vector = self._array(column, field)
+            if vector.ndim == 2 and 1 not in vector.shape:
+                problem = f"array {column!r} has the shape {vector.shape}"
                 remedy = "name an array of one dimension, or a column of it by index"
                 raise SourceError(self.path, problem, field=field, remedy=remedy)
-            return found.ravel()
+            return vector.ravel()
         matrix = self._matrix(array, field)
         matrix = matrix.T if rows else matrix
         if not isinstance(column, int) or column >= matrix.shape[1]:
@@ -245,10 +245,10 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
     Raises:
         SourceError: the file cannot be read, or has no topic that can be read this way.
     """
-    known, messages = mcap_messages.read(path, lambda _, topic: _is_readable(topic))
+    topics, messages = mcap_messages.read(path, lambda _, topic: _is_readable(topic))
     refused = {
         name: f"{t} is neither ROS 2 nor JSON nor Protobuf"
-        for name, t in known.items()
+        for name, t in topics.items()
         if not _is_readable(t)
     }
     by_topic: dict[str, list[tuple[int, bytes]]] = {}
@@ -256,7 +256,7 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
         by_topic.setdefault(name, []).append((stamp, data))
     arrays: dict[str, NDArray[Any]] = {}
     for name, received in by_topic.items():
-        topic = known[name]
+        topic = topics[name]
         try:
             columns = _columns(topic, received)
         except MessageError as error:

@@ -164,10 +164,12 @@ class _Part(ABC):
 
     def decoded(self, topic: str, data: bytes) -> Any:
         """Return a message; MessageError if it cannot be decoded."""
-        found = self.topics[topic]
-        definition = found.definition.decode(errors="replace")
+        described = self.topics[topic]
+        definition = described.definition.decode(errors="replace")
         return decoded(
-            typestore_of(found.kind, definition, found.schema_encoding), found.kind, data
+            typestore_of(described.kind, definition, described.schema_encoding),
+            described.kind,
+            data,
         )
 
 
@@ -202,7 +204,9 @@ class _ReaderPart(_Part):
         }
 
     def messages(self, topic: str) -> Iterator[tuple[int, bytes]]:
-        connections = [one for one in self._reader.connections if one.topic == topic]
+        connections = [
+            connection for connection in self._reader.connections if connection.topic == topic
+        ]
         try:
             for number, (_, stamp, data) in enumerate(self._reader.messages(connections)):
                 if not isinstance(stamp, int) or not isinstance(data, bytes | memoryview):

@@ -202,8 +202,8 @@ class ColumnMap(_Table):
 
     def quantities(self) -> dict[str, Quantity]:
         """Return the quantities in the log, by name."""
-        found = {name: getattr(self, name) for name in UNITS}
-        return {name: quantity for name, quantity in found.items() if quantity is not None}
+        by_name = {name: getattr(self, name) for name in UNITS}
+        return {name: quantity for name, quantity in by_name.items() if quantity is not None}
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> ColumnMap:

@@ -152,15 +152,17 @@ def _columns(path: Path, header: list[str]) -> dict[str, tuple[int, float]]:
     columns = {}
     for name in _NAMES:
         other, unit = _OTHER.get(name, (name, 1.0))
-        found = [spelling for spelling in dict.fromkeys((name, other)) if spelling in header]
-        if len(found) != 1:
-            problem = f"has columns {' and '.join(found)}" if found else f"has no column {name}"
+        spellings = [spelling for spelling in dict.fromkeys((name, other)) if spelling in header]
+        if len(spellings) != 1:
+            problem = (
+                f"has columns {' and '.join(spellings)}" if spellings else f"has no column {name}"
+            )
             remedy = (
                 f"its columns are {','.join(_NAMES)}; lengths in m (a_mm, d_mm: in mm), angles in "
                 "rad (alpha_deg, theta_offset_deg: in degrees)"
             )
             raise InputError(path, problem, field="header", remedy=remedy)
-        columns[name] = header.index(found[0]), 1.0 if found[0] == name else unit
+        columns[name] = header.index(spellings[0]), 1.0 if spellings[0] == name else unit
     return columns
 
 

@@ -32,14 +32,14 @@ def trees(
     """
     try:
         if encoding == "json":
-            found = [json.loads(message) for message in messages]
+            decoded = [json.loads(message) for message in messages]
         else:
-            found = _of_protobuf(kind, definition, messages)
+            decoded = _of_protobuf(kind, definition, messages)
     except Exception as error:  # protobuf does not document what it raises
         raise MessageError(f"cannot be decoded ({error or type(error).__name__})") from error
-    if not all(isinstance(tree, dict) for tree in found):
+    if not all(isinstance(tree, dict) for tree in decoded):
         raise MessageError("are no objects with named fields")
-    return found
+    return decoded
 
 
 def _of_protobuf(kind: str, definition: bytes, messages: Sequence[bytes]) -> list[Any]:
@@ -78,9 +78,9 @@ def columns_of_trees(
     if any(row.keys() != rows[0].keys() for row in rows):
         raise MessageError("have other fields or names from message to message")
     stamps = [_stamp(message) for message in messages]
-    known = all(stamp is not None for stamp in stamps) and any(stamps)
+    are_stamped = all(stamp is not None for stamp in stamps) and any(stamps)
     arrays: dict[str, NDArray[Any]] = {
-        "stamp": np.array(stamps if known else received, dtype=np.int64)
+        "stamp": np.array(stamps if are_stamped else received, dtype=np.int64)
     }
     for name in names:
         try:

@@ -277,9 +277,9 @@ def against_position(time: Array, position: Array, velocity: Array) -> tuple[Arr
     """
     steps = np.diff(time)[:, None]
     usual = np.median(steps[steps > 0.0]) if (steps > 0.0).any() else 0.0  # stamps may repeat
-    known = steps <= 5.0 * usual  # the velocity in a gap is unknown
-    moved = np.where(known, 0.5 * (velocity[1:] + velocity[:-1]) * steps, 0.0).cumsum(axis=0)
-    gone = np.where(known, np.diff(position, axis=0), 0.0).cumsum(axis=0)
+    without_gap = steps <= 5.0 * usual  # the velocity in a gap is unknown
+    moved = np.where(without_gap, 0.5 * (velocity[1:] + velocity[:-1]) * steps, 0.0).cumsum(axis=0)
+    gone = np.where(without_gap, np.diff(position, axis=0), 0.0).cumsum(axis=0)
     moved = moved - moved.mean(axis=0)
     gone = gone - gone.mean(axis=0)
     product = gone.T @ moved

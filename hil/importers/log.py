@@ -313,7 +313,7 @@ class _Log:
         files = self._file_per_joint(names, f"{name}.files")
         columns = quantity.columns
         field = f"{name}.columns"
-        found = []
+        columns_of_files = []
         if isinstance(columns, str):
             columns = tuple(columns.replace("{}", str(k)) for k in range(1, len(files) + 1))
         elif columns is not None and len(columns) == 1:
@@ -329,28 +329,28 @@ class _Log:
                 problem = f"has the shape {values.shape}, expected one column"
                 remedy = "name one of each file, by name or by index from 0: columns = [1]"
                 raise SourceError(file.path, problem, field=field, remedy=remedy)
-            found.append(values.ravel())
+            columns_of_files.append(values.ravel())
         places = [os.path.relpath(file.path, self._folder) for file in files]
-        lengths = dict(zip(places, found, strict=True))
+        lengths = dict(zip(places, columns_of_files, strict=True))
         _check_lengths(lengths, self.path, "files", f"{name}.files")
         units = [
             file.unit(0 if columns is None else columns[joint]) for joint, file in enumerate(files)
         ]
-        return np.column_stack(found), units
+        return np.column_stack(columns_of_files), units
 
     def _file_per_joint(self, names: str | Sequence[str], field: str) -> list[Table | ArrayFile]:
         if isinstance(names, str):
             numbers = range(len(self.joints) + _MORE)
             possible = [names.replace("{}", str(number)) for number in [*numbers, *self.joints]]
-            found = [name for name in possible if (self._folder / name).is_file()]
-            names = self._numbered(names, found, "files", field, found.__contains__)
+            file_names = [name for name in possible if (self._folder / name).is_file()]
+            names = self._numbered(names, file_names, "files", field, file_names.__contains__)
         self._check_count(names, field)
         return [self._file(name, field) for name in names]
 
     def _numbered(
         self,
         pattern: str,
-        known: Collection[str],
+        available: Collection[str],
         what: Literal["columns", "files"],
         field: str,
         has: Callable[[str], bool],
@@ -362,14 +362,14 @@ class _Log:
         count = len(self.joints)
         names = [pattern.replace("{}", str(number)) for number in range(count + _MORE)]
         first = 0 if has(names[0]) and not has(names[count]) else 1
-        found = names[first : first + count]
-        missing = [name for name in found if not has(name)]
+        chosen = names[first : first + count]
+        missing = [name for name in chosen if not has(name)]
         if missing:
-            joint = found.index(missing[0])
+            joint = chosen.index(missing[0])
             raise SourceError(
                 self.path,
                 f"there is no {what[:-1]} {missing[0]!r} for {self.joints[joint]}, joint "
-                f"{joint + 1} of {count}; there are {', '.join(known) or 'none'}",
+                f"{joint + 1} of {count}; there are {', '.join(available) or 'none'}",
                 field=field,
                 remedy=f"{NOT_RECORDED}, name the joints of the log in joints, or list its {what}",
             )
@@ -382,7 +382,7 @@ class _Log:
                 field=field,
                 remedy=f"name the URDF's joint of each in joints, or list {count} {what}",
             )
-        return found
+        return chosen
 
     def _upright(self, matrix: Array, quantity: Quantity, path: Path, name: str) -> Array:
         """Return a whole matrix with time along its rows."""

@@ -182,11 +182,11 @@ def _held(
         )
         raise SourceError(path, problem, field="--lock-others", remedy=remedy)
     limits = urdf_limits(urdf, names)
-    rest = {
+    unrecorded = {
         name: 0.0 if low <= 0.0 <= high else 0.5 * (low + high)
         for name, low, high in zip(names, limits.lower.tolist(), limits.upper.tolist(), strict=True)
     }
-    return {name: at for name, at in rest.items() if name not in recorded} | {**locked}
+    return {name: at for name, at in unrecorded.items() if name not in recorded} | {**locked}
 
 
 def _writable(name: str) -> str:

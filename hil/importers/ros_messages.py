@@ -33,9 +33,9 @@ def typestore_of(kind: str, definition: str, encoding: str) -> Typestore:
     Raises:
         MessageError: the definition is invalid.
     """
-    known = get_typestore(Stores.ROS2_HUMBLE)
-    if not definition.strip() and kind in known.types:
-        return known
+    ros2_store = get_typestore(Stores.ROS2_HUMBLE)
+    if not definition.strip() and kind in ros2_store.types:
+        return ros2_store
     try:
         read = get_types_from_idl(definition) if "idl" in encoding else _of_msg(definition, kind)
         for _, described in read.values():
@@ -43,7 +43,7 @@ def typestore_of(kind: str, definition: str, encoding: str) -> Typestore:
                 _check_size(node)
         # Names of the definition go before those of ROS 2, which may be of another version.
         store = Typestore(max_sequence_length=_LONGEST)
-        store.register({**known.fielddefs, **read})
+        store.register({**ros2_store.fielddefs, **read})
     except Exception as error:  # rosbags does not document what it raises
         raise MessageError(
             f"its definition is invalid ({error or type(error).__name__})"
@@ -103,11 +103,13 @@ def columns_of(stamps: Sequence[int], messages: Sequence[Any]) -> dict[str, NDAr
         except ValueError:  # of different lengths
             raise MessageError(f"its messages differ in lengths of arrays: {path}") from None
     columns = {path: column for path, column in columns.items() if column.size}
-    seconds, rest = (columns.pop(f"header/stamp/{part}", None) for part in ("sec", "nanosec"))
+    seconds, nanoseconds = (
+        columns.pop(f"header/stamp/{part}", None) for part in ("sec", "nanosec")
+    )
     columns.pop(f"header/{_ROS1_HEADER}", None)
     stamp = np.array(stamps, np.int64)
-    if seconds is not None and rest is not None and (seconds.any() or rest.any()):
-        stamp = seconds.astype(np.int64) * 10**9 + rest
+    if seconds is not None and nanoseconds is not None and (seconds.any() or nanoseconds.any()):
+        stamp = seconds.astype(np.int64) * 10**9 + nanoseconds
     return {"stamp": stamp, **columns}
 
 
@@ -165,8 +167,8 @@ class _Element:
 def _check_alike(lists: Sequence[list[Any]], path: str) -> None:
     """Raise MessageError where lists of texts, or the lengths of lists, differ."""
     first = lists[0]
-    if any(len(one) != len(first) for one in lists):
+    if any(len(values) != len(first) for values in lists):
         raise MessageError(f"its messages differ in lengths of arrays: {path}")
     texts = bool(first) and isinstance(first[0], str)
-    if texts and any(one != first for one in lists):
+    if texts and any(values != first for values in lists):
         raise MessageError(f"its messages differ in {path}: {', '.join(first)}")

@@ -185,8 +185,10 @@ class _States:
         names = tuple(content.name)
         if names not in self._orders:
             self._recorded.update(dict.fromkeys(names))
-            known = [self._renamed.get(name, name) for name in names]
-            self._orders[names] = [known.index(joint) for joint in self._joints if joint in known]
+            joint_names = [self._renamed.get(name, name) for name in names]
+            self._orders[names] = [
+                joint_names.index(joint) for joint in self._joints if joint in joint_names
+            ]
         order = self._orders[names]
         if not order:
             return  # such as a gripper on the same topic
@@ -370,7 +372,7 @@ class _States:
         missing = [
             f"{name} of {', '.join(part.joints)}"
             for part, samples in zip(parts, joined, strict=True)
-            for name in {name for one in joined for name in one.values} - set(samples.values)
+            for name in {name for other in joined for name in other.values} - set(samples.values)
         ]
         if missing:
             problem = f"{missing[0]} was not recorded, that of the other joints was"
@@ -388,7 +390,12 @@ class _States:
         how = "with the same stamps" if exact else "interpolated to the stamps of the first"
         self.notes.append(f"merged from messages of their own, {how}: {kinds}")
         values = {
-            name: np.column_stack([_at(stamp, one.stamp, one.values[name]) for one in joined])
+            name: np.column_stack(
+                [
+                    _at(stamp, part_samples.stamp, part_samples.values[name])
+                    for part_samples in joined
+                ]
+            )
             for name in first.values
         }
         return _Joined(stamp, {name: array[:, order] for name, array in values.items()})
@@ -407,9 +414,9 @@ class _States:
         return True
 
 
-def _at(stamp: NDArray[np.int64], known: NDArray[np.int64], values: Array) -> Array:
+def _at(stamp: NDArray[np.int64], stamps: NDArray[np.int64], values: Array) -> Array:
     """Return values (k, n) known at stamps (k,), at other stamps: linear, exact where equal."""
-    origin = known[0]
+    origin = stamps[0]
     at = (stamp - origin).astype(np.float64)
-    places = (known - origin).astype(np.float64)
+    places = (stamps - origin).astype(np.float64)
     return np.column_stack([np.interp(at, places, column) for column in values.T])

@@ -73,13 +73,13 @@ def _is_suspect(archive: Path) -> bool:
 
 
 def _again(
-    imported: ImportedRecording, source: Path, robot_of: RobotOf, found: Look, use: Use
+    imported: ImportedRecording, source: Path, robot_of: RobotOf, look: Look, use: Use
 ) -> ImportedRecording:
     """Import a log again with a map and the gravity that were found."""
-    assert found.map_text is not None
+    assert look.map_text is not None
     column_map = imported.archive.with_suffix(".found.toml")
-    column_map.write_text(found.map_text, encoding="utf-8")
-    gravity = _gravity(found)
+    column_map.write_text(look.map_text, encoding="utf-8")
+    gravity = _gravity(look)
 
     def robot(recorded: object) -> Robot:
         described = robot_of(recorded)  # type: ignore[arg-type]
@@ -92,16 +92,16 @@ def _again(
     aspects = ("order", "signs", "angle unit", "zero", "gravity", "mounting")
     lines = [
         f"{row.aspect}: {row.reading}, concluded; {row.reason}"
-        for row in found.rows
+        for row in look.rows
         if row.aspect in aspects and row.certainty == "sure" and not row.reason.startswith("next")
     ]
     lines = [line for line in lines if "friction takes energy" not in line]
     return replace(again, lines=(*imported.lines, *lines))
 
 
-def _gravity(found: Look) -> tuple[float, ...] | None:
-    words = " ".join(found.options).split()
-    return tuple(float(word) for word in words[1:4]) if words else None
+def _gravity(look: Look) -> tuple[float, ...] | None:
+    option_words = " ".join(look.options).split()
+    return tuple(float(word) for word in option_words[1:4]) if option_words else None
 
 
 def _undecided(source: Path, choices: tuple[Choice, ...]) -> SourceError:

@@ -97,8 +97,8 @@ class Finding:
     def common(self) -> float | None:
         """Factor between measured and expected torque of the whole arm; None if unknown."""
         if self.scale is not None and np.isfinite(self.scale.scale).any():
-            known = np.abs(self.scale.scale[np.isfinite(self.scale.scale)])
-            return float(np.median(known[known > 0.0])) if (known > 0.0).any() else None
+            scales = np.abs(self.scale.scale[np.isfinite(self.scale.scale)])
+            return float(np.median(scales[scales > 0.0])) if (scales > 0.0).any() else None
         return _by_size(self.readings)
 
     @property
@@ -111,7 +111,7 @@ class Finding:
 
     def rows(self) -> list[Row]:
         """Return the rows of the table."""
-        found = [
+        rows = [
             self._order(),
             self._signs(),
             self._unit(),
@@ -123,12 +123,12 @@ class Finding:
         ]
         error = self.readings.score.overall
         if error > EXPLAINED:
-            found = [_no_longer_sure(row, error) for row in found]
-        found.append(
+            rows = [_no_longer_sure(row, error) for row in rows]
+        rows.append(
             Row("as read", f"torque predicted to {100.0 * error:.2g} % from other parts", "sure",
                 "with free parameters, before a fit of the friction law")
         )  # fmt: skip
-        return found
+        return rows
 
     def steps(self, *meanings: Meaning) -> list[Step]:
         """Return the changes of some meanings."""
@@ -297,16 +297,16 @@ class Finding:
 
     def questions(self) -> tuple[tuple[Choice, ...], ...]:
         """Return the readings that fit alike."""
-        found = []
+        choices = []
         for step in self.readings.steps:
             if not step.alike:
                 continue
             pairs = [(step.change, step.error), *step.alike]
-            found.append(tuple(self._choice(step, change, error) for change, error in pairs[:2]))
+            choices.append(tuple(self._choice(step, change, error) for change, error in pairs[:2]))
         small = self.common is not None and self.common < 1.0
         if self.size_is_off and not self._is_thousand and small:
-            found.append(self._sides())
-        return tuple(found)
+            choices.append(self._sides())
+        return tuple(choices)
 
     def _choice(self, step: Step, change: Change, error: float) -> Choice:
         others = [change if other is step else other.change for other in self.readings.steps]
@@ -447,15 +447,15 @@ def determined(readings: Readings) -> tuple[Group, ...]:
     joints = _joints_of(readings)
     for joint, name in enumerate(model.joint_names):
         for quantity in ("body", "friction"):
-            own = [
+            ratios = [
                 float(ratio[k])
                 for k, (owner, kind) in enumerate(joints)
                 if owner == joint and kind == quantity
             ]
-            if own:
-                good = sum(value < LEARNED for value in own)
-                weak = sum(LEARNED <= value < _WEAK for value in own)
-                groups.append(Group(name, quantity, good, weak, len(own) - good - weak))
+            if ratios:
+                good = sum(value < LEARNED for value in ratios)
+                weak = sum(LEARNED <= value < _WEAK for value in ratios)
+                groups.append(Group(name, quantity, good, weak, len(ratios) - good - weak))
     return tuple(groups)
 
 
@@ -463,8 +463,8 @@ def _joints_of(readings: Readings) -> list[tuple[int, str]]:
     """Return the joint of each parameter, and whether it is of its body or its friction."""
     model = readings.model
     width = model.layout.width
-    found = [(min(int(pivot) // width, model.n_joints - 1), "body") for pivot in model.base.pivots]
+    owners = [(min(int(pivot) // width, model.n_joints - 1), "body") for pivot in model.base.pivots]
     assert width >= len(LINK_SYMBOLS)
-    found += [(term.owner, "friction") for term in model.friction.terms]
-    found += [(-1, "element")] * (model.n_parameters - len(found))
-    return found
+    owners += [(term.owner, "friction") for term in model.friction.terms]
+    owners += [(-1, "element")] * (model.n_parameters - len(owners))
+    return owners

@@ -36,15 +36,15 @@ def rows(
     given: object,
 ) -> list[Row]:
     """Return the rows; `lines` say what the names of channels mean, `notes` what was concluded."""
-    found = [_time(recording, lines, notes)]
-    found += [_quantity(line, notes) for line in lines if not line.startswith(("not used", "t:"))]
-    found = [row for row in found if row.aspect != "time" or row is found[0]]
+    table = [_time(recording, lines, notes)]
+    table += [_quantity(line, notes) for line in lines if not line.startswith(("not used", "t:"))]
+    table = [row for row in table if row.aspect != "time" or row is table[0]]
     if recording.velocity is not None:
-        found.append(_velocity(recording))
-    found += [_rests(recording), _wraps(recording), _measured(recording, lines)]
+        table.append(_velocity(recording))
+    table += [_rests(recording), _wraps(recording), _measured(recording, lines)]
     if given is not None:
-        found.append(_range(recording, cell))
-    return found
+        table.append(_range(recording, cell))
+    return table
 
 
 def _time(recording: Recording, lines: Sequence[str], notes: Sequence[str]) -> Row:
@@ -69,10 +69,10 @@ def _time(recording: Recording, lines: Sequence[str], notes: Sequence[str]) -> R
 
 def _quantity(line: str, notes: Sequence[str]) -> Row:
     """Return the row of a group of channels."""
-    channels, _, rest = line.partition(": ")
-    kind, _, reason = rest.partition(", ")
+    channels, _, meaning = line.partition(": ")
+    kind, _, reason = meaning.partition(", ")
     if not reason:
-        return Row("channels", channels, "likely", rest)
+        return Row("channels", channels, "likely", meaning)
     concluded = next((note for note in notes if note.startswith(f"{kind}: ")), "")
     certainty: Certainty = "sure" if "as the log states" in reason else "likely"
     decide = ""
@@ -106,9 +106,11 @@ def _velocity(recording: Recording) -> Row:
                    f"slope over velocity {1.0 / np.mean(factor):.3f}")  # fmt: skip
     reasons = {57.2958: "deg/s beside rad", math.radians(1.0): "rad/s beside deg",
                -1.0: "negated", 9.5493: "rev/min beside rad/s"}  # fmt: skip
-    known = [text for size, text in reasons.items() if np.all(np.abs(factor / size - 1.0) < _CLOSE)]
+    explanations = [
+        text for size, text in reasons.items() if np.all(np.abs(factor / size - 1.0) < _CLOSE)
+    ]
     figures = ", ".join(f"{name} {size:.4g}" for name, size in zip(names, factor, strict=True))
-    reading = known[0] if known else "times the slope of the position"
+    reading = explanations[0] if explanations else "times the slope of the position"
     return Row("velocity", reading, "sure", figures, "state unit, sign or gears of both")
 
 
@@ -177,11 +179,11 @@ def velocity_lag(recording: Recording) -> float | None:
         q = np.interp(even, recording.time, position)
         moved = np.cumsum(np.interp(even, recording.time, velocity)) * step
         lags.append(_lag(q, moved, most))
-    known = np.array([lag for lag in lags if lag is not None]) * step
-    if known.size < 2:
+    delays = np.array([lag for lag in lags if lag is not None]) * step
+    if delays.size < 2:
         return None
-    lag = float(np.median(known))
-    alike = np.abs(known - lag) <= max(step, 0.25 * abs(lag))
+    lag = float(np.median(delays))
+    alike = np.abs(delays - lag) <= max(step, 0.25 * abs(lag))
     clear = abs(lag) > _CLEAR_LAG * step and np.mean(alike) > 0.5
     return lag if clear else None
 

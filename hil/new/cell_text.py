@@ -231,30 +231,32 @@ class NewCell:
             return []
         if self.design_only:
             names = [name for name in names if not name.startswith("controller.")]
-        found = [name for name, origin in self.known.origin.items() if origin == ASSUMED]
-        return [*names, *(name for name in found if not name.startswith("campaign."))]
+        assumed = [name for name, origin in self.known.origin.items() if origin == ASSUMED]
+        return [*names, *(name for name in assumed if not name.startswith("campaign."))]
 
     def _mesh_folders(self, folder: Path) -> list[str] | None:
         """Return the folders that contain the packages of collision meshes; None without meshes."""
         if not self.meshes:
             return None
-        found: dict[str, None] = {}
+        folders: dict[str, None] = {}
         for mesh in self.meshes:
             relative = mesh.removeprefix("package://")
             above = self.urdf_path.resolve().parents
             place = next((place for place in above if (place / relative).is_file()), None)
             if place is None:
                 return [UNKNOWN]
-            found[os.path.relpath(place, folder)] = None
-        return list(found)
+            folders[os.path.relpath(place, folder)] = None
+        return list(folders)
 
     def for_design(self) -> NewCell:
         """Return the cell for design only, with assumed values and a clear home posture."""
-        known = self.known | assumed_for_design(self.known, len(self.joint_names))
+        cell_values = self.known | assumed_for_design(self.known, len(self.joint_names))
         urdf = self.urdf if self.urdf is not None else read_text(self.urdf_path)
         beside = self.urdf_path.resolve().parent
         meshes = [str(beside / folder) for folder in self._mesh_folders(beside) or []]
-        return replace(self, known=known | clear_home(urdf, known, meshes), design_only=True)
+        return replace(
+            self, known=cell_values | clear_home(urdf, cell_values, meshes), design_only=True
+        )
 
     def urdf_beside(self, path: Path) -> Path:
         """Return the path of a changed URDF: next to the cell file, different from the original."""
@@ -349,7 +351,7 @@ def _joints_between(path: Path, text: str, base: str | None, tip: str | None) ->
             remedy = f"its links are {', '.join(similar[:_MOST_NAMES])}"
             raise InputError(path, f"has no link {link!r}", field=option, remedy=remedy)
     ends = [tip] if tip is not None else list(to_link)
-    found: dict[str, None] = {}
+    joints: dict[str, None] = {}
     for end in ends:
         way = list[str]()
         link = end
@@ -357,11 +359,11 @@ def _joints_between(path: Path, text: str, base: str | None, tip: str | None) ->
             name, link = to_link[link]
             way.append(name)
         if base is None or link == base:
-            found |= dict.fromkeys(way)
+            joints |= dict.fromkeys(way)
         elif tip is not None:
             problem = f"link {tip!r} does not hang on link {base!r}"
             raise InputError(path, problem, field="--tip", remedy=_LINKS_REMEDY)
-    return list(found)
+    return list(joints)
 
 
 _GRIPPER: Final = re.compile(
@@ -420,15 +422,15 @@ def _lifting(text: str, chain: Chain) -> list[str]:
     """Return the prismatic joints along gravity with all joints at zero, without grippers'."""
     gripper = _of_gripper(text, chain)
     rotations = list[Array]()
-    found = []
+    lifting = []
     for joint, name in enumerate(chain.joint_names):
         parent = chain.parents[joint]
         outer = rotations[parent] if parent >= 0 else np.eye(3)
         rotations.append(outer @ chain.rotation[joint])
         vertical = abs((rotations[joint] @ chain.axis[joint])[2])
         if not chain.revolute[joint] and vertical > _ALONG and name not in gripper:
-            found.append(name)
-    return found
+            lifting.append(name)
+    return lifting
 
 
 def _note_on_lifting(names: Sequence[str]) -> str:

@@ -53,13 +53,13 @@ class Known:
     def of_origin(cls, origin: str, values: Mapping[str, Any], notes: Sequence[str] = ()) -> Known:
         """Create from values of one origin, without unknown fields."""
         nothing: list[Any] = [UNKNOWN]
-        known = {
+        known_values = {
             name: value
             for name, value in values.items()
             if value != UNKNOWN
             and not (isinstance(value, list) and value and value == nothing * len(value))
         }
-        return cls(known, dict.fromkeys(known, origin), tuple(notes))
+        return cls(known_values, dict.fromkeys(known_values, origin), tuple(notes))
 
     def without(self, table: str) -> Known:
         """Return the values without those of one table."""
@@ -89,21 +89,23 @@ def from_urdf(urdf: str, joint_names: Sequence[str]) -> Known:
     return Known.of_origin("from the URDF", values)
 
 
-def assumed_for_design(known: Known, n_joints: int) -> Known:
+def assumed_for_design(cell_values: Known, n_joints: int) -> Known:
     """Return assumed values for a cell without controller.
 
     Home is zero, or the middle of a range without zero; continuous joints are limited to ±180°;
     full speed takes 0.3 s, full acceleration 0.1 s; no friction; floor at the base.
     """
     lower, upper, speed = (
-        known.values.get(f"limits.{name}_deg", [UNKNOWN] * n_joints)
+        cell_values.values.get(f"limits.{name}_deg", [UNKNOWN] * n_joints)
         for name in ("lower", "upper", "velocity")
     )
-    low = [-180.0 if one == UNKNOWN else one for one in lower]
-    high = [180.0 if one == UNKNOWN else one for one in upper]
+    low = [-180.0 if bound == UNKNOWN else bound for bound in lower]
+    high = [180.0 if bound == UNKNOWN else bound for bound in upper]
 
     def within(seconds: float) -> list[float | str]:
-        return [UNKNOWN if one == UNKNOWN else round(one / seconds, _DECIMALS) for one in speed]
+        return [
+            UNKNOWN if limit == UNKNOWN else round(limit / seconds, _DECIMALS) for limit in speed
+        ]
 
     zeros = [0.0] * n_joints
     values: dict[str, Any] = {
@@ -129,17 +131,19 @@ def assumed_for_design(known: Known, n_joints: int) -> Known:
     return Known.of_origin(ASSUMED, values)
 
 
-def clear_home(urdf: str, known: Known, mesh_folders: Sequence[str]) -> Known:
+def clear_home(urdf: str, cell_values: Known, mesh_folders: Sequence[str]) -> Known:
     """Return the first clear posture with up to three joints turned by 90° from the home posture.
 
     Where none is clear of the floor, no floor is assumed. Notes report this, and pairs that are not
     checked or with less than the margin. Nothing is returned if shapes are missing or unreadable.
     """
-    lower, upper = (np.radians(known.values[f"limits.{end}_deg"]) for end in ("lower", "upper"))
+    lower, upper = (
+        np.radians(cell_values.values[f"limits.{end}_deg"]) for end in ("lower", "upper")
+    )
     limits = JointLimits(lower, upper, *np.ones((3, len(lower))))  # rates do not matter
-    postures = np.array([*_turned(np.radians(known.values["campaign.home_deg"]), limits)])
-    for floor in (known.values["workspace.floor"], None):
-        workspace = Workspace(floor, margin=known.values["workspace.margin"])
+    postures = np.array([*_turned(np.radians(cell_values.values["campaign.home_deg"]), limits)])
+    for floor in (cell_values.values["workspace.floor"], None):
+        workspace = Workspace(floor, margin=cell_values.values["workspace.margin"])
         try:
             checker = CollisionChecker(urdf, workspace, limits, mesh_folders)
         except CollisionModelError:
@@ -206,7 +210,7 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
             f"is of an arm with joints {', '.join(archive.joint_names)}",
             remedy=f"the URDF has {', '.join(joint_names)}",
         )
-    known = Known()
+    cell_values = Known()
     if "cell.toml" in archive.attachments:
         try:
             tables = parse_toml(archive.text("cell.toml"))
@@ -218,21 +222,21 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
         values = {f"{name}.{key}": value for name in tables for key, value in tables[name].items()}
         for name in ("cell.urdf", "cell.mesh_folders"):  # paths on the recording computer
             values.pop(name, None)
-        known = Known.of_origin(f"from {archive.path.name}", values)
+        cell_values = Known.of_origin(f"from {archive.path.name}", values)
     packet = archive.attachments.get("init_packet.bin")
     if packet is not None:
-        arm = known.values.get("controller.arm", 1)
+        arm = cell_values.values.get("controller.arm", 1)
         arm = arm if isinstance(arm, int) and 1 <= arm <= N_ARMS else 1
         try:
-            known |= from_init(InitPacket.decode(packet), len(joint_names), arm)
+            cell_values |= from_init(InitPacket.decode(packet), len(joint_names), arm)
         except PacketError as error:
             raise refusal(f"is not an init packet ({error})", "init_packet.bin") from error
-    if not known.values:
+    if not cell_values.values:
         raise refusal("contains neither a cell nor an init packet")
     if archive.header.only_simulated:
         note = f"{archive.path.name} was recorded from a simulated controller"
-        known |= Known(notes=(note,))
-    return known
+        cell_values |= Known(notes=(note,))
+    return cell_values
 
 
 def _degrees(radians: ArrayLike) -> list[float | str]:

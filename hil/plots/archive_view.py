@@ -129,30 +129,34 @@ def view_of(
             bounds = np.zeros((0, len(head.joint_names))) if limits is None else limits
             traces = (Trace(*_reduced(time, values[:, j]), tuple(bounds[:, j])) for j in shown)
             quantities.append(Quantity(title, tuple(traces)))
-    events = [(one.time - origin, one.name, one.text, one.level >= 30) for one in head.events]
+    events = [
+        (event.time - origin, event.name, event.text, event.level >= 30) for event in head.events
+    ]
     return ArchiveView(
         facts=read_overview(path),
         joint_names=tuple(head.joint_names[j] + " [mm]" * bool(scales.slides[j]) for j in shown),
         start=begin,
         stop=end,
         quantities=tuple(quantities),
-        events=tuple(one for one in events if begin <= one[0] <= end),
+        events=tuple(event for event in events if begin <= event[0] <= end),
         gaps=time[columns["gap"] > 0] if "gap" in columns else None,
         frame=scales.words,
     )
 
 
 def _wanted(names: Sequence[str], joints: Sequence[str]) -> list[int]:
-    known = {str(k + 1): k for k in range(len(names))} | {name: k for k, name in enumerate(names)}
+    index_of = {str(k + 1): k for k in range(len(names))} | {
+        name: k for k, name in enumerate(names)
+    }
     for joint in joints:
-        if joint not in known:
+        if joint not in index_of:
             raise InputError(
                 None,
                 f"{joint!r} is not a joint",
                 field="--joint",
                 remedy=f"name one of {', '.join(names)}",
             )
-    return sorted({known[joint] for joint in joints}) or list(range(len(names)))
+    return sorted({index_of[joint] for joint in joints}) or list(range(len(names)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,10 +255,10 @@ def _slides(archive: Archive, n: int) -> NDArray[np.bool_]:
 def _reduced(time: Array, values: Array) -> tuple[Array, Array]:
     """Return minimum and maximum per interval of samples (m,); NaN where nothing was recorded."""
     leap = _LEAP * float(np.median(np.diff(time))) if len(time) > 1 else np.inf
-    known = np.flatnonzero(np.isfinite(values))
-    ends = np.flatnonzero((np.diff(known) > 1) | (np.diff(time[known]) > leap)) + 1
+    recorded = np.flatnonzero(np.isfinite(values))
+    ends = np.flatnonzero((np.diff(recorded) > 1) | (np.diff(time[recorded]) > leap)) + 1
     parts = list[tuple[Array, Array]]()
-    for rows in np.split(known, ends) if known.size else []:
+    for rows in np.split(recorded, ends) if recorded.size else []:
         bins = max(2, round(_BINS * len(rows) / len(values)))
         parts += [_GAP] * bool(parts) + [thinned(time[rows], values[rows], bins)]
     if not parts:

@@ -7,8 +7,8 @@ from hil.report.rendering import environment, page_bytes
 from hil.version import software
 
 
-def comparison_page(found: Comparison) -> bytes:
+def comparison_page(comparison: Comparison) -> bytes:
     """Return the comparison as one HTML file; the same input gives the same bytes."""
     rules = {"alarms": FALSE_ALARMS, "least": LEAST, "repetitions": MIN_REPETITIONS}
     template = environment().get_template("changes.html.j2")
-    return page_bytes(template.render(found=found, rules=rules, software=software()))
+    return page_bytes(template.render(found=comparison, rules=rules, software=software()))

@@ -42,16 +42,19 @@ def joints_of(results: Results) -> list[Joint]:
     if results.validation:
         example = results.validation[0]
     elif len(results.repetitions) > 1:
-        return [Joint(j, one.joint, one.unit, "") for j, one in enumerate(results.judgement.joints)]
+        return [
+            Joint(j, judgement.joint, judgement.unit, "")
+            for j, judgement in enumerate(results.judgement.joints)
+        ]
     errors = zip(example.relative_error, example.all_rows_joint_errors, strict=True)
     return [
         Joint(
             j,
-            one.joint,
-            one.unit,
+            judgement.joint,
+            judgement.unit,
             f"error in motion {percent(moving)} %, whole recording {percent(every)} %",
         )
-        for j, (one, (moving, every)) in enumerate(
+        for j, (judgement, (moving, every)) in enumerate(
             zip(results.judgement.joints, errors, strict=True)
         )
     ]
@@ -137,8 +140,8 @@ def known_parts(series: ReportSeries) -> list[Legend]:
 
 def part_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart]:
     """Return the predicted torque of each joint and what it consists of."""
-    known = [(part, getattr(series, f"example_{part.key}")) for part in known_parts(series)]
-    if not known or series.example_time.size == 0:
+    contributions = [(part, getattr(series, f"example_{part.key}")) for part in known_parts(series)]
+    if not contributions or series.example_time.size == 0:
         return []
     time = series.example_time - series.example_time[0]
     charts = []
@@ -146,9 +149,9 @@ def part_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart]:
         traces = [
             PREDICTED._replace(colour="--wide", width=3.0).trace(series.example_predicted[:, j])
         ]
-        traces += [part.trace(values[:, j]) for part, values in known]
-        sizes = [float(np.sqrt(np.mean(values[:, j] ** 2))) for _, values in known]
-        largest = known[int(np.argmax(sizes))][0]
+        traces += [part.trace(values[:, j]) for part, values in contributions]
+        sizes = [float(np.sqrt(np.mean(values[:, j] ** 2))) for _, values in contributions]
+        largest = contributions[int(np.argmax(sizes))][0]
         note = f"largest: {largest.key}, RMS {significant(max(sizes))} {unit}"
         caption = Caption(f"d{j}", name, note, "predicted torque by part over time")
         plot = Plot(176.0, f"torque [{unit}]", traces)
@@ -229,12 +232,12 @@ def friction_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart
 def residual_panels(results: Results) -> dict[str, list[Panel]]:
     """Draw the mean residual of each joint over speed and over position."""
     judgement = results.judgement
-    found: dict[str, list[Panel]] = {"speed_panels": [], "position_panels": []}
+    panels_by_kind: dict[str, list[Panel]] = {"speed_panels": [], "position_panels": []}
     for what, per, profiles in (
         ("speed", "/s", judgement.speed),
         ("position", "", judgement.position),
     ):
-        panels = found[f"{what}_panels"]
+        panels = panels_by_kind[f"{what}_panels"]
         for j, (joint, profile) in enumerate(zip(judgement.joints, profiles, strict=True)):
             mean = np.array(profile.mean, np.float64)
             std = np.array(profile.std, np.float64)
@@ -258,29 +261,29 @@ def residual_panels(results: Results) -> dict[str, list[Panel]]:
             axes.line(centre, mean, FIRST, 1.2)
             axes.dots(centre, mean, FIRST, 4.5)
             panels.append(panel([axes], caption))
-    return found
+    return panels_by_kind
 
 
 def precision_panels(results: Results) -> list[Panel]:
     """Draw each required precision over the repetitions, with what the design promised."""
     panels = []
     required = results.conduct.precision if results.conduct is not None else []
-    for k, one in enumerate(required):
-        count = np.array(one.repetitions, np.float64)
-        ratio = np.array(one.ratio)
-        note = f"{one.worst} is worst"
+    for k, requirement in enumerate(required):
+        count = np.array(requirement.repetitions, np.float64)
+        ratio = np.array(requirement.ratio)
+        note = f"{requirement.worst} is worst"
         what = "95 % interval over the required one, over repetitions"
         whole = min(6, int(count.max()))  # so many ticks at most are whole numbers
         axes = single(170.0, "interval / required", "repetitions", x_ticks=whole)
         axes.x_limits = 0.5, float(count.max()) + 0.5
-        promised = np.full(2, np.nan if one.promised is None else one.promised)
+        promised = np.full(2, np.nan if requirement.promised is None else requirement.promised)
         shown = np.concatenate([ratio, promised, [0.0, 1.1]])
         axes.y_limits = padded(shown[np.isfinite(shown)])
         axes.segments(np.array([[-np.inf, np.inf]]), np.ones((1, 2)), MUTED, 0.9)
         axes.line(np.array(axes.x_limits), promised, MUTED, 1.4, dashed=True)
         axes.line(count, ratio, FIRST, 1.2)
         axes.dots(count, ratio, FIRST, 4.5)
-        panels.append(panel([axes], Caption(f"q{k}", one.requirement, note, what)))
+        panels.append(panel([axes], Caption(f"q{k}", requirement.requirement, note, what)))
     return panels
 
 

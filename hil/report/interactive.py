@@ -53,7 +53,9 @@ def chart_data(groups: Mapping[str, Sequence[Chart]], joints: Sequence[str]) -> 
     most = min(max(_VALUES // max(len(lines), 1), _FEWEST), _MOST)
     document = {
         "joints": [one_line(name) for name in joints],
-        "groups": {name: [_chart(one, most) for one in group] for name, group in groups.items()},
+        "groups": {
+            name: [_chart(chart, most) for chart in group] for name, group in groups.items()
+        },
     }
     text = json.dumps(document, separators=(",", ":"), ensure_ascii=True)
     # No text of an archive ends the element.
@@ -87,8 +89,8 @@ def _chart(chart: Chart, most: int) -> dict[str, Any]:
 
 
 def _trace(trace: Trace, chart: Chart, most: int) -> dict[str, Any]:
-    own = trace.x is not None
-    values = trace.values if own else _extremes(trace.values, most)
+    has_own_x = trace.x is not None
+    values = trace.values if has_own_x else _extremes(trace.values, most)
     return {
         "name": trace.name,
         "colour": trace.colour.removeprefix("var(").removesuffix(")"),
@@ -96,7 +98,7 @@ def _trace(trace: Trace, chart: Chart, most: int) -> dict[str, Any]:
         "dashed": trace.dashed,
         "dots": trace.dots,
         "loose": trace.loose,
-        "x": encoded(np.asarray(trace.x)) if own else None,
+        "x": encoded(np.asarray(trace.x)) if has_own_x else None,
         "y": encoded(_log10(values) if chart.log else values),
     }
 

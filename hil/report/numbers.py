@@ -76,9 +76,9 @@ def prose(text: str) -> str:
 def moments(text: str) -> str:
     """Write times of ISO 8601 in a text to the minute: 2026-11-26 12:30 UTC."""
 
-    def readable(found: re.Match[str]) -> str:
-        zone = {"": "", "Z": " UTC", "+00:00": " UTC"}.get(found[3], f" {found[3]}")
-        return f"{found[1]} {found[2]}{zone}"
+    def readable(match: re.Match[str]) -> str:
+        zone = {"": "", "Z": " UTC", "+00:00": " UTC"}.get(match[3], f" {match[3]}")
+        return f"{match[1]} {match[2]}{zone}"
 
     return _MOMENT.sub(readable, text)
 

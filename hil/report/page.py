@@ -68,7 +68,7 @@ def report_bytes(
         "has_ids": any(p.table2_id is not None for p in results.parameters),
         "has_prior": any(p.data_share is not None for p in results.parameters),
         "warnings": grouped_warnings(results),
-        "ranked": [words for group in grouped_warnings(results).values() for words in group],
+        "ranked": [warning for group in grouped_warnings(results).values() for warning in group],
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
         "by_id": by_id,
         "joint_of": lambda parameter: joint_of(parameter, results.joint_names),
@@ -97,7 +97,9 @@ def grouped_warnings(results: Results) -> dict[str, list[str]]:
     ranks = {finding.words: k for k, finding in enumerate(results.judgement.worst_first)}
     groups: dict[str, list[str]] = {title: [] for title in (_OF_MODEL, _OF_RECORDING)}
     # Those that no check found are remarks about the sources, and last.
-    for warning in sorted(results.verdict.warnings, key=lambda words: ranks.get(words, len(ranks))):
+    for warning in sorted(
+        results.verdict.warnings, key=lambda warning: ranks.get(warning, len(ranks))
+    ):
         title = _OF_RECORDING if checks.get(warning) in _RECORDING_CHECKS else _OF_MODEL
         groups[title].append(warning)
     return groups if results.verdict.warnings else {}
@@ -114,8 +116,10 @@ def joint_of(parameter: ParameterResult, joint_names: Sequence[str]) -> str:
 def every_row_errors(results: Results) -> list[float]:
     """Return the median error of each joint over all rows."""
     runs = results.validation
-    known = [run.all_rows_joint_errors for run in runs] or [results.fitted.all_rows_joint_errors]
-    return list(np.median(np.array(known), axis=0).tolist())
+    joint_errors = [run.all_rows_joint_errors for run in runs] or [
+        results.fitted.all_rows_joint_errors
+    ]
+    return list(np.median(np.array(joint_errors), axis=0).tolist())
 
 
 def shown_candidates(choice: Choice) -> list[int]:

@@ -46,7 +46,7 @@ def environment(*scripts: str) -> Environment:
     A page runs these scripts in their order, and then its own.
     """
     # Autoescape always: names come from archives, which may be untrusted.
-    found = Environment(
+    environment = Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
         undefined=StrictUndefined,
@@ -56,7 +56,7 @@ def environment(*scripts: str) -> Environment:
         bytecode_cache=_compiled_templates(),
     )
     every = [*scripts, template_text(_SCRIPT)]
-    found.globals |= {
+    environment.globals |= {
         "style": Markup(template_text(_STYLE)),
         "scripts": [Markup(script) for script in every],
         "policy": policy(every),
@@ -65,11 +65,11 @@ def environment(*scripts: str) -> Environment:
     figures = itertools.count(1)
     tables = itertools.count(1)
     numbering = {"figure": lambda: next(figures), "table": lambda: next(tables)}
-    found.globals |= {"numbers": numbers, "numbering": numbering}
+    environment.globals |= {"numbers": numbers, "numbering": numbering}
     for name in _FORMATS:
-        found.filters[name] = getattr(numbers, name)
-    found.filters["unit_text"] = unit_text
-    return found
+        environment.filters[name] = getattr(numbers, name)
+    environment.filters["unit_text"] = unit_text
+    return environment
 
 
 def _compiled_templates() -> BytecodeCache | None:
@@ -93,7 +93,7 @@ def _shown(value: object) -> object:
     """Escape control and direction characters of a text."""
     if isinstance(value, Markup) or not isinstance(value, str):
         return value
-    return _STEERING.sub(lambda found: escape(found[0]), value)
+    return _STEERING.sub(lambda match: escape(match[0]), value)
 
 
 def template_text(name: str) -> str:

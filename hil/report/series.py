@@ -74,21 +74,25 @@ class ReportSeries:
             "law": len(self.law_torque),
             "spectrum": 0 if self.spectrum_frequency is None else len(self.spectrum_frequency),
         }
-        for name, found in self.arrays.items():
+        for name, array in self.arrays.items():
             length = lengths[name.partition("_")[0]]
             alone = name.endswith(("_time", "_frequency"))
             shape = (length,) if alone else (length, n)
-            numbers = found.dtype == np.float64 and not np.any(np.abs(found) >= _TOO_LARGE)
-            if found.shape != shape or not numbers:
+            numbers = array.dtype == np.float64 and not np.any(np.abs(array) >= _TOO_LARGE)
+            if array.shape != shape or not numbers:
                 raise SeriesError(
-                    f"{name} has shape {found.shape} (expected {shape}), or values that cannot be"
+                    f"{name} has shape {array.shape} (expected {shape}), or values that cannot be"
                     " drawn"
                 )
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Any]) -> ReportSeries:
         """Build the series from the arrays of a file; KeyError if a needed one is missing."""
-        names = [one.name for one in fields(cls) if one.name in arrays or one.name not in _OPTIONAL]
+        names = [
+            field.name
+            for field in fields(cls)
+            if field.name in arrays or field.name not in _OPTIONAL
+        ]
         return cls(**{name: arrays[name] for name in names})
 
     @property
@@ -98,13 +102,13 @@ class ReportSeries:
 
     def checked_for(self, n_joints: int) -> ReportSeries:
         """Return the series, or raise SeriesError unless they have `n_joints`."""
-        found = self.excitation_position.shape[1]
-        if found != n_joints:
-            raise SeriesError(f"excitation_position has {found} columns, not {n_joints}")
+        columns = self.excitation_position.shape[1]
+        if columns != n_joints:
+            raise SeriesError(f"excitation_position has {columns} columns, not {n_joints}")
         return self
 
 
-_OPTIONAL: Final = tuple(one.name for one in fields(ReportSeries) if one.default is None)
+_OPTIONAL: Final = tuple(field.name for field in fields(ReportSeries) if field.default is None)
 
 
 def example_series(
@@ -214,7 +218,9 @@ def _rows_within(time: Array, shown: Array) -> slice:
 
 def _spectra(samples: Samples, error: Array) -> dict[str, Array]:
     """Return the spectra of the longest stretch without a gap; none of less than 16 rows."""
-    part = max(samples.segments, key=lambda one: one.stop - one.start, default=slice(0, 0))
+    part = max(
+        samples.segments, key=lambda segment: segment.stop - segment.start, default=slice(0, 0)
+    )
     rows = part.stop - part.start
     if rows < 16:
         return {}

@@ -66,15 +66,22 @@ class Search:
 def searches(settings: StudySettings, n_joints: int) -> list[Search]:
     """Return all searches of a study."""
     a, b = (
-        own.replaced(
+        preset_settings.replaced(
             seed=settings.seed,
-            search={"population": one.population, "generations": one.generations, "polish": 0},
+            search={
+                "population": effort.population,
+                "generations": effort.generations,
+                "polish": 0,
+            },
         )
-        for own, one in ((preset(A), settings.effort_a), (preset(B), settings.effort_b))
+        for preset_settings, effort in (
+            (preset(A), settings.effort_a),
+            (preset(B), settings.effort_b),
+        )
     )
     sines = [
-        Search(key, f"method A, sines {words}", a.replaced(sines=changes))
-        for key, (words, changes) in SINES.items()
+        Search(key, f"method A, sines {description}", a.replaced(sines=changes))
+        for key, (description, changes) in SINES.items()
         if n_joints == _PRINTED_JOINTS or key not in _PRINTED_SINES
     ]
     return [*sines, Search(B, "method B", b)]
@@ -84,40 +91,40 @@ def run_searches(
     folder: StudyFolder, cell: Cell, wanted: Sequence[Search], reporter: Reporter, workers: int
 ) -> list[Search]:
     """Run the searches that are not complete; an interrupted search resumes from its journal."""
-    found = []
-    for number, one in enumerate(wanted, 1):
-        place = DesignFolder(folder.design(one.key))
+    searches = []
+    for number, search in enumerate(wanted, 1):
+        place = DesignFolder(folder.design(search.key))
         result = DesignResult.load(place.result) if place.result.exists() else None
-        if result is None or not result.complete or result.settings != one.settings:
-            reporter.say(f"search {number} of {len(wanted)}: {one.words}")
+        if result is None or not result.complete or result.settings != search.settings:
+            reporter.say(f"search {number} of {len(wanted)}: {search.words}")
             resume = place.settings.exists()
             try:
                 result = run_design(
-                    place, cell, one.settings, reporter, workers=workers, resume=resume
+                    place, cell, search.settings, reporter, workers=workers, resume=resume
                 ).result
             except NoExcitationError as error:
                 reporter.say(f"no feasible motion: {error}")
                 result = None
-        found.append(replace(one, excitation=None if result is None else result.excitation))
-    return found
+        searches.append(replace(search, excitation=None if result is None else result.excitation))
+    return searches
 
 
-def chosen(found: Sequence[Search]) -> dict[str, Search]:
+def chosen(searches: Sequence[Search]) -> dict[str, Search]:
     """Return the search of each method, of A that of largest determinant, its criterion.
 
     Raises:
         NoExcitationError: a method found no motion.
     """
 
-    def score(one: Search) -> float:
-        return -float("inf") if one.excitation is None else one.excitation.criteria.log10_det
+    def score(search: Search) -> float:
+        return -float("inf") if search.excitation is None else search.excitation.criteria.log10_det
 
-    sines = max((one for one in found if one.key != B), key=score)
-    best = {A: sines, B: next(one for one in found if one.key == B)}
-    for one in best.values():
-        if one.excitation is None:
+    sines = max((search for search in searches if search.key != B), key=score)
+    best = {A: sines, B: next(search for search in searches if search.key == B)}
+    for search in best.values():
+        if search.excitation is None:
             raise NoExcitationError(
-                f"{one.words} found no motion that satisfies all constraints of the cell;"
+                f"{search.words} found no motion that satisfies all constraints of the cell;"
                 " search longer (without --quick), or with another --seed"
             )
     return best
@@ -144,32 +151,32 @@ class Execution:
 
 
 def plan_study(
-    folder: StudyFolder, cell: Cell, settings: StudySettings, found: Mapping[str, Search]
+    folder: StudyFolder, cell: Cell, settings: StudySettings, best: Mapping[str, Search]
 ) -> dict[str, dict[str, Execution]]:
     """Return the campaigns by condition and method; the held-out motions are in those of B.
 
     These are random motions through as many via points as its excitation has, with its fly.
     """
-    excitations = {key: one.excitation for key, one in found.items()}
+    excitations = {key: search.excitation for key, search in best.items()}
     main = cell.with_campaign(
         repetitions=settings.repetitions,
         validation_runs=settings.motions,
         simulation_seed=settings.seed,
     )
-    own = excitations[B]
-    assert own is not None  # see `chosen`
-    random = main.with_values({"campaign.fly": own.fly, "campaign.seed": settings.seed})
-    held_out = {B: plan_around(random, own, MotionChecks.of(cell)).validation}
+    excitation = excitations[B]
+    assert excitation is not None  # see `chosen`
+    random = main.with_values({"campaign.fly": excitation.fly, "campaign.seed": settings.seed})
+    held_out = {B: plan_around(random, excitation, MotionChecks.of(cell)).validation}
     return {
         condition: {
             key: Execution(
                 folder.campaign(condition, key),
                 main,
-                CampaignPlan(one, tuple(held_out.get(key, ())), moves_of(cell, one)),
+                CampaignPlan(excitation, tuple(held_out.get(key, ())), moves_of(cell, excitation)),
                 condition == EFFECTS,
             )
-            for key, one in excitations.items()
-            if one is not None
+            for key, excitation in excitations.items()
+            if excitation is not None
         }
         for condition in ((NO_EFFECTS, EFFECTS) if settings.effects else (NO_EFFECTS,))
     }

@@ -231,22 +231,22 @@ def parameters_of(cell: Cell, truth: Array) -> list[StudyParameter]:
 
 
 def condition_result(
-    key: str, words: str, effects: Sequence[str], roots: Mapping[str, Path], truth: Array
+    key: str, description: str, effects: Sequence[str], roots: Mapping[str, Path], truth: Array
 ) -> ConditionResult:
     """Estimate from the campaigns of A and B (by method), and predict the held-out motions of B.
 
     `truth` are the true parameters (p,).
     """
     methods = [_method(name, _prepared(roots[name], "excitation")) for name in (A, B)]
-    estimates = {one.key: np.array(one.mean) for one in methods} | {TRUE_VALUES: truth}
+    estimates = {method.key: np.array(method.mean) for method in methods} | {TRUE_VALUES: truth}
     prepared = _prepared(roots[B], "validation")
     model = prepared.sources.cell.model
     names = [source.name for source in prepared.sources.training]
     forms = np.array([motion_form(model, run) for run in prepared.fitted])
-    values = [np.array(one.values) for one in methods]
+    values = [np.array(method.values) for method in methods]
     return ConditionResult(
         key=key,
-        words=words,
+        words=description,
         effects=list(effects),
         methods=methods,
         held_out=_held_out(model, dict(zip(names, prepared.fitted, strict=True)), forms, estimates),
@@ -266,25 +266,30 @@ def _method(key: str, prepared: Prepared) -> MethodResult:
     """Estimate from each repetition and from all."""
     model = prepared.sources.cell.model
     sources = prepared.sources.training
-    found = estimate_repetitions(model, prepared.fitted)
+    estimates = estimate_repetitions(model, prepared.fitted)
     executed = Factor.zero(model)
-    parts = [executed_rows(own, one) for own, one in zip(sources, prepared.fitted, strict=True)]
-    for one, part in zip(prepared.fitted, parts, strict=True):
-        executed = executed + Factor.from_samples(model, one.motion.rows(part), one.torque[part])
+    parts = [
+        executed_rows(source, samples)
+        for source, samples in zip(sources, prepared.fitted, strict=True)
+    ]
+    for samples, part in zip(prepared.fitted, parts, strict=True):
+        executed = executed + Factor.from_samples(
+            model, samples.motion.rows(part), samples.torque[part]
+        )
     gram = information(executed)
     motion = prepared.fitted[0].motion
     rows = parts[0]
     shown = motion.rows(_thinned(rows))
-    values = np.array([one.values for one in found.repetitions])
+    values = np.array([estimate.values for estimate in estimates.repetitions])
     return MethodResult(
         key=key,
         label=LABELS[key],
         values=values.tolist(),
         mean=values.mean(axis=0).tolist(),
         std=values.std(axis=0, ddof=1).tolist(),
-        pooled=found.pooled.values.tolist(),
-        pooled_std=found.pooled.std.tolist(),
-        undetermined=list(found.pooled.undetermined),
+        pooled=estimates.pooled.values.tolist(),
+        pooled_std=estimates.pooled.std.tolist(),
+        undetermined=list(estimates.pooled.undetermined),
         log10_det=log10_det(gram, (rows.stop - rows.start) * len(sources)),
         coupling_index=coupling_index(gram),
         correlation=correlation(gram).tolist(),
@@ -300,14 +305,14 @@ def motion_form(model: RobotModel, run: Samples) -> Array:
     It is divided by the sum of the squared torque, so that a quadratic form is a relative error.
     """
     n = model.n_parameters
-    found = np.zeros((n + 1, n + 1))
+    gram = np.zeros((n + 1, n + 1))
     for j, (block, used) in enumerate(zip(*run.regressor(model), strict=True)):
         usable = run.usable[:, j]
         table = np.column_stack([block, run.torque[:, j]]) * usable[:, None]
         passed = low_passed(run, table)[usable]
         both = [*used, n]
-        found[np.ix_(both, both)] += passed.T @ passed
-    return np.asarray(found / (np.where(run.usable, run.torque, 0.0) ** 2).sum())
+        gram[np.ix_(both, both)] += passed.T @ passed
+    return np.asarray(gram / (np.where(run.usable, run.torque, 0.0) ** 2).sum())
 
 
 def relative_errors(forms: Array, values: Array) -> Array:
@@ -336,9 +341,9 @@ def _held_out(
 
     return HeldOut(
         archives=list(runs),
-        overall={name: one.tolist() for name, one in overall.items()},
-        all_rows={n: [float(one[k]) for _, one in errors] for k, n in enumerate(estimates)},
-        mean_abs={n: [one[k].tolist() for one, _ in errors] for k, n in enumerate(estimates)},
+        overall={name: error.tolist() for name, error in overall.items()},
+        all_rows={n: [float(error[k]) for _, error in errors] for k, n in enumerate(estimates)},
+        mean_abs={n: [error[k].tolist() for error, _ in errors] for k, n in enumerate(estimates)},
         left_out=(1.0 - np.mean(np.concatenate(usable), axis=0)).tolist(),
         example=typical,
         time=_rounded(time[shown] - time[shown.start]),
@@ -408,11 +413,11 @@ def compared(forms: Array, first: Array, second: Array) -> Comparison:
     motions = len(logs)
     random = np.random.default_rng(_SEED)
     units = [_blocks(first), _blocks(second)]
-    fewest = min(len(one) for one in units)
+    fewest = min(len(unit) for unit in units)
     low = high = None
     if fewest >= MIN_UNITS and motions > 1:
         before, after = (
-            np.log(relative_errors(forms, _weights(len(one), random) @ one)) for one in units
+            np.log(relative_errors(forms, _weights(len(unit), random) @ unit)) for unit in units
         )
         draws = ((after - before) * _weights(motions, random).T).sum(axis=0)
         width = stats.t.ppf(0.975, min(fewest, motions) - 1) * draws.std(ddof=1)
@@ -446,25 +451,28 @@ def verdict_of(ratio: float, low: float | None, high: float | None) -> Verdict:
 
 def conclusion_of(conditions: Sequence[ConditionResult], *, quick: bool) -> list[str]:
     """Return the sentences of the conclusion: which method predicts better, and by how much."""
-    found = [f"{capitalised(one.words)}: {_outcome(one.comparison)}." for one in conditions]
-    a, b = (len(one.values) * one.duration for one in conditions[0].methods)
-    found.append(f"A was fitted to {a:.0f} s of motion, B to {b:.0f} s.")
+    sentences = [
+        f"{capitalised(condition.words)}: {_outcome(condition.comparison)}."
+        for condition in conditions
+    ]
+    a, b = (len(method.values) * method.duration for method in conditions[0].methods)
+    sentences.append(f"A was fitted to {a:.0f} s of motion, B to {b:.0f} s.")
     if quick:
-        found.append("The quick setting supports no conclusion about the methods.")
-    return found
+        sentences.append("The quick setting supports no conclusion about the methods.")
+    return sentences
 
 
 def _outcome(row: Comparison) -> str:
     """Format whose error is smaller, by how much, and how certain that is."""
     if row.verdict == "too few":
         return "too few repetitions or motions for a conclusion"
-    words = (
+    ratio_text = (
         f"the error with B is {fixed(row.ratio, 3)} times that with A"
         f" (95 %: {fixed(row.low, 3)} to {fixed(row.high, 3)}),"
         f" smaller on {row.wins} of {row.motions} motions"
     )
     if row.verdict == "none":
-        return f"no significant difference, {words}"
+        return f"no significant difference, {ratio_text}"
     saved = significant(100.0 * (1.0 - min(row.ratio, 1.0 / row.ratio)), 2)
     slightly = "slightly " if row.verdict.startswith("slightly") else ""
-    return f"{'B' if row.ratio < 1.0 else 'A'} is {slightly}better by {saved} %, {words}"
+    return f"{'B' if row.ratio < 1.0 else 'A'} is {slightly}better by {saved} %, {ratio_text}"

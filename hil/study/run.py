@@ -64,15 +64,17 @@ def run_study(
     with folder.locked(), Cluster(workers, reporter=reporter) as processes:
         folder.begin(settings)
         wanted = campaigns.searches(settings, len(cell.joint_names))
-        found = campaigns.run_searches(folder, cell, wanted, reporter, workers)
-        best = campaigns.chosen(found)
+        searches = campaigns.run_searches(folder, cell, wanted, reporter, workers)
+        best = campaigns.chosen(searches)
         plans = campaigns.plan_study(folder, cell, settings, best)
-        runs = [(one.root, (one,)) for some in plans.values() for one in some.values()]
+        runs = [
+            (execution.root, (execution,)) for some in plans.values() for execution in some.values()
+        ]
         campaigns.in_children(campaigns.execute, runs, "running campaigns", reporter, processes)
         calls = []
         for key, some in plans.items():
             provenance = simulated_provenance(cell, key == campaigns.EFFECTS)
-            roots = {name: one.root for name, one in some.items()}
+            roots = {name: execution.root for name, execution in some.items()}
             effects = json.loads(provenance["effects"])
             calls.append((folder.campaign(key, ""), (key, _WORDS[key], effects, roots, truth)))
         conditions = campaigns.in_children(
@@ -89,7 +91,7 @@ def run_study(
             joint_names=list(cell.joint_names),
             n_base=len(cell.model.base.names),
             parameters=results.parameters_of(cell, truth),
-            table1=[*_rows(found, best, conditions), *results.printed_rows(cell)],
+            table1=[*_rows(searches, best, conditions), *results.printed_rows(cell)],
             conditions=conditions,
             conclusion=results.conclusion_of(conditions, quick=quick),
         )
@@ -99,21 +101,21 @@ def run_study(
 
 
 def _rows(
-    found: Sequence[Search], best: Mapping[str, Search], conditions: Sequence[ConditionResult]
+    searches: Sequence[Search], best: Mapping[str, Search], conditions: Sequence[ConditionResult]
 ) -> list[MotionRow]:
     """Return a row of Table 1 for each search, with what was executed of the best of a method."""
-    executed = {best[one.key].key: one for one in conditions[0].methods}
+    executed = {best[method.key].key: method for method in conditions[0].methods}
     rows = []
-    for search in found:
-        one = search.excitation
+    for search in searches:
+        excitation = search.excitation
         method = executed.get(search.key)
         row = MotionRow(key=search.key, words=search.words, executed=method is not None)
-        if one is not None:
+        if excitation is not None:
             row = MotionRow.of(
-                one.criteria,
+                excitation.criteria,
                 **row.model_dump(exclude_defaults=True),
-                tried=one.tried,
-                duration=float(one.trajectory.duration),
+                tried=excitation.tried,
+                duration=float(excitation.trajectory.duration),
                 executed_log10_det=None if method is None else method.log10_det,
                 executed_coupling_index=None if method is None else method.coupling_index,
             )
@@ -128,22 +130,33 @@ def study_page(results: StudyResults) -> bytes:
     """Return the page as one HTML file; the same results give the same bytes."""
     first = results.conditions[0]
     n = results.n_base
-    names = [f"{one.printed_id or ''} {one.name}".strip() for one in results.parameters[:n]]
+    names = [
+        f"{parameter.printed_id or ''} {parameter.name}".strip()
+        for parameter in results.parameters[:n]
+    ]
     template = environment().get_template("study.html.j2")
     text = template.render(
         results=results,
-        labels={one.key: one.label for one in first.methods},
-        legend=[*zip((one.label for one in first.methods), ("--first", "--second"), strict=True)],
+        labels={method.key: method.label for method in first.methods},
+        legend=[
+            *zip((method.label for method in first.methods), ("--first", "--second"), strict=True)
+        ],
         parameters=sorted(
-            enumerate(results.parameters), key=lambda one: one[1].printed_id or math.inf
+            enumerate(results.parameters), key=lambda numbered: numbered[1].printed_id or math.inf
         ),
         trajectories=_trajectories(first, results.joint_names),
         correlations=[
-            drawing.matrix_panel(np.array(one.correlation)[:n, :n], names, f"c{k}", one.label)
-            for k, one in enumerate(first.methods)
+            drawing.matrix_panel(np.array(method.correlation)[:n, :n], names, f"c{k}", method.label)
+            for k, method in enumerate(first.methods)
         ],
-        boxes={one.key: _boxes(one, results.joint_names) for one in results.conditions},
-        examples={one.key: _examples(one, results.joint_names) for one in results.conditions},
+        boxes={
+            condition.key: _boxes(condition, results.joint_names)
+            for condition in results.conditions
+        },
+        examples={
+            condition.key: _examples(condition, results.joint_names)
+            for condition in results.conditions
+        },
         quartiles=lambda values: 100.0 * np.percentile(values, (50.0, 25.0, 75.0)),
     )
     return page_bytes(text)
@@ -154,28 +167,28 @@ def _trajectories(condition: ConditionResult, joint_names: list[str]) -> list[dr
     panels: list[drawing.Panel] = []
     for j, name in enumerate(joint_names):
         spans = [
-            f"{one.label} {math.degrees(min(one.position[j])):.0f}° to"
-            f" {math.degrees(max(one.position[j])):.0f}°"
-            for one in condition.methods
+            f"{method.label} {math.degrees(min(method.position[j])):.0f}° to"
+            f" {math.degrees(max(method.position[j])):.0f}°"
+            for method in condition.methods
         ]
         caption = Caption(f"x{j}", name, "; ".join(spans), "position in each excitation")
         axes = drawing.single(170.0, "position [rad]", "time [s]", x_ticks=6)
-        for one, colour in zip(condition.methods, COLOURS, strict=True):
-            axes.line(np.array(one.time), np.array(one.position[j]), colour, 1.3)
+        for method, colour in zip(condition.methods, COLOURS, strict=True):
+            axes.line(np.array(method.time), np.array(method.position[j]), colour, 1.3)
         panels.append(drawing.panel([axes], caption))
     return panels
 
 
 def _boxes(condition: ConditionResult, joint_names: list[str]) -> list[drawing.Panel]:
     """Draw mean |e| on the held-out motions, a box per estimate and a panel per joint (Fig. 3)."""
-    labels = [one.label for one in condition.methods]
-    errors = [np.array(condition.held_out.mean_abs[one.key]) for one in condition.methods]
+    labels = [method.label for method in condition.methods]
+    errors = [np.array(condition.held_out.mean_abs[method.key]) for method in condition.methods]
     panels = []
     for j, name in enumerate(joint_names):
-        columns = [own[:, j] for own in errors]
+        columns = [estimate_errors[:, j] for estimate_errors in errors]
         medians = ", ".join(
-            f"{label} {significant(float(np.median(own)))}"
-            for label, own in zip(labels, columns, strict=True)
+            f"{label} {significant(float(np.median(column)))}"
+            for label, column in zip(labels, columns, strict=True)
         )
         key = f"b{condition.key}{j}"
         what = "mean |e| in N·m"
@@ -186,24 +199,24 @@ def _boxes(condition: ConditionResult, joint_names: list[str]) -> list[drawing.P
 
 def _examples(condition: ConditionResult, joint_names: list[str]) -> list[drawing.Panel]:
     """Draw one held-out motion in time: measured, predicted by each, and the errors (Fig. 4)."""
-    found = condition.held_out
-    time = np.array(found.time)
+    held_out = condition.held_out
+    time = np.array(held_out.time)
     panels = []
     for j, name in enumerate(joint_names):
-        measured = np.array(found.measured[j])
-        names = [one.label for one in condition.methods]
+        measured = np.array(held_out.measured[j])
+        names = [method.label for method in condition.methods]
         lines = [
-            Trace(np.array(found.predicted[one.key][j]), COLOURS[k], 1.1, dashed=k == 1)
-            for k, one in enumerate(condition.methods)
+            Trace(np.array(held_out.predicted[method.key][j]), COLOURS[k], 1.1, dashed=k == 1)
+            for k, method in enumerate(condition.methods)
         ]
-        errors = [measured - one.values for one in lines]
+        errors = [measured - line.values for line in lines]
         reach = 1.05 * max(float(np.abs(error).max()) for error in errors) or 1.0
         both = [Trace(measured, drawing.WIDE, 4.0), *lines]
         plots = [Plot(128.0, "torque [N·m]", both)]
         rms = []
         # A row for each error: where there is noise, one line over another would hide it.
-        for which, one, error in zip(names, lines, errors, strict=True):
-            trace = Trace(error, one.colour, 1.0)
+        for which, line, error in zip(names, lines, errors, strict=True):
+            trace = Trace(error, line.colour, 1.0)
             plots.append(Plot(48.0, f"measured − {which} [N·m]", [trace], reach=reach))
             rms.append(f"{which} {significant(float(np.sqrt(np.mean(error**2))))}")
         note = f"RMS error {', '.join(rms)} N·m"

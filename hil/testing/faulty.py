@@ -59,8 +59,8 @@ def faulty_controller(cell: Cell, *lines: str) -> SimulatedController:
     Raises:
         FaultScriptError: a line is not a fault.
     """
-    _, own = split_faults(map(parse_fault, lines))
-    return simulated_controller(cell, faults=own)
+    _, controller_faults = split_faults(map(parse_fault, lines))
+    return simulated_controller(cell, faults=controller_faults)
 
 
 def faulty_link(
@@ -117,14 +117,14 @@ class UdpController:
         port = free_port()
         path = folder / "udp_cell.toml"
         linked = cell.with_link(transport="udp", host=LOOPBACK, port=port, bind=LOOPBACK)
-        own = linked.with_urdf(path, "udp_robot.urdf")
-        (folder / "udp_robot.urdf").write_text(own.urdf, encoding="utf-8")
-        path.write_text(own.text, encoding="utf-8")
+        own_cell = linked.with_urdf(path, "udp_robot.urdf")
+        (folder / "udp_robot.urdf").write_text(own_cell.urdf, encoding="utf-8")
+        path.write_text(own_cell.text, encoding="utf-8")
         given = [argument for fault in faults for argument in ("--fault", fault)]
         simulator = SimulatorProcess.start(
             path, "--udp", f"{LOOPBACK}:{port}", "--patience", str(PATIENCE), *given, *options
         )
-        controller = cls(own, path, LOOPBACK, port, simulator)
+        controller = cls(own_cell, path, LOOPBACK, port, simulator)
         try:
             yield controller
         finally:

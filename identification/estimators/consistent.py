@@ -183,12 +183,12 @@ def consistent_parameters(
     program = Program.of(model, prior)
     s = model.layout.size
     rows, target = rows_of(equations)
-    known = np.isfinite(prior.std) & (prior.std > 0.0)
-    weight = 1.0 / prior.std[known]
+    informative = np.isfinite(prior.std) & (prior.std > 0.0)
+    weight = 1.0 / prior.std[informative]
     data = rows @ prior.combinations / np.sqrt(design_effect)
     x = program.solve(
-        np.concatenate([data, weight[:, None] * np.eye(len(prior.std))[known]]),
-        np.concatenate([target / np.sqrt(design_effect), weight * prior.mean[known]]),
+        np.concatenate([data, weight[:, None] * np.eye(len(prior.std))[informative]]),
+        np.concatenate([target / np.sqrt(design_effect), weight * prior.mean[informative]]),
     )
     x = without_rounding(model, x)
     return x[:s], x[s:]
@@ -318,8 +318,8 @@ class ConsistentEstimate:
         """Change of each parameter in standard deviations (p,); 0 if they are infinite."""
         moved = self.estimate.values - self.unconstrained.values
         std = self.unconstrained.std
-        known = np.isfinite(std) & (std > 0.0)
-        return np.where(known, moved / np.where(known, std, 1.0), 0.0)
+        determined = np.isfinite(std) & (std > 0.0)
+        return np.where(determined, moved / np.where(determined, std, 1.0), 0.0)
 
 
 def consistent_estimate(

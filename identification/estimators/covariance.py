@@ -173,12 +173,12 @@ def with_block_covariance(
     estimate: Estimate, factor: Factor, weights: Array, name: str = "weighted least squares"
 ) -> Estimate:
     """Return the estimate from a factor and weights (n,) with cluster-robust covariance."""
-    found = block_covariance(factor, weights, estimate.values)
+    clustered = block_covariance(factor, weights, estimate.values)
     return replace(
         estimate,
-        covariance=found.covariance,
-        interval_factor=found.interval_factor,
-        method=f"{name}, {found.words}",
+        covariance=clustered.covariance,
+        interval_factor=clustered.interval_factor,
+        method=f"{name}, {clustered.words}",
     )
 
 
@@ -216,27 +216,27 @@ def leverage_corrected(shares: Array, scores: Array) -> Array:
     `_HIGH_LEVERAGE` the residual of the block, which vanishes, is replaced by the variance of white
     residuals, ``h``, times the design effect of the rest, at least one.
     """
-    own, dependent = _regular(shares, scores)
+    corrected, dependent = _regular(shares, scores)
     regular = np.ones(len(scores), dtype=np.bool_)
     regular[dependent] = False
-    squares = float((scores * own).sum())  # zero where dependent
+    squares = float((scores * corrected).sum())  # zero where dependent
     leverage = float(np.einsum("bii,b->", shares, regular.astype(np.float64)))
-    rows = [own[regular]]
+    rows = [corrected[regular]]
     added = []
     identity = np.eye(scores.shape[1])
     for b in dependent:
-        u, rest, vt = np.linalg.svd(identity - shares[b])
+        u, singular, vt = np.linalg.svd(identity - shares[b])
         trusted = np.clip(
-            (rest - (1.0 - _HIGH_LEVERAGE)) / (_HIGH_LEVERAGE - _LOW_LEVERAGE), 0.0, 1.0
+            (singular - (1.0 - _HIGH_LEVERAGE)) / (_HIGH_LEVERAGE - _LOW_LEVERAGE), 0.0, 1.0
         )
-        without_own = (u.T @ scores[b]) / np.maximum(rest, 1.0 - _HIGH_LEVERAGE)
-        squares += float((trusted * without_own**2 * rest).sum())
-        leverage += float((trusted * (1.0 - rest)).sum())
+        without_own = (u.T @ scores[b]) / np.maximum(singular, 1.0 - _HIGH_LEVERAGE)
+        squares += float((trusted * without_own**2 * singular).sum())
+        leverage += float((trusted * (1.0 - singular)).sum())
         rows.append(((np.sqrt(trusted) * without_own) @ vt)[None])
-        replaced = np.sqrt((1.0 - trusted) * np.maximum(1.0 - rest, 0.0))
+        replaced = np.sqrt((1.0 - trusted) * np.maximum(1.0 - singular, 0.0))
         added.append((replaced[:, None] * vt)[trusted < 1.0])
     effect = max(1.0, squares / leverage) if leverage > 0.0 else 1.0
-    return np.concatenate([*rows, *(np.sqrt(effect) * one for one in added)])
+    return np.concatenate([*rows, *(np.sqrt(effect) * vectors for vectors in added)])
 
 
 def _regular(shares: Array, scores: Array) -> tuple[Array, list[int]]:

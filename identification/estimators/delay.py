@@ -131,8 +131,10 @@ def with_uncertain_delay(
     if precision is not None:
         equations = equations._replace(A=equations.A + precision)
     moved = solve(equations).values
-    known = np.where(np.isfinite(np.diag(estimate.covariance)), moved, 0.0)
-    return replace(estimate, covariance=estimate.covariance + variance * np.outer(known, known))
+    sensitivity = np.where(np.isfinite(np.diag(estimate.covariance)), moved, 0.0)
+    return replace(
+        estimate, covariance=estimate.covariance + variance * np.outer(sensitivity, sensitivity)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,8 +247,8 @@ def _other_minimum(grid: Array, heights: Array, shift: float, height: float) -> 
     padded = np.concatenate([[np.inf], heights, [np.inf]])
     valley = (heights <= padded[:-2]) & (heights <= padded[2:])
     other = np.abs(grid - shift) > grid[1] - grid[0]
-    found = np.flatnonzero(valley & other & (heights < height + _MODEL_ERROR))
-    return float(grid[found[np.argmin(heights[found])]]) if found.size else float("nan")
+    valleys = np.flatnonzero(valley & other & (heights < height + _MODEL_ERROR))
+    return float(grid[valleys[np.argmin(heights[valleys])]]) if valleys.size else float("nan")
 
 
 def _undetermined_reason(half_interval: float, at_limit: bool, other: float) -> str | None:
@@ -291,9 +293,9 @@ class _Blocks:
         parts = np.array_split(self.gram[:, used][:, :, used], _FOLDS)
         folds = np.array([part.sum(axis=0) for part in parts])
         error = 0.0
-        for own in folds:
-            augmented = np.append(-_solved(folds.sum(axis=0) - own).values, 1.0)
-            error += float(augmented @ own @ augmented)
+        for fold in folds:
+            augmented = np.append(-_solved(folds.sum(axis=0) - fold).values, 1.0)
+            error += float(augmented @ fold @ augmented)
         return error / self.rows
 
 
@@ -376,10 +378,10 @@ class _Reader:
             factor = Factor.of(self.model, self.at(shift))
             moving = factor.samples > 0
             if moving.any():
-                found = estimate(self.model, factor)
-                height = 2.0 * np.log(found.noise_std[moving])
+                fit = estimate(self.model, factor)
+                height = 2.0 * np.log(fit.noise_std[moving])
                 heights[k] = np.average(height, weights=factor.samples[moving])
-                best = found.values if heights[k] <= heights.min() else best
+                best = fit.values if heights[k] <= heights.min() else best
         if not np.isfinite(heights).any():
             raise IdentificationError(no_rows_message(self.model))
         return heights, best
@@ -397,10 +399,10 @@ class _Reader:
             table = np.column_stack([block, -rate, samples.torque[:, j]])
             tables.append(np.where(samples.usable[:, j], table.T, 0.0))
         index = np.arange(len(samples.usable)) * _BLOCKS // max(1, len(samples.usable))
-        own = tuple(np.append(used, p) for used in columns)
+        columns_with_delay = tuple(np.append(used, p) for used in columns)
         names = (*model.parameter_names, "delay")
         counts = count_by_block(index, samples.usable)
-        factor = Factor.of_rows([(index, tables)], counts, own, names)
+        factor = Factor.of_rows([(index, tables)], counts, columns_with_delay, names)
         if weights is None:
             nothing = np.zeros((p + 1, 0))
             variance = residual_variance(

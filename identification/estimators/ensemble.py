@@ -146,8 +146,8 @@ def _balanced(normal: Array) -> Array:
 
 
 def _finite_deviations(std: Array) -> Array:
-    known = np.isfinite(std)
-    return np.where(known, std, _FLAT * np.max(std, initial=1.0, where=known))
+    finite = np.isfinite(std)
+    return np.where(finite, std, _FLAT * np.max(std, initial=1.0, where=finite))
 
 
 def _or_one(deviations: Array) -> Array:

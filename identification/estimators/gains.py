@@ -99,13 +99,13 @@ def identify_gains(model: RobotModel, factors: Sequence[Factor]) -> Gains:
     std = np.sqrt(np.diag(clustered.covariance)[layout.gains])
     inverse = unknowns[layout.gains]
     reasons = _reasons(total, rows, inverse, solution.determined[layout.gains], std)
-    known = np.array([reason is None for reason in reasons])
-    gains = 1.0 / np.where(known, inverse, 1.0)
+    determined = np.array([reason is None for reason in reasons])
+    gains = 1.0 / np.where(determined, inverse, 1.0)
     return Gains(
         motor_names=model.joint_names,
-        values=np.where(known, gains, np.nan),
+        values=np.where(determined, gains, np.nan),
         # From the inverses, to first order.
-        std=np.where(known, std * gains**2, np.inf),
+        std=np.where(determined, std * gains**2, np.inf),
         reasons=reasons,
         interval_factor=clustered.interval_factor,
     )
@@ -144,26 +144,26 @@ class _Layout(NamedTuple):
 
 
 def _reasons(
-    total: Array, rows: NDArray[np.intp], found: Array, determined: NDArray[np.bool_], std: Array
+    total: Array, rows: NDArray[np.intp], inverse: Array, determined: NDArray[np.bool_], std: Array
 ) -> tuple[str | None, ...]:
     """Return why each motor's gain is undetermined or None, from inverse and std (n,)."""
     p = total.shape[1] - 3
-    size = np.abs(found)
+    size = np.abs(inverse)
     relative = np.divide(std, size, out=np.full_like(size, np.inf), where=size > _VANISHING)
     # Whether the payload's torque on a motor exceeds rounding.
     powers = np.diagonal(total, axis1=1, axis2=2)
     loaded = powers[:, p] > _NO_LOAD**2 * powers[:, :p].max(axis=1, initial=0.0)
-    good = determined & (found > 0.0) & (relative <= WORST_RELATIVE_STD)
+    good = determined & (inverse > 0.0) & (relative <= WORST_RELATIVE_STD)
     checks = (  # first match
         (rows == 0, "the motor has no usable row"),
         (good, None),
         (~loaded, "the payload does not load it"),
         (~determined, "the payload's torque is not separable from the robot's own"),
-        (~(found > 0.0), "its estimate is not positive: the payload's torque is below the noise"),
+        (~(inverse > 0.0), "its estimate is not positive: the payload's torque is below the noise"),
     )
     return tuple(
         next(
-            (words for holds, words in checks if holds[m]),
+            (reason for holds, reason in checks if holds[m]),
             f"its relative standard deviation is {percentage(relative[m])}, limit "
             f"{percentage(WORST_RELATIVE_STD)}",
         )
@@ -180,14 +180,16 @@ def _motor_by_motor(total: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]
     for m in np.flatnonzero(rows):
         gram = total[m][np.ix_(unknown, unknown)]
         current = total[m][unknown, -1]
-        own = solve(NormalEquations(gram, current))
-        squares = total[m][-1, -1] - own.values @ current
+        solution = solve(NormalEquations(gram, current))
+        squares = total[m][-1, -1] - solution.values @ current
         freedom = max(rows[m] - len(unknown), 1)
         noise[m] = np.sqrt(max(squares, _LEAST_NOISE**2 * total[m][-1, -1]) / freedom)
-        if own.determined[p] and own.values[p] > 0.0:
-            inverses[m] = own.values[p]
-    known = np.isfinite(inverses)
-    return noise, np.where(known, inverses, np.median(inverses[known]) if known.any() else 1.0)
+        if solution.determined[p] and solution.values[p] > 0.0:
+            inverses[m] = solution.values[p]
+    estimated = np.isfinite(inverses)
+    return noise, np.where(
+        estimated, inverses, np.median(inverses[estimated]) if estimated.any() else 1.0
+    )
 
 
 def _offset_variance(
@@ -223,10 +225,10 @@ def _gauss_newton(
         scores = 0.0
         squares = 0.0
         for k, total in enumerate(totals):
-            own = _linearised(layout, k, total[None], unknowns, noise)
-            information = information + own[0][0]
-            scores = scores + own[1][0]
-            squares += float(own[2][0])
+            terms = _linearised(layout, k, total[None], unknowns, noise)
+            information = information + terms[0][0]
+            scores = scores + terms[1][0]
+            squares += float(terms[2][0])
         equations = NormalEquations(
             np.asarray(information + np.diag(prior)), np.asarray(scores - prior * unknowns)
         )
@@ -280,9 +282,9 @@ def _with_covariance(
         information = np.zeros((count, layout.size, layout.size))
         scores = np.zeros((count, layout.size))
         for k, run in enumerate(blocks):
-            own = _linearised(layout, k, run, unknowns, spread)
-            information[: len(run)] += own[0]
-            scores[: len(run)] += own[1]
+            terms = _linearised(layout, k, run, unknowns, spread)
+            information[: len(run)] += terms[0]
+            scores[: len(run)] += terms[1]
         duration = length * FINE_BLOCK  # for the description only
         clustered = cluster_covariance(
             information, scores, solution, np.diag(prior), duration, STRETCH
@@ -315,8 +317,8 @@ def _linearised(
         residual = -inverse * torque
         residual[-1] = 1.0
         place = np.append(np.arange(p), [p + m, offsets[m], scales[m]])
-        own = gram[:, m] / noise[m] ** 2
-        information[:, place[:, None], place] += slope.T @ own @ slope
-        scores[:, place] += own @ residual @ slope
-        squares += np.einsum("i,bij,j->b", residual, own, residual)
+        weighted_gram = gram[:, m] / noise[m] ** 2
+        information[:, place[:, None], place] += slope.T @ weighted_gram @ slope
+        scores[:, place] += weighted_gram @ residual @ slope
+        squares += np.einsum("i,bij,j->b", residual, weighted_gram, residual)
     return information, scores, squares

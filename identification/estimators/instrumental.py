@@ -73,16 +73,16 @@ def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = No
     """
     measured = samples.motion.position
     time = samples.motion.time
-    known = np.asarray(np.isfinite(commanded).all(axis=1))
+    with_command = np.asarray(np.isfinite(commanded).all(axis=1))
     tolerance = np.full(commanded.shape[1], _COMMAND_TOLERANCE)
     splines = []
     for segment in samples.segments:
-        rows = np.flatnonzero(known[segment]) + segment.start
+        rows = np.flatnonzero(with_command[segment]) + segment.start
         if len(rows) >= 2 * ORDER:
-            own = fit_smoothing_spline(
+            segment_spline = fit_smoothing_spline(
                 time[rows], commanded[rows], tolerance, widest=RIGID_BANDWIDTH
             )
-            splines.append((rows, own))
+            splines.append((rows, segment_spline))
     if not splines:
         raise IdentificationError("no commanded positions: no instruments")
     if lag is None:
@@ -103,16 +103,16 @@ def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = No
 
 def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
     """Return whether two pairs of times (m,) and commanded positions (m, n) are of one motion."""
-    (time, one) = first
+    (time, commanded) = first
     (other_time, other) = second
-    if one.shape[1] != other.shape[1]:
+    if commanded.shape[1] != other.shape[1]:
         return False
-    rows = np.isfinite(one).all(axis=1)
+    rows = np.isfinite(commanded).all(axis=1)
     others = np.isfinite(other).all(axis=1)
     if not rows.any() or not others.any():
         return False
     time = time[rows]
-    one = one[rows]
+    commanded = commanded[rows]
     other_time = other_time[others]
     other = other[others]
     start = max(time[0], other_time[0])
@@ -124,9 +124,11 @@ def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
     # A quantile, since gaps are interpolated.
     apart = [
         np.quantile(np.abs(np.interp(at, time, a) - np.interp(at, other_time, b)), _OVERLAP)
-        for a, b in zip(one.T, other.T, strict=True)
+        for a, b in zip(commanded.T, other.T, strict=True)
     ]
-    return bool(np.all(np.array(apart) <= _SAME_PLAN * np.maximum(np.ptp(one, axis=0), _STILL)))
+    return bool(
+        np.all(np.array(apart) <= _SAME_PLAN * np.maximum(np.ptp(commanded, axis=0), _STILL))
+    )
 
 
 def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Array:
@@ -234,7 +236,7 @@ def estimate_instrumental(
     cross = merged(cross, length)
     scores = merged(moments, length) - cross @ solution.values
     moved = spread(cross, scores, solution.right, solution.left)
-    found = estimate_of(
+    estimate = estimate_of(
         model.units,
         rows,
         rows.solve(weights)._replace(
@@ -247,7 +249,7 @@ def estimate_instrumental(
         float(student_limit(0.025, max(1, len(scores) - 1))),
     )
     return InstrumentalEstimate(
-        estimate=found,
+        estimate=estimate,
         weak=tuple(name for name, f in zip(names, first_stage, strict=True) if f < WEAK),
     )
 
@@ -265,8 +267,8 @@ def partial_r2(total: Array) -> Array:
     zw = scaled[:p, p:]
     ww = scaled[p:, p:]
     inverse = partial(np.linalg.pinv, rcond=1.0 / WORST_CONDITION**2, hermitian=True)
-    own = np.diag(inverse(ww))
+    own_inverse = np.diag(inverse(ww))
     by_instruments = np.diag(inverse(zw.T @ inverse(zz) @ zw))
-    known = (own > 0.0) & (by_instruments > 0.0)
-    share = np.where(known, own / np.where(known, by_instruments, 1.0), 0.0)
+    positive = (own_inverse > 0.0) & (by_instruments > 0.0)
+    share = np.where(positive, own_inverse / np.where(positive, by_instruments, 1.0), 0.0)
     return np.clip(share, 0.0, 1.0)

@@ -48,10 +48,16 @@ def fit_least_squares(
     factor = total_factor(model, recordings) if factor is None else factor
     precise = reduced(model, recordings, factor)
     weights = np.ones(model.n_joints) if weighting == "ordinary" else joint_weights(precise)
-    solution, found = clustered_fit(model, precise, recordings, factor, weights)
-    method = f"{weighting} least squares{precise.words}, {found.words}"
+    solution, clustered = clustered_fit(model, precise, recordings, factor, weights)
+    method = f"{weighting} least squares{precise.words}, {clustered.words}"
     return estimate_of(
-        model.units, precise, solution, weights, method, found.covariance, found.interval_factor
+        model.units,
+        precise,
+        solution,
+        weights,
+        method,
+        clustered.covariance,
+        clustered.interval_factor,
     )
 
 
@@ -99,7 +105,7 @@ class RepeatedEstimate:
     @property
     def values(self) -> Array:
         """Parameters of the repetitions (R, p)."""
-        return np.array([one.values for one in self.repetitions])
+        return np.array([estimate.values for estimate in self.repetitions])
 
     @property
     def mean(self) -> Array:
@@ -120,12 +126,14 @@ def no_narrower(covariance: Array, values: Array) -> Array:
     if freedom < 1:
         return covariance
     std = np.sqrt(np.diag(covariance))
-    known = np.isfinite(std) & (std > 0.0)
+    determined = np.isfinite(std) & (std > 0.0)
     scatter = values.std(axis=0, ddof=1) / np.sqrt(len(values))
-    ratio = np.where(known, scatter / np.where(known, std, 1.0), 1.0)
+    ratio = np.where(determined, scatter / np.where(determined, std, 1.0), 1.0)
     chance = np.sqrt(scipy.stats.chi2.ppf(_CERTAIN, freedom) / freedom)
     wider = np.where(ratio > chance, ratio, 1.0)
-    return np.where(np.outer(known, known), covariance * np.outer(wider, wider), covariance)
+    return np.where(
+        np.outer(determined, determined), covariance * np.outer(wider, wider), covariance
+    )
 
 
 def estimate_repetitions(

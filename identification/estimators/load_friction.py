@@ -73,8 +73,10 @@ def fit_with_load(
     if not model.friction.has_load:
         return LoadFit(fit(samples), samples, 1, 0.0)
     samples = tuple(
-        one if one.motion.load is not None else one.with_given_load(_no_load(one))
-        for one in samples
+        recording
+        if recording.motion.load is not None
+        else recording.with_given_load(_no_load(recording))
+        for recording in samples
     )
     predicted: list[Array] | None = None
     passes = 0
@@ -82,9 +84,9 @@ def fit_with_load(
     while True:
         result = fit(samples)
         passes += 1
-        samples = tuple(one.with_load(model, result.values) for one in samples)
+        samples = tuple(recording.with_load(model, result.values) for recording in samples)
         before = predicted
-        predicted = [_predicted(model, result.values, one) for one in samples]
+        predicted = [_predicted(model, result.values, recording) for recording in samples]
         if before is not None:
             change = _change(before, predicted)
         if passes >= most or change < CONVERGED:

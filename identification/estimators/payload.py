@@ -119,8 +119,8 @@ class Run:
             rows = [block, samples.as_measured(j, beside), samples.torque[:, [j]]]
             tables.append(np.concatenate(rows, axis=1).T)
             tables[-1][:, ~samples.usable[:, j]] = 0.0
-            own = p + np.arange(load.shape[1])
-            places.append(np.concatenate([columns[j], own, [p + _BODY + j]]))
+            body_columns = p + np.arange(load.shape[1])
+            places.append(np.concatenate([columns[j], body_columns, [p + _BODY + j]]))
         names = (
             *model.parameter_names,
             *LINK_SYMBOLS,
@@ -181,33 +181,35 @@ def identify_payload(
     model: RobotModel,
     runs: Sequence[Run],
     scale_std: Array | None = None,
-    known: KnownArm | None = None,
+    arm: KnownArm | None = None,
 ) -> PayloadEstimate:
     """Estimate the body that the loaded recordings carry and the bare ones do not.
 
     `scale_std` is the relative standard deviation of each joint's torque scale (n,), by default
-    zero: it is common to all recordings. A `known` arm replaces or adds to bare recordings.
+    zero: it is common to all recordings. A known `arm` replaces or adds to bare recordings.
 
     Raises:
         PayloadError: undetermined mass, or negative mass.
         IdentificationError: no usable row.
     """
-    found = _body_estimate(model, runs, scale_std, known)
-    mass, low, high = _determined_mass(found)
+    estimate = _body_estimate(model, runs, scale_std, arm)
+    mass, low, high = _determined_mass(estimate)
     intervals = np.tile([-np.inf, np.inf], (_BODY, 1))
     intervals[0] = max(0.0, low), high
     if low <= 0.0:
         undetermined = NAMES[1:]
         return PayloadEstimate(
-            found.values, None, intervals, found.moment, undetermined, (), found.words
+            estimate.values, None, intervals, estimate.moment, undetermined, (), estimate.words
         )
-    total, by_scale = (found.variance_of_mass(part) for part in (found.spread, found.by_scale))
-    intervals[1:4] = found.centre_intervals
+    total, by_scale = (
+        estimate.variance_of_mass(part) for part in (estimate.spread, estimate.by_scale)
+    )
+    intervals[1:4] = estimate.centre_intervals
     open_ended = np.isinf(intervals[:, 1])
-    centre = np.where(open_ended[1:4], 0.0, found.values[6:9] / mass)
+    centre = np.where(open_ended[1:4], 0.0, estimate.values[6:9] / mass)
     to_centre = _moved(np.eye(3), -centre)[_INERTIA]
-    six = to_centre @ found.values
-    halves = found.factor * found.std(to_centre)
+    six = to_centre @ estimate.values
+    halves = estimate.factor * estimate.std(to_centre)
     lower, upper = _off_centre(mass, (intervals[1:4, 1] - intervals[1:4, 0]) / 2.0)
     intervals[4:] = np.column_stack([six - halves - lower, six + halves + upper])
     negative = _impossible(intervals, _ROUNDING * mass * (1.0 + float(centre @ centre)))
@@ -221,22 +223,22 @@ def identify_payload(
     carried = _consistent(mass, centre, np.where(open_ended[4:], 0.0, six))
     figures = figures_of(carried)
     return PayloadEstimate(
-        parameters=found.values,
+        parameters=estimate.values,
         body=carried,
         intervals=np.column_stack(
             [np.minimum(intervals[:, 0], figures), np.maximum(intervals[:, 1], figures)]
         ),
-        moment=found.moment,
+        moment=estimate.moment,
         undetermined=tuple(np.array(NAMES)[open_ended].tolist()),
         impossible=tuple(np.array(NAMES)[negative].tolist()),
-        method=found.words,
+        method=estimate.words,
         scale_share=by_scale / total,
     )
 
 
-def _determined_mass(found: _BodyEstimate) -> tuple[float, float, float]:
+def _determined_mass(estimate: _BodyEstimate) -> tuple[float, float, float]:
     """Return mass and interval [kg] of a body; PayloadError if undetermined, or negative."""
-    mass, low, high = found.mass
+    mass, low, high = estimate.mass
     if not np.isfinite(high):
         raise PayloadError(
             "the motion does not separate the mass from other parameters; record one that moves"
@@ -270,7 +272,7 @@ def contradiction(
     model: RobotModel,
     runs: Sequence[Run],
     estimate: PayloadEstimate,
-    known: KnownArm | None = None,
+    arm: KnownArm | None = None,
 ) -> tuple[Weighing, Weighing] | None:
     """Return two loaded, or two bare recordings that carry different bodies; None if all agree.
 
@@ -285,15 +287,15 @@ def contradiction(
     size = max(estimate.moment[0], mass * ball_radius(mass))
     limits = np.array([SAME_CENTRE * size] * 3 + [SAME_MASS * mass])
     if len(loaded) > 1:
-        single = [_body_estimate(model, [*bare, run], known=known) for run in loaded]
-        for one, run in zip(single[1:], loaded[1:], strict=True):
-            if _differs(single[0], one, limits):
-                return _weighing(loaded[0].name, single[0]), _weighing(run.name, one)
+        single = [_body_estimate(model, [*bare, run], arm=arm) for run in loaded]
+        for other, run in zip(single[1:], loaded[1:], strict=True):
+            if _differs(single[0], other, limits):
+                return _weighing(loaded[0].name, single[0]), _weighing(run.name, other)
     for run in bare[1:]:
-        found = _body_estimate(model, [bare[0], replace(run, loaded=True)])
-        if _differs(None, found, limits):
+        difference = _body_estimate(model, [bare[0], replace(run, loaded=True)])
+        if _differs(None, difference, limits):
             nothing = Weighing(bare[0].name, (0.0, 0.0, 0.0), np.full(3, np.nan))
-            return nothing, _weighing(run.name, found)
+            return nothing, _weighing(run.name, difference)
     return None
 
 
@@ -310,10 +312,14 @@ def _differs(first: _BodyEstimate | None, second: _BodyEstimate, limits: Array) 
     return bool(beyond.any())
 
 
-def _weighing(name: str, found: _BodyEstimate) -> Weighing:
-    known = np.isfinite(found.std(np.eye(_BODY)[6:]))
-    centre = found.values[6:9] / found.values[9] if found.values[9] != 0.0 else np.full(3, np.nan)
-    return Weighing(name, found.mass, np.where(known[:3], centre, np.nan))
+def _weighing(name: str, estimate: _BodyEstimate) -> Weighing:
+    determined = np.isfinite(estimate.std(np.eye(_BODY)[6:]))
+    centre = (
+        estimate.values[6:9] / estimate.values[9]
+        if estimate.values[9] != 0.0
+        else np.full(3, np.nan)
+    )
+    return Weighing(name, estimate.mass, np.where(determined[:3], centre, np.nan))
 
 
 def reach(model: RobotModel, frame: str | None, travel: Array) -> float:
@@ -386,9 +392,7 @@ class _Fit(NamedTuple):
         return np.asarray(axes[:, lost < _PARTICIPATION**2].T * scale)
 
 
-def _fit(
-    model: RobotModel, runs: Sequence[Run], shape: Array, known: KnownArm | None = None
-) -> _Fit:
+def _fit(model: RobotModel, runs: Sequence[Run], shape: Array, arm: KnownArm | None = None) -> _Fit:
     """Solve the joint problem for the r unknowns of the body, ten parameters by shape (10, r)."""
     rows = np.sum([run.factor.samples for run in runs], axis=0)
     if not rows.any():
@@ -406,7 +410,7 @@ def _fit(
 
     def problem_of(length: int | None = None) -> list[_Rows]:
         """Return Gram matrices over the unknowns, of merged blocks."""
-        found = []
+        rows_of_problem = []
         for k, run in enumerate(runs):
             factor = run.factor.merged(length or max(1, len(run.factor)))
             for joint, (gram, columns) in enumerate(
@@ -423,13 +427,13 @@ def _fit(
                     mapping[len(arm) : len(arm) + _BODY, part] = shape
                 used = np.flatnonzero(mapping.any(axis=0))
                 small = mapping[:, used]
-                found.append((joint, small.T @ gram @ small, used))
-        return found
+                rows_of_problem.append((joint, small.T @ gram @ small, used))
+        return rows_of_problem
 
     expected = np.zeros(width)
     information = np.zeros((width, width))
-    if known is not None:
-        expected[:p], information[:p, :p] = known.values, known.information
+    if arm is not None:
+        expected[:p], information[:p, :p] = arm.values, arm.information
 
     def prior_of(problem: Sequence[_Rows], weights: Array) -> Array:
         """Return the information on the unknowns, of known arm, offsets and friction scales."""
@@ -480,8 +484,8 @@ def _fit(
     pulls = np.zeros((width, n))
     for joint, gram, places in problem:
         pulls[places[:-1], joint] += scaled[joint] * gram.sum(axis=0)[:-1, -1]
-    if known is not None:
-        pulls[:p] += known.information @ known.sensitivity
+    if arm is not None:
+        pulls[:p] += arm.information @ arm.sensitivity
     return _Fit(
         values=solution.values[part],
         root=basis[part] / np.linalg.norm(basis, axis=0),
@@ -499,8 +503,8 @@ def _weights(problem: Sequence[_Rows], values: Array, rows: NDArray[np.intp]) ->
     augmented = np.append(-values, 1.0)
     for joint, gram, places in problem:
         total = gram.sum(axis=0)
-        own = augmented[places]
-        squares[joint] += own @ total @ own
+        run_values = augmented[places]
+        squares[joint] += run_values @ total @ run_values
         torque[joint] += total[-1, -1]
     squares = np.maximum(squares, _LEAST_NOISE**2 * torque)
     return np.divide(rows, squares, out=np.zeros(len(rows)), where=squares > 0.0)
@@ -523,8 +527,8 @@ class _BodyEstimate(NamedTuple):
 
     def covariance(self, rows: Array) -> Array:
         """Return the covariance of functions (k, 10) of the parameters, determined part (k, k)."""
-        own = rows @ np.linalg.pinv(self.determined)
-        return np.asarray(own @ self.spread @ own.T)
+        combinations = rows @ np.linalg.pinv(self.determined)
+        return np.asarray(combinations @ self.spread @ combinations.T)
 
     def std(self, rows: Array) -> Array:
         """Return standard deviations of functions (k, 10), infinite if undetermined."""
@@ -532,8 +536,8 @@ class _BodyEstimate(NamedTuple):
         scale = np.where(scale > _ROUNDING * scale.max(initial=0.0), scale, 1.0)
         lost = (rows - rows @ np.linalg.pinv(self.determined) @ self.determined) / scale
         size = np.linalg.norm(rows / scale, axis=1)
-        known = np.linalg.norm(lost, axis=1) < _PARTICIPATION * size
-        return np.where(known, np.sqrt(np.diag(self.covariance(rows))), np.inf)
+        determined = np.linalg.norm(lost, axis=1) < _PARTICIPATION * size
+        return np.where(determined, np.sqrt(np.diag(self.covariance(rows))), np.inf)
 
     @property
     def mass(self) -> tuple[float, float, float]:
@@ -555,14 +559,14 @@ class _BodyEstimate(NamedTuple):
     @property
     def centre_intervals(self) -> Array:
         """95 % intervals of the centre (3, 2), a ratio (Fieller 1954)."""
-        known = np.isfinite(self.std(np.eye(_BODY)))
+        determined = np.isfinite(self.std(np.eye(_BODY)))
         covariance = self.factor**2 * self.covariance(np.eye(_BODY))
         first = self.values[6:9]
         mass = self.values[9]
         a = mass**2 - covariance[9, 9]
         b = first * mass - covariance[9, 6:9]
         c = first**2 - np.diag(covariance)[6:9]
-        root = np.where(known[6:9], np.sqrt(np.maximum(b**2 - a * c, 0.0)), np.inf)
+        root = np.where(determined[6:9], np.sqrt(np.maximum(b**2 - a * c, 0.0)), np.inf)
         return np.column_stack([(b - root) / a, (b + root) / a])
 
 
@@ -570,15 +574,15 @@ def _body_estimate(
     model: RobotModel,
     runs: Sequence[Run],
     scale_std: Array | None = None,
-    known: KnownArm | None = None,
+    arm: KnownArm | None = None,
 ) -> _BodyEstimate:
     """Estimate the body of the loaded runs, of least norm where undetermined."""
-    fit = _fit(model, runs, np.eye(_BODY), known)
+    fit = _fit(model, runs, np.eye(_BODY), arm)
     determined = np.eye(_BODY)
-    found = fit.determined
-    if len(found) < _BODY:
-        determined = found
-        fit = _fit(model, runs, np.asarray(np.linalg.pinv(determined)), known)
+    directions = fit.determined
+    if len(directions) < _BODY:
+        determined = directions
+        fit = _fit(model, runs, np.asarray(np.linalg.pinv(determined)), arm)
     std = np.zeros(model.n_joints)
     factor = fit.clustered.interval_factor
     if scale_std is not None:

@@ -87,7 +87,7 @@ class GaussianPrior:
 
     @classmethod
     def of_combinations(
-        cls, combinations: Array, mean: Array, std: Array, words: str = "given"
+        cls, combinations: Array, mean: Array, std: Array, origin: str = "given"
     ) -> GaussianPrior:
         """Return the prior on ``combinations @ s`` of independent s with mean and std (s,).
 
@@ -103,7 +103,7 @@ class GaussianPrior:
         scale = np.sqrt(np.diag(covariance))
         lower = np.linalg.cholesky(covariance / np.outer(scale, scale))
         root = scipy.linalg.solve_triangular(lower, seen.T / scale[:, None], lower=True) / size
-        return cls(combinations @ mean, np.asarray(root), words)
+        return cls(combinations @ mean, np.asarray(root), origin)
 
     @cached_property
     def information(self) -> Array:
@@ -356,7 +356,7 @@ def body_prior(
     model: RobotModel,
     factor: Factor,
     share: float = BODY_SHARE,
-    known: Mapping[str, tuple[float, float]] | None = None,
+    stated: Mapping[str, tuple[float, float]] | None = None,
 ) -> BodyPrior:
     """Return the prior of an arm; its scale without masses, and of friction, is the torque's.
 
@@ -364,7 +364,7 @@ def body_prior(
     its square. Without masses in the description, or with masses that have no relation to the
     torque of the factor: zero with bodies that could make all of the torque. Rotors: zero, with the
     inertia of the links outboard or, if larger, what makes half of the torque's scatter. Friction,
-    offsets and elements: zero, with a coefficient that makes half of it. `known` replaces mean and
+    offsets and elements: zero, with a coefficient that makes half of it. `stated` replaces mean and
     standard deviation by name:
     ``{"I3m": (1.2, 0.2), "f0_1": (40.0, 40.0)}``.
     """
@@ -393,10 +393,10 @@ def body_prior(
         share = 1.0
     std[layout.links] = _body_deviations(share * masses, length)
     std[layout.rotors] = _outboard_inertia(model, masses, length)
-    words = f"nominal bodies to {100.0 * share:g} %"
+    origin = f"nominal bodies to {100.0 * share:g} %"
     if reason:
         std[: layout.size] *= _torque_scale(model, factor, combinations[:, : layout.size], std)
-        words = f"bodies of the size of the torque, as {reason}"
+        origin = f"bodies of the size of the torque, as {reason}"
     # Motors of a wrist are heavier, seen through their gears, than what they move.
     for rotor in layout.rotors.tolist():
         if rotor in model.base.pivots:
@@ -404,11 +404,11 @@ def body_prior(
             std[rotor] = max(std[rotor], whole_torque[column])
     pairs = [np.sqrt(std[layout.rotors][i] * std[layout.rotors][j]) for i, j in layout.pairs]
     std[layout.couplings] = pairs
-    for name, (value, spread) in (known or {}).items():
+    for name, (value, spread) in (stated or {}).items():
         mean[names.index(name)], std[names.index(name)] = value, spread
-    if known:
-        words += f", {len(known)} given"
-    return BodyPrior(mean, std, combinations, words, bool(reason))
+    if stated:
+        origin += f", {len(stated)} given"
+    return BodyPrior(mean, std, combinations, origin, bool(reason))
 
 
 def nominal_deviations(model: RobotModel, share: float = BODY_SHARE) -> Array:

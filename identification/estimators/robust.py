@@ -87,10 +87,10 @@ def robust_estimate(
     n = model.n_joints
     state = _State(factor, factor.solve(np.ones(n)), np.full(n, np.inf))
     stages = [(Huber(), _STEP_TOLERANCE)] if isinstance(loss, Tukey) else []
-    for one, tolerance in [*stages, (loss, TOLERANCE)]:
+    for stage_loss, tolerance in [*stages, (loss, TOLERANCE)]:
         state = state._replace(converged=False)
         for _ in range(most_iterations):
-            state = _iterate(model, recordings, state, one, tolerance)
+            state = _iterate(model, recordings, state, stage_loss, tolerance)
             if state.converged:
                 break
     weights = inverse_variance(state.scale**2)
@@ -133,8 +133,8 @@ def _iterate(
     change = solution.values - state.solution.values
     squares = float(inverse_variance(scale**2) @ factor.products(change[:, None])[:, 0, 0])
     step = np.sqrt(max(squares, 0.0) / len(change))
-    known = np.isfinite(scale)
-    moved = np.abs(scale[known] / state.scale[known] - 1.0).max(initial=0.0)
+    finite = np.isfinite(scale)
+    moved = np.abs(scale[finite] / state.scale[finite] - 1.0).max(initial=0.0)
     return _State(
         factor,
         solution,
@@ -175,9 +175,9 @@ def _scales(recordings: Sequence[Samples], residuals: Sequence[Array], solution:
     rows = np.count_nonzero(usable)
     wider = np.sqrt(rows / max(rows - solution.root.shape[1], 1))
     scale = np.full(left.shape[1], np.nan)
-    for joint, own in enumerate(usable.T):
-        if own.any():
-            floor = _SMALLEST_SCALE * np.sqrt(np.mean(torque[own, joint] ** 2))
-            spread = np.median(np.abs(left[own, joint])) / _MAD * wider
+    for joint, joint_rows in enumerate(usable.T):
+        if joint_rows.any():
+            floor = _SMALLEST_SCALE * np.sqrt(np.mean(torque[joint_rows, joint] ** 2))
+            spread = np.median(np.abs(left[joint_rows, joint])) / _MAD * wider
             scale[joint] = max(spread, floor, np.finfo(np.float64).tiny ** 0.5)
     return scale

@@ -151,11 +151,11 @@ class _Joint(NamedTuple):
     @classmethod
     def of(cls, columns: NDArray[np.intp], gram: Array, rows: float) -> _Joint:
         """Take apart the sums (B, c + 5, c + 5) of :meth:`_Segment.add`."""
-        own = slice(0, -4)
+        regressors = slice(0, -4)
         return cls(
             columns,
-            np.ascontiguousarray(gram[:, own, own]).reshape(len(gram), -1),
-            np.concatenate([gram[:, own, place] for place in (-4, -3, -2, -1)]),
+            np.ascontiguousarray(gram[:, regressors, regressors]).reshape(len(gram), -1),
+            np.concatenate([gram[:, regressors, place] for place in (-4, -3, -2, -1)]),
             float(gram[:, -4, -4].sum()),
             gram[:, -4, -2] + 1j * gram[:, -4, -1],
             gram[:, -2, -2],
@@ -185,14 +185,14 @@ class _Spectra:
         step = float(np.median(np.diff(time)))
         edges = _band_edges(0.5 / step)
         segments = [_Segment.of(time, segment, edges) for segment in samples.segments]
-        count = np.sum([one.bins for one in segments], axis=0)
+        count = np.sum([segment.bins for segment in segments], axis=0)
         bands = np.flatnonzero(count)
-        total = np.sum([one.bins * one.frequency for one in segments], axis=0)
+        total = np.sum([segment.bins * segment.frequency for segment in segments], axis=0)
         joints = []
         for joint, (block, columns) in enumerate(zip(*samples.regressor(model), strict=True)):
             table = np.vstack([block.T, load[:, joint], torque[:, joint]])
             gram = np.zeros((len(count), len(table) + 3, len(table) + 3))
-            rows = sum(one.add(gram, table, usable[:, joint]) for one in segments)
+            rows = sum(segment.add(gram, table, usable[:, joint]) for segment in segments)
             if rows > 0.0:
                 joints.append(_Joint.of(columns, gram[bands], rows))
         frequency = total[bands] / count[bands]

@@ -69,8 +69,8 @@ def with_torque_scale(
     """
     sensitivity = scale_sensitivity(factor, weights, inverse)
     added = scale_covariance(sensitivity, std, estimate.interval_factor)
-    known = np.isfinite(np.diag(estimate.covariance))
-    both = np.outer(known, known)
+    determined = np.isfinite(np.diag(estimate.covariance))
+    both = np.outer(determined, determined)
     return replace(
         estimate,
         covariance=np.where(

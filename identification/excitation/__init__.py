@@ -57,6 +57,6 @@ from identification.excitation.violation import KINDS, NoFeasibleMotionError, Vi
 
 __all__ = [
     name
-    for name, one in globals().items()
-    if not (name.startswith("_") or isinstance(one, types.ModuleType))
+    for name, member in globals().items()
+    if not (name.startswith("_") or isinstance(member, types.ModuleType))
 ]

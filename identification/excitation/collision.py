@@ -63,7 +63,9 @@ def _unread_shapes(urdf: str, links: Iterable[str]) -> str | None:
     read = Counter(links)
     for link in urdf_tree(urdf).findall("link"):
         name = link.get("name", "")
-        written = sum(max(1, len(one.findall("geometry/*"))) for one in link.findall("collision"))
+        written = sum(
+            max(1, len(collision.findall("geometry/*"))) for collision in link.findall("collision")
+        )
         if read[name] != written:
             return (
                 f"of the {written} collision shapes of link {name!r} {read[name]} could be read; "
@@ -442,20 +444,20 @@ def reaches(chain: Chain, bodies: Sequence[Body], pairs: Separation, slides: Arr
         float(np.linalg.norm(hull.centre) + np.hypot(hull.half_length, hull.radius) + hull.ball)
         for hull in hulls
     ]
-    found = np.zeros((len(pairs.first), chain.n_joints))
+    reach = np.zeros((len(pairs.first), chain.n_joints))
     for row, pair in enumerate(zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)):
         branches = [
             chain.ancestors(bodies[body].joint) if bodies[body].joint >= 0 else () for body in pair
         ]
-        for body, own, other in zip(pair, branches, reversed(branches), strict=True):
+        for body, branch, other in zip(pair, branches, reversed(branches), strict=True):
             arm = radius[body]
-            for joint in reversed(own):
+            for joint in reversed(branch):
                 if joint in other:
                     break
                 arm += 0.0 if chain.revolute[joint] else slides[joint]
-                found[row, joint] += arm if chain.revolute[joint] else 1.0
+                reach[row, joint] += arm if chain.revolute[joint] else 1.0
                 arm += float(np.linalg.norm(chain.translation[joint]))
-    return found
+    return reach
 
 
 # Another contact may be deeper by this: in given postures, and along a motion [m].
@@ -715,13 +717,13 @@ class CollisionChecker:
         beyond = acceleration_bound(trajectory, time[:1], time[-1:])[:, 0] * _STEP**2 / 8.0
         reach = self.reaches(np.abs(q).max(axis=0) + beyond)
         pair, node = np.indices((len(reach), len(time))).reshape(2, -1)
-        found = nearest.visit(q, time, pair, node).reshape(-1, len(time))
+        distances = nearest.visit(q, time, pair, node).reshape(-1, len(time))
         ends = time[:-1], time[1:], q[:-1], q[1:]
         change = reach @ _passed(trajectory, *ends, between=between)
-        least = (found[:, :-1] + found[:, 1:] - change) / 2.0
+        least = (distances[:, :-1] + distances[:, 1:] - change) / 2.0
         pair, node = np.nonzero(~(least >= nearest.limit))
         start, stop, q0, q1 = (end[node] for end in ends)
-        gaps = _Gaps(pair, start, stop, q0, q1, found[pair, node], found[pair, node + 1])
+        gaps = _Gaps(pair, start, stop, q0, q1, distances[pair, node], distances[pair, node + 1])
         for _ in range(_DIVISIONS):
             if not between:
                 gaps = gaps.take(gaps.stop - gaps.start > _SAMPLE_STEP)

@@ -97,7 +97,7 @@ def _beyond_limits(extrema: Extrema, limits: JointLimits, motion: Motion) -> lis
     for name in _RATES:
         bound = getattr(limits, name)
         rows.append((name, getattr(extrema, name), bound, 1.0, 0.0 * bound, bound))
-    found = []
+    violations = []
     for quantity, value, bound, sign, tolerance, scale in rows:
         broken = np.flatnonzero(~(sign * value <= sign * bound + tolerance)).tolist()  # NaN as well
         for joint in broken:
@@ -106,7 +106,7 @@ def _beyond_limits(extrema: Extrema, limits: JointLimits, motion: Motion) -> lis
             else:
                 size = _rates(motion)[_RATES.index(quantity)]
             k = int(np.argmax(size[:, joint]))
-            found.append(
+            violations.append(
                 Violation(
                     "joint limit",
                     f"{quantity} of joint {joint}",
@@ -117,7 +117,7 @@ def _beyond_limits(extrema: Extrema, limits: JointLimits, motion: Motion) -> lis
                     scale=float(scale[joint]),
                 )
             )
-    return found
+    return violations
 
 
 def _rates(motion: Motion) -> tuple[Array, Array, Array]:
@@ -167,27 +167,27 @@ class CurrentModel:
         joints = self.model.joint_names
         motors = tuple(f"motor of {name}" for name in joints)
         usable = self.usable * self.current_limit
-        found = _beyond("current", motors, self.current(torque), usable, motion)
+        violations = _beyond("current", motors, self.current(torque), usable, motion)
         if self.usable < 1.0:
             remedy = f"a motion may use {percentage(self.usable)} of the motor's limit"
-            found = [replace(violation, remedy=remedy) for violation in found]
+            violations = [replace(violation, remedy=remedy) for violation in violations]
         if self.torque_limit is not None:
-            found += _beyond("torque", joints, torque, self.torque_limit, motion)
-        return found
+            violations += _beyond("torque", joints, torque, self.torque_limit, motion)
+        return violations
 
 
 def _beyond(
     kind: Kind, subjects: tuple[str, ...], values: Array, bounds: Array, motion: Motion
 ) -> list[Violation]:
-    found = []
+    violations = []
     size = np.abs(values)
     for j, k in enumerate(np.argmax(size, axis=0)):
         if not size[k, j] <= bounds[j]:  # NaN as well
             posture = tuple(motion.position[k].tolist())
             time = float(motion.time[k])
             most = float(size[k, j]), float(bounds[j])
-            found.append(Violation(kind, subjects[j], *most, time, posture))
-    return found
+            violations.append(Violation(kind, subjects[j], *most, time, posture))
+    return violations
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,22 +213,22 @@ class Constraints:
         Raises:
             ShapeError: samples of another arm.
         """
-        found = rest_violations(trajectory, self.limits) if self.at_rest else []
+        violations = rest_violations(trajectory, self.limits) if self.at_rest else []
         beyond = limit_violations(trajectory, self.limits, motion)
-        found += beyond
+        violations += beyond
         duration = trajectory.duration
         bound = min(max(duration, self.min_duration), self.max_duration)
         if bound != duration:
-            found.append(Violation("duration", "the motion", duration, bound, None))
+            violations.append(Violation("duration", "the motion", duration, bound, None))
         if beyond and not all(np.all(np.isfinite(column)) for column in motion[:4]):
-            return tuple(found)
+            return tuple(violations)
         if self.checker is not None:
             # With rates beyond the limits, the bounds between samples are too wide to be of use.
             contact = self.checker.deepest_along(trajectory, between=not beyond)
-            found += [] if contact is None else [_collision(self.checker, contact)]
+            violations += [] if contact is None else [_collision(self.checker, contact)]
         if self.currents is not None:
-            found += self.currents.check(motion)
-        return tuple(found)
+            violations += self.currents.check(motion)
+        return tuple(violations)
 
 
 def check_motion(

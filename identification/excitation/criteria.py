@@ -144,8 +144,8 @@ def measures(gram: Array, n_samples: float) -> dict[str, float]:
     """Return the values of all `CRITERIA` for a Gram matrix (p, p)."""
     root = _factorised(gram)
     return {
-        name: -one.sense * np.inf if root is None else one.score(root, n_samples)
-        for name, one in CRITERIA.items()
+        name: -criterion.sense * np.inf if root is None else criterion.score(root, n_samples)
+        for name, criterion in CRITERIA.items()
     }
 
 
@@ -237,10 +237,10 @@ class Criteria:
     @classmethod
     def of_gram(cls, gram: Array, n_samples: int, given: float = 0.0) -> Self:
         """Evaluate the criteria for the Gram matrix (p, p) of N time samples and `given` others."""
-        found = measures(gram, n_samples + given)
+        values = measures(gram, n_samples + given)
         return cls(
-            **found,
-            fitness=fitness_eq7(found["log10_det"], found["coupling_index"], len(gram)),
+            **values,
+            fitness=fitness_eq7(values["log10_det"], values["coupling_index"], len(gram)),
             n_samples=n_samples,
             condition=condition_number(gram, scaled=False),
             scaled_condition=condition_number(gram, scaled=True),
@@ -316,12 +316,12 @@ class Objective:
     def scores(self, motion: Motion) -> tuple[dict[str, float], float]:
         """Return the `CRITERIA` of a sampled motion, and the criterion of the precision, else 0."""
         grams = self._joint_grams(motion)
-        found = measures(
+        values = measures(
             self._judged(motion, self._gram(grams)), motion.n_samples + self.n_given(motion)
         )
         if self.precision is None:
-            return found, 0.0
-        return found, self.precision.criterion(self._gram(grams, self._joint_weights(motion)))
+            return values, 0.0
+        return values, self.precision.criterion(self._gram(grams, self._joint_weights(motion)))
 
     def grams_by_joint(self, motion: Motion) -> Array:
         """Return the Gram matrix of the rows of each joint (n, p, p)."""
@@ -361,9 +361,9 @@ class Objective:
         root = _factorised(gram)
         total = np.zeros_like(gram)
         if root is not None:
-            for weight, one in zip(weights.tolist(), CRITERIA.values(), strict=True):
-                if weight != 0.0 and one.slope is not None:
-                    total += weight * one.slope(root)
+            for weight, criterion in zip(weights.tolist(), CRITERIA.values(), strict=True):
+                if weight != 0.0 and criterion.slope is not None:
+                    total += weight * criterion.slope(root)
         return total
 
     def along(self, motion: Motion, matrix: Array, weights: Array | None = None) -> Array:

@@ -63,9 +63,9 @@ def random_validation_motions(
             worst = max((v for v in violations if v.kind == kind), key=lambda v: v.excess)
             nearest[kind] = min(nearest.get(kind, worst), worst, key=lambda v: v.excess)
 
-    found = None if checker is None else clearance(checker, home[None])
-    if found is not None:
-        reject([replace(found, subject=f"{found.subject} at home")])
+    contact = None if checker is None else clearance(checker, home[None])
+    if contact is not None:
+        reject([replace(contact, subject=f"{contact.subject} at home")])
         raise NoFeasibleMotionError(rejected, nearest)
     half = (limits.upper - limits.lower) / 2.0 * _RANGE_SHARE
     middle = (limits.upper + limits.lower) / 2.0

@@ -61,7 +61,7 @@ class Arm:
         if self.model.payload is not None:
             joint, carried = self.model.payload.carried_by(self.model.chain)
             inertial[joint] += carried
-        return tuple(body(one) for one in inertial)
+        return tuple(body(parameters) for parameters in inertial)
 
     @property
     def rotors(self) -> Array:
@@ -71,12 +71,12 @@ class Arm:
     def spring(self, joint: int) -> tuple[float, float]:
         """Return stiffness [N·m/rad] and rest angle [rad] of all torsion springs of a joint."""
         stiffness = moment = 0.0
-        for one in self.model.elements.placed:
-            if one.joint == joint and isinstance(one.element, TorsionSpring):
-                found = self.values[self.model.element_part][one.part]
-                k = float(found[0]) if len(found) else one.element.stiffness or 0.0
+        for placed in self.model.elements.placed:
+            if placed.joint == joint and isinstance(placed.element, TorsionSpring):
+                coefficients = self.values[self.model.element_part][placed.part]
+                k = float(coefficients[0]) if len(coefficients) else placed.element.stiffness or 0.0
                 stiffness = stiffness + k
-                moment = moment + k * one.element.rest
+                moment = moment + k * placed.element.rest
         return stiffness, moment / stiffness if stiffness else 0.0
 
     def link(self, joint: int) -> str:

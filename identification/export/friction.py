@@ -58,9 +58,9 @@ def median_load(model: RobotModel, values: Array, recordings: Sequence[Samples])
     """
     if not model.friction.has_load:
         return np.zeros(model.n_joints)
-    sizes = [np.abs(model.gear_torque(values, *one.motion[1:4])) for one in recordings]
+    sizes = [np.abs(model.gear_torque(values, *recording.motion[1:4])) for recording in recordings]
     size = np.concatenate(sizes)
-    usable = np.concatenate([one.usable for one in recordings])
+    usable = np.concatenate([recording.usable for recording in recordings])
     return np.array(
         [
             np.median(column[rows] if rows.any() else column)

@@ -50,11 +50,11 @@ def parameters_json(
         "payload": None if model.payload is None else dataclasses.asdict(model.payload),
         "elements": [
             {
-                "law": type(one.element).__name__,
-                **dataclasses.asdict(one.element),
-                "parameters": list(model.elements.names[one.part]),
+                "law": type(placed.element).__name__,
+                **dataclasses.asdict(placed.element),
+                "parameters": list(model.elements.names[placed.part]),
             }
-            for one in model.elements.placed
+            for placed in model.elements.placed
         ],
         "gravity": model.gravity.tolist(),
         "friction_laws": [law.table() for law in model.friction.laws],
@@ -179,10 +179,10 @@ def estimate_in(content: Mapping[str, Any]) -> Estimate:
     """
     parameters = content["parameters"]
     return Estimate(
-        tuple(str(one["name"]) for one in parameters),
-        tuple(str(one["unit"]) for one in parameters),
+        tuple(str(parameter["name"]) for parameter in parameters),
+        tuple(str(parameter["unit"]) for parameter in parameters),
         # "Infinity" and "NaN" are numbers to float()
-        np.array([float(one["value"]) for one in parameters]),
+        np.array([float(parameter["value"]) for parameter in parameters]),
         np.array([[float(value) for value in row] for row in content["covariance"]]),
         np.array([float(value) for value in content["noise_std"]]),
         np.array(content["samples"], dtype=np.intp),

@@ -83,7 +83,7 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = (), *, step: float = _TIM
         _add(link, "inertial", pos=as_text(mass.centre), mass=as_text(mass.mass),
              fullinertia=as_text(six))  # fmt: skip
         friction = arm.friction[j]
-        (stiffness, rest) = arm.spring(j)
+        (stiffness, rest_angle) = arm.spring(j)
         third = {term.symbol: term for term in model.friction.laws[j].terms}.get("f2")
         damping = [  # of v, v |v| and v³
             friction.get("f1", 0.0),
@@ -106,7 +106,7 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = (), *, step: float = _TIM
             frictionloss=as_text(max(0.0, friction.get("f0", 0.0))),
             solreffriction=as_text([_FRICTION_STEPS * step, 1.0]),
             stiffness=as_text(stiffness) if stiffness else None,
-            springref=as_text(rest) if stiffness else None,
+            springref=as_text(rest_angle) if stiffness else None,
             range=as_text([lower, upper]) if limited else None,
             actuatorfrcrange=effort,
         )
@@ -264,7 +264,10 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[Part]:
                 yield f"{kind.description}, {_ACCELERATES}", partial(torque, left), False
     diagonal = np.diag(np.diag(arm.rotors))
     coupled = arm.rotors - diagonal
-    motors = [one.motor and not (form.drives and one.term.label in _DRY_LABELS) for one in terms]
+    motors = [
+        friction_term.motor and not (form.drives and friction_term.term.label in _DRY_LABELS)
+        for friction_term in terms
+    ]
     yield "rotor inertias", lambda: qdd @ diagonal, form.drives or form.rotors
     yield "inertia of coupled motors", lambda: qdd @ coupled, form.drives
     yield "friction of coupled motors", lambda: _friction(arm, motion, motors), form.drives
@@ -273,17 +276,19 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[Part]:
         lambda: model.load_torque(*motion[1:4]) - model.elements.known(q),
         form.drives,
     )
-    for one in model.elements.placed:
-        supported = form.drives and isinstance(one.element, TorsionSpring)
-        description = f"{type(one.element).__name__} of {one.element.joint}"
-        yield description, partial(_element_torque, arm, motion, one), supported
+    for placed in model.elements.placed:
+        supported = form.drives and isinstance(placed.element, TorsionSpring)
+        description = f"{type(placed.element).__name__} of {placed.element.joint}"
+        yield description, partial(_element_torque, arm, motion, placed), supported
 
 
 def _brakes(arm: Arm) -> NDArray[np.bool_]:
     """Return whether each friction term is no power of the speed with a negative coefficient."""
     terms = arm.model.friction.terms
     values = arm.values[arm.model.friction_part]
-    of_speed = np.array([one.term in _OF_SPEED for one in terms], dtype=np.bool_)
+    of_speed = np.array(
+        [friction_term.term in _OF_SPEED for friction_term in terms], dtype=np.bool_
+    )
     return np.asarray(~(of_speed & (values < 0.0)))
 
 
@@ -293,11 +298,13 @@ def _friction_of(arm: Arm, motion: Motion, kind: FrictionTerm, chosen: NDArray[n
     return torque - _at_load(arm, motion) if kind.of_load else torque
 
 
-def _element_torque(arm: Arm, motion: Motion, one: PlacedElement) -> Array:
+def _element_torque(arm: Arm, motion: Motion, placed: PlacedElement) -> Array:
     """Return the torque (m, n) of a passive element."""
     torque = np.zeros(motion.position.shape)
-    values = arm.values[arm.model.element_part][one.part]
-    torque[:, one.joint] = one.columns(motion.position) @ values + one.known(motion.position)
+    values = arm.values[arm.model.element_part][placed.part]
+    torque[:, placed.joint] = placed.columns(motion.position) @ values + placed.known(
+        motion.position
+    )
     return torque
 
 
@@ -363,7 +370,7 @@ def _friction(arm: Arm, motion: Motion, chosen: Sequence[bool], load: Array | No
 
 def _at_load(arm: Arm, motion: Motion) -> Array:
     """Return the torque (m, n) of load-dependent friction at the load for which it is written."""
-    shares = [one.term.label == LOAD.label for one in arm.model.friction.terms]
+    shares = [friction_term.term.label == LOAD.label for friction_term in arm.model.friction.terms]
     return _friction(arm, motion, shares, np.tile(arm.written_load, (motion.n_samples, 1)))
 
 
@@ -371,7 +378,9 @@ def _dry(arm: Arm, motion: Motion, *, jumps: bool = False) -> Array:
     """Return the torque (m, n) of dry friction of the model, or with a jump at zero speed."""
     if not jumps:
         terms = arm.model.friction.terms
-        dry = _friction(arm, motion, [one.term.label in _DRY_LABELS for one in terms])
+        dry = _friction(
+            arm, motion, [friction_term.term.label in _DRY_LABELS for friction_term in terms]
+        )
         return dry + _at_load(arm, motion) if arm.model.friction.has_load else dry
     friction = arm.model.friction
     n = arm.model.n_joints
@@ -489,8 +498,8 @@ def _comment(node: Node, remarks: Sequence[str]) -> None:
 
 
 def _add(parent: Node, tag: str, /, **attributes: str | None) -> Node:
-    known = {key: value for key, value in attributes.items() if value is not None}
-    return ElementTree.SubElement(parent, tag, known)
+    stated = {key: value for key, value in attributes.items() if value is not None}
+    return ElementTree.SubElement(parent, tag, stated)
 
 
 def _rms(torque: Array) -> Array:

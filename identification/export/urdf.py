@@ -123,13 +123,13 @@ def _joined(urdf: str, root: Element, remarks: Sequence[str]) -> str:
     """Return a text with another root element, and a comment before it."""
     prolog = _PROLOG.match(urdf)
     assert prolog is not None
-    rest = re.split(rf"</{re.escape(root.tag)}\s*>", urdf)[-1]
+    epilog = re.split(rf"</{re.escape(root.tag)}\s*>", urdf)[-1]
     lines = "".join(f"  {comment_text(line)}\n" for line in remarks)
     comment = f"<!--\n{lines}-->\n" if remarks else ""
     text = ElementTree.tostring(root, encoding="unicode")
     if 2 * urdf.count(" />") < urdf.count("/>"):
         text = text.replace(" />", "/>")
-    return prolog[0] + comment + text + rest
+    return prolog[0] + comment + text + epilog
 
 
 def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
@@ -169,9 +169,9 @@ def _without_locked(urdf: str, model: RobotModel, inertial: Array) -> tuple[Arra
     removed = list(carried.get(-1, {}))
     for index, bodies in carried.items():
         if index >= 0:
-            rest = remaining[index] - sum(bodies.values())
-            if margin(rest) > 0.0:
-                remaining[index] = rest
+            remainder = remaining[index] - sum(bodies.values())
+            if margin(remainder) > 0.0:
+                remaining[index] = remainder
                 removed += bodies
     return remaining, frozenset(removed)
 

@@ -43,7 +43,10 @@ def instrument_factor(
     rows = samples.usable & model.moving(instrument.velocity)
     if usable is not None:
         rows &= usable
-    columns = tuple(np.append(own, own + model.n_parameters) for own in model.plan.columns)
+    columns = tuple(
+        np.append(joint_columns, joint_columns + model.n_parameters)
+        for joint_columns in model.plan.columns
+    )
     measured = augmented_rows(model, replace(samples, usable=rows))
     # The same rows, with the same torque low-pass.
     instrument = instrument._replace(load=samples.motion.load)
@@ -181,11 +184,11 @@ def standard_factor(model: RobotModel, recordings: Sequence[Samples]) -> Factor:
         part = slice(None, None, 1 if filtered else every)  # filters need all rows
         motion = samples.motion.rows(part)
         load = model.gear_load(*motion[1:4], motion.load)
-        found = [plan.evaluate(*motion[1:4], load=load) for plan in plans]
+        evaluated = [plan.evaluate(*motion[1:4], load=load) for plan in plans]
         for joint in range(n):
             usable = samples.usable[::every, joint]
             table = np.zeros((len(usable), 4 * s + 1))
-            for k, (blocks, columns) in enumerate(found):
+            for k, (blocks, columns) in enumerate(evaluated):
                 block = blocks[joint]
                 if filtered:
                     block = samples.as_measured(joint, block)[::every]
@@ -205,9 +208,9 @@ def under_gravity(factor: Factor, gravity: Array) -> Factor:
     n = factor.n_joints
     s = factor.n_parameters // 4
     half = share @ factor.gram[:, :-1, :-1].reshape(n, 4, s * 4 * s)
-    found = np.empty((n, s + 1, s + 1))
-    found[:, :s, :s] = share @ half.reshape(n, s, 4, s)
-    found[:, :s, s] = share @ factor.gram[:, :-1, -1].reshape(n, 4, s)
-    found[:, s, :s] = found[:, :s, s]
-    found[:, s, s] = factor.gram[:, -1, -1]
-    return Factor.of_gram(found, factor.samples, factor.parameter_names[:s])
+    gram = np.empty((n, s + 1, s + 1))
+    gram[:, :s, :s] = share @ half.reshape(n, s, 4, s)
+    gram[:, :s, s] = share @ factor.gram[:, :-1, -1].reshape(n, 4, s)
+    gram[:, s, :s] = gram[:, :s, s]
+    gram[:, s, s] = factor.gram[:, -1, -1]
+    return Factor.of_gram(gram, factor.samples, factor.parameter_names[:s])

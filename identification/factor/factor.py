@@ -149,7 +149,7 @@ class Factor:
         A table (c_j + 1, k) has the columns and, last, the torque, zero for unusable rows; `counts`
         (B, n) are the usable ones.
         """
-        widths = [len(own) + 1 for own in columns]
+        widths = [len(joint_columns) + 1 for joint_columns in columns]
         matrices = tuple(np.zeros((len(counts), width, width)) for width in widths)
         factor = cls(matrices, columns, counts, names, storage)
         for index, tables in chunks:
@@ -184,9 +184,9 @@ class Factor:
         """Gram matrices (n, p + 1, p + 1), symmetric; of triangles with loss of digits."""
         width = self.n_parameters + 1
         whole = np.zeros((self.n_joints, width, width))
-        for joint, own in enumerate(self._sums):
+        for joint, joint_sum in enumerate(self._sums):
             place = self._places(joint)
-            whole[joint][np.ix_(place, place)] = own
+            whole[joint][np.ix_(place, place)] = joint_sum
         return whole
 
     @cached_property
@@ -194,8 +194,10 @@ class Factor:
         """Gram matrices over the columns of each joint (c_j + 1, c_j + 1)."""
         if self.storage == "gram":
             # That of one block is no copy, which can be large.
-            return tuple(own[0] if len(own) == 1 else own.sum(axis=0) for own in self.matrices)
-        return tuple(np.einsum("bki,bkj->ij", own, own) for own in self.matrices)
+            return tuple(
+                matrix[0] if len(matrix) == 1 else matrix.sum(axis=0) for matrix in self.matrices
+            )
+        return tuple(np.einsum("bki,bkj->ij", triangles, triangles) for triangles in self.matrices)
 
     @property
     def words(self) -> str:
@@ -292,7 +294,7 @@ class Factor:
         if self.storage == "gram":
             return np.asarray(directions.T @ self.gram[:, :size, :size] @ directions)
         moved = [self._wide(joint)[:, :size] @ directions for joint in range(self.n_joints)]
-        return np.array([own.T @ own for own in moved])
+        return np.array([triangle.T @ triangle for triangle in moved])
 
     # Blocks
 
@@ -339,15 +341,15 @@ class Factor:
 
     def blocks(self, which: slice | NDArray[np.bool_]) -> Self:
         """Return some blocks, by slice or mask (B,)."""
-        matrices = tuple(own[which] for own in self.matrices)
+        matrices = tuple(matrix[which] for matrix in self.matrices)
         return replace(self, matrices=matrices, counts=self.counts[which])
 
     def without(self, which: slice | NDArray[np.bool_]) -> Self:
         """Return the sum of all blocks but some, by slice or mask (B,), as one block."""
         assert self.storage == "gram"
         matrices = tuple(
-            (total - own[which].sum(axis=0))[None]
-            for total, own in zip(self._sums, self.matrices, strict=True)
+            (total - matrix[which].sum(axis=0))[None]
+            for total, matrix in zip(self._sums, self.matrices, strict=True)
         )
         counts = self.samples - self.counts[which].sum(axis=0)
         return replace(self, matrices=matrices, counts=counts[None])
@@ -360,7 +362,7 @@ class Factor:
     def merged(self, length: int) -> Self:
         """Merge runs of `length` blocks; the last one may be shorter."""
         assert self.storage == "gram"
-        matrices = tuple(merged(own, length) for own in self.matrices)
+        matrices = tuple(merged(matrix, length) for matrix in self.matrices)
         counts = merged(self.counts, length)
         block = length * self.block
         return replace(self, matrices=matrices, counts=counts, block=block)
@@ -378,10 +380,10 @@ class Factor:
         place[chosen] = np.arange(len(chosen))
         matrices = []
         columns = []
-        for own, used in zip(self.matrices, self.columns, strict=True):
+        for matrix, used in zip(self.matrices, self.columns, strict=True):
             stays = np.flatnonzero(place[used] >= 0)
             both = np.append(stays, len(used))
-            matrices.append(own[:, both[:, None], both])
+            matrices.append(matrix[:, both[:, None], both])
             columns.append(place[used[stays]])
         names = tuple(self.parameter_names[k] for k in chosen)
         return replace(
@@ -454,10 +456,10 @@ def equal_runs(index: Indices) -> list[EqualRuns]:
 def add_grams(total: Array, rows: Array, runs: Iterable[EqualRuns]) -> None:
     """Add ``rows rows'`` of each block to the total (B, c, c), in place; rows is (c, k)."""
     for first, count, start, length in runs:
-        own = rows[:, start : start + count * length].reshape(len(rows), count, length)
+        run_rows = rows[:, start : start + count * length].reshape(len(rows), count, length)
         # A product with the own transpose takes half the work.
-        own = own.transpose(1, 0, 2)
-        total[first : first + count] += own @ own.transpose(0, 2, 1)
+        run_rows = run_rows.transpose(1, 0, 2)
+        total[first : first + count] += run_rows @ run_rows.transpose(0, 2, 1)
 
 
 def count_by_block(index: Indices, usable: NDArray[np.bool_]) -> Indices:
@@ -474,8 +476,8 @@ def merged(blocks: Blocks, length: int) -> Blocks:
     """Sum runs of `length` blocks along the first axis (B, ...); the last may be shorter."""
     total = blocks[::length].copy()
     for later in range(1, length):  # faster than np.add.reduceat
-        own = blocks[later::length]
-        total[: len(own)] += own
+        addend = blocks[later::length]
+        total[: len(addend)] += addend
     return total
 
 
@@ -492,7 +494,7 @@ def _added(first: Blocks, second: Blocks) -> Blocks:
 def _triangles_of_both(first: Array, second: Array) -> Array:
     """Add triangles (B, c, c) of possibly different number."""
     longer, shorter = (first, second) if len(first) >= len(second) else (second, first)
-    both = [_triangle(np.concatenate(own)) for own in zip(longer, shorter, strict=False)]
+    both = [_triangle(np.concatenate(pair)) for pair in zip(longer, shorter, strict=False)]
     return np.array([*both, *longer[len(shorter) :]]).reshape(longer.shape)
 
 
@@ -530,8 +532,8 @@ def solve(equations: NormalEquations, worst: float = WORST_CONDITION) -> Solutio
     length = np.sqrt(np.diag(equations.A))
     scale = _unit_columns(length)
     eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
-    found = _determined_part(length, np.sqrt(np.maximum(eigenvalues, 0.0)), vectors, worst)
-    return found._replace(values=found.root @ (found.root.T @ equations.b))
+    part = _determined_part(length, np.sqrt(np.maximum(eigenvalues, 0.0)), vectors, worst)
+    return part._replace(values=part.root @ (part.root.T @ equations.b))
 
 
 def solve_with_ridge(gram: Array, cross: Array, ridge: float) -> Array:
@@ -558,9 +560,9 @@ def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -
     left, singular, right = np.linalg.svd(rows / _unit_columns(length), full_matrices=True)
     size = np.zeros(rows.shape[1])
     size[: len(singular)] = singular
-    found = _determined_part(length, size, right.T, worst)
+    part = _determined_part(length, size, right.T, worst)
     # Significant values come first.
-    return found._replace(values=found.root @ (left[:, : found.root.shape[1]].T @ target))
+    return part._replace(values=part.root @ (left[:, : part.root.shape[1]].T @ target))
 
 
 def rows_of(equations: NormalEquations) -> tuple[Array, Array]:
@@ -595,8 +597,8 @@ def joint_weights(factor: Factor) -> Array:
 
 def inverse_variance(variance: Array) -> Array:
     """Return weights (n,) of joints, zero for variances of NaN or infinity."""
-    known = np.isfinite(variance)
-    return np.where(known, 1.0 / np.where(known, variance, 1.0), 0.0)
+    finite = np.isfinite(variance)
+    return np.where(finite, 1.0 / np.where(finite, variance, 1.0), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -693,7 +695,9 @@ def mark_undetermined(covariance: Array, determined: NDArray[np.bool_]) -> None:
 
 def undetermined_names(names: Sequence[str], determined: NDArray[np.bool_]) -> tuple[str, ...]:
     """Return the names (p,) of undetermined parameters (p,)."""
-    return tuple(name for name, known in zip(names, determined, strict=True) if not known)
+    return tuple(
+        name for name, is_determined in zip(names, determined, strict=True) if not is_determined
+    )
 
 
 def reduced(model: RobotModel, recordings: Sequence[Samples], gram: Factor) -> Factor:

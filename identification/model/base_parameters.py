@@ -54,7 +54,7 @@ class BaseParameters:
 
     def expressions(self, digits: int = 6) -> tuple[str, ...]:
         """Return each group as a formula: ``I1yy + I1m + 0.09 m2 + ...``."""
-        found = []
+        formulas = []
         for row, pivot in zip(self.grouping, self.pivots, strict=True):
             text = self.standard_names[pivot]
             others = [
@@ -62,8 +62,8 @@ class BaseParameters:
                 for column in np.flatnonzero(np.abs(row) > _NEGLIGIBLE)
                 if column != pivot
             ]
-            found.append(self.expression(text, others, digits))
-        return tuple(found)
+            formulas.append(self.expression(text, others, digits))
+        return tuple(formulas)
 
     def expression(
         self, name: str, others: Sequence[tuple[float, str]] = (), digits: int = 6
@@ -109,8 +109,8 @@ def select_base(regressor: Array, names: Sequence[str], units: Sequence[str]) ->
 def share_left(columns: Array, basis: Array) -> Array:
     """Return the relative residual of columns (rows, k) after projection on `basis` (rows, b)."""
     orthonormal, _ = np.linalg.qr(basis / np.linalg.norm(basis, axis=0))
-    rest = columns - orthonormal @ (orthonormal.T @ columns)
-    return np.asarray(np.linalg.norm(rest, axis=0) / np.linalg.norm(columns, axis=0))
+    residual = columns - orthonormal @ (orthonormal.T @ columns)
+    return np.asarray(np.linalg.norm(residual, axis=0) / np.linalg.norm(columns, axis=0))
 
 
 def _first_independent(columns: Array) -> tuple[NDArray[np.intp], Array, Array]:
@@ -119,12 +119,12 @@ def _first_independent(columns: Array) -> tuple[NDArray[np.intp], Array, Array]:
     pivots: list[int] = []
     shares = np.zeros(columns.shape[1])
     for index in range(columns.shape[1]):
-        rest = columns[:, index].copy()
+        residual = columns[:, index].copy()
         for _ in range(2):  # twice, against rounding
             earlier = basis[:, : len(pivots)]
-            rest -= earlier @ (earlier.T @ rest)
-        shares[index] = np.linalg.norm(rest)
+            residual -= earlier @ (earlier.T @ residual)
+        shares[index] = np.linalg.norm(residual)
         if shares[index] > TOLERANCE and len(pivots) < basis.shape[1]:
-            basis[:, len(pivots)] = rest / shares[index]
+            basis[:, len(pivots)] = residual / shares[index]
             pivots.append(index)
     return np.array(pivots, dtype=np.intp), basis[:, : len(pivots)], shares

@@ -57,16 +57,21 @@ class Element(ABC):
     @property
     def symbols(self) -> tuple[str, ...]:
         """Names of the c identified parameters, without the number of the joint."""
-        return tuple(one.symbol for one in self.coefficients if one.identified)
+        return tuple(
+            coefficient.symbol for coefficient in self.coefficients if coefficient.identified
+        )
 
     def columns(self, q: Array) -> Array:
         """Return the torque per unit of each identified parameter, at angles (m,): (m, c)."""
-        return self.shapes(q)[:, [one.identified for one in self.coefficients]]
+        return self.shapes(q)[:, [coefficient.identified for coefficient in self.coefficients]]
 
     def known(self, q: Array) -> Array:
         """Return the known part of the torque [N·m] (m,)."""
-        known = [0.0 if one.identified else one.value or 0.0 for one in self.coefficients]
-        return np.asarray(self.shapes(q) @ np.array(known))
+        values = [
+            0.0 if coefficient.identified else coefficient.value or 0.0
+            for coefficient in self.coefficients
+        ]
+        return np.asarray(self.shapes(q) @ np.array(values))
 
 
 @dataclass(frozen=True)
@@ -289,17 +294,19 @@ class JointElements:
     @property
     def elements(self) -> tuple[Element, ...]:
         """The elements in the order of the parameters."""
-        return tuple(one.element for one in self.placed)
+        return tuple(placed.element for placed in self.placed)
 
     @property
     def identified(self) -> tuple[PlacedElement, ...]:
         """Elements with parameters."""
-        return tuple(one for one in self.placed if one.element.symbols)
+        return tuple(placed for placed in self.placed if placed.element.symbols)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the e parameters: ``spring_2``, ``spring_2b`` for another on that joint."""
-        first = [f"{s}_{one.joint + 1}" for one in self.placed for s in one.element.symbols]
+        first = [
+            f"{s}_{placed.joint + 1}" for placed in self.placed for s in placed.element.symbols
+        ]
         before = [first[:k].count(name) for k, name in enumerate(first)]
         return tuple(
             name + (chr(ord("a") + k) if k else "") for name, k in zip(first, before, strict=True)
@@ -307,23 +314,25 @@ class JointElements:
 
     @property
     def _coefficients(self) -> list[Coefficient]:
-        return [c for one in self.elements for c in one.coefficients if c.identified]
+        return [c for element in self.elements for c in element.coefficients if c.identified]
 
     @property
     def units(self) -> tuple[str, ...]:
         """Units of the e parameters."""
-        return tuple(one.unit for one in self._coefficients)
+        return tuple(coefficient.unit for coefficient in self._coefficients)
 
     @property
     def nominal(self) -> Array:
         """Given values of the e parameters, else zero."""
-        return np.array([one.value or 0.0 for one in self._coefficients], dtype=np.float64)
+        return np.array(
+            [coefficient.value or 0.0 for coefficient in self._coefficients], dtype=np.float64
+        )
 
     def known(self, q: Array) -> Array:
         """Return the known part of the torque (m, n) [N·m] at positions (m, n)."""
         torque = np.zeros(q.shape)
-        for one in self.placed:
-            torque[:, one.joint] += one.known(q)
+        for placed in self.placed:
+            torque[:, placed.joint] += placed.known(q)
         return torque
 
 

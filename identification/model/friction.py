@@ -458,9 +458,9 @@ class JointFriction:
 
         The joint and every coupled motor that acts on it must be faster than standstill.
         """
-        one = self.one_law
-        if one is not None:
-            moving = one.moving(velocity)
+        common_law = self.one_law
+        if common_law is not None:
+            moving = common_law.moving(velocity)
         else:
             rows = [law.moving(velocity[:, j]) for j, law in enumerate(self.laws)]
             moving = np.column_stack(rows)

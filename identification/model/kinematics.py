@@ -242,8 +242,10 @@ def locked_posture(model: pin.Model, locked: Mapping[str, float]) -> Array:
     names = list(model.names)[1:]
     for name, position in locked.items():
         if name not in names:
-            known = ", ".join(names) or "none"
-            raise ModelError(f"there is no moving joint {name!r} to lock; there are {known}")
+            moving_joints = ", ".join(names) or "none"
+            raise ModelError(
+                f"there is no moving joint {name!r} to lock; there are {moving_joints}"
+            )
         if not math.isfinite(position):
             raise ModelError(
                 f"joint {name!r} is locked at {position!r}; give a finite number", joint=name

@@ -25,7 +25,7 @@ class Motion(NamedTuple):
 
     def rows(self, which: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Motion:
         """Return the motion at some of the instants."""
-        return Motion(*(None if one is None else one[which] for one in self))  # type: ignore[arg-type]
+        return Motion(*(None if column is None else column[which] for column in self))  # type: ignore[arg-type]
 
     @property
     def n_samples(self) -> int:

@@ -135,12 +135,12 @@ def reference_bodies(nominal: Array, translation: Array) -> ReferenceBodies:
     size = max(float(distances.mean()) if len(distances) else 0.0, _SMALLEST_SIZE)
     masses = nominal[nominal[:, 9] > 0.0, 9]
     mass = float(np.median(masses)) if len(masses) else _SOME_MASS
-    found = [_reference(link, mass, _BALL * size) for link in nominal]
-    matrices = np.array([matrix for matrix, _ in found])
+    references = [_reference(link, mass, _BALL * size) for link in nominal]
+    matrices = np.array([matrix for matrix, _ in references])
     return ReferenceBodies(
         inertial=inertial_from_pseudo(matrices),
         frames=np.linalg.cholesky(matrices),
-        origins=tuple(origin for _, origin in found),
+        origins=tuple(origin for _, origin in references),
     )
 
 

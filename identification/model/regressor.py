@@ -325,7 +325,7 @@ class _DriveRows(NamedTuple):
         others = [sum(pair) - joint for pair in plan.couplings if joint in pair]
         couplings = {other: row + k for k, other in enumerate(others)}
         row += len(others)
-        sizes = [len(one.element.symbols) for one in plan.elements if one.joint == joint]
+        sizes = [len(placed.element.symbols) for placed in plan.elements if placed.joint == joint]
         elements = slice(row, row + sum(sizes))
         return cls(friction, motors, rotor, couplings, elements, elements.stop)
 
@@ -391,9 +391,9 @@ class _Workspace:
         direction = self._direction[: len(velocity)]
         if self._joint_friction is None:
             return []
-        if (one := self._joint_friction.one_law) is not None:
+        if (common_law := self._joint_friction.one_law) is not None:
             rows = self.rows[:, self._drive_rows[0].friction]
-            return [(one, velocity, direction, self._load, rows.transpose(1, 0, 2))]
+            return [(common_law, velocity, direction, self._load, rows.transpose(1, 0, 2))]
         return [
             (
                 law,
@@ -425,10 +425,10 @@ class _Workspace:
         """Return springs and balancers with target rows."""
         free = [drive.elements.start for drive in self._drive_rows]
         parts = []
-        for one in plan.elements:
-            first = free[one.joint]
-            free[one.joint] += one.part.stop - one.part.start
-            parts.append((one, self.rows[one.joint, first : free[one.joint]]))
+        for placed in plan.elements:
+            first = free[placed.joint]
+            free[placed.joint] += placed.part.stop - placed.part.start
+            parts.append((placed, self.rows[placed.joint, first : free[placed.joint]]))
         return parts
 
     def _write_motor_friction(self, friction: JointFriction) -> None:
@@ -450,8 +450,8 @@ class _Workspace:
             return
         velocity = self._motion.velocity
         n = friction.n_joints
-        if (one := friction.one_law) is not None:
-            one.sign(velocity, out=self._direction[:n])
+        if (common_law := friction.one_law) is not None:
+            common_law.sign(velocity, out=self._direction[:n])
         else:
             for law, speed, out in zip(friction.laws, velocity, self._direction, strict=False):
                 law.sign(speed, out=out)
@@ -581,9 +581,9 @@ def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.in
         for other in drive.couplings:
             pair = (min(joint, other), max(joint, other))
             columns[joint].append(offsets[-1] + plan.couplings.index(pair))
-        for one in plan.elements:
-            if one.joint == joint:
-                part = one.part
+        for placed in plan.elements:
+            if placed.joint == joint:
+                part = placed.part
                 columns[joint] += range(first_element + part.start, first_element + part.stop)
         rows[joint] += range(plan.first_drive_row, drive.response)
     return (
@@ -700,8 +700,8 @@ class _Step:
         # Rotation of the axes: as a whole, or one axis fixed and two in a plane.
         rows = columns = slice(0, 3)
         self._fixed_axis: tuple[Array, float, Array] | None = None
-        if (found := _find_fixed_axis(self.blend)) is not None:
-            row, column, sign = found
+        if (fixed_axis := _find_fixed_axis(self.blend)) is not None:
+            row, column, sign = fixed_axis
             self._fixed_axis = (self._shifted[:, :, column], sign, self._carried[:, :, row])
             rows = _OTHERS[row]
             columns = _OTHERS[column]

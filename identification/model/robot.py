@@ -247,7 +247,9 @@ class RobotModel:
     def friction_columns(self) -> NDArray[np.bool_]:
         """Which of the p parameters are friction (p,), without offsets."""
         columns = np.zeros(self.n_parameters, dtype=np.bool_)
-        columns[self.friction_part] = [one.term.is_friction for one in self.friction.terms]
+        columns[self.friction_part] = [
+            friction_term.term.is_friction for friction_term in self.friction.terms
+        ]
         return columns
 
     @property
@@ -508,12 +510,12 @@ def _require_separate_elements(
     m, n = q.shape
     offsets = [j for j, law in enumerate(friction.laws) if OFFSET.symbol in law.symbols]
     columns = np.column_stack([columns, np.tile(np.eye(n)[:, offsets], (m, 1))])
-    for one in elements.identified:
-        values = one.columns(q)
-        owner = one.element.joint
-        for k, name in enumerate(elements.names[one.part]):
+    for placed in elements.identified:
+        values = placed.columns(q)
+        owner = placed.element.joint
+        for k, name in enumerate(elements.names[placed.part]):
             torque = np.zeros((m, n))
-            torque[:, one.joint] = values[:, k]
+            torque[:, placed.joint] = values[:, k]
             column = torque.reshape(-1, 1)
             if share_left(column, columns)[0] <= TOLERANCE:
                 raise ElementError(

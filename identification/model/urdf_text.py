@@ -72,9 +72,9 @@ def refusal(text: str) -> str | None:
     """
     if len(text) > LONGEST:
         return f"it has {len(text)} characters; at most {LONGEST} are read"
-    found = _Reading()
+    reading = _Reading()
     try:
-        found.read(text)
+        reading.read(text)
     except _RefusedError as refused:
         return str(refused)
     except UnicodeEncodeError as problem:

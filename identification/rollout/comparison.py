@@ -61,11 +61,11 @@ class RecordedMotion:
     def _held(self, servo: Servo) -> Array:
         """Return the constant torque beside a servo in each window (w, 1, n)."""
         torque = []
-        for one in self.windows.stretches:
-            position, rate = command_of(one, servo.delay)
-            error = position - one.motion.position
-            slip = rate - one.after
-            torque.append(one.torque - servo.kp * error - servo.kd * slip)
+        for stretch in self.windows.stretches:
+            position, rate = command_of(stretch, servo.delay)
+            error = position - stretch.motion.position
+            slip = rate - stretch.after
+            torque.append(stretch.torque - servo.kp * error - servo.kd * slip)
         return self.windows.at_start(torque)[:, None]
 
 
@@ -192,11 +192,11 @@ class ToolFrame:
     def positions(self, joints: Array) -> Array:
         """Return the origins (m, 3) [m] at joint positions (m, n)."""
         neutral = pin.neutral(self._model)
-        found = np.empty((len(joints), 3))
+        origins = np.empty((len(joints), 3))
         for k, q in enumerate(joints):
             pin.forwardKinematics(self._model, self._data, pin.integrate(self._model, neutral, q))
-            found[k] = self._data.oMi[self._joint].act(self._place)
-        return found
+            origins[k] = self._data.oMi[self._joint].act(self._place)
+        return origins
 
 
 def leading_joint(positions: Array, measured: Array, tool: ToolFrame) -> int:
@@ -219,13 +219,13 @@ def coverage(ensemble: Array, measured: Array) -> Array:
     The band is that of one more arm, from mean and scatter of the stable ones.
     """
     count = np.count_nonzero(np.isfinite(ensemble), axis=0)
-    known = count >= _FEWEST
+    in_band = count >= _FEWEST
     filled = np.where(np.isfinite(ensemble), ensemble, 0.0)
     mean = filled.sum(axis=0) / np.maximum(count, 1)
     deviation = np.where(np.isfinite(ensemble), ensemble - mean, 0.0)
     variance = np.sum(deviation**2, axis=0) / np.maximum(count - 1, 1)
     factor = float(student_limit(0.025, len(ensemble))) * np.sqrt(1.0 + 1.0 / len(ensemble))
-    inside = known & (np.abs(measured - mean) <= factor * np.sqrt(variance))
+    inside = in_band & (np.abs(measured - mean) <= factor * np.sqrt(variance))
     return np.asarray(inside.mean(axis=0))
 
 
@@ -244,11 +244,14 @@ class ResidualTorque:
         cls, residuals: Sequence[Array], fitted: Sequence[Samples], windows: Windows
     ) -> ResidualTorque:
         """Return the residuals (m, n) of recordings, for windows."""
-        found = []
+        means = []
         for residual, samples in zip(residuals, fitted, strict=True):
             parts = stretches_of(samples, np.zeros_like(samples.torque), windows.step)
-            found += [one.mean_about_instants(residual[one.part]) for one in parts]
-        return cls(tuple(one for one in found if len(one) >= windows.steps), windows.steps)
+            means += [stretch.mean_about_instants(residual[stretch.part]) for stretch in parts]
+        return cls(
+            tuple(stretch_means for stretch_means in means if len(stretch_means) >= windows.steps),
+            windows.steps,
+        )
 
     def draw(self, count: int, random: np.random.Generator) -> Array | float:
         """Return random stretches (count, K, n), zero without any that is long enough."""
@@ -274,7 +277,10 @@ def variants(joint: int) -> list[Variant]:
             values = arm.values.copy()
             model = arm.model
             part = model.friction_part
-            of = [one.owner == joint and one.symbol in symbols for one in model.friction.terms]
+            of = [
+                friction_term.owner == joint and friction_term.symbol in symbols
+                for friction_term in model.friction.terms
+            ]
             values[part] = np.where(of, factor * values[part], values[part])
             return replace(arm, values=values), motion
 

@@ -52,8 +52,10 @@ class Driven:
 
     def on(self, motion: RecordedMotion) -> Driven:
         """Return the arm, its servo and its delay on the windows of another motion."""
-        own = self.motion
-        return replace(self, motion=replace(motion, servo=own.servo, delay=own.delay))
+        driven_motion = self.motion
+        return replace(
+            self, motion=replace(motion, servo=driven_motion.servo, delay=driven_motion.delay)
+        )
 
     def positions(self) -> Array:
         """Return the simulated positions at the horizons (w, h, n)."""
@@ -62,9 +64,9 @@ class Driven:
     def residuals(self) -> Array:
         """Return position errors at the horizons (w, h, n), `LARGEST_ERROR` where unstable."""
         windows = self.motion.windows
-        found = self.positions()
+        simulated = self.positions()
         measured = windows.reached[:, horizon_rows(windows)]
-        return np.where(np.isfinite(found), found - measured, LARGEST_ERROR)
+        return np.where(np.isfinite(simulated), simulated - measured, LARGEST_ERROR)
 
 
 class Quantity(NamedTuple):
@@ -90,16 +92,19 @@ def polished(start: Driven) -> Driven:
     scale = np.where(size > 0.0, size, 1.0) * np.sqrt(len(start.motion.windows))
 
     def residuals(columns: Array) -> Array:
-        found = []
+        columns_of_errors = []
         for changes in np.atleast_2d(columns.T):
             errors = _changed(start, quantities, changes).residuals() / scale
-            found.append(np.concatenate([errors.ravel(), _WEIGHT * changes]))
-        return np.column_stack(found)
+            columns_of_errors.append(np.concatenate([errors.ravel(), _WEIGHT * changes]))
+        return np.column_stack(columns_of_errors)
 
     best, _ = minimize.least_squares(
         np.zeros(len(quantities)),
         residuals,
-        bounds=[np.array([getattr(one, end) for one in quantities]) for end in ("lower", "upper")],
+        bounds=[
+            np.array([getattr(quantity, end) for quantity in quantities])
+            for end in ("lower", "upper")
+        ],
         eps=_STEP,
         xtol=_SETTLED,
         max_iter=_ITERATIONS,
@@ -120,25 +125,28 @@ def _quantities(start: Driven) -> list[Quantity]:
     arm = start.arm
     servo = start.motion.servo
     model = arm.model
-    found = list[Quantity]()
+    quantities = list[Quantity]()
     for joint in range(model.n_joints):
         for symbols in (_DRY, _VISCOUS):
-            chosen = [one.owner == joint and one.symbol in symbols for one in model.friction.terms]
+            chosen = [
+                friction_term.owner == joint and friction_term.symbol in symbols
+                for friction_term in model.friction.terms
+            ]
             rows = model.friction_part.start + np.flatnonzero(chosen)
             if arm.values[rows].any():
-                found.append(Quantity(partial(_with_friction, rows)))
+                quantities.append(Quantity(partial(_with_friction, rows)))
     if model.layout.rotor_inertia:
         rotors = arm.standard[model.layout.rotors]
         for joint, inertia in enumerate(joint_inertia(arm, start.motion.windows.step)):
             unit = _ROTOR_UNIT * float(inertia)
             least = max(-float(rotors[joint]) / unit, -_LARGEST)
-            found.append(Quantity(partial(_with_rotor, joint, unit), least))
+            quantities.append(Quantity(partial(_with_rotor, joint, unit), least))
     if servo is None:
-        return [*found, Quantity(_with_delay)]
+        return [*quantities, Quantity(_with_delay)]
     for joint in range(model.n_joints):
-        found += [Quantity(partial(_with_gain, name, joint)) for name in ("kp", "kd")]
+        quantities += [Quantity(partial(_with_gain, name, joint)) for name in ("kp", "kd")]
     ends = (np.array([0.0, LONGEST_DELAY]) - servo.delay) / _DELAY_UNIT
-    return [*found, Quantity(_with_delay, *ends.tolist())]
+    return [*quantities, Quantity(_with_delay, *ends.tolist())]
 
 
 def _with_friction(rows: NDArray[np.intp], driven: Driven, change: float) -> Driven:

@@ -58,9 +58,9 @@ def identify_servo(stretches: Sequence[Stretch], step: float) -> Servo:
     """
     best: tuple[float, Servo] | None = None
     for delay in step * np.arange(int(LONGEST_DELAY / step + 1e-9) + 1):
-        found = _gains_at(stretches, float(delay), step)
-        if best is None or found[0] < best[0]:
-            best = found
+        candidate = _gains_at(stretches, float(delay), step)
+        if best is None or candidate[0] < best[0]:
+            best = candidate
     assert best is not None
     servo = best[1]
     if not (servo.kp > 0.0).all():
@@ -78,14 +78,14 @@ def _gains_at(stretches: Sequence[Stretch], delay: float, step: float) -> tuple[
     errors = []
     rates = []
     torques = []
-    for one in stretches:
-        position, _ = command_of(one, delay)
+    for stretch in stretches:
+        position, _ = command_of(stretch, delay)
         rate = np.gradient(position, step, axis=0)
         # The same rows for every delay: those whose command is known.
-        known = slice(round(LONGEST_DELAY / step) + 1, -1)
-        errors += _without_means((position - one.motion.position)[known], rows)
-        rates += _without_means((rate - one.motion.velocity)[known], rows)
-        torques += _without_means(one.torque[known], rows)
+        with_command = slice(round(LONGEST_DELAY / step) + 1, -1)
+        errors += _without_means((position - stretch.motion.position)[with_command], rows)
+        rates += _without_means((rate - stretch.motion.velocity)[with_command], rows)
+        torques += _without_means(stretch.torque[with_command], rows)
     if not errors:
         raise NoServoError(f"no stretch lasts {BLOCK:g} s")
     error, rate, torque = (np.concatenate(part) for part in (errors, rates, torques))

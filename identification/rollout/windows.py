@@ -67,11 +67,11 @@ class Windows:
         With `shift` of these so many instants later.
         """
         offsets = shift + np.arange(self.steps)
-        found = np.empty((len(self), self.steps, parts[0].shape[1]))
+        windows = np.empty((len(self), self.steps, parts[0].shape[1]))
         for k, values in enumerate(parts):
             inside = self.stretch == k
-            found[inside] = values[self.first[inside][:, None] + offsets]
-        return found
+            windows[inside] = values[self.first[inside][:, None] + offsets]
+        return windows
 
     def at_start(self, parts: Sequence[Array]) -> Array:
         """Return arrays at the instants of each stretch (g, n) where each window starts (w, n)."""
@@ -80,22 +80,22 @@ class Windows:
     @cached_property
     def position(self) -> Array:
         """Measured positions before each step (w, K, n) [rad or m]."""
-        return self.cut([one.motion.position for one in self.stretches])
+        return self.cut([stretch.motion.position for stretch in self.stretches])
 
     @cached_property
     def reached(self) -> Array:
         """Measured positions after each step (w, K, n) [rad or m]."""
-        return self.cut([one.motion.position for one in self.stretches], 1)
+        return self.cut([stretch.motion.position for stretch in self.stretches], 1)
 
     @cached_property
     def start(self) -> Array:
         """Measured velocity half a step before each window (w, n) [rad/s or m/s]."""
-        return self.at_start([one.before for one in self.stretches])
+        return self.at_start([stretch.before for stretch in self.stretches])
 
     @cached_property
     def torque(self) -> Array:
         """Recorded torque, mean over a step about each instant (w, K, n) [N·m or N]."""
-        return self.cut([one.torque for one in self.stretches])
+        return self.cut([stretch.torque for stretch in self.stretches])
 
     def some(self, most: int) -> Windows:
         """Return at most so many windows, evenly distributed."""
@@ -106,14 +106,14 @@ class Windows:
 
 
 def stretches_of(
-    samples: Samples, known: Array, step: float, commanded: Array | None = None
+    samples: Samples, load: Array, step: float, commanded: Array | None = None
 ) -> list[Stretch]:
     """Return the stretches of a recording without gap.
 
-    `known` torque (m, n), which was subtracted from that of the samples, is added. The positions
+    `load` torque (m, n), which was subtracted from that of the samples, is added. The positions
     are interpolated by a cubic spline, of which the velocity is the derivative.
     """
-    found = []
+    stretches = []
     for part in samples.segments:
         motion = samples.motion.rows(part)
         time = motion.time
@@ -128,9 +128,9 @@ def stretches_of(
         if commanded is not None and np.isfinite(commanded[part]).all():
             columns = commanded[part].T
             command = np.column_stack([np.interp(grid, time, column) for column in columns])
-        torque = mean_about(time, (samples.torque + known)[part], grid)
-        found.append(Stretch(on_grid, before, after, torque, time, part, command))
-    return found
+        torque = mean_about(time, (samples.torque + load)[part], grid)
+        stretches.append(Stretch(on_grid, before, after, torque, time, part, command))
+    return stretches
 
 
 def mean_about(time: Array, values: Array, grid: Array) -> Array:
@@ -159,10 +159,11 @@ def windows_of(stretches: Sequence[Stretch], step: float, horizon: float, stride
     steps = round(horizon / step)
     between = max(1, round(stride / step))
     starts = [
-        np.arange(0, len(one.motion.time) - steps, between, dtype=np.intp) for one in stretches
+        np.arange(0, len(stretch.motion.time) - steps, between, dtype=np.intp)
+        for stretch in stretches
     ]
     if not sum(len(first) for first in starts):
-        longest = max((np.ptp(one.motion.time) for one in stretches), default=0.0)
+        longest = max((np.ptp(stretch.motion.time) for stretch in stretches), default=0.0)
         raise NoWindowError(
             f"no part of the motion without gap lasts {horizon:g} s; the longest lasts"
             f" {longest:.3g} s"

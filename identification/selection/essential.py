@@ -208,8 +208,8 @@ class _Path:
         solution = self.current.solution
         left = self.current.left
         if not solution.determined.all():
-            own = self._equations.part(left).A
-            lost = 1.0 - np.einsum("ij,ji->i", solution.inverse, own)
+            information = self._equations.part(left).A
+            lost = 1.0 - np.einsum("ij,ji->i", solution.inverse, information)
             return int(left[np.flatnonzero(lost > 0.99 * lost.max())[-1]]), np.inf
         worst = int(np.argmax(np.where(self._free, self.current.relative, -1.0)))
         return int(left[worst]), float(self.current.relative[worst])

@@ -230,7 +230,7 @@ def choose_settings(
     low_passes: LowPasses,
     delays: Sequence[float] = (),
     ripples: Sequence[Sequence[TorqueRipple]] = (),
-    known: Known | None = None,
+    stated: Known | None = None,
 ) -> Settings:
     """Choose settings one after the other, from data that `ready` prepares for the arm's `model`.
 
@@ -238,7 +238,7 @@ def choose_settings(
     than that of `start`, and `ripples` those for "ripple". Returns settings with their choices;
     `start` if the data are too short, or predict no part of themselves.
     """
-    trial = _Trial(model, ready, known, ripples)
+    trial = _Trial(model, ready, stated, ripples)
     now = start
     if "bandwidth" in questions:
         now = now.preprocessed(rigid_bandwidth=BANDWIDTHS[0])
@@ -679,7 +679,7 @@ class _Trial:
         if key not in self._tables:
             model = self.model(settings)
             folds = Folds.of(model, self.samples(settings))
-            prior = body_prior(model, folds.fitted, known=self._known)
+            prior = body_prior(model, folds.fitted, stated=self._known)
             self._tables[key] = _Reduced(folds, prior)
         return self._tables[key]
 

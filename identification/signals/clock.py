@@ -208,9 +208,9 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     certain = bool(abs(share - 0.5) > max(_MARGIN * deviation, 0.25))
     is_even = certain and share < 0.5 and bool(np.all(np.diff(even[~(repeated | idle)]) > 0.0))
     out = repeated | idle if is_even else repeated
-    words = []
+    sentences = []
     if out.any():
-        words.append(
+        sentences.append(
             f"{np.count_nonzero(out)} rows repeat the sample before them while the arm moves and"
             " were removed"
         )
@@ -218,7 +218,7 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
         used = f"even times, {missing} missing samples counted" if is_even else "the stamps"
         if not certain or (share < 0.5 and not is_even):
             used += " (positions are inconclusive)"
-        words.append(
+        sentences.append(
             f"the time stamps scatter by {percentage(0.0 if base.uniform else scattered.std(), 1)} "
             "of a step;"
             f" share confirmed by the positions: {share:.2f} ± {deviation:.1g}; high-frequency"
@@ -226,8 +226,8 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
             f" {residuals[1]:.3g} with even times; used: {used}"
         )
     if not out.any() and not is_even:
-        return recording, tuple(words)
-    return replace(recording, time=even if is_even else time).rows(~out), tuple(words)
+        return recording, tuple(sentences)
+    return replace(recording, time=even if is_even else time).rows(~out), tuple(sentences)
 
 
 def _numbers(time: Array, signals: Array, step: float) -> Array:

@@ -119,8 +119,8 @@ def mask_rows(
     reversal = near_any_reversal(model, motion, REVERSAL_PERIODS / bandwidth)
     reasons = {EDGE: np.broadcast_to(edge[:, None], shape)}
     if left_out == "rests":
-        rest = long_rests(motion.time, np.all(still, axis=1)[:, None])
-        reasons |= {REST: np.broadcast_to(rest, shape)}
+        resting = long_rests(motion.time, np.all(still, axis=1)[:, None])
+        reasons |= {REST: np.broadcast_to(resting, shape)}
     elif left_out == "halts":
         at_once = near_any_reversal(model, motion, np.zeros(shape[1]))
         reasons |= {REST: long_rests(motion.time, still), REVERSAL: at_once}

@@ -125,11 +125,11 @@ class Recording:
         """Time of the first commanded motion [s], of the first sample without command."""
         if self.commanded_position is None:
             return float(self.time[0])
-        known = np.isfinite(self.commanded_position).all(axis=1)
-        if not known.any():
+        with_command = np.isfinite(self.commanded_position).all(axis=1)
+        if not with_command.any():
             return float(self.time[0])
-        first = self.commanded_position[int(np.argmax(known))]
-        moved = known & (self.commanded_position != first).any(axis=1)
+        first = self.commanded_position[int(np.argmax(with_command))]
+        moved = with_command & (self.commanded_position != first).any(axis=1)
         return float(self.time[int(np.argmax(moved))])
 
     def segments(self) -> list[slice]:
@@ -194,12 +194,12 @@ class Recording:
             if name in self.held_joints:
                 continue
             if self.commanded_position is not None:
-                found = stuck(self.position[:, j], self.commanded_position[:, j])
-                if found is not None:
+                standstill = stuck(self.position[:, j], self.commanded_position[:, j])
+                if standstill is not None:
                     raise RecordingError(
                         f"joint {name} is stuck: its position stays"
-                        f" {self.position[found[0], j]:.6g} from sample {found[0]} on while its"
-                        f" command moves by {found[1]:.3g}"
+                        f" {self.position[standstill[0], j]:.6g} from sample {standstill[0]} on "
+                        f"while its command moves by {standstill[1]:.3g}"
                     )
             elif ranges[j] == 0.0 and np.any(ranges > STUCK_MOVEMENT):
                 raise RecordingError(
@@ -310,8 +310,8 @@ _REFINED: Final = 21  # offsets tried within a step
 def offsets_of_repetitions(recordings: Sequence[Recording]) -> Array | None:
     """Return the offsets of clocks from the first (R,) [s]; None without a common motion."""
     offsets = [0.0]
-    for one in recordings[1:]:
-        offset = _offset(recordings[0], one)
+    for repetition in recordings[1:]:
+        offset = _offset(recordings[0], repetition)
         if offset is None:
             return None
         offsets.append(offset)
@@ -351,9 +351,9 @@ def _lag(a: Array, b: Array) -> int | None:
     common = np.zeros(len(lags))
     for x, y in zip(a.T, b.T, strict=True):
         common += scipy.signal.correlate(y, x, method="fft")
-    power_a, power_b = (np.append(0.0, np.cumsum((one**2).sum(axis=1))) for one in (a, b))
-    own = power_a[last] - power_a[first] + power_b[last + lags] - power_b[first + lags]
-    squares = np.where(enough, (own - 2.0 * common) / np.maximum(rows, 1), np.inf)
+    power_a, power_b = (np.append(0.0, np.cumsum((signal**2).sum(axis=1))) for signal in (a, b))
+    powers = power_a[last] - power_a[first] + power_b[last + lags] - power_b[first + lags]
+    squares = np.where(enough, (powers - 2.0 * common) / np.maximum(rows, 1), np.inf)
     return int(lags[np.argmin(squares)])
 
 

@@ -100,9 +100,9 @@ class Samples:
         if motion.direction is not None:  # a view would hold the whole recording's
             motion = motion._replace(direction=motion.direction.copy())
         segments = [
-            slice(max(one.start, start) - start, min(one.stop, stop) - start)
-            for one in self.segments
-            if one.start < stop and one.stop > start
+            slice(max(segment.start, start) - start, min(segment.stop, stop) - start)
+            for segment in self.segments
+            if segment.start < stop and segment.stop > start
         ]
         return replace(
             self,

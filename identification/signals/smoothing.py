@@ -75,14 +75,14 @@ def difference_variance(time: Array, values: Array) -> Array:
         raise RecordingError(
             f"a noise variance requires {2 * _HIGHEST_DIFFERENCE} samples, got {len(time)}"
         )
-    found = [_difference_variance(time, values, 1)]
+    variances = [_difference_variance(time, values, 1)]
     settled = np.zeros((0, values.shape[1]), dtype=np.bool_)
     for order in range(2, _HIGHEST_DIFFERENCE + 1):
-        found.append(_difference_variance(time, values, order))
-        settled = np.array(found[1:]) > 0.95 * np.array(found[:-1])
+        variances.append(_difference_variance(time, values, order))
+        settled = np.array(variances[1:]) > 0.95 * np.array(variances[:-1])
         if settled.any(axis=0).all():  # higher orders are not needed
             break
-    estimates = np.array(found)
+    estimates = np.array(variances)
     first = np.where(settled.any(axis=0), settled.argmax(axis=0), _HIGHEST_DIFFERENCE - 1)
     return np.asarray(np.take_along_axis(estimates, first[None, :], axis=0)[0])
 
@@ -125,13 +125,15 @@ def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> f
         return None
     above = np.cumsum(power[::-1], axis=0)[::-1]
     silent = np.all(above < _NO_POWER * above[0], axis=1)
-    found = float(frequency[np.argmax(silent)])
-    return found if silent.any() and found < _LOW_PASSED * frequency[-1] else None
+    edge = float(frequency[np.argmax(silent)])
+    return edge if silent.any() and edge < _LOW_PASSED * frequency[-1] else None
 
 
 def _power(time: Array, signals: Array, segments: Sequence[slice]) -> tuple[Array, Array]:
     """Return frequencies (f,) above zero and power spectral densities (f, c)."""
-    longest = max(segments, key=lambda one: int(one.stop - one.start), default=slice(0, 0))
+    longest = max(
+        segments, key=lambda segment: int(segment.stop - segment.start), default=slice(0, 0)
+    )
     time = time[longest]
     signals = signals[longest]
     if time.size < _FEWEST:
@@ -189,7 +191,7 @@ def fit_smoothing_spline(
         if fine or np.all(np.mean(problem.closest_residual**2, axis=0) <= tolerance):
             break
     penalties = np.array(
-        [problem.penalty_for(c, float(one), widest) for c, one in enumerate(tolerance)]
+        [problem.penalty_for(c, float(variance), widest) for c, variance in enumerate(tolerance)]
     )
     coefficients = problem.closest.copy()
     for channel, penalty in enumerate(penalties.tolist()):

@@ -113,9 +113,9 @@ def calibrate(
         spread = np.sqrt(np.nansum(inner**2, axis=0) / np.count_nonzero(~np.isnan(inner), axis=0))
     # Repetitions share blocks: repeated errors are not independent.
     limit = float(student_limit(0.025, len(np.unique(fitted.block))))
-    known = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
+    covariance = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
     errors = np.abs(held_out.errors(estimate.values))
-    by_parameters = estimate.interval_factor**2 * held_out.variance(known)
+    by_parameters = estimate.interval_factor**2 * held_out.variance(covariance)
     half = np.sqrt(by_parameters + (limit * spread) ** 2)
     white = estimate.noise_std**2 / np.maximum(held_out.count, 1)
     white_half = np.sqrt(by_parameters + normal_limit(0.025) ** 2 * white)
@@ -129,8 +129,10 @@ def calibrate(
         )
         for limits in (half, white_half)
     )
-    widths = [own[rows] for own, rows in zip(half.T, judged.T, strict=True)]
-    half_width = np.array([np.median(own) if own.size else np.nan for own in widths])
+    widths = [joint_widths[rows] for joint_widths, rows in zip(half.T, judged.T, strict=True)]
+    half_width = np.array(
+        [np.median(joint_widths) if joint_widths.size else np.nan for joint_widths in widths]
+    )
     return Calibration(blocks, inside, half_width, white_inside)
 
 
@@ -149,31 +151,31 @@ def inner_errors(factor: Factor, means: TorqueMeans, refit: Refit) -> Array:
     before = np.cumsum(rows) - 0.5 * rows
     # Blocks at rest after the last row belong to the last fold.
     fold = np.minimum(np.floor(FOLDS * before / rows.sum()).astype(np.intp), FOLDS - 1)
-    found = np.full((len(means.block), factor.n_joints), np.nan)
+    fold_errors = np.full((len(means.block), factor.n_joints), np.nan)
     for k in range(FOLDS):
         others = factor.without(np.repeat(fold == k, fine)[: len(factor)])
         inside = fold[means.block] == k
         errors = means.errors(refit(others))[inside]
         errors[:, others.samples == 0] = np.inf
-        found[inside] = errors
-    return found
+        fold_errors[inside] = errors
+    return fold_errors
 
 
 def _means(model: RobotModel, samples: Samples) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
     """Return the fields of :class:`TorqueMeans` of one recording with rows."""
-    known = np.ones(samples.torque.shape, dtype=np.bool_)
+    usable = np.ones(samples.torque.shape, dtype=np.bool_)
     if samples.mask is not None:
         for reason in (EDGE, SATURATED):
-            known &= ~samples.mask.reasons[reason]
+            usable &= ~samples.mask.reasons[reason]
     index = block_index(samples)
     p = model.n_parameters
     present = np.unique(index)
-    count = count_by_block(index, known)[present]
-    places = [np.append(own, p) for own in model.plan.columns]
+    count = count_by_block(index, usable)[present]
+    places = [np.append(joint_columns, p) for joint_columns in model.plan.columns]
     sums = np.zeros((int(index[-1]) + 1, model.n_joints, p + 1))
-    for part, chunk in augmented_rows(model, replace(samples, usable=known)):
+    for part, chunk in augmented_rows(model, replace(samples, usable=usable)):
         for block, at in block_slices(index[part]):
-            for joint, own in enumerate(chunk):
-                sums[block, joint, places[joint]] += own[:, at].sum(axis=1)
+            for joint, joint_rows in enumerate(chunk):
+                sums[block, joint, places[joint]] += joint_rows[:, at].sum(axis=1)
     divisor = np.where(count > 0.5 * np.bincount(index).max(), count, np.nan)
     return sums[present] / divisor[:, :, None], present, count

@@ -126,15 +126,15 @@ def find_causes(
     """
     if noise is None:
         noise = noise_floor(model, values, recordings[:_NOISE_OF])
-    words = tuple(names) or tuple(f"recording {k + 1}" for k in range(len(recordings)))
-    search = _Search(model, recordings, values, words, noise)
-    found: list[Cause] = []
-    while len(found) < _MOST_CAUSES and (trial := _best(search.trials())) is not None:
-        found.append(search.resized(trial))
+    recording_names = tuple(names) or tuple(f"recording {k + 1}" for k in range(len(recordings)))
+    search = _Search(model, recordings, values, recording_names, noise)
+    causes: list[Cause] = []
+    while len(causes) < _MOST_CAUSES and (trial := _best(search.trials())) is not None:
+        causes.append(search.resized(trial))
         if trial.cause.fault.kind == "changed arm":
             break  # with separate parameters nothing is left to compare
         search.correct(trial.cause.fault)
-    return tuple(found)
+    return tuple(causes)
 
 
 class _Trial(NamedTuple):
@@ -171,7 +171,7 @@ def _best(trials: Sequence[_Trial]) -> _Trial | None:
     better = [trial for trial in trials if trial.better]
     least = min((trial.cause.ratio for trial in better), default=0.0)
     alike = [trial for trial in better if trial.cause.ratio <= _ALIKE * least]
-    best = min(alike, key=lambda one: (one.coefficients, one.cause.ratio), default=None)
+    best = min(alike, key=lambda trial: (trial.coefficients, trial.cause.ratio), default=None)
     return best if best and not any(best.ambiguous_with(trial) for trial in better) else None
 
 
@@ -190,7 +190,7 @@ class _Search:
         self._values = values
         self._names = names
         self._noise = np.zeros(model.n_joints) if noise is None else np.nan_to_num(noise)
-        travel = np.max([np.ptp(one.motion.position, axis=0) for one in recordings], axis=0)
+        travel = np.max([np.ptp(samples.motion.position, axis=0) for samples in recordings], axis=0)
         self._moved = np.flatnonzero(travel > STUCK_MOVEMENT)
         self._recordings = recordings
         self._few = _Few.of(model, recordings)
@@ -200,7 +200,9 @@ class _Search:
     def correct(self, fault: Fault) -> None:
         """Correct a fault in all following trials."""
         if fault.discrete:
-            self._recordings = [corrected(self._model, one, fault) for one in self._recordings]
+            self._recordings = [
+                corrected(self._model, samples, fault) for samples in self._recordings
+            ]
             self._few = _Few.of(self._model, self._recordings)
             self._motion_tables.clear()
         else:
@@ -213,15 +215,15 @@ class _Search:
         tables = _Tables.of(model, self._recordings, values)
         target = tables.torques
         none = np.zeros((*tables.gram.shape[:3], 0))
-        known = [_columns_of(tables, model, values, one) for one in self._known]
-        before = np.concatenate([none, *known], axis=3)
+        corrections = [_columns_of(tables, model, values, earlier) for earlier in self._known]
+        before = np.concatenate([none, *corrections], axis=3)
         usual = _score(tables, before, target)
         noise = self._noise**2 * tables.rows.sum(axis=0)
         separate: dict[Part | None, _Score] = {}
         excluded = self._excluded(usual, noise)
         trials = []
         for fault in self._faults(tables):
-            own = none
+            added = none
             measured = target.copy()
             seen = tables
             joints = list(fault.joints)
@@ -237,7 +239,7 @@ class _Search:
                 if fault.kind in excluded or not self._few.improved_by(fault):
                     continue
                 if fault not in self._motion_tables:
-                    moved = [corrected(model, one, fault) for one in self._recordings]
+                    moved = [corrected(model, samples, fault) for samples in self._recordings]
                     self._motion_tables[fault] = _Tables.of(model, moved, values)
                 seen = self._motion_tables[fault]
             elif fault.kind == "torque sign":
@@ -245,13 +247,13 @@ class _Search:
             elif fault.kind == "torque order":
                 measured[joints] = target[joints[::-1]]
             else:
-                own = _columns_of(tables, model, values, fault)
-                if not own.any():
+                added = _columns_of(tables, model, values, fault)
+                if not added.any():
                     continue  # such as friction of a frictionless joint
-            score = _score(seen, np.concatenate([own, before], axis=3), measured)
+            score = _score(seen, np.concatenate([added, before], axis=3), measured)
             explains = score.explains(joints, usual, noise, separate.get(fault.part))
             ratio, highest = score.ratio_to(usual)
-            size, std = _size(fault, score, tables, own)
+            size, std = _size(fault, score, tables, added)
             worst = float(np.sqrt(score.shares(score.squares.sum(axis=0))[joints].max(initial=0.0)))
             if fault.kind == "load friction" and (size or 0.0) <= 0.0:
                 continue  # friction dissipates
@@ -259,7 +261,7 @@ class _Search:
                 _Trial(
                     cause=Cause(fault, ratio, size, std),
                     highest=highest,
-                    coefficients=own.shape[3],
+                    coefficients=added.shape[3],
                     left=worst,
                     values=score.values.mean(axis=0),
                     explains=explains,
@@ -313,8 +315,8 @@ class _Search:
         if fault.kind == "changed arm":
             alike = Fault("payload")
         for k in range(1, len(self._recordings)):
-            own = Part(self._names[k], tuple((tables.recording == k).tolist()))
-            columns.append(_columns_of(tables, model, self._values, alike._replace(part=own)))
+            part = Part(self._names[k], tuple((tables.recording == k).tolist()))
+            columns.append(_columns_of(tables, model, self._values, alike._replace(part=part)))
         score = _score(tables, np.concatenate(columns, axis=3), tables.torques)
         sizes = score.added.mean(axis=0).reshape(len(columns), -1)
         sizes = np.append(0.0, sizes[:, _MASS if alike.kind == "payload" else 0])
@@ -330,10 +332,12 @@ class _Search:
         for first in range(_FEWEST_BLOCKS, blocks - _FEWEST_BLOCKS + 1):
             k = int(tables.recording[first])
             start = tables.start[first]
-            words = f"{self._names[k]} from {start:.3g} s on" if start > 0.0 else self._names[k]
+            description = (
+                f"{self._names[k]} from {start:.3g} s on" if start > 0.0 else self._names[k]
+            )
             if k < len(self._recordings) - 1:
-                words += " and what follows it"
-            yield Part(words, tuple((np.arange(blocks) >= first).tolist()))
+                description += " and what follows it"
+            yield Part(description, tuple((np.arange(blocks) >= first).tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -386,8 +390,8 @@ class _Tables:
             usable = samples.usable[some]
             tables *= usable.T[:, :, None]
             for a, b in pairwise(edges):
-                own = tables[:, a:b]
-                grams.append(np.swapaxes(own, 1, 2) @ own)
+                block_rows = tables[:, a:b]
+                grams.append(np.swapaxes(block_rows, 1, 2) @ block_rows)
                 rows.append(np.count_nonzero(usable[a:b], axis=0))
                 starts.append(samples.motion.time[some[a]] - samples.motion.time[0] if a else 0.0)
         recording = np.repeat(np.arange(len(recordings)), count)
@@ -433,9 +437,9 @@ class _Few:
         ]
         factor = joined(parts)
         gram = np.zeros((len(factor), factor.n_joints, p + 1, p + 1))
-        for joint, own in enumerate(factor.matrices):
+        for joint, matrix in enumerate(factor.matrices):
             place = np.append(factor.columns[joint], p)
-            gram[:, joint, place[:, None], place] = own
+            gram[:, joint, place[:, None], place] = matrix
         blocks = np.arange(len(factor))
         tables = _Tables(gram, factor.counts, blocks, blocks.astype(np.float64), p)
         torque = np.eye(1, p + 1, p).repeat(factor.n_joints, axis=0)
@@ -475,7 +479,7 @@ def _rate(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.i
     direction = now.direction
     if direction is None:
         direction = model.friction.direction(*now[:3])
-    low, high = (model.torque(values, *one[1:4], direction) for one in (first, last))
+    low, high = (model.torque(values, *motion[1:4], direction) for motion in (first, last))
     return np.asarray((high - low) / np.maximum(last.time - first.time, 1e-9)[:, None])
 
 
@@ -512,8 +516,8 @@ class _Score(NamedTuple):
 
     def shares(self, squares: Array) -> Array:
         """Return squared errors (n,) as shares of the squared torque, zero without torque."""
-        known = self.torque > _NO_TORQUE * self.torque.max(initial=0.0)
-        return np.where(known, squares / np.where(known, self.torque, 1.0), 0.0)
+        loaded = self.torque > _NO_TORQUE * self.torque.max(initial=0.0)
+        return np.where(loaded, squares / np.where(loaded, self.torque, 1.0), 0.0)
 
     def explains(
         self, joints: Sequence[int], usual: _Score, noise: Array, separate: _Score | None
@@ -526,44 +530,44 @@ class _Score(NamedTuple):
         before = usual.shares(usual.fitted)
         after = self.shares(self.fitted)
         every = np.flatnonzero(before > 0.0)
-        own = np.array(joints, dtype=np.intp) if len(joints) else every
-        own = own[np.isin(own, every)]
-        if not own.size:
+        affected = np.array(joints, dtype=np.intp) if len(joints) else every
+        affected = affected[np.isin(affected, every)]
+        if not affected.size:
             return False
         floor = usual.shares(noise)
-        if np.all(after[own] <= _NEAR_NOISE**2 * floor[own]):
+        if np.all(after[affected] <= _NEAR_NOISE**2 * floor[affected]):
             return True
-        ratio = _geometric_mean(np.sqrt(after[own] / before[own]))
+        ratio = _geometric_mean(np.sqrt(after[affected] / before[affected]))
         if ratio <= _EXPLAINS:
             return True
-        others = np.setdiff1d(every, own)
+        others = np.setdiff1d(every, affected)
         if others.size and ratio <= _STANDS_OUT:
             level = float(np.median(after[others]))
-            if np.all(after[own] <= level) and np.all(before[own] > level):
+            if np.all(after[affected] <= level) and np.all(before[affected] > level):
                 return True
         if separate is None or ratio > _SAME_PART:
             return False
-        least = separate.squares.sum(axis=0)[own]
-        mine = self.squares.sum(axis=0)[own]
-        known = (least > 0.0) & (mine > 0.0)
-        return bool(known.any()) and _geometric_mean(np.sqrt(mine[known] / least[known])) <= (
-            _NEAR_SEPARATE
-        )
+        least = separate.squares.sum(axis=0)[affected]
+        mine = self.squares.sum(axis=0)[affected]
+        positive = (least > 0.0) & (mine > 0.0)
+        return bool(positive.any()) and _geometric_mean(
+            np.sqrt(mine[positive] / least[positive])
+        ) <= (_NEAR_SEPARATE)
 
     def fit_ratio_to(self, other: _Score) -> float:
         """Return the ratio of the errors of the fits, geometric mean over the joints."""
-        known = (self.fitted > 0.0) & (other.fitted > 0.0)
-        return _geometric_mean(np.sqrt(self.fitted[known] / other.fitted[known]))
+        positive = (self.fitted > 0.0) & (other.fitted > 0.0)
+        return _geometric_mean(np.sqrt(self.fitted[positive] / other.fitted[positive]))
 
     def ratio_to(self, other: _Score) -> tuple[float, float]:
         """Return the error ratio, geometric mean over the joints, and its upper limit by blocks."""
         tested = np.isfinite(self.squares) & np.isfinite(other.squares)
         tested &= (self.squares > 0.0) & (other.squares > 0.0)
-        known = tested.any(axis=0)
-        if not known.any():
+        tested_joints = tested.any(axis=0)
+        if not tested_joints.any():
             return 1.0, np.inf
-        ours = np.where(tested, self.squares, 0.0).sum(axis=0)[known]
-        theirs = np.where(tested, other.squares, 0.0).sum(axis=0)[known]
+        ours = np.where(tested, self.squares, 0.0).sum(axis=0)[tested_joints]
+        theirs = np.where(tested, other.squares, 0.0).sum(axis=0)[tested_joints]
         ratio = _geometric_mean(np.sqrt(ours / theirs))
         change = np.zeros(tested.shape)
         change[tested] = 0.5 * np.log(self.squares[tested] / other.squares[tested])
@@ -602,11 +606,11 @@ def _score(tables: _Tables, added: Array, target: Array) -> _Score:
     squares = np.zeros((blocks, n))
     coefficients = []
     for k in range(_FOLDS):
-        own = slice(k, None, _FOLDS)
+        fold_blocks = slice(k, None, _FOLDS)
         fold = _Sums(*(part[k] for part in folds))
         values = _solved(total - fold.weighted(weights))
         coefficients.append(values)
-        squares[own] = _Sums(*(part[own] for part in sums)).squares(values)
+        squares[fold_blocks] = _Sums(*(part[fold_blocks] for part in sums)).squares(values)
     squares = np.where(tables.rows >= _FEWEST_ROWS, np.maximum(squares, floor / blocks), 0.0)
     fitted = np.maximum(whole.squares(_solved(total)), floor)
     of_folds = np.array(coefficients)
@@ -644,7 +648,7 @@ def _solved(gram: Array) -> Array:
     return solve_with_ridge(gram[:-1, :-1], gram[:-1, -1], _RIDGE)
 
 
-def _size(fault: Fault, score: _Score, tables: _Tables, own: Array) -> tuple[float | None, float]:
+def _size(fault: Fault, score: _Score, tables: _Tables, added: Array) -> tuple[float | None, float]:
     """Return the size of a fault of columns (B, n, q, r), and its jackknife deviation."""
     if fault.discrete or fault.kind == "changed arm":
         return None, 0.0
@@ -655,7 +659,7 @@ def _size(fault: Fault, score: _Score, tables: _Tables, own: Array) -> tuple[flo
         return float(loaded.mean()), float(np.sqrt((_FOLDS - 1) * loaded.var()))
     if fault.kind in ("gain", "changed gain", "changed friction"):
         # Its column uses the pooled parameters, the fit finds others beside it.
-        columns = own[..., :p, 0].reshape(-1, p)
+        columns = added[..., :p, 0].reshape(-1, p)
         column = columns[np.argmax(columns.any(axis=1))]
         power = tables.gram[:, fault.joints[0], :p, :p].sum(axis=0) @ column
         size = power @ column

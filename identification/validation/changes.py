@@ -91,16 +91,16 @@ def find_changes(
     """Compare unseen with fitted motion under parameters (p,); return the joints that changed."""
     fitted, unseen = (_Part.of(model, values, runs) for runs in (training, held_out))
     usual = np.maximum(fitted.relative, 1e-9)
-    found = []
+    changes = []
     for joint in np.flatnonzero(unseen.relative > _GROWN * usual).tolist():
         beyond = unseen.relative[joint] ** 2 - usual[joint] ** 2
         trials = []
         for k, kind in enumerate(_KINDS):
-            own = unseen.shares[k]
+            unseen_share = unseen.shares[k]
             reference = fitted.shares[k]
             base = 1.0 + float(np.nan_to_num(reference.mean[joint]))
-            share = float(own.mean[joint])
-            std = float(own.std[joint])
+            share = float(unseen_share.mean[joint])
+            std = float(unseen_share.std[joint])
             if not np.isfinite(share) or base <= 0.0:
                 continue
             ratio = (1.0 + share) / base
@@ -117,18 +117,18 @@ def find_changes(
         if trials:
             least = min(trial.relative for trial in trials)
             alike = [trial for trial in trials if trial.relative <= _ALIKE * least]
-            found.append(alike[-1])
-    return tuple(found)
+            changes.append(alike[-1])
+    return tuple(changes)
 
 
 def _by_block(block: NDArray[np.intp], first: Array, second: Array) -> Array:
     """Sum products of two tables (m, n) by block (B, n)."""
     joints = zip(first.T, second.T, strict=True)
-    return np.column_stack([np.bincount(block, one * other) for one, other in joints])
+    return np.column_stack([np.bincount(block, column * other) for column, other in joints])
 
 
 def _relative(squares: Array, torque: Array) -> Array:
     """Return the root of squares over squared torque, zero without torque."""
-    known = torque > 0.0
-    share = np.where(known, np.maximum(squares, 0.0) / np.where(known, torque, 1.0), 0.0)
+    loaded = torque > 0.0
+    share = np.where(loaded, np.maximum(squares, 0.0) / np.where(loaded, torque, 1.0), 0.0)
     return np.asarray(np.sqrt(share))

@@ -177,8 +177,8 @@ def repetition_noise(
         parts.append((index[rows], joints, left[rows, joints]))
     length = max((int(index.max(initial=-1)) for index, _, _ in parts), default=-1) + 1
     table = np.full((len(parts), length, model.n_joints), np.nan)
-    for own, (index, joints, left) in zip(table, parts, strict=True):
-        own[index, joints] = left
+    for repetition_row, (index, joints, left) in zip(table, parts, strict=True):
+        repetition_row[index, joints] = left
     count = np.count_nonzero(~np.isnan(table), axis=0)
     shared = count >= 2
     mean = np.nansum(table, axis=0) / np.maximum(count, 1)
@@ -204,7 +204,7 @@ def find_load(
     predicted: Factor,
 ) -> CarriedLoad:
     """Fit the training motion, then ten parameters of the last link to the unseen motion."""
-    seen, unseen = (under_gravity(one, model.gravity) for one in (fitted, predicted))
+    seen, unseen = (under_gravity(factor, model.gravity) for factor in (fitted, predicted))
     values = _solved(seen, fitted.samples / np.maximum(seen.gram[:, -1, -1], 1e-300))
     # Squared error of the fit, scaled to as many rows.
     floor = 1e-12 * unseen.gram[:, -1, -1] + 1e-300
@@ -220,13 +220,13 @@ def find_load(
     body = _solved(left, weights)
     after = left.squared_errors(body)
     beyond = weights @ np.maximum(before - usual, 0.0)
-    found = CarriedLoad(
+    load = CarriedLoad(
         mass=float(body[LINK_SYMBOLS.index("m")]),
         explained=float(weights @ (before - after) / beyond) if beyond > 0.0 else 0.0,
         axes=int(np.count_nonzero(before > _GROWN * np.maximum(usual, floor))),
     )
-    if found.explained <= Thresholds().load:
-        return found
+    if load.explained <= Thresholds().load:
+        return load
     try:
         runs = [
             Run.of(str(k), model, samples, None, loaded=loaded)
@@ -235,8 +235,8 @@ def find_load(
         ]
         mass, _, high = mass_difference(model, runs)
     except IdentificationError:
-        return found
-    return found._replace(mass=mass, half_interval=high - mass) if np.isfinite(high) else found
+        return load
+    return load._replace(mass=mass, half_interval=high - mass) if np.isfinite(high) else load
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,7 +443,9 @@ def _one_way(recordings: Sequence[Samples]) -> NDArray[np.bool_]:
 def _disagreement(result: RepeatedEstimate) -> Array:
     """Return the largest torque difference of repetitions to the pooled estimate (n,)."""
     gram = result.factor.gram
-    differences = np.array([one.values for one in result.repetitions]) - result.pooled.values
+    differences = (
+        np.array([repetition.values for repetition in result.repetitions]) - result.pooled.values
+    )
     torque = np.einsum("ri,jik,rk->rj", differences, gram[:, :-1, :-1], differences)
     share = np.maximum(torque, 0.0) / np.maximum(gram[:, -1, -1], 1e-300)
     return np.asarray(np.sqrt(share.max(axis=0)))
@@ -451,7 +453,7 @@ def _disagreement(result: RepeatedEstimate) -> Array:
 
 def _estimation_noise(result: RepeatedEstimate, held_out: Factor) -> Array:
     """Return the standard deviation (n,) of predicted torque by scatter of the estimates."""
-    values = np.array([one.values for one in result.repetitions])
+    values = np.array([repetition.values for repetition in result.repetitions])
     differences = values - values.mean(axis=0)
     count = len(values)
     torque = np.einsum("ri,jik,rk->j", differences, held_out.gram[:, :-1, :-1], differences)

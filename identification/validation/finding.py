@@ -30,8 +30,8 @@ class Finding:
 
 def joined(names: Sequence[str], most: int = 6) -> str:
     """Return names separated by commas, the first few of many."""
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
+    omitted = len(names) - most
+    return ", ".join(names[:most]) + (f" and {omitted} more" if omitted > 0 else "")
 
 
 @dataclass(frozen=True)

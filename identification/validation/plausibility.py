@@ -70,24 +70,24 @@ def implausibilities(
     torque_rms = np.sqrt(motion.gram[:, -1, -1] / np.maximum(motion.samples, 1))
     little = little_torque(torque_rms, ~model.chain.revolute)
     limit = np.where(little, _FAR_ABOVE, 1.0) * error_rms
-    for words, part, by_added in _wrong_signs(model, estimate, speed, added):
+    for message, part, by_added in _wrong_signs(model, estimate, speed, added):
         if by_added:
-            chosen.append(words)
+            chosen.append(message)
             continue
-        own = np.where(part, estimate.values, 0.0)
-        squares = np.einsum("i,jik,k->j", own, motion.gram[:, :-1, :-1], own)
+        part_values = np.where(part, estimate.values, 0.0)
+        squares = np.einsum("i,jik,k->j", part_values, motion.gram[:, :-1, :-1], part_values)
         torque = np.sqrt(np.maximum(squares, 0.0) / np.maximum(motion.samples, 1))
-        (impossible if np.any(torque > limit) else doubtful).append(words)
+        (impossible if np.any(torque > limit) else doubtful).append(message)
     return Implausible(tuple(impossible), tuple(doubtful), tuple(chosen))
 
 
 def _is_negative(estimate: Estimate, direction: Array) -> bool:
     """Return whether direction · parameters is significantly below zero."""
-    known = np.isfinite(np.diag(estimate.covariance))
-    if np.any(direction[~known]):
+    determined = np.isfinite(np.diag(estimate.covariance))
+    if np.any(direction[~determined]):
         return False
-    part = direction[known]
-    variance = float(part @ estimate.covariance[np.ix_(known, known)] @ part)
+    part = direction[determined]
+    variance = float(part @ estimate.covariance[np.ix_(determined, determined)] @ part)
     return float(direction @ estimate.values) < -_SIGMAS * float(np.sqrt(variance))
 
 
@@ -99,28 +99,28 @@ def _wrong_signs(
     first = model.base.rank
     count = len(estimate.values)
     for joint, (name, law) in enumerate(zip(model.joint_names, model.friction.laws, strict=True)):
-        one = speed[joint : joint + 1]
+        top_speed = speed[joint : joint + 1]
         top, coulomb, stated = np.zeros((3, count))
         for k, (_, term, owner, motor, _) in enumerate(model.friction.terms, start=first):
             if owner == joint and not motor and term.is_friction:
-                top[k] = term.column(one, law.sign(one))[0]
+                top[k] = term.column(top_speed, law.sign(top_speed))[0]
                 coulomb[k] = term == COULOMB
                 stated[k] = term.symbol not in added
         if _is_negative(estimate, coulomb):
-            words = (
+            message = (
                 f"Coulomb friction of {name} is negative ({coulomb @ values:.3g}): a torque or a"
                 " direction has the wrong sign"
             )
-            yield words, top != 0.0, False
+            yield message, top != 0.0, False
         elif _is_negative(estimate, top - 0.5 * coulomb):
             by_added = not _is_negative(estimate, stated * top - 0.5 * coulomb)
-            words = (
+            message = (
                 f"friction of {name} is {top @ values:.3g} at its top speed of {speed[joint]:.3g},"
                 f" less than half of its Coulomb friction {coulomb @ values:.3g}"
             )
             if by_added:
-                words += ", by a friction term that was chosen by inner prediction"
-            yield words, top != 0.0, by_added
+                message += ", by a friction term that was chosen by inner prediction"
+            yield message, top != 0.0, by_added
     alone = {  # names of single parameters
         k: f"friction {term.name} of {'motor' if term.motor else 'joint'} {term.owner + 1}"
         for k, term in enumerate(model.friction.terms, start=first)
@@ -150,9 +150,9 @@ class Dissipation(NamedTuple):
     @property
     def all_driving(self) -> NDArray[np.bool_]:
         """Joints with known friction (n,) if it drives all of them, most of the arm; else none."""
-        known = self.known
-        most = np.count_nonzero(known) >= max(2, 0.5 * len(known))
-        return known & bool(most and np.all(self.torque[known] < 0.0))
+        determined = self.known
+        most = np.count_nonzero(determined) >= max(2, 0.5 * len(determined))
+        return determined & bool(most and np.all(self.torque[determined] < 0.0))
 
     @property
     def described(self) -> NDArray[np.object_]:
@@ -171,10 +171,10 @@ def dissipation_of(model: RobotModel, estimate: Estimate, speed: Array) -> Dissi
     covariance = np.where(np.outer(determined, determined), estimate.covariance, 0.0)
     for joint, law in enumerate(model.friction.laws):
         top = np.zeros(count)
-        one = speed[joint : joint + 1]
+        top_speed = speed[joint : joint + 1]
         for k, (_, term, owner, motor, _) in enumerate(model.friction.terms, start=first):
             if owner == joint and not motor and term.is_friction:
-                top[k] = term.column(one, law.sign(one))[0]
+                top[k] = term.column(top_speed, law.sign(top_speed))[0]
         torque[joint] = top @ estimate.values
         if top.any() and not np.any(top[~determined]):
             std[joint] = float(np.sqrt(top @ covariance @ top))
@@ -184,9 +184,9 @@ def dissipation_of(model: RobotModel, estimate: Estimate, speed: Array) -> Dissi
 def inertia_matrices(model: RobotModel, values: Array, position: Array) -> Array:
     """Return inertia matrices (k, n, n) with rotors, of parameters (p,) at positions (k, n)."""
     still = np.zeros_like(position)
-    rest = model.torque(values, position, still, still)
+    static_torque = model.torque(values, position, still, still)
     columns = [
-        model.torque(values, position, still, still + axis) - rest
+        model.torque(values, position, still, still + axis) - static_torque
         for axis in np.eye(model.n_joints)
     ]
     return np.stack(columns, axis=2)
@@ -307,19 +307,19 @@ def check_consistency(
     Raises:
         IdentificationError: see :func:`identification.estimators.consistent.consistent_estimate`.
     """
-    found = consistent_estimate(
+    consistent = consistent_estimate(
         model, training, unconstrained, weights=weights, prior=prior, design_effect=design_effect
     )
-    values = found.estimate.values
+    values = consistent.estimate.values
     free = unconstrained.values
-    shift = np.abs(found.shift)
+    shift = np.abs(consistent.shift)
     links = model.layout.links
     rise = held_out.relative_errors(values) - held_out.relative_errors(free)
     torque = np.sqrt(held_out.gram[:, -1, -1] / np.maximum(held_out.samples, 1))
     rise[little_torque(torque, ~model.chain.revolute)] = np.nan
     # In axes in which the reference's pseudo-inertia is the unit matrix.
     frames = reference_bodies(model.nominal[links], model.chain.translation).frames
-    inner = np.linalg.solve(frames, pseudo_inertia(found.standard[links]))
+    inner = np.linalg.solve(frames, pseudo_inertia(consistent.standard[links]))
     inner = np.linalg.solve(frames, inner.transpose(0, 2, 1))
     room = np.asarray(np.linalg.eigvalsh(inner)[:, 0])
     bounds: list[str] = []
@@ -335,7 +335,7 @@ def check_consistency(
         if room[joint] < _EDGE:
             bounds.append(f"the link of {name} would need a negative mass or moment of inertia")
     return ConsistencyCheck(
-        consistent=found,
+        consistent=consistent,
         held_out=held_out.relative_error(values),
         unconstrained_held_out=held_out.relative_error(free),
         held_out_rise=rise,
@@ -391,17 +391,17 @@ class NominalScale(NamedTuple):
     def off(self) -> NDArray[np.bool_]:
         """Whether the scale of each axis differs significantly from 1 (n,)."""
         # A factor that may be zero does not determine the nominal torque.
-        known = np.abs(self.scale) > self.tolerance
-        return known & (np.abs(self.scale - 1.0) > self.tolerance)
+        determined = np.abs(self.scale) > self.tolerance
+        return determined & (np.abs(self.scale - 1.0) > self.tolerance)
 
     @property
     def common(self) -> float:
         """Factor common to most axes, such as a wrong unit or motor torques; 1 if there is none."""
-        known = np.isfinite(self.scale) & (self.scale > 0.0)
-        if np.count_nonzero(known) < 2:
+        positive = np.isfinite(self.scale) & (self.scale > 0.0)
+        if np.count_nonzero(positive) < 2:
             return 1.0
-        logs = np.log(self.scale[known])
-        sure = np.abs(self.scale[known] - 1.0) > self.tolerance[known]
+        logs = np.log(self.scale[positive])
+        sure = np.abs(self.scale[positive] - 1.0) > self.tolerance[positive]
         alike = sure & (np.abs(logs) > np.log(_OTHER_UNIT)) & (logs * np.median(logs) > 0.0)
         most = np.count_nonzero(alike) > len(logs) / 2
         return float(np.exp(np.median(logs))) if most else 1.0
@@ -409,9 +409,9 @@ class NominalScale(NamedTuple):
     @property
     def negated(self) -> bool:
         """Whether all known scales are negative, two of them or that of one joint significantly."""
-        known = self.scale[np.isfinite(self.scale)]
+        finite_scale = self.scale[np.isfinite(self.scale)]
         sure = np.count_nonzero(self.scale + self.tolerance < 0.0)
-        return bool(sure >= min(2, len(self.scale)) and np.all(known < 0.0))
+        return bool(sure >= min(2, len(self.scale)) and np.all(finite_scale < 0.0))
 
     def without(self, joints: Iterable[int]) -> NominalScale:
         """Return the scales with those of some axes unknown."""
@@ -438,7 +438,7 @@ def nominal_scale(
     if all(run.torque_bandwidth is None for run in runs):
         step = max(1, sum(len(run.torque) for run in runs) // _MOST_ROWS)
         runs = [run.thinned(step) for run in runs]
-    found = []
+    scales = []
     regressors = [run.regressor(model) for run in runs]
     for joint in range(model.n_joints):
         columns = regressors[0].columns[joint]
@@ -460,8 +460,8 @@ def nominal_scale(
             torques.append(run.torque[rows, joint])
             deviations.append((block[:, inertial] @ bodies[columns[inertial]])[rows])
         whole = (np.concatenate(parts) for parts in (tables, torques, deviations))
-        found.append(_scale(*whole, share=share or 0.0))
-    return NominalScale(*np.array(found).T)
+        scales.append(_scale(*whole, share=share or 0.0))
+    return NominalScale(*np.array(scales).T)
 
 
 def _scale(table: Array, torque: Array, deviations: Array, *, share: float) -> tuple[float, float]:
@@ -494,8 +494,8 @@ def _scale(table: Array, torque: Array, deviations: Array, *, share: float) -> t
     tolerance = noise + model_error
     # Tolerances scale with the unit of the torque. Uncertain bodies alone leave a scale known.
     unit = max(1.0, abs(scale))
-    known = noise + _SURE * misfit < _WIDEST * unit and tolerance < unit
-    return (scale, float(tolerance)) if known else (np.nan, np.inf)
+    is_certain = noise + _SURE * misfit < _WIDEST * unit and tolerance < unit
+    return (scale, float(tolerance)) if is_certain else (np.nan, np.inf)
 
 
 class InertiaRatio(NamedTuple):
@@ -516,9 +516,9 @@ def inertia_ratio(
     if not np.any(theirs):
         return None
     ours = np.diagonal(inertia_matrices(model, values, position), axis1=1, axis2=2)
-    known = (ours > 0.0) & (theirs > 0.0)
-    ratio = np.where(known, theirs, np.nan) / np.where(known, ours, 1.0)
-    whole = known.mean(axis=0) > 0.9
+    comparable = (ours > 0.0) & (theirs > 0.0)
+    ratio = np.where(comparable, theirs, np.nan) / np.where(comparable, ours, 1.0)
+    whole = comparable.mean(axis=0) > 0.9
     median, spread = np.full((2, model.n_joints), np.nan)
     median[whole] = np.nanmedian(ratio[:, whole], axis=0)
     spread[whole] = np.nanstd(ratio[:, whole], axis=0)
@@ -605,19 +605,21 @@ def _steps_of(recording: Recording, parts: Sequence[slice], name: str) -> Positi
     usual = np.partition(size, -_USUAL, axis=0)[-_USUAL] if len(size) > 10 * _USUAL else 0.0
     least = np.maximum(np.maximum(_STANDS_OUT * spread, _BEYOND_USUAL * usual), _FASTEST * steps**2)
     # Missing or repeated rows cause departures by whole steps of the motion.
-    one = speed * steps
-    count = np.clip(np.rint(departure / np.where(one == 0.0, np.inf, one)), -1.0, GAP_STEPS)
-    apart = np.abs(departure - count * one)
-    whole = apart < np.maximum(least, _WHOLE * np.abs(one))
+    motion_step = speed * steps
+    count = np.clip(
+        np.rint(departure / np.where(motion_step == 0.0, np.inf, motion_step)), -1.0, GAP_STEPS
+    )
+    apart = np.abs(departure - count * motion_step)
+    whole = apart < np.maximum(least, _WHOLE * np.abs(motion_step))
     suspect = (size - 0.5 * change > least) & (shown | ~whole)
     lasting = np.zeros_like(suspect)
     for joint, k in np.argwhere(suspect.T):
         around = departure[max(0, k - _BESIDE) : k + _BESIDE + 1, joint]
         # Otherwise the steps beside it reverse it.
         lasting[k, joint] = np.abs(around.sum()) > 0.5 * size[k, joint]
-    by_whole_steps = (count != 0.0) & (apart < _WHOLE * np.abs(one))
+    by_whole_steps = (count != 0.0) & (apart < _WHOLE * np.abs(motion_step))
     often = np.count_nonzero(lasting & by_whole_steps) >= _OFTEN
-    moving = np.abs(one) > _MOVES * spread
+    moving = np.abs(motion_step) > _MOVES * spread
     together = np.count_nonzero(_nearby(lasting) & moving, axis=1)
     every = (together >= 2) & (together > 0.5 * np.count_nonzero(moving, axis=1))
     jumps: list[PositionJump] = []
@@ -625,10 +627,12 @@ def _steps_of(recording: Recording, parts: Sequence[slice], name: str) -> Positi
     for joint, k in np.argwhere(lasting.T):
         row = int(after[k])
         jump = float(departure[k, joint])
-        found = PositionJump(name, recording.joint_names[joint], float(time[row] - time[0]), jump)
+        position_jump = PositionJump(
+            name, recording.joint_names[joint], float(time[row] - time[0]), jump
+        )
         by_log = every[k] or (by_whole_steps[k, joint] and often)
         by_log |= _on_path(time, position[:, joint], row, jump)
-        (logged if by_log else jumps).append(found)
+        (logged if by_log else jumps).append(position_jump)
     return PositionSteps(tuple(jumps), tuple(logged))
 
 
@@ -678,7 +682,10 @@ def _without_clock(departure: Array, speed: Array, steps: Array) -> tuple[Array,
     # Departures of zero, at rest, do not measure noise.
     size = np.abs(departure)
     noise = np.array(
-        [_NORMAL * np.median(some) if (some := one[one > 0.0]).size else np.inf for one in size.T]
+        [
+            _NORMAL * np.median(some) if (some := column[column > 0.0]).size else np.inf
+            for column in size.T
+        ]
     )
     off = departure / noise
     rate = speed / noise

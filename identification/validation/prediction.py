@@ -88,16 +88,16 @@ class PredictionError:
     @property
     def relative(self) -> Array:
         """||e|| / ||tau|| of each joint (n,); NaN for a joint without a row or without torque."""
-        known = (self.rows > 0) & (self.torque_squared > 0.0)
-        share = self.squared / np.where(known, self.torque_squared, 1.0)
-        return np.where(known, np.sqrt(share), np.nan)
+        loaded = (self.rows > 0) & (self.torque_squared > 0.0)
+        share = self.squared / np.where(loaded, self.torque_squared, 1.0)
+        return np.where(loaded, np.sqrt(share), np.nan)
 
     @property
     def explained(self) -> Array:
         """Share of each joint's torque variance that the prediction explains (n,), R²."""
         varies = self.torque_squared - self.torque_sum**2 / np.maximum(self.rows, 1)
-        known = (self.rows > 0) & (varies > 1e-12 * self.torque_squared)
-        return np.where(known, 1.0 - self.squared / np.where(known, varies, 1.0), np.nan)
+        varying = (self.rows > 0) & (varies > 1e-12 * self.torque_squared)
+        return np.where(varying, 1.0 - self.squared / np.where(varying, varies, 1.0), np.nan)
 
     @property
     def overall(self) -> float:

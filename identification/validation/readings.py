@@ -354,10 +354,10 @@ class _Search:
         """Yield whole orders: from several starts, the best exchange while the error falls."""
         is_poor = self.score.overall > EXPLAINED
         for kind in _IN_ORDER:
-            own = [trial for trial in trials if trial.change.meaning == kind]
-            if not is_poor and not any(trial.against.ratio < _IMPROVES for trial in own):
+            trials_of_kind = [trial for trial in trials if trial.change.meaning == kind]
+            if not is_poor and not any(trial.against.ratio < _IMPROVES for trial in trials_of_kind):
                 continue
-            tried = {_whole_order(trial.change, self.model.n_joints) for trial in own}
+            tried = {_whole_order(trial.change, self.model.n_joints) for trial in trials_of_kind}
             for order in _best_orders(fits, kind, _STARTS if is_poor else 1):
                 change = _order_change(kind, order)
                 if change.joints and order not in tried:
@@ -737,13 +737,13 @@ class Axes(NamedTuple):
 
     def _after(self, change: Change) -> Axes:
         meaning = change.meaning
-        own = list(change.joints)
+        joints = list(change.joints)
         order = np.arange(len(self.zero))
         sign = np.ones(len(self.zero))
         if meaning.endswith("order"):
-            order[own] = change.places
+            order[joints] = change.places
         elif meaning.endswith("sign"):
-            sign[own] = -1.0
+            sign[joints] = -1.0
         axes = self
         if meaning in ("position order", "joint order", "position sign", "axis sign"):
             axes = axes._replace(
@@ -760,7 +760,7 @@ class Axes(NamedTuple):
             axes = axes._replace(factor=axes.factor * factor, zero=axes.zero * factor)
         if meaning == "zero":
             zero = axes.zero.copy()
-            zero[own] += change.size
+            zero[joints] += change.size
             axes = axes._replace(zero=zero)
         return axes
 

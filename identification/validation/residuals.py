@@ -129,16 +129,16 @@ def _profile(
     highest = np.where(moved, highest, 1.0)
     edges = np.linspace(lowest, highest, BINS + 1, axis=1)
     sums = []
-    for run, residual, own in zip(runs, left, over, strict=True):
+    for run, residual, quantity in zip(runs, left, over, strict=True):
         block = block_index(run)
-        found = np.zeros((2, int(block[-1]) + 1, len(edges), BINS))
+        binned_sums = np.zeros((2, int(block[-1]) + 1, len(edges), BINS))
         for joint, usable in enumerate(run.usable.T):
-            bins = np.searchsorted(edges[joint, 1:-1], own[:, joint], side="right")
+            bins = np.searchsorted(edges[joint, 1:-1], quantity[:, joint], side="right")
             place = block * BINS + bins
-            for table, weights in zip(found, (residual[:, joint], usable), strict=True):
+            for table, weights in zip(binned_sums, (residual[:, joint], usable), strict=True):
                 some = np.bincount(place, np.where(usable, weights, 0.0), len(table) * BINS)
                 table[:, joint] = some.reshape(-1, BINS)
-        sums.append(found)
+        sums.append(binned_sums)
     return Profile(edges, block_mean(sums, repeated))
 
 
@@ -174,14 +174,14 @@ def _ripple_sums(samples: Samples, residual: Array, motor_from_joint: Array) -> 
     block = block_index(samples)
     motor = samples.motion.position @ motor_from_joint.T
     count = int(block[-1]) + 1
-    found = np.zeros((2, count, residual.shape[1], len(HARMONICS), 2))
+    sums = np.zeros((2, count, residual.shape[1], len(HARMONICS), 2))
     for joint, rows in enumerate(samples.usable.T):
         for h, harmonic in enumerate(HARMONICS):
             angle = harmonic * motor[rows, joint]
             for part, wave in enumerate((np.cos(angle), np.sin(angle))):
-                for table, one in zip(found, (residual[rows, joint], wave), strict=True):
-                    table[:, joint, h, part] = np.bincount(block[rows], one * wave, count)
-    return found
+                for table, factor in zip(sums, (residual[rows, joint], wave), strict=True):
+                    table[:, joint, h, part] = np.bincount(block[rows], factor * wave, count)
+    return sums
 
 
 class FrictionDrift(NamedTuple):
@@ -215,33 +215,33 @@ def _drift_sums(
 
 def _friction_drift(sums: Sequence[Array]) -> FrictionDrift | None:
     """Fit a trend over all parts in order; None with too few."""
-    if sum(one.shape[1] for one in sums) < _FEWEST_PIECES:
+    if sum(run_sums.shape[1] for run_sums in sums) < _FEWEST_PIECES:
         return None
     product, power = np.concatenate(sums, axis=1)
     pieces, n = product.shape
     usual = np.median(power, axis=0)
-    known = power > 0.1 * np.where(usual > 0.0, usual, np.inf)
-    share = np.where(known, product / np.where(known, power, 1.0), np.nan)
+    moving = power > 0.1 * np.where(usual > 0.0, usual, np.inf)
+    share = np.where(moving, product / np.where(moving, power, 1.0), np.nan)
     parts = sums[0].shape[1] if len(sums) >= _FEWEST_PIECES else 1
     freedom = max(pieces - parts - 1, 1)
-    weight = np.where(known, power, 0.0)
+    weight = np.where(moving, power, 0.0)
 
     def about_means(values: Array) -> Array:
         """Subtract the weighted mean over the recordings from values (P, n), part by part."""
         table = values.reshape(-1, parts, n)
-        own = weight.reshape(-1, parts, n)
-        total = own.sum(axis=0)
-        mean = (own * table).sum(axis=0) / np.where(total > 0.0, total, 1.0)
+        weights = weight.reshape(-1, parts, n)
+        total = weights.sum(axis=0)
+        mean = (weights * table).sum(axis=0) / np.where(total > 0.0, total, 1.0)
         return np.asarray((table - mean).reshape(-1, n))
 
     at = about_means(np.repeat(np.linspace(-0.5, 0.5, pieces)[:, None], n, axis=1))
-    y = about_means(np.where(known, share, 0.0))
-    count = np.count_nonzero(known, axis=0)
+    y = about_means(np.where(moving, share, 0.0))
+    count = np.count_nonzero(moving, axis=0)
     spread = np.where(
         count < _FEWEST_PIECES + parts - 1, np.nan, np.einsum("pn,pn->n", weight, at**2)
     )
     change = np.einsum("pn,pn,pn->n", weight, at, y) / spread
-    left = np.where(known, y - change * at, 0.0)
+    left = np.where(moving, y - change * at, 0.0)
     scale = count / np.maximum(freedom - (pieces - count), 1)
     std = np.sqrt(((weight * at * left) ** 2).sum(axis=0) / spread**2 * scale)
     return FrictionDrift(share, change, std, freedom)
@@ -376,9 +376,12 @@ def check_residuals(
     ]
     ripple = None
     if motor_from_joint is not None:
-        waves = [_ripple_sums(*one, motor_from_joint) for one in zip(runs, left, strict=True)]
+        waves = [
+            _ripple_sums(*run_residual, motor_from_joint)
+            for run_residual in zip(runs, left, strict=True)
+        ]
         ripple = Ripple(block_mean(waves, repeated))
-    friction_power = sum(one[1].sum(axis=0) for one in drift)
+    friction_power = sum(run_sums[1].sum(axis=0) for run_sums in drift)
     seen = torque[:fitted].sum(axis=0)
     judged = slice(fitted if held_out else 0, None)
     usable = [run.usable for run in runs]
@@ -390,7 +393,7 @@ def check_residuals(
     steps = [np.median(np.diff(run.motion.time)) for run in training]
     return ResidualChecks(
         torque_rms=np.sqrt(torque.sum(axis=0) / rows),
-        rms=np.sqrt(sum(np.einsum("mj,mj->j", own, own) for own in left) / rows),
+        rms=np.sqrt(sum(np.einsum("mj,mj->j", residual, residual) for residual in left) / rows),
         autocorrelation=autocorrelation(
             list(zip(left[:fitted], usable[:fitted], strict=True)), float(np.median(steps))
         ),

@@ -133,8 +133,8 @@ def facts_in_order(evidence: Evidence, limits: Thresholds) -> tuple[Facts, ...]:
 
 def _without_explained(findings: Sequence[Finding]) -> list[Finding]:
     """Leave out that nothing explains the error, if a wrong cause does."""
-    explained = any(one.role == "cause" and one.level == "wrong" for one in findings)
-    return [one for one in findings if not (explained and one.check == UNEXPLAINED)]
+    explained = any(finding.role == "cause" and finding.level == "wrong" for finding in findings)
+    return [finding for finding in findings if not (explained and finding.check == UNEXPLAINED)]
 
 
 def _measure(names: Sequence[str], evidence: Evidence) -> str:

@@ -91,35 +91,35 @@ class TestRow:
         "split", [Split(fitted="one", predicted="other"), Split(fitted="one", part="all")], ids=str
     )
     def test_both_are_near_the_noise(self, split: Split, logs: Logs, archives: Archives) -> None:
-        found = board.row("arm", split, archives, logs)
+        row = board.row("arm", split, archives, logs)
         torque = board.cut(split, logs).predicted.torque
         floor = 0.3 * np.sqrt(torque.size) / np.linalg.norm(torque)
         for name in ("hil", "plain"):
-            error, joints = found[name], found[f"{name}_joints"]
+            error, joints = row[name], row[f"{name}_joints"]
             assert 0.9 * floor < error < 1.5 * floor
             squares = np.square(joints) @ np.square(np.linalg.norm(torque, axis=0))
             assert error == pytest.approx(np.sqrt(squares) / np.linalg.norm(torque))
-        assert found["ratio"] == found["hil"] / found["plain"]
+        assert row["ratio"] == row["hil"] / row["plain"]
         # The URDF has neither friction nor rotors, and its bodies are the true ones.
-        assert found["nominal"] > 3.0 * floor
-        assert 0.9 * floor < found["nominal + friction"] < 2.0 * floor
-        assert 0.9 * floor < found["plain + prior"] < 2.0 * floor
-        assert (found["inside"] is None) == split.in_sample
-        assert found["inside"] is None or found["inside"] > 0.9
+        assert row["nominal"] > 3.0 * floor
+        assert 0.9 * floor < row["nominal + friction"] < 2.0 * floor
+        assert 0.9 * floor < row["plain + prior"] < 2.0 * floor
+        assert (row["inside"] is None) == split.in_sample
+        assert row["inside"] is None or row["inside"] > 0.9
 
     def test_the_line_of_json(self, logs: Logs, archives: Archives) -> None:
         split = Split(fitted="one", predicted="other")
         rows = [board.row("arm", split, archives, logs)] * 2
-        found = json.loads(json.dumps(board.summary(rows, [])))
-        assert found.keys() == {
+        summary = json.loads(json.dumps(board.summary(rows, [])))
+        assert summary.keys() == {
             "rows", "worst_ratio", "mean_ratio", "worst_row", "above_plain",
             "above_nominal_friction",
         }  # fmt: skip
-        assert found["rows"][0].keys() == {
+        assert summary["rows"][0].keys() == {
             "data", "split", "hil", "plain", "ratio", "plain + prior", "nominal",
             "nominal + friction", "hil_joints", "plain_joints", "seconds", "inside", "white_inside",
         }  # fmt: skip
-        assert found["worst_ratio"] == pytest.approx(found["mean_ratio"])
+        assert summary["worst_ratio"] == pytest.approx(summary["mean_ratio"])
 
     def test_the_summary_names_the_rows_that_lost(self) -> None:
         """A ratio of 1.03 is not above it; a row without masses is not above their model."""
@@ -197,8 +197,8 @@ class TestDegradations:
 
     def test_the_payload_is_there_in_the_second_half_only(self) -> None:
         """Its weight, at rest and with the arm stretched out level, on the elbow."""
-        rest = np.zeros_like(self.CLEAN.position)
-        still = replace(self.CLEAN, position=rest, velocity=rest)
+        zeros = np.zeros_like(self.CLEAN.position)
+        still = replace(self.CLEAN, position=zeros, velocity=zeros)
         added = degradations.payload_in_second_half(still).torque - still.torque
         assert not added[:500].any()
         # 0.5 kg straight above the elbow, which is 0.45 m of level way from the shoulder.
@@ -228,10 +228,10 @@ class TestPlainFit:
     @pytest.mark.parametrize("cutoff", [5.0, 12.0])
     def test_noise_free_data_are_predicted_exactly(self, cutoff: float) -> None:
         """A torque that the model can make is predicted to rounding, by the cut-off it has."""
-        one, other = (of_the_regressor(cutoff, seed) for seed in (1, 2))
-        fitted = plain_fit.fit(ROBOT, one)
+        fitted_rows, other = (of_the_regressor(cutoff, seed) for seed in (1, 2))
+        fitted = plain_fit.fit(ROBOT, fitted_rows)
         assert fitted.cutoff == cutoff
-        for measured in (one, other):
+        for measured in (fitted_rows, other):
             predicted = fitted.predicted_torque(measured)
             assert plain_fit.relative_error(measured.torque, predicted) < 1e-8
 
@@ -257,8 +257,8 @@ class TestPlainFit:
         """The second joint stands: its rotor and its viscous friction stay at their mean, zero."""
         measured = of_the_regressor(plain_fit.PRIOR_CUTOFF, 1)
         position = measured.position * [1.0, 0.0]
-        found = plain_fit.fit_with_prior(ROBOT, measured._replace(position=position))
-        rotor, viscous = found.parameters[[21, 25]]
+        fit = plain_fit.fit_with_prior(ROBOT, measured._replace(position=position))
+        rotor, viscous = fit.parameters[[21, 25]]
         assert abs(rotor) < 1e-6
         assert abs(viscous) < 1e-6
 

@@ -84,16 +84,18 @@ class TestFetch:
                 wheel.writestr("share/robots/r.urdf", content)
 
         monkeypatch.setattr(fetch.subprocess, "run", download)
-        found = fetch.fetch(["arm"], [robot], tmp_path / "data")[-1].found
-        assert (found and "package index: robots-1.whl") == found
-        assert (found is None) == (state is None)
+        origin = fetch.fetch(["arm"], [robot], tmp_path / "data")[-1].found
+        assert (origin and "package index: robots-1.whl") == origin
+        assert (origin is None) == (state is None)
         assert (tmp_path / "data" / "arm" / "r.urdf").exists() == (state is not None)
 
     @pytest.mark.parametrize("name", known())
     def test_every_robot_names_source_and_digests(self, name: str) -> None:
         published = Published.named(name)
         assert {*published.logs.values(), published.urdf} <= published.source.sha256.keys()
-        assert all(re.fullmatch("[0-9a-f]{64}", one) for one in published.source.sha256.values())
+        assert all(
+            re.fullmatch("[0-9a-f]{64}", digest) for digest in published.source.sha256.values()
+        )
 
     def test_the_recordings_here_have_these_digests(self, tmp_path: Path) -> None:
         if not board.DATA.is_dir():
@@ -118,7 +120,7 @@ class TestPage:
         behind, others = text.split("## Behind")[1].split("## Not behind")
         assert re.findall(r"\| a to b \| 10 % \| \S+ ?%? \| (\S+) %", behind) == ["12", "9"]
         assert re.findall(r"\| a to b \| 10 % \| \S+ ?%? \| (\S+) %", others) == ["5"]
-        ratios = [float(one) for one in re.findall(r"% \| (\d+\.\d\d) \|", behind)]
+        ratios = [float(ratio) for ratio in re.findall(r"% \| (\d+\.\d\d) \|", behind)]
         assert ratios == sorted(ratios, reverse=True)
 
     def test_what_was_measured_elsewhere_says_so(self) -> None:

@@ -56,10 +56,10 @@ class TestArm:
         assert 0.1 < np.std(traces) < 0.2
 
     def test_a_seed_is_one_arm(self) -> None:
-        one, same, other = (drawn_arm(ARM_TYPES["panda"], seed) for seed in (1, 1, 2))
-        masses = [[body.mass for body in arm.robot.inertias] for arm in (one, same, other)]
+        first, same, other = (drawn_arm(ARM_TYPES["panda"], seed) for seed in (1, 1, 2))
+        masses = [[body.mass for body in arm.robot.inertias] for arm in (first, same, other)]
         assert masses[0] == masses[1] != masses[2]
-        assert np.array_equal(one.friction.offset, same.friction.offset)
+        assert np.array_equal(first.friction.offset, same.friction.offset)
 
 
 class TestMotion:
@@ -129,14 +129,14 @@ class TestFigures:
         late = CLEAN._replace(
             inertial=[True] * 20, delay_error=[4e-4, 0.0], blamed=["friction"], good=False
         )
-        found = coverage.figures([[CLEAN], [late]])
-        assert found["inertial"] == pytest.approx(39 / 40)
-        assert found["inertial_unsure"] == pytest.approx(0.05)  # 2 x 0.0354 / sqrt(2)
-        assert found["friction"] == 1.0
-        assert found["delay_near"] == 1  # a run with a late axis is not near
-        assert found["delay_bias_ms"] == pytest.approx(0.1)
-        assert found["false_causes"] == {"friction": 1}
-        assert (found["good"], found["inside"], found["seconds"]) == (1, 0.9, 10.0)
+        figures = coverage.figures([[CLEAN], [late]])
+        assert figures["inertial"] == pytest.approx(39 / 40)
+        assert figures["inertial_unsure"] == pytest.approx(0.05)  # 2 x 0.0354 / sqrt(2)
+        assert figures["friction"] == 1.0
+        assert figures["delay_near"] == 1  # a run with a late axis is not near
+        assert figures["delay_bias_ms"] == pytest.approx(0.1)
+        assert figures["false_causes"] == {"friction": 1}
+        assert (figures["good"], figures["inside"], figures["seconds"]) == (1, 0.9, 10.0)
 
     def test_runs_of_one_draw_are_one_sample(self) -> None:
         """Of the same noise at two delays nothing can be said about other noise."""
@@ -151,10 +151,10 @@ def test_a_run_is_read_from_the_results(monkeypatch: pytest.MonkeyPatch) -> None
     """All parameters of the arm are counted; the error is that of the noise of the torque."""
     monkeypatch.setattr(coverage, "FITTED_TIME", 10.0)
     monkeypatch.setattr(coverage, "HELD_OUT_TIME", 5.0)
-    found = coverage.run("ns16", 0.0, 1, Conditions(white=True))
+    run = coverage.run("ns16", 0.0, 1, Conditions(white=True))
     n_base, n_friction = 40, 18
-    counted = len(found.inertial) + len(found.friction) + found.undetermined
-    assert counted + found.dropped >= n_base + n_friction
-    assert len(found.delay_error) == 6
-    assert 0.005 < found.error < 0.05
-    assert found.seconds > 0.0
+    counted = len(run.inertial) + len(run.friction) + run.undetermined
+    assert counted + run.dropped >= n_base + n_friction
+    assert len(run.delay_error) == 6
+    assert 0.005 < run.error < 0.05
+    assert run.seconds > 0.0

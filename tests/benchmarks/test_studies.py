@@ -47,8 +47,8 @@ def pinocchios_torque(urdf: str, samples: Samples, weights: Array) -> Array:
     acting = length > 1e-10 * length.max()
     table = table[:, acting] / length[acting]
     scale = np.broadcast_to(np.sqrt(weights), usable.shape)[usable]
-    found = np.linalg.lstsq(scale[:, None] * table, scale * samples.torque[usable], rcond=1e-10)
-    return np.asarray(table @ found[0])
+    solution = np.linalg.lstsq(scale[:, None] * table, scale * samples.torque[usable], rcond=1e-10)
+    return np.asarray(table @ solution[0])
 
 
 def require_same_fit(model: RobotModel, urdf: str, samples: Samples, weights: Array) -> None:
@@ -85,8 +85,8 @@ def test_the_fit_of_a_simulated_recording_is_pinocchios() -> None:
     assert sources.noise_variance is not None and sources.torque_variance is not None
     law = FrictionLaw(third=None, offset=True, standstill=0.1)
     model = RobotModel.from_urdf(urdf, friction=law)
-    (one,) = sources.training
-    samples = prepare(one.recording, model, noise_variance=sources.noise_variance)
+    (source,) = sources.training
+    samples = prepare(source.recording, model, noise_variance=sources.noise_variance)
     weights = 1.0 / sources.torque_variance
     require_same_fit(model, urdf, samples, weights)
 
@@ -96,17 +96,17 @@ class TestPayload:
 
     def test_a_few_loads_are_weighed_within_two_percent(self) -> None:
         """Of 8 with 95 %, fewer than 5 inside come once in some hundred times, of one figure."""
-        found = payload_coverage(range(1000, 1008))
-        assert found.worst < 0.02
-        assert min(*found.covered.values(), found.moment_covered) >= 0.5
+        coverage = payload_coverage(range(1000, 1008))
+        assert coverage.worst < 0.02
+        assert min(*coverage.covered.values(), coverage.moment_covered) >= 0.5
 
     @pytest.mark.slow
     @pytest.mark.parametrize(("pairs", "within"), [(1, 0.95), (8, 0.99)])
     def test_of_200_loads_intervals_hold_90_to_99_percent(self, pairs: int, within: float) -> None:
         """Up to eight pairs bring the masses within 1 %."""
-        found = payload_coverage(range(200), pairs)
-        assert found.within_one_percent >= within
-        for figure, share in {**found.covered, "moment": found.moment_covered}.items():
+        coverage = payload_coverage(range(200), pairs)
+        assert coverage.within_one_percent >= within
+        for figure, share in {**coverage.covered, "moment": coverage.moment_covered}.items():
             assert 0.90 <= share <= 0.99, figure
 
 
@@ -116,17 +116,17 @@ class TestGains:
     @pytest.mark.parametrize("how", [{}, {"duration": 8.0}, {"drift": 0.0, "other_motions": True}])
     def test_intervals_of_a_few_pairs_hold_the_truth(self, how: dict[str, Any]) -> None:
         """Of 72 with 95 %, fewer than 61 inside come once in 500 times."""
-        found = gain_coverage(range(1000, 1012), **how)
-        assert found.determined > 0.95
-        assert found.covered >= 61 / 72
+        coverage = gain_coverage(range(1000, 1012), **how)
+        assert coverage.determined > 0.95
+        assert coverage.covered >= 61 / 72
 
     @pytest.mark.slow
     @pytest.mark.parametrize(
         "how", [{}, {"duration": 8.0}, {"drift": 0.0}, {"other_motions": True}]
     )
     def test_of_200_pairs_intervals_hold_93_to_98_percent(self, how: dict[str, Any]) -> None:
-        found = gain_coverage(range(200), **how)
-        assert 0.93 <= found.covered <= 0.98
+        coverage = gain_coverage(range(200), **how)
+        assert 0.93 <= coverage.covered <= 0.98
 
 
 @pytest.fixture(scope="module")
@@ -139,8 +139,8 @@ def tx40(shared_data: Path) -> Case:
     return load_case(shared_data / "tx40")
 
 
-def wls(one: Case, model: RobotModel, kind: str) -> float:
-    fitted, predicted, _ = one.prepared(model, splits_of(one.recording)[kind])
+def wls(case: Case, model: RobotModel, kind: str) -> float:
+    fitted, predicted, _ = case.prepared(model, splits_of(case.recording)[kind])
     return error(model, ESTIMATORS["wls"](model, fitted), predicted)
 
 

@@ -67,7 +67,7 @@ def undamaged(root: Path) -> Undamaged:
         {path: path.read_bytes() for path in paths},
         archives,
         identify_archives(fitted, Silent()),
-        frozenset().union(*(_rows(one.columns) for one in archives.values())),
+        frozenset().union(*(_rows(archive.columns) for archive in archives.values())),
     )
 
 
@@ -101,7 +101,7 @@ def blamed(text: str, truth: Undamaged, harmed: Sequence[Path]) -> bool:
 def _reads(truth: Undamaged, path: Path) -> Iterator[str]:
     archive = open_archive(path)
     if archive.complete:
-        if not any(_same(archive, one) for one in truth.archives.values()):
+        if not any(_same(archive, original) for original in truth.archives.values()):
             yield f"{path.name}: opened as complete with other content"
     elif not archive.missing:
         yield f"{path.name}: incomplete without a message"
@@ -118,8 +118,8 @@ def _repairs(truth: Undamaged, path: Path) -> Iterator[str]:
     """Check that the samples of all undamaged chunks are saved, of a file with chunks in order."""
     before, now = truth.files[path], path.read_bytes()
     whole = [before[begin:end] for begin, end in chunks(before)]
-    places = [now.find(one) for one in whole]
-    found = [at for at in places if at >= 0]
+    places = [now.find(chunk) for chunk in whole]
+    saved_places = [at for at in places if at >= 0]
     defined = places[0] >= 0 or now.endswith(before[chunks(before)[-1][1] :])
     with tempfile.TemporaryDirectory() as folder:
         saved = open_archive(repair(path, Path(folder) / path.name).output or path)
@@ -127,9 +127,9 @@ def _repairs(truth: Undamaged, path: Path) -> Iterator[str]:
         yield f"{path.name}: repaired with a sample that was never written"
     if saved.missing:
         yield f"repaired, and not complete: {saved.missing}"
-    if defined and found == sorted(found):
+    if defined and saved_places == sorted(saved_places):
         needed = set().union(
-            *(_stamps(one) for one, at in zip(whole, places, strict=True) if at >= 0)
+            *(_stamps(chunk) for chunk, at in zip(whole, places, strict=True) if at >= 0)
         )
         if lost := needed - set(saved.columns["stamp"].tolist()):
             yield f"{path.name}: {len(lost)} samples of undamaged chunks are lost"
@@ -139,7 +139,7 @@ def _stamps(chunk: bytes) -> set[int]:
     """Stamps of the cycles in a chunk [ns]."""
     record = container.Record(0, container.CHUNK, chunk[container.RECORD.size :])
     content = container.chunk_data(container.parse_chunk(record), 0)
-    return {one.log_time for one in heads(content) if one.channel == 1}
+    return {head.log_time for head in heads(content) if head.channel == 1}
 
 
 def _shows(truth: Undamaged, path: Path) -> Iterator[str]:
@@ -160,14 +160,14 @@ def _shows(truth: Undamaged, path: Path) -> Iterator[str]:
 
 def _identifies(truth: Undamaged, harmed: Sequence[Path], *, campaign: bool) -> Iterator[str]:
     if campaign:
-        found, what = identify_campaign(truth.root, Silent()), "identify of the campaign"
+        identification, what = identify_campaign(truth.root, Silent()), "identify of the campaign"
     else:
-        found, what = identify_archives(truth.paths, Silent()), "identify"
-    before, now = truth.loose.estimate.pooled, found.estimate.pooled
+        identification, what = identify_archives(truth.paths, Silent()), "identify"
+    before, now = truth.loose.estimate.pooled, identification.estimate.pooled
     same_parameters = before.values.shape == now.values.shape
     if same_parameters and np.allclose(before.values, now.values, rtol=SAME, atol=0.0):
         return
-    messages = [*found.results.notes, *found.results.verdict.warnings]
+    messages = [*identification.results.notes, *identification.results.verdict.warnings]
     if not any(path.name in text for path in harmed for text in messages):
         yield f"{what}: another estimate without a message about {harmed[0].name}"
     if same_parameters:  # with too few samples left, they may be others
@@ -182,14 +182,16 @@ APART = 5.0
 are correlated, so that 5 is generous, and a wrong sample moves an estimate by far more."""
 
 
-def _same(one: Archive, other: Archive) -> bool:
+def _same(archive: Archive, other: Archive) -> bool:
     return (
-        one.columns.keys() == other.columns.keys()
-        and all(np.array_equal(v, other.columns[k], equal_nan=True) for k, v in one.columns.items())
-        and one.header == other.header
-        and one.outcome == other.outcome
-        and one.attachments == other.attachments
-        and one.events == other.events
+        archive.columns.keys() == other.columns.keys()
+        and all(
+            np.array_equal(v, other.columns[k], equal_nan=True) for k, v in archive.columns.items()
+        )
+        and archive.header == other.header
+        and archive.outcome == other.outcome
+        and archive.attachments == other.attachments
+        and archive.events == other.events
     )
 
 
@@ -224,7 +226,7 @@ def draw(rng: Random, files: Files, kind: str | None = None) -> tuple[Files, str
     """
     path, kind = rng.choice(sorted(files)), kind or rng.choice([SWAPPED, *KINDS])
     if kind == SWAPPED:
-        alike = [one for one in files if one.name.startswith(path.name.partition("_")[0])]
+        alike = [file for file in files if file.name.startswith(path.name.partition("_")[0])]
         other = rng.choice(sorted(alike))
         return {path: files[other], other: files[path]}, f"{kind} in {path.name} and {other.name}"
     other = rng.choice(sorted(set(files) - {path}))
@@ -321,11 +323,11 @@ def campaign(folder: Path, repetitions: int = 3) -> Undamaged:
 
 def play(truth: Undamaged, number: int, kind: str | None = None) -> tuple[str, list[str]]:
     """Run one round; return the damage and the violated laws. The files are restored."""
-    changed, words = draw(random.Random(f"{SEED}/{number}"), truth.files, kind)
+    changed, damage = draw(random.Random(f"{SEED}/{number}"), truth.files, kind)
     try:
         for path, data in changed.items():
             path.write_bytes(data)
-        return words, list(broken(truth, sorted(changed), number))
+        return damage, list(broken(truth, sorted(changed), number))
     finally:
         for path in changed:
             path.write_bytes(truth.files[path])
@@ -341,11 +343,11 @@ def main(arguments: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         truth = campaign(Path(folder))
         for number in range(given.start, given.start + given.rounds):
-            words, laws = play(truth, number)
+            damage, laws = play(truth, number)
             failed += [number] * bool(laws)
             for law in laws:
                 again = f"python -m tests.disk.damage --rounds 1 --start {number}"
-                sys.stderr.write(f"round {number} ({words}): {law}\n  again: {again}\n")
+                sys.stderr.write(f"round {number} ({damage}): {law}\n  again: {again}\n")
     sys.stdout.write(f"{given.rounds} rounds, {len(failed)} failed {failed or ''}\n")
     return 1 if failed else 0
 

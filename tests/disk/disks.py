@@ -99,7 +99,7 @@ class Faults:
         text = file.read_text() if file.exists() else "[0]"
         if text != self._text:
             self._text, self._seen, self._until = text, {}, {}
-            self._rules = [Rule(**one) for one in json.loads(text)[1:]]
+            self._rules = [Rule(**rule) for rule in json.loads(text)[1:]]
 
 
 @contextmanager
@@ -195,7 +195,9 @@ def _opening(faults: Faults, true: Callable[..., Any]) -> Callable[..., Any]:
         buffered = io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
         if "b" in mode:
             return buffered
-        words = {key: named[key] for key in ("encoding", "errors", "newline") if key in named}
-        return io.TextIOWrapper(buffered, **words)
+        text_options = {
+            key: named[key] for key in ("encoding", "errors", "newline") if key in named
+        }
+        return io.TextIOWrapper(buffered, **text_options)
 
     return function

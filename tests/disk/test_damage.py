@@ -27,8 +27,8 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Undamaged:
 
 def test_each_kind_of_damage_is_named_or_harmless(truth: Undamaged) -> None:
     for number, kind in enumerate([SWAPPED, *KINDS]):
-        words, laws = play(truth, number, kind)
-        assert not laws, f"round {number}, {words}"
+        damage, laws = play(truth, number, kind)
+        assert not laws, f"round {number}, {damage}"
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_error_must_name_what_was_damaged(truth: Undamaged, text: str, blames: b
 def test_hundreds_of_damages_are_named_or_harmless(tmp_path: Path) -> None:
     truth = campaign(tmp_path)
     rounds = {number: play(truth, number) for number in range(1000, 1300)}
-    assert not {number: one for number, one in rounds.items() if one[1]}
+    assert not {number: outcome for number, outcome in rounds.items() if outcome[1]}
 
 
 def excitations(truth: Undamaged) -> list[Path]:

@@ -81,14 +81,14 @@ def run(campaign: Campaign, disk: Disk, rule: Rule | None, after: str) -> Ended:
 
 def lost(campaign: Campaign) -> dict[str, str]:
     """Archives that lack an answered cycle between their first and their last."""
-    found = {}
+    incomplete = {}
     for path in sorted(campaign.folder.archives.glob("*.mcap")):
         archive = open_archive(path)
         missed = int(np.diff(archive.columns["cycle"]).sum()) - (archive.n_samples - 1)
         stated = archive.outcome or ArchiveOutcome()
         if not archive.complete or stated.records_lost != 0 or missed != stated.lost_packets:
-            found[path.name] = str(archive.missing or stated)
-    return found
+            incomplete[path.name] = str(archive.missing or stated)
+    return incomplete
 
 
 @pytest.mark.slow
@@ -110,8 +110,8 @@ def test_longer_hang_stops_the_arm_and_is_named(disk: Disk, tmp_path: Path) -> N
     ended = run(campaign, disk, rule, "dryrun_000_a1.mcap")
     disk.do_wrong()
     assert ended.status == 4
-    words = r"dryrun_000_a1\.mcap\) was stopped: .*\(it waited for its disk for [67]\.\d s"
-    assert re.search(words, " ".join(ended.output.split())), ended.output
+    message = r"dryrun_000_a1\.mcap\) was stopped: .*\(it waited for its disk for [67]\.\d s"
+    assert re.search(message, " ".join(ended.output.split())), ended.output
     assert ended.arm["ended"], "open mode was left, and the session ended"
     dry_run = open_archive(campaign.folder.archives / "dryrun_000_a1.mcap")
     assert (dry_run.outcome or ArchiveOutcome()).outcome == "stopped"

@@ -215,8 +215,8 @@ STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
 SHORT = {"population": 8, "generations": 1}  # settings of the shortest search
 
 
-def hil(*words: object) -> Result:
-    return CliRunner().invoke(app, [str(word) for word in words])
+def hil(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in arguments])
 
 
 @pytest.fixture(scope="module")

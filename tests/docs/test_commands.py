@@ -137,8 +137,8 @@ def two_campaigns(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cell = cell.with_campaign(repetitions=2, validation_runs=1)
     plan = design(cell, Silent())
     for seed, name in enumerate(("march", "june"), 1):
-        own = cell.with_campaign(simulation_seed=seed)
-        Campaign.create(folder / name, own, plan).run(unrehearsed=True, durable=False)
+        seeded_cell = cell.with_campaign(simulation_seed=seed)
+        Campaign.create(folder / name, seeded_cell, plan).run(unrehearsed=True, durable=False)
     return folder
 
 
@@ -158,48 +158,48 @@ def test_no_page_makes_a_demo_in_the_folder_of_another() -> None:
     assert len(folders) > 2
 
 
-def reason_not_to(words: list[str]) -> str | None:
-    if words[0] != "hil":
-        return OTHER_PROGRAMS[words[0]]
-    line = shlex.join(words)
+def reason_not_to(command: list[str]) -> str | None:
+    if command[0] != "hil":
+        return OTHER_PROGRAMS[command[0]]
+    line = shlex.join(command)
     return next((why for begin, why in NOT_TYPED.items() if line.startswith(begin)), None)
 
 
 def type_page(page: Path) -> list[str]:
     """Type what can be typed of a page; the commands that were."""
     typed = []
-    for words in commands(page):
-        if reason_not_to(words) is not None:
+    for command in commands(page):
+        if reason_not_to(command) is not None:
             continue
-        extra = SHORTER.get(words[1], ())
-        result = CliRunner().invoke(app, [*words[1:], *extra], env={"COLUMNS": "120"})
-        allowed = (0, 5) if words[1] in NOT_GOOD_EITHER else (0,)
-        assert result.exit_code in allowed, (words, result.output, result.exception)
-        typed.append(" ".join(words))
+        extra = SHORTER.get(command[1], ())
+        result = CliRunner().invoke(app, [*command[1:], *extra], env={"COLUMNS": "120"})
+        allowed = (0, 5) if command[1] in NOT_GOOD_EITHER else (0,)
+        assert result.exit_code in allowed, (command, result.output, result.exception)
+        typed.append(" ".join(command))
     return typed
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_the_command_line_understands_every_command(page: Path) -> None:
-    for words in commands(page):
-        if words[0] == "hil":
-            parse(words[1:])
-        elif words[0] == "make":
-            assert f"\n{words[1]}:" in (ROOT / "Makefile").read_text()
-        elif words[:2] == ["python", "-m"]:
-            module = Path(*words[2].split("."))
+    for command in commands(page):
+        if command[0] == "hil":
+            parse(command[1:])
+        elif command[0] == "make":
+            assert f"\n{command[1]}:" in (ROOT / "Makefile").read_text()
+        elif command[:2] == ["python", "-m"]:
+            module = Path(*command[2].split("."))
             assert any((ROOT / f).exists() for f in (module, module.with_suffix(".py"))) or (
-                words[2] == "cantools"
-            ), words
-        elif words[0] == "python" and words[1].startswith("examples/"):
-            assert (ROOT / words[1]).exists()
+                command[2] == "cantools"
+            ), command
+        elif command[0] == "python" and command[1].startswith("examples/"):
+            assert (ROOT / command[1]).exists()
 
 
 def test_no_exception_is_left_over() -> None:
-    written = [words for page in PAGES for words in commands(page)]
-    lines = [shlex.join(words) for words in written]
+    written = [command for page in PAGES for command in commands(page)]
+    lines = [shlex.join(command) for command in written]
     assert not [b for b in NOT_TYPED if not any(line.startswith(b) for line in lines)]
-    assert OTHER_PROGRAMS.keys() >= {words[0] for words in written} - {"hil"}
+    assert OTHER_PROGRAMS.keys() >= {command[0] for command in written} - {"hil"}
 
 
 FAST = ("connect.md", "i-have-a-log.md", "motion.md", "README.md")
@@ -228,7 +228,9 @@ def test_a_page_is_typed_from_its_first_command_to_its_last(
 
 def test_every_page_with_something_to_type_is_typed() -> None:
     to_type = {
-        page.name for page in PAGES if any(reason_not_to(words) is None for words in commands(page))
+        page.name
+        for page in PAGES
+        if any(reason_not_to(command) is None for command in commands(page))
     }
     assert to_type <= {*FAST, *SLOW, *TYPED_ELSEWHERE}
 

@@ -92,17 +92,17 @@ def test_every_command_has_the_options_beside_it() -> None:
 
 
 def test_every_entry_is_one_of_a_file() -> None:
-    known = {entry for model in (ColumnMap, CellFile, DesignSettings) for entry in keys(model)}
+    existing = {entry for model in (ColumnMap, CellFile, DesignSettings) for entry in keys(model)}
     entries = [
-        (place, found["table"], found["key"])
+        (place, match["table"], match["key"])
         for place, text in MESSAGES
         for pattern in ENTRIES
-        for found in pattern.finditer(text)
-        if found["key"] not in OTHER_WORDS
+        for match in pattern.finditer(text)
+        if match["key"] not in OTHER_WORDS
     ]
     assert len(entries) > 30
     wrong = [f"{place}: [{table}] {key}" for place, table, key in entries
-             if (table, key) not in known]  # fmt: skip
+             if (table, key) not in existing]  # fmt: skip
     assert not wrong, "\n".join(wrong)
 
 
@@ -120,6 +120,8 @@ def test_paths_in_commands_are_quoted() -> None:
                 )
                 for command in re.findall(r"\bhil [a-z][a-z -]* (?:[^`;]*)", line):
                     fields = re.findall(r"{([^{}]*)}", command)
-                    bare = [one for one in fields if PATH.search(one) and "typed(" not in one]
-                    wrong += [f"{module.name}:{text.lineno}: {one}" for one in bare]
+                    bare = [
+                        field for field in fields if PATH.search(field) and "typed(" not in field
+                    ]
+                    wrong += [f"{module.name}:{text.lineno}: {field}" for field in bare]
     assert not wrong, "\n".join(wrong)

@@ -99,9 +99,9 @@ def test_commands_that_findings_recommend_exist() -> None:
         named += COMMAND.findall(text)
     assert named
     for line in named:
-        command, words = command_of(line.split())
-        known = {option for parameter in command.params for option in parameter.opts}
-        assert {word for word in words if word.startswith("-")} <= known, line
+        command, arguments = command_of(line.split())
+        known_options = {option for parameter in command.params for option in parameter.opts}
+        assert {word for word in arguments if word.startswith("-")} <= known_options, line
 
 
 @pytest.fixture(scope="module")

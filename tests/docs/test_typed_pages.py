@@ -137,7 +137,7 @@ def log_of(motion: str, path: str) -> None:
     trajectory = MotionTable.of(Path("runs/motion", motion).read_text())
     once = np.arange(0.0, trajectory.duration + 0.5, 2e-3)
     times = np.arange(2 * len(once)) * 2e-3
-    q, qd, qdd = (np.tile(one, (2, 1)) for one in trajectory.sample(once))
+    q, qd, qdd = (np.tile(column, (2, 1)) for column in trajectory.sample(once))
     n = len(cell.joint_names)
     values = cell.parameter_values(
         rotor_inertia=np.full(n, 0.3), coulomb=np.full(n, 5.0), viscous=np.full(n, 3.0),
@@ -172,9 +172,9 @@ def test_simulators_run_what_was_exported(workplace: Path) -> None:
         assert language == "sh"
         ran += typed(block)
     assert ran == ["demo", "identify", "export", "rollout", "export"]
-    found = RolloutResult.load(Path("runs/simulators/rollout.json"))
-    assert found.ratio is not None
-    assert found.ratio[2] <= 0.5  # at 0.5 s
+    rollout = RolloutResult.load(Path("runs/simulators/rollout.json"))
+    assert rollout.ratio is not None
+    assert rollout.ratio[2] <= 0.5  # at 0.5 s
     assert matplotlib.image.imread("runs/simulators/rollout.png").std() > 0.0
     assert len([*Path("runs/simulators/identified_ensemble").iterdir()]) == 20
     archives = {path.name for path in Path("runs/simulators/archives").iterdir()}
@@ -286,4 +286,4 @@ def test_it_runs(path: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert LAST_LINE[path.name[:2]] in done.stdout
     assert (tmp_path / "runs" / "examples" / f"{path.stem}.png").stat().st_size > 5_000
-    assert sorted(one.name for one in folder.iterdir()) == sorted([path.name, "two_joints"])
+    assert sorted(entry.name for entry in folder.iterdir()) == sorted([path.name, "two_joints"])

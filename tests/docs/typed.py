@@ -23,11 +23,11 @@ _BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 def commands(page: Path) -> list[list[str]]:
     """The commands of a page in order, split into words; output and comments are left out."""
-    found = []
+    lines = []
     for language, block in _BLOCK.findall(page.read_text(encoding="utf-8")):
         if language in SHELL:
-            found += _of_block(page, block)
-    return found
+            lines += _of_block(page, block)
+    return lines
 
 
 def _of_block(page: Path, block: str) -> list[list[str]]:
@@ -43,25 +43,31 @@ def _of_block(page: Path, block: str) -> list[list[str]]:
     return [shlex.split(_REDIRECTION.sub("", line), comments=True) for line in lines]
 
 
-def command_of(words: Sequence[str]) -> tuple[Any, list[str]]:
+def command_of(typed: Sequence[str]) -> tuple[Any, list[str]]:
     """The command that words behind `hil` name, and the rest of them."""
     command: Any = typer.main.get_command(app)
-    rest = list(words)
+    arguments = list(typed)
     while hasattr(command, "commands"):
-        assert rest and rest[0] in command.commands, f"hil {' '.join(words)}: no such command"
-        command = command.commands[rest.pop(0)]
-    return command, rest
+        assert arguments and arguments[0] in command.commands, (
+            f"hil {' '.join(typed)}: no such command"
+        )
+        command = command.commands[arguments.pop(0)]
+    return command, arguments
 
 
-def parse(words: Sequence[str]) -> None:
+def parse(typed: Sequence[str]) -> None:
     """Let the command line read words behind `hil`, and do nothing."""
-    command, rest = command_of(words)
-    command.make_context(command.name, rest)
+    command, arguments = command_of(typed)
+    command.make_context(command.name, arguments)
 
 
 def options(command: Any = None) -> set[str]:
     """Options of a command and of all below it; by default of the whole command line."""
     command = command or typer.main.get_command(app)
     below = getattr(command, "commands", {}).values()
-    own = {option for one in command.params for option in (*one.opts, *one.secondary_opts)}
-    return own.union(*map(options, below))
+    names = {
+        option
+        for parameter in command.params
+        for option in (*parameter.opts, *parameter.secondary_opts)
+    }
+    return names.union(*map(options, below))

@@ -381,9 +381,9 @@ class Conduct:
             if name == "jerk" and self.without_jerk_bound:
                 self.without_jerk_bound -= 1
                 continue
-            found = np.abs(np.diff(rows, order, axis=0)[-1]) / self.period**order
+            rates = np.abs(np.diff(rows, order, axis=0)[-1]) / self.period**order
             rounding = 2**order * (8 * EPS * np.abs(rows).max() + noise) / self.period**order
-            assert (found <= bound * (1 + 2e-6) + rounding).all(), (name, found / bound)
+            assert (rates <= bound * (1 + 2e-6) + rounding).all(), (name, rates / bound)
 
     def _advance(self, row: np.ndarray, first_order: int, noise: float) -> None:
         self.sent.append(row)

@@ -122,7 +122,7 @@ def echo(data: bytes) -> bytes:
 
 def differences(ours: Packet, expected: Packet) -> list[str]:
     """Names of the fields in which two answers differ, slots counted from 0."""
-    found = [
+    different = [
         name
         for name in ("number", "status", "functionality")
         if getattr(ours, name) != getattr(expected, name)
@@ -131,9 +131,9 @@ def differences(ours: Packet, expected: Packet) -> list[str]:
     names = ("D1", "D2", "D3", "D4", "D5", "extra1", "extra2", "extra3")
     for slot, (a, b) in enumerate(zip(ours.axes, expected.axes, strict=True)):
         if a.mode != b.mode:
-            found.append(f"mode[{slot}]")
-        found += [f"{n}[{slot}]" for n, x, y in zip(names, a.d, b.d, strict=True) if x != y]
-    return found
+            different.append(f"mode[{slot}]")
+        different += [f"{n}[{slot}]" for n, x, y in zip(names, a.d, b.d, strict=True) if x != y]
+    return different
 
 
 LAST = 0x7FFF

@@ -398,14 +398,14 @@ def moving(cycles: int = 300, **options) -> tuple[Rig, Cruise]:
 
 def resumptions(rig: Rig) -> list:
     """Position, velocity and cycles of each resumption of a motion, from now on."""
-    source, found = rig.session.execution._source, []
+    source, resumed = rig.session.execution._source, []
 
     def resume_from(*arguments):
-        found.append(arguments)
+        resumed.append(arguments)
         source._position = arguments[0]
 
     source.resume_from = resume_from
-    return found
+    return resumed
 
 
 def exiting(**options) -> Rig:

@@ -98,8 +98,8 @@ class Bench:
         self.number = oracle.answer_number(self.number)
         axes = []
         for target, mode in zip(self.d1, self.modes, strict=True):
-            words = [target, 0.0, target, 0.0, 0.5, 0.25, 0.125, 0.0]
-            axes.append(oracle.Axis(mode, tuple(struct.pack("<f", w) for w in words)))
+            values = [target, 0.0, target, 0.0, 0.5, 0.25, 0.125, 0.0]
+            axes.append(oracle.Axis(mode, tuple(struct.pack("<f", w) for w in values)))
         received = oracle.Packet(self.number, bytes(self.status), bytes([1, 2, 3, 4]), tuple(axes))
         reply = self.send(oracle.build(received))
         assert len(reply) == oracle.length(len(self.slots))

@@ -218,8 +218,8 @@ class TestBusLoad:
         if float(percent) <= 100.0 * LOAD_LIMIT:
             rates.require_load(n_axes, period)
             return
-        words = f"{percent} % of a cycle of {1e3 * period:g} ms; allowed is 70 %"
-        with pytest.raises(CanBusLoadError, match=re.escape(words)):
+        load = f"{percent} % of a cycle of {1e3 * period:g} ms; allowed is 70 %"
+        with pytest.raises(CanBusLoadError, match=re.escape(load)):
             rates.require_load(n_axes, period)
 
     @pytest.mark.parametrize("n_bytes", [1, 48, 56, 57, 116, 117, 228, 732, 1500])
@@ -244,9 +244,12 @@ class TestDbc:
         for index, frame in enumerate(End(BusRates(), sends).frames(packet)):
             message = database.get_message_by_frame_id(frame.id)
             assert (message.name, message.is_fd) == (name, True)
-            found = message.decode(frame.data, decode_choices=False)
-            assert (found.pop("index"), found.pop("length")) == (index, cyclic_length(N))
-            signals |= found
+            frame_signals = message.decode(frame.data, decode_choices=False)
+            assert (frame_signals.pop("index"), frame_signals.pop("length")) == (
+                index,
+                cyclic_length(N),
+            )
+            signals |= frame_signals
         assert signals["number"] == wanted.number
         assert [signals[f"status_arm{arm}"] for arm in range(1, 5)] == [*wanted.status]
         assert signals["functionality"].to_bytes(4, "little") == wanted.functionality
@@ -258,11 +261,11 @@ class TestDbc:
                                           np.float32([*axis["d"], *axis["extra"]]))  # fmt: skip
 
     def test_modes_have_their_names(self, database):
-        known = {int(mode): mode.name.lower() for mode in Mode}
+        name_of = {int(mode): mode.name.lower() for mode in Mode}
         for message in database.messages:
             choices = message.get_signal_by_name("mode_axis3").choices
             assert {code: str(choice) for code, choice in choices.items()} == {
-                mode: known.get(mode, f"mode_{mode}") for mode in MODES
+                mode: name_of.get(mode, f"mode_{mode}") for mode in MODES
             }
 
 

@@ -272,9 +272,9 @@ def test_replies_are_the_documented_ones(shared_data: Path, name: str):
             seen.setdefault(what, set()).update(fields(oracle.differences(ours, theirs)))
     assert replay.session.state is State.ENDED
     assert replay.session.counters.malformed == replay.session.counters.stale == 0
-    for what, found in seen.items():
-        assert found <= DIFFERENT_ON_PURPOSE[what], (what, found)
-        assert found or what == "open", f"{what}: nothing differs any more"
+    for what, differing in seen.items():
+        assert differing <= DIFFERENT_ON_PURPOSE[what], (what, differing)
+        assert differing or what == "open", f"{what}: nothing differs any more"
     assert {"driving on", "closed"} <= set(seen)
     assert ("opening" in seen) == (name == "a_stagger")
     (ended,) = replay.seen(MotionEnded)

@@ -108,7 +108,7 @@ class TestExchange:
     )
     def test_motion_completes_on_a_poor_link(self, fault):
         faults = [fault(cycle) for cycle in range(1, 300)]
-        rig, _, transport = run([one for one in faults if 50 <= one.cycle < 300])
+        rig, _, transport = run([fault for fault in faults if 50 <= fault.cycle < 300])
         assert rig.ended.outcome == "completed"
         for surplus in transport.surplus_replies:
             assert surplus in [reply for _, reply in rig.transcript] or len(surplus) == 228

@@ -216,9 +216,9 @@ def run_to_the_end(exchange: ExchangeProcess, controller: UdpController) -> list
 
 
 def the(kind, events):
-    found = [event for event in events if isinstance(event, kind)]
-    assert len(found) == 1, events
-    return found[0]
+    matching = [event for event in events if isinstance(event, kind)]
+    assert len(matching) == 1, events
+    return matching[0]
 
 
 def start_cruise(exchange: ExchangeProcess, controller: UdpController) -> None:

@@ -185,13 +185,13 @@ class TestLatencyBins:
     @given(
         st.lists(st.floats(SHORTEST, LONGEST), min_size=1), st.floats(0.0, 1.0, exclude_min=True)
     )
-    def test_quantile_is_at_most_one_bin_too_long(self, found, share):
+    def test_quantile_is_at_most_one_bin_too_long(self, latencies, share):
         counts = [0] * BINS
-        for seconds in found:
+        for seconds in latencies:
             counts[bin_of(seconds)] += 1
         estimated = quantile(counts, share)
         assert estimated is not None
-        needed = sorted(found)[max(0, math.ceil(share * len(found) - 1e-9) - 1)]
+        needed = sorted(latencies)[max(0, math.ceil(share * len(latencies) - 1e-9) - 1)]
         assert needed <= estimated * (1.0 + 1e-12)
         assert estimated <= needed * 2.0**0.25 * (1.0 + 1e-12)
 

@@ -54,8 +54,8 @@ def run(execution: Execution, cycles: int, first: int = 1) -> None:
         execution.advance(cycle)
 
 
-def fails(execution: Execution, words: str, cycle: int = 7) -> None:
-    with pytest.raises(SourceFailed, match=words) as caught:
+def fails(execution: Execution, message: str, cycle: int = 7) -> None:
+    with pytest.raises(SourceFailed, match=message) as caught:
         execution.advance(cycle)
     assert caught.value.cycle == cycle
 

@@ -63,7 +63,7 @@ class TestLimits:
                 limits(**{name: np.where(np.arange(N) == 3, value, 1.0)})
 
     @pytest.mark.parametrize(
-        ("changes", "words"),
+        ("changes", "message"),
         [
             *(
                 ({name: value}, f"{name} {value} is not positive")
@@ -78,8 +78,8 @@ class TestLimits:
             ),
         ],
     )
-    def test_other_figures(self, changes, words):
-        with pytest.raises(ValueError, match=words):
+    def test_other_figures(self, changes, message):
+        with pytest.raises(ValueError, match=message):
             limits(**changes)
         limits(**{name: 1.0 for name in changes if name != "upper"})
 
@@ -353,14 +353,14 @@ class TestAfterGap:
     def test_the_target_s_velocity_is_the_one_sent(self, joint, sign, sent, off, way):
         guard, step = Guard(limits(), PERIOD), at(joint, sign * sent)
         # The arm does as commanded.
-        found = np.array([step + at(joint, way * off * 0.999), step])
-        guard.check_after_gap(REST, found, REST, step, 1, EVERY)
-        found[0] = step + at(joint, way * off * 1.001)
+        measured = np.array([step + at(joint, way * off * 0.999), step])
+        guard.check_after_gap(REST, measured, REST, step, 1, EVERY)
+        measured[0] = step + at(joint, way * off * 1.001)
         check = guard.check_after_gap
-        error = refused(Check.GAP_VELOCITY, check, REST, found, REST, step, 3, EVERY)
+        error = refused(Check.GAP_VELOCITY, check, REST, measured, REST, step, 3, EVERY)
         assert (error.joint, error.cycle) == (joint, 3)
         assert (error.value, error.bound) == (pytest.approx(1.001 * off), pytest.approx(off))
-        check(REST, found, REST, step, 1, np.arange(N) != joint)
+        check(REST, measured, REST, step, 1, np.arange(N) != joint)
 
     def test_velocity_of_the_arm(self, joint, sign):
         check, step = Guard(limits(), PERIOD).check_after_gap, at(joint, sign * 4e-3)

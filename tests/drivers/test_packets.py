@@ -64,8 +64,8 @@ class TestCyclicPacket:
     @given(data=st.data(), n=st.integers(1, MAX_AXES))
     def test_any_bytes_decode_and_encode_unchanged(self, data, n):
         number = data.draw(st.integers(1, LAST_NUMBER))
-        rest = data.draw(st.binary(min_size=cyclic_length(n) - 4, max_size=cyclic_length(n) - 4))
-        packet = struct.pack("<i", number) + rest
+        payload = data.draw(st.binary(min_size=cyclic_length(n) - 4, max_size=cyclic_length(n) - 4))
+        packet = struct.pack("<i", number) + payload
         assert CyclicPacket.decode(packet, n).encode() == packet
 
     @pytest.mark.parametrize("length", [0, 3, 12, 227, 733, INIT_LENGTH])
@@ -123,8 +123,8 @@ class TestInitPacket:
         assert init.encode() == bytes(raw)
 
     @given(st.binary(min_size=INIT_LENGTH - 16, max_size=INIT_LENGTH - 16))
-    def test_any_bytes_decode_and_encode_unchanged(self, rest):
-        packet = struct.pack("<iiii", 10, 3, 9, 6) + rest
+    def test_any_bytes_decode_and_encode_unchanged(self, payload):
+        packet = struct.pack("<iiii", 10, 3, 9, 6) + payload
         assert InitPacket.decode(packet).encode() == packet
 
     def test_number_10_alone_is_not_init(self):

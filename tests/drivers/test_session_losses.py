@@ -402,10 +402,10 @@ class TestLongGaps:
         assert rig.state is State.OPEN
 
     @pytest.mark.parametrize(
-        ("speed", "factor", "found"),
+        ("speed", "factor", "expected"),
         [(0.5, 1.2, 0.6), (0.5, 0.8, 0.4), (0.01, 1.2, 0.01), (0.01, 0.0, 0.01)],
     )
-    def test_the_motion_continues_with_the_velocity_of_its_target(self, speed, factor, found):
+    def test_the_motion_continues_with_the_velocity_of_its_target(self, speed, factor, expected):
         """Not that of the arm; below standstill, where a velocity says little, with its own."""
         rig = at_speed(1200, speed=speed)
         resumed = resumptions(rig)
@@ -416,7 +416,7 @@ class TestLongGaps:
         d[:, 3] *= 0.9
         rig.cycle()
         ((_, velocity, _),) = resumed
-        np.testing.assert_allclose(velocity, found * np.eye(N)[0], rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(velocity, expected * np.eye(N)[0], rtol=1e-4, atol=1e-6)
 
     @pytest.mark.parametrize("late", [0, 1, 2])
     def test_a_target_reported_late_is_further_on_by_now(self, late):
@@ -698,11 +698,11 @@ class TestSentAgain:
         ],
     )
     def test_each_is_counted_once(self, steps, behind, counts, way):
-        sent, found = Sent(way * SENT_STEP), []
+        sent, counted = Sent(way * SENT_STEP), []
         for step, back in zip(steps, behind, strict=True):
-            found.append(sent.check(-back))
+            counted.append(sent.check(-back))
             sent.add(step)
-        assert found == counts
+        assert counted == counts
 
     @pytest.mark.parametrize(("share", "again"), [(3.99, False), (4.01, True)])
     def test_small_step_is_not_repeated(self, share, again):

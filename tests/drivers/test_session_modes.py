@@ -64,8 +64,8 @@ class TestEveryMode:
 
     @pytest.mark.parametrize("source", [None, object(), 3, "begin"])
     def test_what_is_no_source_is_refused(self, source):
-        words = f"a {type(source).__name__} is no source of a motion"
-        with pytest.raises(RequestError, match=words):
+        message = f"a {type(source).__name__} is no source of a motion"
+        with pytest.raises(RequestError, match=message):
             Rig().session.request(source)
 
     @pytest.mark.parametrize("mode", sorted(POSITION_MODES))
@@ -200,7 +200,7 @@ class TestSourcesThatRaise:
     """A method, or a property where a method should be."""
 
     @pytest.mark.parametrize(
-        ("source", "words"),
+        ("source", "message"),
         [
             (failing(error=SystemExit(), override=property(no)), "SystemExit: no"),
             (failing(error=SystemExit(), resume=property(no)), "SystemExit: no"),
@@ -208,9 +208,9 @@ class TestSourcesThatRaise:
             (failing("override", error=ZeroDivisionError("not now")), "ZeroDivisionError: not now"),
         ],
     )
-    def test_request_is_refused_and_the_motion_continues(self, source, words):
+    def test_request_is_refused_and_the_motion_continues(self, source, message):
         rig = running(source, 50)
-        with pytest.raises(RequestError, match=words):
+        with pytest.raises(RequestError, match=message):
             if isinstance(vars(type(source))["resume"], property):
                 rig.session.resume()
             else:
@@ -318,11 +318,11 @@ def stopping(source) -> Rig:
     return rig
 
 
-@pytest.mark.parametrize(("situation", "request_", "words"), NOT_FITTING)
-def test_refused_overrides_and_resumptions(situation, request_, words):
+@pytest.mark.parametrize(("situation", "request_", "reason"), NOT_FITTING)
+def test_refused_overrides_and_resumptions(situation, request_, reason):
     rig = situation()
     state = rig.state
-    message = f"no {WHAT[request_]} can be requested in state '{state.name.lower()}': {words}"
+    message = f"no {WHAT[request_]} can be requested in state '{state.name.lower()}': {reason}"
     with pytest.raises(RequestError, match=f"^{message}$"):
         getattr(rig.session, request_)(*[0.5] * (request_ == "override"))
     assert rig.state is state

@@ -37,8 +37,8 @@ class TestMotion:
             rig.run()
             end = rig.train.joint_position(rig.axes["d"][:, 0])
             np.testing.assert_allclose(end, here + distance, atol=1e-6)
-        one = [State.OPEN, State.EXITING, State.CLOSED]
-        assert rig.path == [State.INIT, State.CLOSED, *one, *one]
+        motion_states = [State.OPEN, State.EXITING, State.CLOSED]
+        assert rig.path == [State.INIT, State.CLOSED, *motion_states, *motion_states]
         assert [event.interval for event in rig.seen(MotionStarted)] == [0, 1]
         ended = [(event.outcome, event.interval) for event in rig.seen(MotionEnded)]
         assert ended == [("completed", 0), ("completed", 1)]
@@ -100,20 +100,22 @@ class TestStaggeredOpening:
         assert rig.cycle().axes["mode"].tolist() == [0, 4, 0, 0, 508, 0]
 
     @pytest.mark.parametrize(
-        ("mode", "modes", "outcome", "words"),
+        ("mode", "modes", "outcome", "reason"),
         [
             (Mode.POSITION, Mode.CLOSED, "lost", "the controller closed open mode"),
             (Mode.POSITION_RELATIVE, None, "refused", "joint 3 is in mode 5"),
         ],
     )
-    def test_axis_that_closes_or_opens_otherwise_ends_the_motion(self, mode, modes, outcome, words):
+    def test_axis_that_closes_or_opens_otherwise_ends_the_motion(
+        self, mode, modes, outcome, reason
+    ):
         rig = closed()
         rig.session.request(still(3))
         rig.axes["mode"][2] = mode
         rig.cycle()
         rig.cycle(mode=modes)
         assert (rig.ended.outcome, rig.ended.interval) == (outcome, -1)
-        assert words in rig.ended.reason
+        assert reason in rig.ended.reason
         rig.open()
         rig.cycle(20)
         assert (rig.state, rig.exits_asked) == (State.OPEN, 0)

@@ -318,14 +318,14 @@ class TestAfterRefusal:
 
 
 @pytest.mark.parametrize(
-    ("before", "modes", "words"),
+    ("before", "modes", "message"),
     [
         (closed, [0, 0, 3, 0, 0, 0], "joint 3 is in mode 3: the reply to that mode is unknown"),
         (closed, [4, 4, 4, 4, 4, 3], "joint 6 is in mode 3: the reply to that mode is unknown"),
         (started, [4] * N, "joint 1 is in mode 4: it was not closed before"),
     ],
 )
-def test_refused_modes(before, modes, words):
+def test_refused_modes(before, modes, message):
     rig = before()
     rig.session.request(source := still(3))
     for _ in range(3):
@@ -333,7 +333,7 @@ def test_refused_modes(before, modes, words):
         assert all_drive_off(answer) == (4 in modes)
     (event,) = rig.seen(Refused)
     assert type(event.error) is ModeRefused
-    assert words in str(event.error)
+    assert message in str(event.error)
     assert rig.session.counters.refused == 1
     assert (rig.state, rig.ended.outcome, source.index) == (State.FAULTED, "lost", 0)
 

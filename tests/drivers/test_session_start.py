@@ -149,34 +149,34 @@ class TestReplies:
         assert rig.seen(PacketRejected)[-1].reason.endswith("does not follow 511")
 
     @pytest.mark.parametrize(
-        ("packet", "words"),
+        ("packet", "reason"),
         [
             *((packet, "expected at least the 12") for packet in (b"", b"\x0b", bytes(11))),
             (struct.pack("<i", 11) + bytes(223), "227 bytes: packet length"),
             (bytes(228), "228 bytes: packet number is 0; expected 1..32767"),
         ],
     )
-    def test_malformed_packets(self, packet, words):
+    def test_malformed_packets(self, packet, reason):
         rig = started()
         assert rig.send(packet) is None
         assert rig.state is State.INIT
         assert rig.session.counters.malformed == 1
         (event,) = rig.seen(PacketRejected)
-        assert words in event.reason
+        assert reason in event.reason
 
     @pytest.mark.parametrize(
-        ("status", "length", "words"),
+        ("status", "length", "reason"),
         [
             (DRIVE_ON, 732, "status is '05000000'; expected no drive on before init"),
             (0, INIT_LENGTH, f"length is {INIT_LENGTH}; expected less than {INIT_LENGTH} bytes"),
         ],
     )
-    def test_malformed_packets_before_init(self, status, length, words):
+    def test_malformed_packets_before_init(self, status, length, reason):
         rig = Rig()
         rig.sync(1)
         assert rig.send(struct.pack("<2i", 2, status) + bytes(length - 8)) is None
         (event,) = rig.seen(PacketRejected)
-        assert event.reason == f"{length} bytes: packet {words}"
+        assert event.reason == f"{length} bytes: packet {reason}"
 
 
 class TestSilence:
@@ -253,7 +253,7 @@ class TestSilence:
 
 class TestConstruction:
     @pytest.mark.parametrize(
-        ("options", "words"),
+        ("options", "message"),
         [
             *(({"max_gap": gap}, rf"gap of {gap} .* not one of 0\.\.100") for gap in (-1, 101)),
             *(({"arm": arm}, rf"arm {arm} is not one of 1\.\.4") for arm in (0, 5)),
@@ -267,8 +267,8 @@ class TestConstruction:
             ),
         ],
     )
-    def test_invalid_options(self, options, words):
-        with pytest.raises(ValueError, match=words):
+    def test_invalid_options(self, options, message):
+        with pytest.raises(ValueError, match=message):
             Rig(**options)
 
     @pytest.mark.parametrize(
@@ -385,7 +385,7 @@ class TestInit:
     """Differences are named with the axis and both values; with one of them nothing moves."""
 
     @pytest.mark.parametrize(
-        ("init", "words"),
+        ("init", "difference"),
         [
             *((described(change[:3]), f"{change[3]} is ") for change in ANOTHER_ARM),
             (init_packet(sample_time=1), CYCLE),
@@ -397,18 +397,18 @@ class TestInit:
             (beside(4, 10), "axis 10 of arm 4 is open"),
         ],
     )
-    def test_arm_with_a_difference_is_not_moved(self, init, words):
+    def test_arm_with_a_difference_is_not_moved(self, init, difference):
         rig = Rig(init=init)
         rig.session.request(still(3))
         rig.start()
         (event,) = rig.seen(InitReceived)
         assert event.differences == (event.unusable,)
-        assert event.unusable.startswith(words)
+        assert event.unusable.startswith(difference)
         assert rig.cycle() is not None
         for _ in range(2):
             assert all_drive_off(rig.cycle(mode=Mode.POSITION))
         rig.cycle(mode=Mode.CLOSED)
-        with pytest.raises(RequestError, match=words):
+        with pytest.raises(RequestError, match=difference):
             rig.session.request(still(3))
 
     def test_rounding_of_float32_is_no_difference(self):
@@ -417,8 +417,8 @@ class TestInit:
         for name in ("gear_ratio", "calibration", "kinematic_influence"):
             row = init.record[name][0, 0]
             row[:N] = np.where(row[:N] != 0, np.nextafter(row[:N], up), row[:N])
-        for one in (init, init_packet(), described(("gear_ratio", 6, np.nan))):
-            _, event = received(one)
+        for packet in (init, init_packet(), described(("gear_ratio", 6, np.nan))):
+            _, event = received(packet)
             assert (event.differences, event.unusable) == ((), None)
 
     def test_every_difference_is_named(self):
@@ -429,8 +429,8 @@ class TestInit:
             "gear ratio of axis 1 is 119.5 in the controller, -120 in the cell"
         )
         names = ("cycle", "packet open_axes_map", "gear ratio of axis 1", "k65 of axis 6")
-        for found, words in zip(event.differences, names, strict=True):
-            assert found.startswith(words)
+        for difference, name in zip(event.differences, names, strict=True):
+            assert difference.startswith(name)
         _, event = received(init_packet(n_axes=4, open_axes_map=FOUR_OPEN))
         assert event.differences == tuple(
             f"axis {axis} of arm 1 is not open in the controller, joint {axis} in the cell"

@@ -133,12 +133,12 @@ class TestFaults:
                 packet = transport.receive(1.0)
                 seen.append((transport.now / peer.period, packet[0]))
                 transport.send(b"re:" + packet)
-        assert seen == [pytest.approx(one) for one in expected]
-        for found, replies in zip(
+        assert seen == [pytest.approx(packet_time) for packet_time in expected]
+        for received, replies in zip(
             (peer.accepted, transport.surplus_replies, transport.late_replies),
             (accepted, surplus, late), strict=True,
         ):  # fmt: skip
-            assert [reply and reply[3] for reply in found] == replies
+            assert [reply and reply[3] for reply in received] == replies
 
     cycles = st.integers(0, 30)
     directions = st.sampled_from(["to_pc", "to_controller"])

@@ -255,7 +255,7 @@ class TestOpening:
         assert "net.ipv4.ip_unprivileged_port_start=1000" in caught.value.remedy
 
     @pytest.mark.parametrize(
-        ("address", "words"),
+        ("address", "message"),
         [
             ((HOST, 0, "192.0.2.1"), "no network device"),
             (("no host", 0), "controller's address is unknown"),
@@ -263,8 +263,8 @@ class TestOpening:
             ((HOST, 65536), "no such port"),
         ],
     )
-    def test_invalid_address_is_refused(self, address, words):
-        with pytest.raises(TransportError, match=words):
+    def test_invalid_address_is_refused(self, address, message):
+        with pytest.raises(TransportError, match=message):
             UdpTransport(*address)
 
     def test_closed_link_frees_its_port(self, transport):

@@ -70,7 +70,7 @@ def missing(sample: Line) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "campaign", "words"),
+    ("change", "campaign", "fault"),
     [
         (leaking, {}, "the archive's memory grew"),
         (with_a_thread_more, {}, "the supervisor has 2 threads"),
@@ -83,16 +83,16 @@ def missing(sample: Line) -> None:
         (None, {"descriptors": dict.fromkeys(PROCESSES, 13)}, "has 13 descriptors"),
     ],
 )
-def test_each_fault_is_found(change: Change | None, campaign: Line, words: str) -> None:
-    one = piece(*([] if change is None else [change]), **campaign)
-    assert any(words in text for text in judge([one]).faults)
+def test_each_fault_is_found(change: Change | None, campaign: Line, fault: str) -> None:
+    journal_piece = piece(*([] if change is None else [change]), **campaign)
+    assert any(fault in text for text in judge([journal_piece]).faults)
 
 
 def test_hours_without_a_fault_pass_and_short_runs_warn() -> None:
     sound = piece()
-    found = judge([sound, sound])
-    assert (found.faults, found.warnings) == ([], [])
-    assert found.figures[0]["motions"] == 26 * 160
+    verdict = judge([sound, sound])
+    assert (verdict.faults, verdict.warnings) == ([], [])
+    assert verdict.figures[0]["motions"] == 26 * 160
     short = judge([Piece(sound.begun, sound.samples[:20], sound.campaigns[:3])])
     assert short.faults == []
     assert len(short.warnings) == 2
@@ -100,14 +100,17 @@ def test_hours_without_a_fault_pass_and_short_runs_warn() -> None:
 
 
 def test_pieces_of_a_journal_are_merged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, one = tmp_path / "j.jsonl", piece()
+    path, original = tmp_path / "j.jsonl", piece()
     for _ in range(2):
         with Journal(path) as journal:
-            journal.add(kind="begin", **one.begun)
-            for kind, lines in [("sample", one.samples[:9]), ("campaign", one.campaigns[:2])]:
+            journal.add(kind="begin", **original.begun)
+            for kind, lines in [
+                ("sample", original.samples[:9]),
+                ("campaign", original.campaigns[:2]),
+            ]:
                 for line in lines:
                     journal.add(kind=kind, **line)
-    assert [len(found.campaigns) for found in read_journal(path)] == [2, 2]
+    assert [len(merged.campaigns) for merged in read_journal(path)] == [2, 2]
     assert main(["--merge", "--journal", str(path), "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["figures"]) == 2
     (tmp_path / "other.jsonl").write_text('{"round": 1}\n')
@@ -130,9 +133,9 @@ def test_some_seconds_of_it_leave_archives_and_a_journal(tmp_path: Path) -> None
     report = json.loads(done.stdout)
     assert report["faults"] == []
     assert report["figures"][0]["archives"] > 0
-    (found,) = read_journal(journal)
-    assert found.ended == [{"reason": ""}]
-    last = found.samples[-1]
+    (recorded,) = read_journal(journal)
+    assert recorded.ended == [{"reason": ""}]
+    last = recorded.samples[-1]
     assert set(last["processes"]) == set(PROCESSES)
     # Every packet with a reply is in the histogram, but for those under way.
     assert abs(sum(last["latencies"]) - last["counters"]["replied"]) <= 50

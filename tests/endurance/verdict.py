@@ -92,10 +92,13 @@ def _figures(piece: Piece) -> Line:
     return {
         "minutes": round(piece.samples[-1]["t"] / 60.0, 1) if piece.samples else 0.0,
         "campaigns": len(ran),
-        "complete": sum(one["complete"] for one in ran),
-        "restarts": sum(len(one["restarts"]) for one in ran),
-        "outcomes": dict(sum((Counter(one["outcomes"]) for one in ran), Counter())),
-        **{name: sum(one[name] for one in ran) for name in ("motions", "archives", "records")},
+        "complete": sum(campaign["complete"] for campaign in ran),
+        "restarts": sum(len(campaign["restarts"]) for campaign in ran),
+        "outcomes": dict(sum((Counter(campaign["outcomes"]) for campaign in ran), Counter())),
+        **{
+            name: sum(campaign[name] for campaign in ran)
+            for name in ("motions", "archives", "records")
+        },
         **counters,
     }
 
@@ -105,15 +108,18 @@ def _faults(piece: Piece) -> Iterator[str]:
     for end in piece.ended:
         if end["reason"] not in ("", "interrupted"):
             yield f"ended early: {end['reason']}"
-    for one in piece.campaigns:
-        what, moved = [*one["faulty"]], one["archives"] - one["outcomes"].get("void", 0)
-        if not one["complete"] and not one["stopped"]:
-            what.append(f"abandoned after {one['restarts']}")
-        if not one["stopped"] and moved != one["motions"]:
-            what.append(f"{one['motions']} motions ended and there are {moved} archives")
-        if one["records_lost"]:
-            what.append(f"{one['records_lost']} records lost")
-        yield from (f"campaign {one['number']}: {text}" for text in what)
+    for campaign in piece.campaigns:
+        what, moved = (
+            [*campaign["faulty"]],
+            campaign["archives"] - campaign["outcomes"].get("void", 0),
+        )
+        if not campaign["complete"] and not campaign["stopped"]:
+            what.append(f"abandoned after {campaign['restarts']}")
+        if not campaign["stopped"] and moved != campaign["motions"]:
+            what.append(f"{campaign['motions']} motions ended and there are {moved} archives")
+        if campaign["records_lost"]:
+            what.append(f"{campaign['records_lost']} records lost")
+        yield from (f"campaign {campaign['number']}: {text}" for text in what)
     if piece.samples:
         counters = piece.samples[-1]["counters"]
         for name in ("missed", "late"):
@@ -128,11 +134,11 @@ def _growth(piece: Piece) -> Iterator[str]:
     that is used up.
     """
     samples, over = piece.samples, piece.samples[-1]["t"]
-    first = [one for one in samples if 0.5 * BLOCK <= one["t"] < 1.5 * BLOCK]
-    last = [one for one in samples if one["t"] >= over - BLOCK]
+    first = [sample for sample in samples if 0.5 * BLOCK <= sample["t"] < 1.5 * BLOCK]
+    last = [sample for sample in samples if sample["t"] >= over - BLOCK]
     for name in PROCESSES:
         memory, threads = (
-            [[one["processes"][name][what] for one in block] for block in (first, last)]
+            [[sample["processes"][name][what] for sample in block] for block in (first, last)]
             for what in ("memory", "threads")
         )
         before, after = map(float, map(np.median, memory))
@@ -140,7 +146,9 @@ def _growth(piece: Piece) -> Iterator[str]:
             yield f"the {name}'s memory grew from {before:.3g} to {after:.3g} bytes"
         if max(threads[1]) > max(threads[0]):
             yield f"the {name} has {max(threads[1])} threads, {max(threads[0])} at the beginning"
-        idle = [one["descriptors"][name] for one in piece.campaigns if not one["stopped"]]
+        idle = [
+            campaign["descriptors"][name] for campaign in piece.campaigns if not campaign["stopped"]
+        ]
         early, late = (max(half, default=0) for half in np.array_split(idle, 2))
         if late > early > 0:
             yield f"the {name} has {late} descriptors, {early} in the first half"

@@ -21,8 +21,8 @@ Outcomes = Mapping[str, tuple[str, ...]]
 def expected(first: str) -> dict[str, Outcomes]:
     """Outcomes by fault, of the table in the document whose first column after them is this one."""
     _, _, text = DOCUMENT.read_text("utf-8").partition(f"| fault | {first} |")
-    rest, _, rows = text.partition("\n|---")
-    columns = [first, *_cells(rest)]
+    heading, _, rows = text.partition("\n|---")
+    columns = [first, *_cells(heading)]
     table: dict[str, Outcomes] = {}
     for line in rows.partition("\n\n")[0].splitlines()[1:]:
         fault, *cells = _cells(line)
@@ -44,8 +44,8 @@ def main() -> None:
         cells = [fault]
         for situation in SITUATIONS:
             runs = [play(fault, situation, how) for how in behaviours(fault, situation)]
-            found = [run.outcome for run in runs]
-            cells.append(" / ".join(found if len(set(found)) > 1 else found[:1]))
+            outcomes = [run.outcome for run in runs]
+            cells.append(" / ".join(outcomes if len(set(outcomes)) > 1 else outcomes[:1]))
             for run in runs:
                 broken.update(run.broken)
                 if run.outcome != "no start" and not run.recovery.startswith("completed"):

@@ -105,12 +105,12 @@ def signature(error: BaseException) -> str:
     Of a RecursionError it is the first line, since the last is arbitrary.
     """
     places = [
-        f"{Path(one.filename).relative_to(ROOT)}:{one.lineno}"
-        for one in traceback.extract_tb(error.__traceback__)
-        if Path(one.filename).is_relative_to(ROOT) and ".venv" not in Path(one.filename).parts
+        f"{Path(frame.filename).relative_to(ROOT)}:{frame.lineno}"
+        for frame in traceback.extract_tb(error.__traceback__)
+        if Path(frame.filename).is_relative_to(ROOT) and ".venv" not in Path(frame.filename).parts
     ]
-    own = [place for place in places if place.split("/")[0] in OURS] or places or ["nowhere"]
-    place = own[0 if isinstance(error, RecursionError) else -1]
+    own_places = [place for place in places if place.split("/")[0] in OURS] or places or ["nowhere"]
+    place = own_places[0 if isinstance(error, RecursionError) else -1]
     return f"{type(error).__name__}-{place.replace('/', '.')}".replace(":", "-")
 
 

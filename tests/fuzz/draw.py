@@ -120,18 +120,18 @@ def mutate_text(data: bytes, most: int, seed: int) -> bytes:
 
 def _of_tokens(text: str, rng: random.Random) -> str:
     tokens = _TOKEN.findall(text) or [""]
-    words = [k for k, token in enumerate(tokens) if not token.isspace()] or [0]
-    numbers = [k for k in words if tokens[k][:1].isdigit() or tokens[k][:1] in "-+"]
-    at = rng.choice(numbers) if numbers and rng.random() < 0.5 else rng.choice(words)
+    visible = [k for k, token in enumerate(tokens) if not token.isspace()] or [0]
+    numbers = [k for k in visible if tokens[k][:1].isdigit() or tokens[k][:1] in "-+"]
+    at = rng.choice(numbers) if numbers and rng.random() < 0.5 else rng.choice(visible)
     kind = rng.random()
     if kind < 0.45:
         tokens[at] = rng.choice(_VALUES)
     elif kind < 0.65:
-        tokens[at] = tokens[rng.choice(words)]
+        tokens[at] = tokens[rng.choice(visible)]
     elif kind < 0.8:
         del tokens[at : at + rng.choice((1, 1, 2, 5))]
     elif kind < 0.9:
-        tokens.insert(at, tokens[rng.choice(words)])
+        tokens.insert(at, tokens[rng.choice(visible)])
     else:
         tokens[at] = tokens[at] * rng.choice((2, 2, 3, 50))
     return "".join(tokens)

@@ -73,10 +73,10 @@ def split_file(data: bytes) -> list[Record] | None:
 
 def split_records(data: bytes) -> list[tuple[int, bytes]]:
     """Return opcodes and bodies up to the first invalid record."""
-    found: list[tuple[int, bytes]] = []
+    records: list[tuple[int, bytes]] = []
     with contextlib.suppress(Damage):
-        found.extend((record.opcode, record.body) for record in container.split_records(data, 0))
-    return found
+        records.extend((record.opcode, record.body) for record in container.split_records(data, 0))
+    return records
 
 
 def _opened(opcode: int, body: bytes) -> Record:
@@ -94,12 +94,12 @@ def join_file(records: list[Record], *, index: bool) -> bytes:
     built = Indexed()
     file = built.data
     described = _described(records)
-    for one in records:
-        body = _sealed(one, {header.DESCRIPTION: described})
+    for record in records:
+        body = _sealed(record, {header.DESCRIPTION: described})
         if index:
-            built.put(record_of(one.opcode, body))
+            built.put(record_of(record.opcode, body))
             continue
-        file += record_of(one.opcode, body)
+        file += record_of(record.opcode, body)
     if index:
         return built.ended()
     end = record_of(container.DATA_END, bytes(4)) + record_of(container.FOOTER, bytes(20))
@@ -108,64 +108,66 @@ def join_file(records: list[Record], *, index: bool) -> bytes:
 
 def _described(records: list[Record]) -> str:
     """Return the checksum of the description, which the outcome repeats."""
-    for one in records:
+    for record in records:
         with contextlib.suppress(Damage):  # unreadable
-            name, entries = entries_of(one) if one.opcode == container.METADATA else ("", {})
+            name, entries = entries_of(record) if record.opcode == container.METADATA else ("", {})
             if name == header.METADATA:
                 entries.pop("checksum", None)
                 return header.checksum(entries)
     return ""
 
 
-def _sealed(one: Record, seals: dict[str, str]) -> bytes:
+def _sealed(record: Record, seals: dict[str, str]) -> bytes:
     """Return the body with valid checksums and entries of the outcome."""
-    if one.inside is not None:
-        data = one.content
-        packed = _PACKED.get(one.compression, bytes)(data)
-        start, end = one.times
-        return body_of(Chunk(one.compression, packed, end, start, zlib.crc32(data), len(data)))
-    if one.opcode == container.ATTACHMENT and len(one.body) > 4:
-        return one.body[:-4] + zlib.crc32(one.body[:-4]).to_bytes(4, "little")
-    if one.opcode == container.METADATA:
+    if record.inside is not None:
+        data = record.content
+        packed = _PACKED.get(record.compression, bytes)(data)
+        start, end = record.times
+        return body_of(Chunk(record.compression, packed, end, start, zlib.crc32(data), len(data)))
+    if record.opcode == container.ATTACHMENT and len(record.body) > 4:
+        return record.body[:-4] + zlib.crc32(record.body[:-4]).to_bytes(4, "little")
+    if record.opcode == container.METADATA:
         with contextlib.suppress(Damage):  # unreadable
-            name, entries = entries_of(one)
+            name, entries = entries_of(record)
             if entries.pop("checksum", None) is not None:
                 entries |= {key: seals[key] for key in seals if key in entries}
                 return body_of(Metadata(name, header.with_checksum(entries)))
-    return one.body
+    return record.body
 
 
 def body_of(record: Attachment | Chunk | Metadata) -> bytes:
     return encode(record)[container.RECORD.size :]
 
 
-def entries_of(one: Record) -> tuple[str, dict[str, str]]:
-    found = container.parse(Metadata, container.Record(0, one.opcode, one.body))
-    return found.name, found.metadata
+def entries_of(record: Record) -> tuple[str, dict[str, str]]:
+    metadata = container.parse(Metadata, container.Record(0, record.opcode, record.body))
+    return metadata.name, metadata.metadata
 
 
 def _change(records: list[Record], rng: random.Random) -> None:
-    one = rng.choice(records)
+    record = rng.choice(records)
     kind = rng.random()
     if kind < 0.12:
         _shuffled(records, rng)
-    elif one.inside:
+    elif record.inside:
         if kind < 0.25:
-            one.times = (rng.choice((0, *one.times, 1 << 63)), rng.choice((*one.times, 0)))
+            record.times = (rng.choice((0, *record.times, 1 << 63)), rng.choice((*record.times, 0)))
         elif kind < 0.4:
-            one.compression = rng.choice(("", "zstd", "lz4", "gzip"))
+            record.compression = rng.choice(("", "zstd", "lz4", "gzip"))
         elif kind < 0.55:
-            _shuffled(one.inside, rng)
+            _shuffled(record.inside, rng)
         else:
-            for message in rng.sample(one.inside, min(len(one.inside), rng.choice((1, 1, 3, 50)))):
+            for message in rng.sample(
+                record.inside, min(len(record.inside), rng.choice((1, 1, 3, 50)))
+            ):
                 _of_a_message(message, rng)
-    elif one.opcode in (container.METADATA, container.ATTACHMENT):
+    elif record.opcode in (container.METADATA, container.ATTACHMENT):
         with contextlib.suppress(Damage):  # unreadable
-            one.body = body_of(_with_other_entry(one, rng))
-    elif one.opcode in (container.SCHEMA, container.CHANNEL) and kind < 0.7:
-        one.body = one.body[:4] + _mutated(one.body[4:], rng, mutate_text)
+            record.body = body_of(_with_other_entry(record, rng))
+    elif record.opcode in (container.SCHEMA, container.CHANNEL) and kind < 0.7:
+        record.body = record.body[:4] + _mutated(record.body[4:], rng, mutate_text)
     else:
-        one.body = _mutated(one.body, rng)
+        record.body = _mutated(record.body, rng)
 
 
 def _mutated(data: bytes, rng: random.Random, mutate: Mutation = mutate_bytes) -> bytes:
@@ -207,19 +209,19 @@ def _of_a_message(message: Record, rng: random.Random) -> None:
     message.body = _MESSAGE.pack(*head) + data
 
 
-def _with_other_entry(one: Record, rng: random.Random) -> Attachment | Metadata:
+def _with_other_entry(record: Record, rng: random.Random) -> Attachment | Metadata:
     """Metadata with an entry changed or removed, or an attachment with other data or name."""
-    if one.opcode == container.METADATA:
-        name, entries = entries_of(one)
+    if record.opcode == container.METADATA:
+        name, entries = entries_of(record)
         key = rng.choice([*entries, "period", "joint_names", "kind"])
         changed = _mutated(entries.pop(key, "").encode() or b"0", rng, mutate_text)
         if rng.random() > 0.2:
             entries[key] = changed.decode("utf-8", "replace")
         return Metadata(name, entries)
-    found = container.parse(Attachment, container.Record(0, one.opcode, one.body))
+    attachment = container.parse(Attachment, container.Record(0, record.opcode, record.body))
     if rng.random() < 0.1:
-        found.name = rng.choice(("../../x", "/dev/zero", "", "plan.json", "init_packet.bin"))
+        attachment.name = rng.choice(("../../x", "/dev/zero", "", "plan.json", "init_packet.bin"))
     else:
-        binary = found.name.endswith(".bin")
-        found.data = _mutated(found.data, rng, mutate_bytes if binary else mutate_text)
-    return found
+        binary = attachment.name.endswith(".bin")
+        attachment.data = _mutated(attachment.data, rng, mutate_bytes if binary else mutate_text)
+    return attachment

@@ -38,7 +38,11 @@ def test_well_formed_input_is_accepted(name: str) -> None:
     seeds = target.seeds()
     assert [at for at, data in enumerate(seeds) if not target.run(data)] == []
     planted = [path.name for path in sorted((CORPORA / name).glob("seed-*"))]
-    assert [one for one in planted if not target.run((CORPORA / name / one).read_bytes())] == []
+    assert [
+        file_name
+        for file_name in planted
+        if not target.run((CORPORA / name / file_name).read_bytes())
+    ] == []
 
 
 @pytest.mark.parametrize("name", targets.NAMES)

@@ -56,7 +56,7 @@ def test_position_too_large_for_degrees_is_not_shown(tmp_path: Path) -> None:
     position = np.array([[0.1, 0.2], [1e307, -1e307], [0.3, 0.4]])
     large = Samples(np.arange(3) * 2_000_000, position=position, torque=np.ones((3, 2)))
     view = view_of(archive(tmp_path / "imported.mcap", large))
-    (shown,) = (one for one in view.quantities if one.title == "position [deg]")
+    (shown,) = (quantity for quantity in view.quantities if quantity.title == "position [deg]")
     assert np.nanmax(np.abs(shown.traces[0].value)) == pytest.approx(np.degrees(0.3))
 
 
@@ -81,10 +81,10 @@ def test_cell_from_an_invalid_archive_is_refused(
 
 
 def with_controller(folder: Path, written: str) -> Cell:
-    begin, _, rest = CELL.partition("[controller]")
+    begin, _, tail = CELL.partition("[controller]")
     path = folder / "cell.toml"
     (folder / "fast.urdf").write_text(CELLS_URDF)
-    path.write_text(f"{written}\n{begin}{rest[rest.index('[campaign]') :]}")
+    path.write_text(f"{written}\n{begin}{tail[tail.index('[campaign]') :]}")
     return Cell.load(path)
 
 

@@ -101,16 +101,16 @@ class TestFindings:
     def test_one_cause_has_one_folder(self, tmp_path: Path) -> None:
         for wrong in ("x", "y"):
             command.record_finding(tmp_path, self.raised(wrong), wrong.encode())
-        (found,) = tmp_path.iterdir()
-        assert (found / command.INPUT).read_bytes() == b"x"
-        assert "could not convert" in (found / command.TRACEBACK).read_text()
+        (folder,) = tmp_path.iterdir()
+        assert (folder / command.INPUT).read_bytes() == b"x"
+        assert "could not convert" in (folder / command.TRACEBACK).read_text()
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="atheris is not installed")
 def test_fuzzing_extends_the_corpus(tmp_path: Path) -> None:
-    words = ("-m", "tests.fuzz", "codec", "--minutes", "0.15", "--folder", str(tmp_path))
-    done = subprocess.run([sys.executable, *words], cwd=command.ROOT, check=False)
+    arguments = ("-m", "tests.fuzz", "codec", "--minutes", "0.15", "--folder", str(tmp_path))
+    done = subprocess.run([sys.executable, *arguments], cwd=command.ROOT, check=False)
     assert done.returncode == 0
     assert len([*(tmp_path / "corpus").iterdir()]) > len(targets.load("codec").seeds())
     assert not [*(tmp_path / "findings").iterdir()]

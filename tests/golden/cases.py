@@ -30,14 +30,14 @@ RECORDINGS: Final = HERE.parents[2] / "shared" / "data"
 def identify(folder: Path, *arguments: str) -> dict[str, Any]:
     """Values, standard deviations, choices and verdict of an identification."""
     status = CliRunner().invoke(app, ["identify", *arguments, "--output", str(folder)]).exit_code
-    found = Results.load(folder / "results.json")
+    results = Results.load(folder / "results.json")
     return {
-        "names": [one.name for one in found.parameters],
-        "values": [one.estimate for one in found.parameters],
-        "std": [one.std for one in found.parameters],
-        "errors": [one.all_rows_relative_error for one in found.validation],
-        "choices": [one.candidates[one.chosen] for one in found.choices],
-        "checks": sorted({one.check for one in found.judgement.findings}),
+        "names": [parameter.name for parameter in results.parameters],
+        "values": [parameter.estimate for parameter in results.parameters],
+        "std": [parameter.std for parameter in results.parameters],
+        "errors": [prediction.all_rows_relative_error for prediction in results.validation],
+        "choices": [choice.candidates[choice.chosen] for choice in results.choices],
+        "checks": sorted({finding.check for finding in results.judgement.findings}),
         "status": status,
     }
 
@@ -66,9 +66,9 @@ def keys(scratch: Path) -> list[str]:
 def batch(scratch: Path) -> dict[str, Any]:
     """The same archives by a batch."""
     arguments = ["batch", str(FAST), "--json", "--quiet", "--cache", "none", "--workers", "1"]
-    found = CliRunner().invoke(app, arguments)
-    (arm,) = json.loads(found.stdout)["arms"].values()
-    return {**next(iter(arm["campaigns"].values()))["parameters"], "status": found.exit_code}
+    printed = CliRunner().invoke(app, arguments)
+    (arm,) = json.loads(printed.stdout)["arms"].values()
+    return {**next(iter(arm["campaigns"].values()))["parameters"], "status": printed.exit_code}
 
 
 def quick_design(scratch: Path) -> dict[str, Any]:

@@ -14,19 +14,19 @@ from tests.golden.cases import CASES, HERE, PUBLISHED, RECORDINGS
 SAME = 1e-9
 
 
-def assert_same(found: Any, golden: Any, place: str) -> None:
+def assert_same(result: Any, golden: Any, place: str) -> None:
     """Words alike, numbers to rounding of the largest of their list."""
     if isinstance(golden, dict):
-        assert found.keys() == golden.keys(), place
+        assert result.keys() == golden.keys(), place
         for key in golden:
-            assert_same(found[key], golden[key], f"{place}.{key}")
+            assert_same(result[key], golden[key], f"{place}.{key}")
     elif isinstance(golden, list) and golden and isinstance(golden[0], float):
         scale = max(map(abs, golden))
-        assert found == pytest.approx(golden, rel=SAME, abs=SAME * scale), place
+        assert result == pytest.approx(golden, rel=SAME, abs=SAME * scale), place
     elif isinstance(golden, float):
-        assert found == pytest.approx(golden, rel=SAME), place
+        assert result == pytest.approx(golden, rel=SAME), place
     else:
-        assert found == golden, place
+        assert result == golden, place
 
 
 class TestGoldenResults:
@@ -38,7 +38,10 @@ class TestGoldenResults:
     @pytest.mark.parametrize(
         "name",
         # The heavy arm asks most of the consistent estimate.
-        [pytest.param(one, marks=() if one == "kr300" else pytest.mark.slow) for one in PUBLISHED],
+        [
+            pytest.param(robot, marks=() if robot == "kr300" else pytest.mark.slow)
+            for robot in PUBLISHED
+        ],
     )
     def test_those_of_published_recordings_stay(self, name: str, tmp_path: Path) -> None:
         if not RECORDINGS.is_dir():

@@ -55,10 +55,10 @@ def write_exports(folder: Path, *args: Any, **kwargs: Any) -> Exports:
 def packaged_urdf(name: str) -> str:
     """Text of a description in the package example-robot-data, or a skip."""
     files = metadata.files("example-robot-data") or ()
-    found = next((str(file.locate()) for file in files if file.name == name), None)
-    if found is None:
+    path = next((str(file.locate()) for file in files if file.name == name), None)
+    if path is None:
         pytest.skip(f"the package example-robot-data, which has {name}, is not installed")
-    return Path(found).read_text(encoding="utf-8")
+    return Path(path).read_text(encoding="utf-8")
 
 
 def identified_arm(

@@ -66,13 +66,13 @@ def heads(chunk: bytes) -> Iterator[Head]:
 
 def chunks(data: bytes) -> list[tuple[int, int]]:
     """Return begin and end of each chunk of a file."""
-    found, at = [], len(container.MAGIC)
+    bounds, at = [], len(container.MAGIC)
     while at < len(data) and data[at] != container.DATA_END:
         opcode, end = container.record_bounds(data, at, 0)
         if opcode == container.CHUNK:
-            found.append((at, end))
+            bounds.append((at, end))
         at = end
-    return found
+    return bounds
 
 
 def with_attachment(source: Path, target: Path, old: str, new: str) -> Path:
@@ -80,11 +80,11 @@ def with_attachment(source: Path, target: Path, old: str, new: str) -> Path:
     assert len(old.encode()) == len(new.encode())
     data, changed = bytearray(source.read_bytes()), 0
     with source.open("rb") as stream:
-        for one in container.records(stream, len(data)):
-            if one.opcode == container.ATTACHMENT and old.encode() in one.body:
-                content = one.body[:-4].replace(old.encode(), new.encode())
-                begin = one.offset + container.RECORD.size
-                data[begin : one.end] = content + zlib.crc32(content).to_bytes(4, "little")
+        for record in container.records(stream, len(data)):
+            if record.opcode == container.ATTACHMENT and old.encode() in record.body:
+                content = record.body[:-4].replace(old.encode(), new.encode())
+                begin = record.offset + container.RECORD.size
+                data[begin : record.end] = content + zlib.crc32(content).to_bytes(4, "little")
                 changed += 1
     assert changed == 1
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -126,15 +126,17 @@ class Content:
             messages = [
                 Message(
                     channel.topic, kind.name if kind else "", kind.data.decode() if kind else "",
-                    one.log_time, one.publish_time, one.sequence, one.data,
+                    message.log_time, message.publish_time, message.sequence, message.data,
                 )
-                for kind, channel, one in reader.iter_messages(log_time_order=False)
+                for kind, channel, message in reader.iter_messages(log_time_order=False)
             ]  # fmt: skip
-            found = [dict(record.metadata) for record in reader.iter_metadata()]
-            attachments = {one.name: one.data for one in reader.iter_attachments()}
-        for entries in found:
+            metadata = [dict(record.metadata) for record in reader.iter_metadata()]
+            attachments = {
+                attachment.name: attachment.data for attachment in reader.iter_attachments()
+            }
+        for entries in metadata:
             entries.pop("checksum")
-        return cls(messages, found[0], found[1], attachments)
+        return cls(messages, metadata[0], metadata[1], attachments)
 
     def write(self, path: Path) -> Path:
         with path.open("wb") as stream:
@@ -178,10 +180,10 @@ class Indexed:
         item = Record(len(self.data), data[0], data[container.RECORD.size :])
         if item.opcode == container.CHUNK:
             head, parser = container.parse_chunk(item), ChunkParser()
-            found = parser.messages(container.chunk_data(head, item.offset), item.offset)
+            by_channel = parser.messages(container.chunk_data(head, item.offset), item.offset)
             for definition in parser.definitions:
                 self._writer.note(definition)
-            self._writer.add_chunk(head, entries_of(found))
+            self._writer.add_chunk(head, entries_of(by_channel))
         elif item.opcode == container.HEADER:
             self._writer.put(container.parse(Header, item))
         else:

@@ -72,9 +72,9 @@ class Terminal:
             with contextlib.suppress(OSError):
                 self.seen += os.read(self.near, 65536)
 
-    def await_seen(self, words: bytes, timeout: float = 120.0) -> None:
+    def await_seen(self, shown: bytes, timeout: float = 120.0) -> None:
         until = time.monotonic() + timeout
-        while words not in self.seen:
+        while shown not in self.seen:
             assert time.monotonic() < until and self.process.poll() is None, self.seen[-2000:]
             self.look()
 
@@ -121,13 +121,13 @@ def main() -> int:
             last: OperatorRequest | None = None
             until = time.monotonic() + LONGEST
             if ending in ("question", "contradiction"):
-                found = DryRunRecord(
+                dry_run = DryRunRecord(
                     "0" * 64, 0.2, ("dryrun_000_a1.mcap",), 12.0, True, NAMES,
                     (0.2, 0.4), (0.001, 0.002), 0, 0,
                     against_gravity=NAMES[1:] if ending == "contradiction" else (),
                 )  # fmt: skip
                 for _ in range(3):
-                    reported.write(json.dumps({"accepted": screen.accept_dry_run(found)}) + "\n")
+                    reported.write(json.dumps({"accepted": screen.accept_dry_run(dry_run)}) + "\n")
             while not stop.requested and time.monotonic() < until:
                 request = screen.request()
                 screen.show(status(request))

@@ -80,16 +80,16 @@ def identify(
     return Found(prepared, fit, error.overall)
 
 
-def assert_found(found: Found, simulated: Simulated) -> None:
+def assert_found(identified: Found, simulated: Simulated) -> None:
     """What was planted is found, and what was held out predicted down to the noise."""
-    model = found.prepared.sources.cell.model
+    model = identified.prepared.sources.cell.model
     truth = planted(model, simulated)
     # Smoothing leaves a bias below a percent; chance goes beyond 5 std once in two million.
-    far = np.abs(found.fit.values - truth) > 5.0 * found.fit.std + 0.01 * np.abs(truth)
+    far = np.abs(identified.fit.values - truth) > 5.0 * identified.fit.std + 0.01 * np.abs(truth)
     assert not far.any(), np.array(model.parameter_names)[far]
     rms = np.sqrt((simulated.clean**2).mean(axis=0) @ np.ones(model.n_joints))
     noise = TORQUE_NOISE * np.sqrt(np.sum(simulated.clean.var(axis=0)))
-    assert found.held_out_error < 1.5 * noise / rms
+    assert identified.held_out_error < 1.5 * noise / rms
 
 
 def write(path: Path, header: str, table: Array, form: Callable[[float], str] = repr) -> None:
@@ -109,7 +109,7 @@ def test_seven_axes_in_degrees_at_an_uneven_100_hz(tmp_path: Path) -> None:
     stamp = EPOCH_MS + np.round(time * 1e3, 3)
     table = np.column_stack([degrees, np.full(len(time), 0.04), torque, np.zeros(len(time)), stamp])
     table = np.insert(table, 500, table[499], axis=0)  # a line written twice
-    names = [f"panda_joint{one + 1}" for one in order]
+    names = [f"panda_joint{joint + 1}" for joint in order]
     header = ",".join([*(f"q{k}" for k in range(1, 9)), *(f"u{k}" for k in range(1, 9)), "stamp"])
     write(tmp_path / "log.csv", header, table)
     columns = f"""
@@ -123,9 +123,9 @@ def test_seven_axes_in_degrees_at_an_uneven_100_hz(tmp_path: Path) -> None:
         [torque]
         columns = "u{{}}"
         """
-    found = identify(tmp_path, simulated, "log.csv", columns, FINGERS)
-    assert_found(found, simulated)
-    notes = " ".join(found.prepared.notes)
+    identified = identify(tmp_path, simulated, "log.csv", columns, FINGERS)
+    assert_found(identified, simulated)
+    notes = " ".join(identified.prepared.notes)
     assert "uneven" in notes
     assert "1 gaps" in notes
 
@@ -145,13 +145,15 @@ def test_a_standstill_gives_the_noise(tmp_path: Path) -> None:
     uses: dict[str, Use] = {"a": "excitation", "b": "validation", "c": "standstill"}
     paths = []
     for seed, (name, use) in enumerate(uses.items()):
-        one = simulate(UR5, time, seed=seed)
-        arrays = {"q": one.position, "tau": one.torque}
+        simulated = simulate(UR5, time, seed=seed)
+        arrays = {"q": simulated.position, "tau": simulated.torque}
         position = {"columns": "q"}
         quantities = {"position": position, "torque": {"columns": "tau"}}
         if use == "standstill":
-            noise = POSITION_NOISE * np.random.default_rng(9).standard_normal(one.position.shape)
-            arrays, quantities = {"q": one.position[0] + noise}, {"position": position}
+            noise = POSITION_NOISE * np.random.default_rng(9).standard_normal(
+                simulated.position.shape
+            )
+            arrays, quantities = {"q": simulated.position[0] + noise}, {"position": position}
         np.savez(tmp_path / f"{name}.npz", **arrays)
         paths.append(
             import_log(
@@ -163,15 +165,15 @@ def test_a_standstill_gives_the_noise(tmp_path: Path) -> None:
             )
         )
     sources = gather_sources(paths, 0.7)
-    assert [one.name for one in sources.training] == ["a.mcap"]
-    assert [one.name for one in sources.held_out] == ["b.mcap"]
+    assert [source.name for source in sources.training] == ["a.mcap"]
+    assert [source.name for source in sources.held_out] == ["b.mcap"]
     assert sources.tested_on == "unseen motion"
     assert sources.noise_variance == pytest.approx(np.full(6, POSITION_NOISE**2), rel=0.2)
     prepared = prepare_sources(sources, Options(torque_bandwidth=None), Silent())
     assert any("at standstill" in note for note in prepared.notes)
 
     unread = gather_sources(paths[:1], 0.7, predict=paths[1:2])
-    assert [one.name for one in unread.held_out] == ["b.mcap"]
+    assert [source.name for source in unread.held_out] == ["b.mcap"]
 
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -241,10 +243,10 @@ def prepared(
     return prepare_sources(gather_sources([archive], 0.7), options, Silent())
 
 
-def held_out_error(found: Prepared) -> float:
-    model = found.sources.cell.model
-    values = estimate(model, Factor.of(model, found.fitted[0])).values
-    (error,) = prediction_error(model, values, found.held_out, all_rows=True)
+def held_out_error(prepared_data: Prepared) -> float:
+    model = prepared_data.sources.cell.model
+    values = estimate(model, Factor.of(model, prepared_data.fitted[0])).values
+    (error,) = prediction_error(model, values, prepared_data.held_out, all_rows=True)
     return error.overall
 
 
@@ -260,18 +262,18 @@ class TestFilteredTorque:
     @pytest.mark.parametrize(("order", "causal"), [(1, False), (4, False), (1, True), (2, True)])
     def test_is_found(self, tmp_path: Path, order: int, causal: bool, unfiltered: Prepared) -> None:
         """The lag of a causal low-pass, some 10 ms, is not identified as a delay."""
-        found = prepared(tmp_path, order, causal=causal)
-        preprocessing = found.settings.preprocessing
+        filtered = prepared(tmp_path, order, causal=causal)
+        preprocessing = filtered.settings.preprocessing
         assert preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
-        assert held_out_error(found) < 1.3 * held_out_error(unfiltered)
+        assert held_out_error(filtered) < 1.3 * held_out_error(unfiltered)
         if causal:
             assert preprocessing.torque_shape.causal
             assert preprocessing.torque_delay == 0.0
-            assert found.delays is None
+            assert filtered.delays is None
 
 
 def test_fixed_options_decide_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("choose_settings", "estimate_delay", "possible_low_passes"):
         monkeypatch.setattr(f"hil.identify.prepared.{name}", pytest.fail)
-    found = prepared(tmp_path, 2, causal=True, options=FIXED)
-    assert found.settings == stated_settings(found.sources.cell, FIXED)
+    prepared_data = prepared(tmp_path, 2, causal=True, options=FIXED)
+    assert prepared_data.settings == stated_settings(prepared_data.sources.cell, FIXED)

@@ -83,16 +83,16 @@ def bits(values: Any, like: NDArray[Any]) -> bytes:
     return np.asarray(values, like.dtype).tobytes()
 
 
-def assert_same_messages(found: dict[str, list[Any]], ours: Archive) -> None:
+def assert_same_messages(by_topic: dict[str, list[Any]], ours: Archive) -> None:
     """Decoded messages by topic hold what our reader reads."""
-    cycles, measured = found[profile.CYCLE], found[profile.MEASURED]
+    cycles, measured = by_topic[profile.CYCLE], by_topic[profile.MEASURED]
     for name, column in ours.columns.items():
         if name != "stamp":
             assert bits(stacked(cycles, name), column) == column.tobytes(), name
     for word, column_name in STATE.items():
         column = ours.columns[column_name]
         assert bits(stacked(measured, word), column) == column.tobytes()
-    commanded = found[profile.COMMANDED]
+    commanded = by_topic[profile.COMMANDED]
     for word in ("position", "velocity"):
         column, inside = (ours.columns[f"{whose}_{word}"] for whose in ("commanded", "target"))
         column = np.where(np.isnan(column), inside, column)
@@ -104,8 +104,8 @@ def assert_same_messages(found: dict[str, list[Any]], ours: Archive) -> None:
         stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in messages]
         assert stamps == ours.columns["stamp"].tolist()
         assert {message.header.frame_id for message in messages} == {""}
-    assert [message.data for message in found[profile.DESCRIPTION]] == [URDF]
-    (event,) = found[profile.EVENTS]
+    assert [message.data for message in by_topic[profile.DESCRIPTION]] == [URDF]
+    (event,) = by_topic[profile.EVENTS]
     assert (event.name, event.msg, event.level) == ("MotionStarted", "off we go", 20)
     assert event.stamp.sec == 4000
 
@@ -134,10 +134,10 @@ def decoded_by_rosbags(path: Path) -> Iterator[tuple[str, Any]]:
     ],
 )
 def test_others_read_the_same_values(path: Path, ours: Archive, decoded: Any) -> None:
-    found: dict[str, list[Any]] = {}
+    by_topic: dict[str, list[Any]] = {}
     for topic, message in decoded(path):
-        found.setdefault(topic, []).append(message)
-    assert_same_messages(found, ours)
+        by_topic.setdefault(topic, []).append(message)
+    assert_same_messages(by_topic, ours)
 
 
 def test_mcap_finds_index_statistics_metadata_and_attachments(path: Path, ours: Archive) -> None:

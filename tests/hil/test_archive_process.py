@@ -171,10 +171,10 @@ class TestArchiveProcess:
         for number in range(5000):  # far more than the log holds, faster than it is read
             memory.events.write(PacketRejected("foreign", number))
         done = rig.end()
-        found = outcome(path)
+        stored = outcome(path)
         assert (done.late, done.not_accepted) == (7, 2)
-        assert (found.late_replies, found.replies_not_accepted) == (7, 2)
-        assert found.events_lost == done.events_lost > 0
+        assert (stored.late_replies, stored.replies_not_accepted) == (7, 2)
+        assert stored.events_lost == done.events_lost > 0
         # The name of lost replies in archives is older than that of their event.
         names = {event.name for event in complete_archive(path).events}
         assert names >= {"EventsLost", "AnswersLost"}
@@ -186,8 +186,8 @@ class TestArchiveProcess:
         time.sleep(0.2)
         memory.end()
         wait(lambda: not rig.process.process.alive)
-        found = outcome(path)
-        assert (found.outcome, found.reason) == (
+        stored = outcome(path)
+        assert (stored.outcome, stored.reason) == (
             "void", "nothing was sent: the supervising program ended"
         )  # fmt: skip
 

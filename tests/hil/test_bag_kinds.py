@@ -107,9 +107,9 @@ class TestPublishers:
 
     def test_of_other_stamps_they_are_interpolated(self, urdf) -> None:
         parts = [
-            one
+            sent
             for k in range(COUNT)
-            for one in (
+            for sent in (
                 message(k, joints=(0, 1)),
                 message(k, joints=(2,), stamp=STAMPS[k] + PERIOD // 3),
             )
@@ -141,9 +141,9 @@ class TestPublishers:
     def test_a_second_publisher_of_zeros_is_named_and_left_out(self, urdf) -> None:
         zeros = np.zeros_like(POSITION)
         both = [
-            one
+            sent
             for k in range(COUNT)
-            for one in (
+            for sent in (
                 message(k),
                 message(k, stamp=STAMPS[k] + PERIOD // 2, position=zeros, velocity=zeros,
                         effort=zeros, late=PERIOD // 2),
@@ -155,8 +155,8 @@ class TestPublishers:
         assert "second publisher" in typed.message
 
     def test_contradicting_samples_of_one_stamp_are_refused(self, urdf) -> None:
-        both = [one for k in range(COUNT)
-                for one in (message(k), message(k, position=POSITION + 1.0))]  # fmt: skip
+        both = [sent for k in range(COUNT)
+                for sent in (message(k), message(k, position=POSITION + 1.0))]  # fmt: skip
         typed = Typed(urdf, both)
         assert typed.refused
         assert "messages 0 and 1 have the same stamp and positions 1 rad or m apart" in (
@@ -165,7 +165,7 @@ class TestPublishers:
         assert f"{COUNT} such stamps" in typed.message
 
     def test_a_message_sent_twice_is_no_contradiction(self, urdf) -> None:
-        assert not Typed(urdf, [one for one in WHOLE for _ in range(2)]).refused
+        assert not Typed(urdf, [sent for sent in WHOLE for _ in range(2)]).refused
 
 
 class TestMissingQuantities:
@@ -297,11 +297,11 @@ class TestFiles:
             connection = writer.add_connection("/joint_states", STATE, typestore=store)
             for k, stamp in enumerate(STAMPS):
                 time = clock(sec=stamp // 10**9, nanosec=stamp % 10**9)
-                one = store.types[STATE](
+                state = store.types[STATE](
                     header=header(seq=k, stamp=time, frame_id=""), name=list(JOINTS),
                     position=POSITION[k], velocity=SLOPE[k], effort=TORQUE[k],
                 )  # fmt: skip
-                writer.write(connection, stamp + 77, store.serialize_ros1(one, STATE))
+                writer.write(connection, stamp + 77, store.serialize_ros1(state, STATE))
         assert_right(self.read(path, urdf))
 
     def test_a_truncated_mcap_names_what_recovers_it(self, urdf) -> None:

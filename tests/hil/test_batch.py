@@ -63,12 +63,12 @@ def found_in(*roots, cache=UNCACHED):
 
 def reasons_of(ones):
     """Return the reasons of unused archives by file name."""
-    return {Path(one.path).name: one.reason for one in ones}
+    return {Path(unused.path).name: unused.reason for unused in ones}
 
 
 def fitted(result):
     """Return the names of the archives of the repetitions."""
-    return [Path(one.archive).name for one in result.repetitions]
+    return [Path(estimate.archive).name for estimate in result.repetitions]
 
 
 def excitations(folder):
@@ -93,15 +93,15 @@ def damage(path):
 
 def bits(result):
     levels = (*result.repetitions, *result.campaigns, *result.pooled)
-    return [one.estimate.values.tobytes() + one.estimate.std.tobytes() for one in levels]
+    return [level.estimate.values.tobytes() + level.estimate.std.tobytes() for level in levels]
 
 
-def assert_equal_repetitions(result, one):
+def assert_equal_repetitions(result, single_result):
     """Values are equal; of standard deviations the leverages of blocks are those of the archive.
 
     They agree far better than the scatter over its blocks, at least 20, determines them.
     """
-    for mine, theirs in zip(result.repetitions, one.repetitions, strict=True):
+    for mine, theirs in zip(result.repetitions, single_result.repetitions, strict=True):
         mine = mine.estimate
         np.testing.assert_allclose(mine.values, theirs.values, **EXACT)
         np.testing.assert_allclose(mine.noise_std, theirs.noise_std, **EXACT)
@@ -137,27 +137,29 @@ def prepared(campaign):
 
 
 @pytest.fixture(scope="module")
-def found(campaign):
+def batch_result(campaign):
     return batch(campaign.folder.root)
 
 
 class TestNumbers:
     def test_equal_those_of_hil_identify(self, campaign):
         """With the default options, which choose the settings."""
-        one = identify_campaign(campaign.folder.root, Silent()).estimate
-        found = batch(campaign.folder.root, options=Options())
-        (level,), (pooled,) = found.campaigns, found.pooled
+        identified = identify_campaign(campaign.folder.root, Silent()).estimate
+        result = batch(campaign.folder.root, options=Options())
+        (level,), (pooled,) = result.campaigns, result.pooled
         assert (pooled.level, pooled.campaign) == ("pooled", "")
         level, pooled = level.estimate, pooled.estimate
         assert pooled.values.tobytes() == level.values.tobytes()
-        np.testing.assert_allclose(level.values, one.pooled.values, **EXACT)
-        np.testing.assert_allclose(level.covariance, one.pooled.covariance, rtol=1e-9, atol=1e-15)
-        np.testing.assert_allclose(level.noise_std, one.pooled.noise_std, **EXACT)
+        np.testing.assert_allclose(level.values, identified.pooled.values, **EXACT)
+        np.testing.assert_allclose(
+            level.covariance, identified.pooled.covariance, rtol=1e-9, atol=1e-15
+        )
+        np.testing.assert_allclose(level.noise_std, identified.pooled.noise_std, **EXACT)
         for name in ("interval_factor", "method", "names"):
-            assert getattr(level, name) == getattr(one.pooled, name)
-        assert list(level.samples) == list(one.pooled.samples)
-        assert len(found.repetitions) == len(one.repetitions) == 3
-        assert_equal_repetitions(found, one)
+            assert getattr(level, name) == getattr(identified.pooled, name)
+        assert list(level.samples) == list(identified.pooled.samples)
+        assert len(result.repetitions) == len(identified.repetitions) == 3
+        assert_equal_repetitions(result, identified)
 
     @pytest.mark.parametrize(
         "changes",
@@ -172,32 +174,32 @@ class TestNumbers:
         """As inner prediction may decide, the prior counts, and the gears are loaded, alike."""
 
         def decided(sources, options, reporter):
-            found = decide(sources, FIXED, reporter)
-            return found._replace(settings=replace(found.settings, **changes))
+            decisions = decide(sources, FIXED, reporter)
+            return decisions._replace(settings=replace(decisions.settings, **changes))
 
         monkeypatch.setattr("hil.identify.prepared.decide", decided)
         monkeypatch.setattr(batch_run, "decide", decided)
         options = replace(FIXED, estimator="auto")
         ready = with_transmitted_load(prepare(campaign, options))
-        one = estimate_with(ready, options, Silent()).result
-        found = batch(campaign.folder.root, options=options)
-        level = found.campaigns[0].estimate
-        np.testing.assert_allclose(level.values, one.pooled.values, **EXACT)
-        np.testing.assert_allclose(level.std, one.pooled.std, **EXACT)
-        assert level.method == one.pooled.method
-        assert_equal_repetitions(found, one)
+        identified = estimate_with(ready, options, Silent()).result
+        result = batch(campaign.folder.root, options=options)
+        level = result.campaigns[0].estimate
+        np.testing.assert_allclose(level.values, identified.pooled.values, **EXACT)
+        np.testing.assert_allclose(level.std, identified.pooled.std, **EXACT)
+        assert level.method == identified.pooled.method
+        assert_equal_repetitions(result, identified)
 
     @pytest.mark.parametrize("name", get_args(BatchEstimator))
     def test_equal_those_with_samples_for_each_estimator(self, name, campaign, prepared):
-        one = estimate_with(prepared, replace(FIXED, estimator=name), Silent()).result
+        identified = estimate_with(prepared, replace(FIXED, estimator=name), Silent()).result
         level = batch(campaign.folder.root, estimator=name).campaigns[0].estimate
         # The program of the consistent estimate stops at its own tolerance.
         rtol, atol = (1e-4, 1e-4) if name == "consistent" else (1e-8, 1e-12)
-        np.testing.assert_allclose(level.values, one.pooled.values, rtol=rtol, atol=atol)
-        np.testing.assert_allclose(level.std, one.pooled.std, rtol=1e-8)
+        np.testing.assert_allclose(level.values, identified.pooled.values, rtol=rtol, atol=atol)
+        np.testing.assert_allclose(level.std, identified.pooled.std, rtol=1e-8)
 
-    def test_held_out_errors_equal_those_of_samples(self, prepared, found):
-        (level,), model = found.campaigns, prepared.sources.cell.model
+    def test_held_out_errors_equal_those_of_samples(self, prepared, batch_result):
+        (level,), model = batch_result.campaigns, prepared.sources.cell.model
         squares, rows = np.zeros(6), np.zeros(6)
         for samples in prepared.held_out:
             error = samples.torque - samples.predicted_torque(model, level.estimate.values)
@@ -205,15 +207,15 @@ class TestNumbers:
             rows += samples.usable.sum(axis=0)
         np.testing.assert_allclose(level.unseen_rms, np.sqrt(squares / rows), rtol=1e-6)
 
-    def test_campaigns_of_an_arm_are_pooled(self, campaign, found, tmp_path):
+    def test_campaigns_of_an_arm_are_pooled(self, campaign, batch_result, tmp_path):
         """In two folders, each with the standstill: pooled they equal those of one folder."""
         copied(campaign, tmp_path / "first", NAMES[0], "standstill_000")
         copied(campaign, tmp_path / "second", *NAMES[1:], "standstill_000")
         result = batch(tmp_path)
-        assert [one.repetitions for one in result.campaigns] == [1, 2]
-        assert [one.repetitions for one in result.pooled] == [3]
+        assert [level.repetitions for level in result.campaigns] == [1, 2]
+        assert [level.repetitions for level in result.pooled] == [3]
         # Sums in another order: rounding of poorly determined parameters.
-        mine, theirs = result.pooled[0].estimate, found.pooled[0].estimate
+        mine, theirs = result.pooled[0].estimate, batch_result.pooled[0].estimate
         assert np.abs((mine.values - theirs.values) / theirs.std).max() < 1e-6
         np.testing.assert_allclose(mine.std, theirs.std, rtol=1e-6)
 
@@ -230,11 +232,11 @@ class TestNumbers:
             return decide(sources, options, reporter)
 
         monkeypatch.setattr(batch_run, "decide", spied)
-        found = batch(tmp_path, friction="auto")
+        result = batch(tmp_path, friction="auto")
         assert read == [["excitation_001_a1.mcap"]]
-        assert [Path(one.campaign).name for one in found.campaigns] == ["b", "c"]
-        assert found.campaigns[0].settings != found.campaigns[1].settings
-        assert found.pooled[0].repetitions == 2
+        assert [Path(level.campaign).name for level in result.campaigns] == ["b", "c"]
+        assert result.campaigns[0].settings != result.campaigns[1].settings
+        assert result.pooled[0].repetitions == 2
 
     @pytest.mark.slow
     def test_do_not_depend_on_workers_order_or_cache(self, folder, tmp_path, monkeypatch):
@@ -291,9 +293,9 @@ class TestBroken:
             assert set(reasons) == {truncated.name, damaged.name, "nothing.mcap", "other.mcap"}
             assert "repair" in reasons[truncated.name]
             assert fitted(result) == [left.name]
-        found = result.repetitions[0].estimate.values
+        values = result.repetitions[0].estimate.values
         expected = intact.repetitions[2].estimate.values
-        np.testing.assert_allclose(found, expected, **EXACT)
+        np.testing.assert_allclose(values, expected, **EXACT)
 
     def test_repaired_copies_are_not_fitted_with_their_originals(self, loose):
         """One wrong bit in an index, which is not read, makes the two files differ."""
@@ -338,9 +340,11 @@ class TestBroken:
         alone = copied(campaign, tmp_path / "alone", *(f"{kind}_000" for kind in kinds))
         with pytest.raises(InputError, match="alone could not be used: it holds no excitation"):
             batch(alone)
-        found = batch(alone, folder)
-        assert len(found.campaigns) == 1
-        assert [tuple(one) for one in found.broken] == [(str(alone), "it holds no excitation")]
+        result = batch(alone, folder)
+        assert len(result.campaigns) == 1
+        assert [tuple(unused) for unused in result.broken] == [
+            (str(alone), "it holds no excitation")
+        ]
 
 
 def test_the_command_exits_with_5_if_archives_are_broken(folder, tmp_path):
@@ -353,10 +357,10 @@ def test_the_command_exits_with_5_if_archives_are_broken(folder, tmp_path):
     (folder / "archives" / "bad.mcap").write_bytes(b"")
     ran = CliRunner().invoke(app, [*command, "--json"])
     assert ran.exit_code == 5, ran.output
-    found = json.loads(ran.stdout)
-    assert [Path(one["path"]).name for one in found["broken"]] == ["bad.mcap"]
-    assert (found["read"], found["cached"]) == (0, 5)
-    assert all(Path(path).is_file() for path in found["written"])
+    printed = json.loads(ran.stdout)
+    assert [Path(unused["path"]).name for unused in printed["broken"]] == ["bad.mcap"]
+    assert (printed["read"], printed["cached"]) == (0, 5)
+    assert all(Path(path).is_file() for path in printed["written"])
 
 
 CLOCK = "the clock falls back 2 times; cut the log where it does"
@@ -407,15 +411,15 @@ class TestWarnings:
         record(tmp_path / "line" / "a", 1, first=0)
         (laden,) = record(tmp_path / "line" / "b", 1, first=1, cell=LADEN, index="1")
         laden.rename(tmp_path / "line" / "a" / "excitation_001_a1.mcap")
-        found = batch(tmp_path)
-        (pooled,) = found.pooled
+        result = batch(tmp_path)
+        (pooled,) = result.pooled
         assert (pooled.repetitions, pooled.setup) == (2, "")
         assert "cells state different payloads" in pooled.warnings[0]
         command = ["batch", str(tmp_path), "--cache", "none", "--json", *NOTHING_OPEN]
         (arm,) = json.loads(CliRunner().invoke(app, command).stdout)["arms"].values()
         for setups in (
-            [one.setup for one in found.campaigns],
-            [one["setup"] for one in arm["campaigns"].values()],
+            [campaign.setup for campaign in result.campaigns],
+            [campaign["setup"] for campaign in arm["campaigns"].values()],
         ):
             assert sorted("carries 3 kg" in text for text in setups) == [False, True]
 
@@ -535,7 +539,7 @@ class TestGroups:
         monkeypatch.setattr(reduction, "archive_factor", spied)
         result = batch(loose)
         assert not result.broken
-        assert [one.repetitions for one in result.campaigns] == [2, 1]
+        assert [campaign.repetitions for campaign in result.campaigns] == [2, 1]
         assert used.pop(victim.name) == pytest.approx(0.0042)
         assert set(used.values()) == {0.0002}
 
@@ -579,10 +583,10 @@ class TestGroups:
         manifest.write_text(manifest.read_text()[:-40])
         result = found_in(folder)
         assert len(result.refs) == 6
-        (one,) = result.broken
-        assert one.path == manifest.as_posix()
-        assert "damaged" in one.reason
-        assert "without being checked" in one.reason
+        (unused,) = result.broken
+        assert unused.path == manifest.as_posix()
+        assert "damaged" in unused.reason
+        assert "without being checked" in unused.reason
 
 
 class TestMetadata:

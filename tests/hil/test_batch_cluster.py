@@ -48,7 +48,7 @@ def batch(*places, cluster=None, cache=UNCACHED):
 
 def bits(result):
     levels = (*result.repetitions, *result.campaigns, *result.pooled)
-    return [one.estimate.values.tobytes() + one.estimate.std.tobytes() for one in levels]
+    return [level.estimate.values.tobytes() + level.estimate.std.tobytes() for level in levels]
 
 
 @pytest.fixture(scope="module")
@@ -225,7 +225,7 @@ class TestUrls:
         result = batch(f"{server}/{folder.name}", cache=cache)
         assert result.broken == ()
         assert bits(result) == bits(expected)
-        assert {one.campaign for one in result.campaigns} == {f"{server}/{folder.name}"}
+        assert {campaign.campaign for campaign in result.campaigns} == {f"{server}/{folder.name}"}
         assert result.repetitions[0].archive.startswith(server)
         again = batch(f"{server}/{folder.name}", cache=cache)
         assert (again.read, again.cached) == (0, 5)

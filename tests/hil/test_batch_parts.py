@@ -205,20 +205,20 @@ class TestDigests:
 
     def test_that_of_an_arm_ignores_payload_and_campaign(self):
         cell = Cell.load(CELL_PATH)
-        own = arm_digest(cell, b"drives")
-        assert arm_digest(cell.with_campaign(repetitions=7), b"drives") == own
+        digest = arm_digest(cell, b"drives")
+        assert arm_digest(cell.with_campaign(repetitions=7), b"drives") == digest
 
         def changed(**robot):
             file = cell.file.model_copy(update={"robot": cell.file.robot.model_copy(update=robot)})
             return arm_digest(replace(cell, file=file), b"drives")
 
         spring = {"kind": "torsion_spring", "joint": "joint_2", "rest_deg": 0.0, "stiffness": 9.0}
-        assert changed(payload=PayloadTable(mass=2.0, centre=[0.0, 0.0, 0.1])) == own
-        assert changed(gravity=[0.0, 1.0, -9.8]) != own
-        assert changed(elements=[TorsionSpringTable(**spring)]) != own
-        assert arm_digest(replace(cell, urdf=cell.urdf + "\n"), b"drives") != own
-        assert arm_digest(cell, b"other drives") != own
-        assert arm_digest(cell, b"drives", simulated=True) != own
+        assert changed(payload=PayloadTable(mass=2.0, centre=[0.0, 0.0, 0.1])) == digest
+        assert changed(gravity=[0.0, 1.0, -9.8]) != digest
+        assert changed(elements=[TorsionSpringTable(**spring)]) != digest
+        assert arm_digest(replace(cell, urdf=cell.urdf + "\n"), b"drives") != digest
+        assert arm_digest(cell, b"other drives") != digest
+        assert arm_digest(cell, b"drives", simulated=True) != digest
 
     def test_that_of_settings_ignores_those_of_the_estimate(self):
         stated = Settings(Preprocessing(torque_delay=0.002), noise_variance=(1e-9,) * 6)
@@ -236,7 +236,7 @@ class TestDigests:
             replace(stated, delay_variance=1e-9),
             replace(stated, loading=(1.0, 2.0)),
         ]
-        assert len({settings_digest(one) for one in (stated, *others)}) == 1 + len(others)
+        assert len({settings_digest(settings) for settings in (stated, *others)}) == 1 + len(others)
         both = [a_ref(0), a_ref(1)]
         assert reduction_key(both, stated) != reduction_key(both[::-1], stated)
 
@@ -246,13 +246,13 @@ DOCS = Path(__file__).parents[2] / "docs" / "batch.md"
 
 @cache
 def result():
-    one, other = history(steady, 2, seed=2)
-    covariance = one.estimate.covariance.copy()
+    first, other = history(steady, 2, seed=2)
+    covariance = first.estimate.covariance.copy()
     covariance[3, 3] = np.inf
-    names = (one.estimate.names[3],)
-    open_estimate = replace(one.estimate, covariance=covariance, undetermined=names)
+    names = (first.estimate.names[3],)
+    open_estimate = replace(first.estimate, covariance=covariance, undetermined=names)
     repetition = replace(
-        one,
+        first,
         level="repetition",
         archive='line "3", spring/\udcff.mcap',
         sha256="ab" * 32,
@@ -260,13 +260,13 @@ def result():
         when="",
         warnings=("stood still at first", "two gaps"),
     )
-    pooled = replace(one, level="pooled", campaign="", unseen_rms=0.1 * one.torque_rms)
+    pooled = replace(first, level="pooled", campaign="", unseen_rms=0.1 * first.torque_rms)
     return BatchResult(
         estimator="wls",
         arms={"digest": Arm("digest", cell())},
         repetitions=(repetition,),
-        campaigns=(one, other),
-        pooled=(replace(pooled, unseen_torque_rms=one.torque_rms),),
+        campaigns=(first, other),
+        pooled=(replace(pooled, unseen_torque_rms=first.torque_rms),),
         broken=(Unused("a/truncated.mcap", "its footer is missing"),),
         skipped=(Unused("a/slow.mcap", "holds a validation run"),),
         read=1,
@@ -282,13 +282,13 @@ def levels():
 @pytest.fixture(scope="module")
 def tables(tmp_path_factory):
     """Rows of the tables by name."""
-    found = {}
+    rows = {}
     for path in write_tables(tmp_path_factory.mktemp("tables"), result()):
         if path.suffix != ".csv":
             continue
         with path.open(encoding="utf-8", newline="") as file:
-            found[path.stem] = list(csv.DictReader(file))
-    return found
+            rows[path.stem] = list(csv.DictReader(file))
+    return rows
 
 
 class TestTables:
@@ -302,8 +302,8 @@ class TestTables:
             )
         ]
         for row, expected in zip(rows, columns, strict=True):
-            found = (row["level"], row["campaign"], row["parameter"])
-            assert (*found, float(row["value"]), float(row["std"])) == expected
+            key = (row["level"], row["campaign"], row["parameter"])
+            assert (*key, float(row["value"]), float(row["std"])) == expected
         row, undetermined = rows[0], rows[3]
         half = levels()[0].estimate.interval_factor * float(row["std"])
         for end, sign in (("low", -1.0), ("high", 1.0)):
@@ -323,9 +323,9 @@ class TestTables:
         by_name = {row["parameter"]: (row["kind"], row["axis"]) for row in rows}
         assert by_name["f1_3"] == ("friction", "joint_3")
         assert by_name["mc2x"] == ("inertial", "")
-        one = result().campaigns[0]
-        weight, noise = one.estimate.samples.astype(float), one.estimate.noise_std
-        expected = math.sqrt((weight @ noise**2) / (weight @ one.torque_rms**2))
+        estimated = result().campaigns[0]
+        weight, noise = estimated.estimate.samples.astype(float), estimated.estimate.noise_std
+        expected = math.sqrt((weight @ noise**2) / (weight @ estimated.torque_rms**2))
         campaign = next(row for row in rows if row["level"] == "campaign")
         assert datetime.fromisoformat(campaign["when"]) == datetime(2026, 1, 1, 8, tzinfo=UTC)
         assert float(campaign["relative_error"]) == pytest.approx(expected)

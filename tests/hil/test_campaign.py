@@ -321,7 +321,7 @@ def shifted(motion: PiecewiseCubic, joint: int | None, by: float) -> PiecewiseCu
 
 
 @pytest.mark.parametrize(
-    ("change", "line", "words"),
+    ("change", "line", "message"),
     [
         pytest.param(lambda m: shifted(m, None, 0.01), None, "validation 1 .* begins with joint",
                      id="jump"),
@@ -341,11 +341,11 @@ def test_a_plan_that_can_never_run_becomes_no_folder(
     plan: CampaignPlan,
     change: Callable[[Any], PiecewiseCubic],
     line: dict[str, Any] | None,
-    words: str,
+    message: str,
 ) -> None:
     changed = PlannedMotion(change(plan.validation[0].trajectory))
     bad = replace(plan, validation=(changed,)) if line is None else plan
-    with pytest.raises(MotionRefusedError, match=words):
+    with pytest.raises(MotionRefusedError, match=message):
         Campaign.create(tmp_path / "bad", cell if line is None else cell.with_values(line), bad)
     assert not list(tmp_path.iterdir())
 
@@ -366,7 +366,7 @@ def test_only_a_move_from_the_arm_asks_for_jogging(cell: Cell, plan: CampaignPla
     low = cell.home + np.array([0.0, 1.6, -1.5, 0.0, 0.0, 0.0])
     intervals = planned_intervals(cell, plan)
     moves = StraightMoves(cell, MotionChecks.of(cell)).joining(intervals, low)
-    assert [one.from_arm for one in moves if one.kind == "move"] == [True, True]
+    assert [interval.from_arm for interval in moves if interval.kind == "move"] == [True, True]
     buried = MotionChecks.of(written(cell, "floor = 0.0", "floor = 0.3"))
     with pytest.raises(MotionRefusedError, match=r"move 1 .*jog the arm"):
         StraightMoves(cell, buried).joining(intervals, low)
@@ -400,7 +400,7 @@ class TestPlan:
         assert file.plan().trajectory.to_dict() == planned.to_dict()
 
     @pytest.mark.parametrize(
-        ("change", "words"),
+        ("change", "message"),
         [
             ({"format_version": 3}, "format version 3"),
             ({"moves": 7}, "is not a campaign plan"),
@@ -409,11 +409,11 @@ class TestPlan:
         ],
     )
     def test_other_content_is_refused(
-        self, tmp_path: Path, plan: CampaignPlan, change: dict[str, object], words: str
+        self, tmp_path: Path, plan: CampaignPlan, change: dict[str, object], message: str
     ) -> None:
         path = tmp_path / "plan.json"
         path.write_text(json.dumps(json.loads(plan.to_text()) | change))
-        with pytest.raises(InputError, match=words):
+        with pytest.raises(InputError, match=message):
             CampaignPlan.load(path)
 
 

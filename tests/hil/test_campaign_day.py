@@ -88,15 +88,15 @@ def test_every_command_of_the_document_runs(day: dict[str, str]) -> None:
     assert day["run runs/mine --accept-dry-run"].rstrip().splitlines()[-1].startswith("The model")
     assert "all steps are done" in day["status runs/mine"]
     assert day["report runs/mine"].rstrip().endswith("report.html")
-    found = json.loads(day["status runs/mine --json"])
-    assert [(step["name"], step["state"]) for step in found["steps"]] == [
+    printed = json.loads(day["status runs/mine --json"])
+    assert [(step["name"], step["state"]) for step in printed["steps"]] == [
         (name, "done")
         for name in (
             *("design", "rehearse", "dry run", "warm-up"),
             *("repetitions", "validation", "identify", "report"),
         )
     ]
-    assert found["complete"] and found["next_command"] == ""
+    assert printed["complete"] and printed["next_command"] == ""
 
 
 def test_the_python_of_the_document_runs_too(
@@ -162,9 +162,9 @@ def folder(ran: Campaign, tmp_path: Path) -> CampaignFolder:
 
 
 def test_the_conduct_has_what_was_left_out(ran: Campaign) -> None:
-    found = identify_campaign(ran.folder.root, Silent()).results.conduct
-    assert found == conduct_of(ran.folder)
-    steps = {one.step: one for one in found.steps}
+    conduct = identify_campaign(ran.folder.root, Silent()).results.conduct
+    assert conduct == conduct_of(ran.folder)
+    steps = {step.step: step for step in conduct.steps}
     assert not steps["rehearsal"].done and steps["rehearsal"].words.startswith("not rehearsed")
     assert not steps["dry run"].done
     assert (steps["repetitions"].words, steps["repetitions"].details) == ("2 complete", [])
@@ -183,7 +183,7 @@ def test_the_page_has_rehearsal_dry_run_warm_up_and_rejections(folder: CampaignF
     name = "excitation_001_a9.mcap"
     shutil.copy(folder.archives / "excitation_001_a1.mcap", folder.archives / name)
     folder.add(name, "rejected", "it was held")
-    steps = {one.step: one for one in conduct_of(folder).steps}
+    steps = {step.step: step for step in conduct_of(folder).steps}
     assert steps["rehearsal"].done
     assert "accepted by ada at 2026-03-01" in steps["dry run"].words
     assert "shoulder 30 %, elbow 12 %" in steps["dry run"].details[0]
@@ -201,7 +201,7 @@ def test_the_conduct_has_killed_attempts_and_no_wanted_warm_up(
     name = "excitation_001_a9.mcap"
     whole = (folder.archives / "excitation_001_a1.mcap").read_bytes()
     (folder.archives / name).write_bytes(whole[: len(whole) // 2])
-    steps = {one.step: one for one in conduct_of(folder).steps}
+    steps = {step.step: step for step in conduct_of(folder).steps}
     assert steps["repetitions"].words == "2 complete; 1 rejected or ended early"
     assert steps["repetitions"].details[0].startswith(f"{name} killed: ")
     assert steps["validation"].details == []
@@ -216,9 +216,9 @@ def test_steps_of_another_plan_or_unreadable_are_not_done(folder: CampaignFolder
     assert not step.done and "another cell, URDF or plan" in step.words
     for path in (folder.rehearsal, folder.dry_run, folder.warmup):
         path.write_text("{")
-    found = conduct_of(folder).steps[:3]
-    assert all(not one.done for one in found)
-    assert all("cannot be read" in one.words for one in found[:2])
+    steps = conduct_of(folder).steps[:3]
+    assert all(not step.done for step in steps)
+    assert all("cannot be read" in step.words for step in steps[:2])
 
 
 def test_dates_are_those_of_motions_in_real_time() -> None:
@@ -253,13 +253,13 @@ def test_exist_ok_opens_what_fits_and_nothing_else(
     other = replace(ran.plan, validation=ran.plan.validation[:0])
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").touch()
-    for where, which, plan, exist_ok, words in (
+    for where, which, plan, exist_ok, message in (
         (root, fast_cell(tmp_path, repetitions=7), ran.plan, True, "a campaign with another cell"),
         (root, cell, other, True, "a campaign with another excitation"),
         (root, cell, ran.plan, False, "is not empty"),
         (tmp_path / "mine", cell, ran.plan, True, "is not empty"),
     ):
-        with pytest.raises(hil.errors.InputError, match=words):
+        with pytest.raises(hil.errors.InputError, match=message):
             Campaign.create(where, which, plan, exist_ok=exist_ok)
     made = Campaign.create(tmp_path / "new", cell, ran.plan, exist_ok=True)
     assert made.folder.plan.exists()
@@ -278,8 +278,8 @@ def test_one_seed_gives_the_same_bytes_in_any_folder(tmp_path: Path, ran: Campai
     again = Campaign.create(tmp_path / "another name", ran.cell, ran.plan)
     again.run(unrehearsed=True, durable=False)
     first, second = (
-        {path.name: path.read_bytes() for path in one.folder.archives.iterdir()}
-        for one in (ran, again)
+        {path.name: path.read_bytes() for path in run.folder.archives.iterdir()}
+        for run in (ran, again)
     )
     assert len(first) >= 4
     assert first == second

@@ -64,8 +64,8 @@ def test_motions_are_planned_within_a_share_of_the_currents(
     worst = max(_largest_shares(cell, strong))
     limits = [float(limit * worst / 0.9) for limit in cell.drive_train.current_limit]
     weak = cell.with_values({"drive_train.current_limit": limits})
-    found = design(weak, Silent())
-    assert max(_largest_shares(weak, found)) <= PLANNED_CURRENT
+    excitation = design(weak, Silent())
+    assert max(_largest_shares(weak, excitation)) <= PLANNED_CURRENT
     # What was designed elsewhere is judged by the whole limit before it is sent.
     assert MotionChecks.of(weak).refusal(strong.excitation.trajectory) is None
 
@@ -91,8 +91,15 @@ def test_a_plan_states_the_criteria_of_its_motion_alone(quick: Cell, plan: Campa
 
 
 def test_a_design_that_cannot_be_read_is_named_first(tmp_path: Path) -> None:
-    words = ["demo", "--output", str(tmp_path / "demo"), "--excitation", str(CELL_PATH), "--quiet"]
-    result = CliRunner().invoke(app, words)
+    arguments = [
+        "demo",
+        "--output",
+        str(tmp_path / "demo"),
+        "--excitation",
+        str(CELL_PATH),
+        "--quiet",
+    ]
+    result = CliRunner().invoke(app, arguments)
     assert isinstance(result.exception, InputError)
     assert "cell.toml" in str(result.exception)
     assert not (tmp_path / "demo").exists()
@@ -109,9 +116,9 @@ def test_the_demo_runs_a_design_and_identifies_from_its_archives(
     small = {"population": 12, "generations": 2, "polish": 0}
     settings = preset(method).replaced(search=small, **changes)
     run_design(DesignFolder(made), Cell.load(CELL_PATH), settings, Silent())
-    words = ["demo", "--output", str(folder), "--excitation", str(made / "excitation.toml")]
-    words += ["--repetitions", "2", "--validation", "1", "--quiet"]
-    result = CliRunner().invoke(app, words)
+    arguments = ["demo", "--output", str(folder), "--excitation", str(made / "excitation.toml")]
+    arguments += ["--repetitions", "2", "--validation", "1", "--quiet"]
+    result = CliRunner().invoke(app, arguments)
     assert result.exit_code in (0, 5), result.output  # a poor motion may not make a good model
     wanted = load_design(made)
     paths = Campaign.open(folder).folder.completed("excitation")
@@ -120,8 +127,8 @@ def test_the_demo_runs_a_design_and_identifies_from_its_archives(
         stored = json.loads(open_archive(path).attachments["plan.json"])["excitation"]
         assert stored["trajectory"] == wanted.trajectory.to_dict()
         assert stored["method"] == method
-    found = Results.load(folder / "results.json").excitation
-    assert (found.method, found.n_sines, found.n_via) == (
+    excitation = Results.load(folder / "results.json").excitation
+    assert (excitation.method, excitation.n_sines, excitation.n_via) == (
         (method, 3, None) if method == "a" else (method, None, 6)
     )
 
@@ -190,9 +197,9 @@ def test_the_arm_moves_to_the_start_of_the_sines_and_home(finished: Campaign) ->
 
 @pytest.mark.slow
 def test_the_model_of_a_swinging_arm_predicts_unseen_motion(finished: Campaign) -> None:
-    found = identify_campaign(finished.folder.root, Silent())
-    assert found.verdict.good, found.verdict.line
-    coverage = found.results.coverage
+    identification = identify_campaign(finished.folder.root, Silent())
+    assert identification.verdict.good, identification.verdict.line
+    coverage = identification.results.coverage
     assert coverage is not None and coverage.within_3 >= 55
 
 

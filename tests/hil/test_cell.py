@@ -150,9 +150,9 @@ FAULTS = [
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault[2])
 def test_a_bad_field_gets_a_sentence(folder: Path, fault: tuple[str, ...]) -> None:
-    old, new, *words = fault
+    old, new, *phrases = fault
     sentence = error_of(folder, (old, new))
-    for word in words:
+    for word in phrases:
         assert word in sentence
 
 
@@ -255,15 +255,15 @@ def test_a_sliding_joint_in_degrees_is_refused_by_name(folder: Path) -> None:
     sliding = re.sub(r'(name="joint_3"\s+type=)"revolute"', r'\1"prismatic"', text)
     (folder / "ns16.urdf").write_text(sliding, "utf-8")
     sentence = error_of(folder, ("^margin = 0.05", "margin = 0.04"))
-    for words in ("cell.toml: limits: is in degrees", "joint_3 is prismatic", 'type = "fixed"'):
-        assert words in sentence
+    for phrase in ("cell.toml: limits: is in degrees", "joint_3 is prismatic", 'type = "fixed"'):
+        assert phrase in sentence
     (folder / "cell.toml").write_text('[cell]\nname = "x"\nurdf = "ns16.urdf"\n', "utf-8")
     assert Cell.load(folder / "cell.toml").model.n_joints == 6  # recordings of it can be used
 
 
 def test_a_joint_may_have_friction_of_its_own(folder: Path) -> None:
-    own = '[robot.friction.joints.joint_5]\nthird = "none"\nstribeck = 0.1\nzone = "linear"'
-    laws = loaded(folder, ("$", own)).model.friction.laws
+    joint_table = '[robot.friction.joints.joint_5]\nthird = "none"\nstribeck = 0.1\nzone = "linear"'
+    laws = loaded(folder, ("$", joint_table)).model.friction.laws
     assert (laws[4].symbols, laws[4].stribeck) == (("f0", "f1", "fs"), 0.1)
     # Other fields are those of all joints.
     assert laws[4].standstill == laws[0].standstill
@@ -323,8 +323,12 @@ def tables(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, type
     for name, info in model.model_fields.items():
         for part in models_of(info.annotation):
             kind = part.model_fields.get("kind")
-            for one in [""] if kind is None else [f".{one}" for one in get_args(kind.annotation)]:
-                full = f"{prefix}{name}{one}"
+            for suffix in (
+                [""]
+                if kind is None
+                else [f".{kind_name}" for kind_name in get_args(kind.annotation)]
+            ):
+                full = f"{prefix}{name}{suffix}"
                 yield full, part
                 yield from tables(part, f"{full}.")
 
@@ -346,19 +350,19 @@ def default_text(info: FieldInfo) -> str:
 
 def documented() -> dict[str, dict[str, str]]:
     """Of each table in a heading: its fields' defaults as the rows below say."""
-    found: dict[str, dict[str, str]] = {}
+    defaults: dict[str, dict[str, str]] = {}
     here: list[str] = []
     for line in DOCUMENT.read_text("utf-8").splitlines():
         if line.startswith("#"):
             here = re.findall(r"`\[+([a-z_.]+)\]+`", line)
             if kinds := re.findall(r"`kind = \"([a-z_]+)\"`", line):
                 here = [f"{name}.{kind}" for name in here for kind in kinds]
-            found |= {name: {} for name in here}
+            defaults |= {name: {} for name in here}
         row = re.fullmatch(r"\| `(\w+)` \| (.+?) \| (.+) \|", line)
         for name in here if row else ():
-            assert row[1] not in found[name], f"{row[1]} stands twice in {name}"
-            found[name][row[1]] = row[2]
-    return found
+            assert row[1] not in defaults[name], f"{row[1]} stands twice in {name}"
+            defaults[name][row[1]] = row[2]
+    return defaults
 
 
 def test_document_and_schema_have_the_same_fields_and_defaults() -> None:

@@ -17,19 +17,19 @@ class TestWrappedAngles:
     def test_they_are_unwrapped(self, lowest):
         wrapped = np.mod(ANGLES[:, 1] - lowest, 2.0 * np.pi) + lowest
         assert np.abs(np.diff(wrapped)).max() > 6.0
-        found = unwrap(np.column_stack([SWINGING, wrapped]))
-        turns = (found[:, 1] - TURNING) / (2.0 * np.pi)
+        angles = unwrap(np.column_stack([SWINGING, wrapped]))
+        turns = (angles[:, 1] - TURNING) / (2.0 * np.pi)
         np.testing.assert_allclose(turns, np.rint(turns[0]), atol=1e-12)
-        np.testing.assert_array_equal(found[:, 0], SWINGING)
+        np.testing.assert_array_equal(angles[:, 0], SWINGING)
 
     def test_the_joints_are_noted(self):
         wrapped = np.mod(ANGLES + np.pi, 2.0 * np.pi) - np.pi
-        found = unwrapped(Recording(TIME, wrapped, ("swing", "turn")))
-        assert found.provenance[UNWRAPPED] == "turn"
+        recording = unwrapped(Recording(TIME, wrapped, ("swing", "turn")))
+        assert recording.provenance[UNWRAPPED] == "turn"
 
     def test_others_keep_every_bit(self):
-        one = Recording(TIME, ANGLES, ("swing", "turn"))
-        assert unwrapped(one) is one
+        recording = Recording(TIME, ANGLES, ("swing", "turn"))
+        assert unwrapped(recording) is recording
 
     @pytest.mark.parametrize("size", [-3.4, 4.5, 0.2])
     def test_a_jump_of_another_size_stays(self, size):

@@ -78,29 +78,34 @@ class TestRecorded:
     @pytest.mark.parametrize("order", [("march", "june/results.json"), ("june", "march")])
     def test_changed_friction_is_found_on_its_axis_only(self, folders, order):
         """The first campaign given is the reference."""
-        found = compared(*(folders["march"].parent / name for name in order))
-        assert found.names == tuple(name.split("/")[0] for name in order)
+        comparison = compared(*(folders["march"].parent / name for name in order))
+        assert comparison.names == tuple(name.split("/")[0] for name in order)
         factor = MORE if order[0] == "march" else 1.0 / MORE
-        assert {(one.kind, one.axis) for one in found.changed} == {("friction", "shoulder")}
-        (one,) = found.changed
-        assert abs(one.change) - one.half < abs((factor - 1.0) * one.before)
-        assert one.after / one.before == pytest.approx(factor, abs=0.02)
-        assert found.verdict == "Changed: friction of shoulder"
+        assert {(entry.kind, entry.axis) for entry in comparison.changed} == {
+            ("friction", "shoulder")
+        }
+        (change,) = comparison.changed
+        assert abs(change.change) - change.half < abs((factor - 1.0) * change.before)
+        assert change.after / change.before == pytest.approx(factor, abs=0.02)
+        assert comparison.verdict == "Changed: friction of shoulder"
 
     def test_json_has_numbers_and_an_exit_status(self, folders, tmp_path):
         pair = [str(folders["march"]), str(folders["june"])]
         page = tmp_path / "pages" / "compare.html"
         done = CliRunner().invoke(app, ["compare", *pair, "--json", "-o", str(page)])
         assert done.exit_code == 0
-        found = json.loads(done.stdout, parse_constant=pytest.fail)
-        assert found["simulated"] and found["changed"]
-        assert [o["axis"] for o in found["parameters"] if o["changed"]] == ["shoulder"]
-        assert [Path(one["folder"]).name for one in found["campaigns"]] == ["march", "june"]
+        printed = json.loads(done.stdout, parse_constant=pytest.fail)
+        assert printed["simulated"] and printed["changed"]
+        assert [o["axis"] for o in printed["parameters"] if o["changed"]] == ["shoulder"]
+        assert [Path(campaign["folder"]).name for campaign in printed["campaigns"]] == [
+            "march",
+            "june",
+        ]
         text = Page(page.read_text("utf-8")).text
         assert text.index("friction of shoulder") < text.index("SIMULATED")
         done = CliRunner().invoke(app, ["compare", *pair, "--quiet", "--fail-on-change"])
         assert done.exit_code == 5
-        assert done.stdout == f"{found['verdict']}.\n"
+        assert done.stdout == f"{printed['verdict']}.\n"
 
     @pytest.mark.parametrize(
         ("other", "why"),
@@ -155,61 +160,63 @@ class TestInMemory:
     """Campaigns made in memory."""
 
     def test_a_payload_changes_the_inertia_of_its_link(self):
-        found = in_memory(load=3.0)
-        assert {one.kind for one in found.changed} == {"inertia"}
-        assert "joint_6" in {one.axis for one in found.changed}
+        comparison = in_memory(load=3.0)
+        assert {change.kind for change in comparison.changed} == {"inertia"}
+        assert "joint_6" in {change.axis for change in comparison.changed}
         assert not in_memory().changed
 
     def test_quantities_are_inertial_parameters_and_friction_of_axes(self):
         """Friction is the mean of both directions."""
         arm, (level,) = arm_histories.model(), levels_of(Condition())
-        found = quantities(arm, level)
-        axes = {one.name: one.axis for one in found if one.kind == "inertia"}
-        assert len(found) == arm.base.rank + 6
+        compared = quantities(arm, level)
+        axes = {quantity.name: quantity.axis for quantity in compared if quantity.kind == "inertia"}
+        assert len(compared) == arm.base.rank + 6
         assert all(name.startswith("I") for name, axis in axes.items() if not axis)
         assert [axes[name] for name in ("mc2x", "I5xz")] == ["joint_2", "joint_5"]
         values = np.random.default_rng(1).uniform(0.1, 2.0, arm.n_parameters)
         values[: arm.base.rank] = 0.0
         still = np.zeros((1, 6))
-        for j, one in enumerate(q for q in found if q.kind == "friction"):
+        for j, quantity in enumerate(q for q in compared if q.kind == "friction"):
             speed = still.copy()
-            speed[0, j] = float(one.name.split()[-2])
+            speed[0, j] = float(quantity.name.split()[-2])
             both = [arm.torque(values, still, sign * speed, still)[0, j] for sign in (1.0, -1.0)]
-            assert one.weights @ values == pytest.approx(0.5 * (both[0] - both[1]), rel=0.05)
+            assert quantity.weights @ values == pytest.approx(0.5 * (both[0] - both[1]), rel=0.05)
 
     def test_scatter_of_repetitions_hides_a_change(self):
         certain, uncertain = in_memory(1.5), in_memory(1.5, repetitions=scattered)
-        assert {one.axis for one in certain.changed} == {f"joint_{j}" for j in range(1, 7)}
+        assert {change.axis for change in certain.changed} == {f"joint_{j}" for j in range(1, 7)}
         assert not uncertain.changed
 
     def test_a_change_too_small_to_matter_is_none(self):
-        found = in_memory(1.035)
-        slight = [one for one in found.changes if one.p_value < 0.01]
-        assert slight and not found.changed
-        assert all(abs(one.change) < 0.05 * abs(one.before) for one in slight)
+        comparison = in_memory(1.035)
+        slight = [change for change in comparison.changes if change.p_value < 0.01]
+        assert slight and not comparison.changed
+        assert all(abs(change.change) < 0.05 * abs(change.before) for change in slight)
 
     def test_names_have_folders_and_stated_payloads(self):
-        one, other = levels_of(Condition(), Condition())
-        folders = [replace(one, campaign="/runs/cold/b"), replace(other, campaign="/runs/warm/b")]
+        first, other = levels_of(Condition(), Condition())
+        folders = [replace(first, campaign="/runs/cold/b"), replace(other, campaign="/runs/warm/b")]
         assert [name[:6] for name in judged(folders).names] == ["cold/b", "warm/b"]
-        laden = replace(other, setup="carries 3 kg", campaign=one.campaign)
-        found = judged([one, laden])
-        assert "carries 3 kg" in found.names[1] and "carries 3 kg" in found.warnings[0]
+        laden = replace(other, setup="carries 3 kg", campaign=first.campaign)
+        comparison = judged([first, laden])
+        assert "carries 3 kg" in comparison.names[1] and "carries 3 kg" in comparison.warnings[0]
 
     def test_a_page_of_hostile_names_is_inert(self):
-        found = in_memory(1.3)
+        comparison = in_memory(1.3)
         spoilt = replace(
-            found,
-            arm=found.arm + HOSTILE,
-            campaigns=tuple(replace(o, campaign=HOSTILE, setup=HOSTILE) for o in found.campaigns),
+            comparison,
+            arm=comparison.arm + HOSTILE,
+            campaigns=tuple(
+                replace(o, campaign=HOSTILE, setup=HOSTILE) for o in comparison.campaigns
+            ),
             names=(HOSTILE, HOSTILE),
             changes=tuple(
-                replace(one, parameter=HOSTILE, axis=HOSTILE, campaign=HOSTILE)
-                for one in found.changes
+                replace(change, parameter=HOSTILE, axis=HOSTILE, campaign=HOSTILE)
+                for change in comparison.changes
             ),
             warnings=(HOSTILE,),
         )
-        assert_stands_alone(comparison_page(found).decode())
+        assert_stands_alone(comparison_page(comparison).decode())
         assert_inert(Page(comparison_page(spoilt).decode()), charts=False)
 
     def test_undetermined_values_are_not_judged(self):
@@ -245,21 +252,22 @@ class TestStatistics:
         random = np.random.default_rng(count)
 
         def one():
-            found = [random.standard_normal()]
+            estimates = [random.standard_normal()]
             for shock in random.standard_normal(count - 1):
-                found.append(memory * found[-1] + np.sqrt(1.0 - memory**2) * shock)
-            return np.array(found)
+                estimates.append(memory * estimates[-1] + np.sqrt(1.0 - memory**2) * shock)
+            return np.array(estimates)
 
         pairs = [
-            [[figure(own.mean(), 0.0, 30.0, own)] for own in (one(), one())] for _ in range(2000)
+            [[figure(estimates.mean(), 0.0, 30.0, estimates)] for estimates in (one(), one())]
+            for _ in range(2000)
         ]
         p_values = [against_first(np.array(pair))[2][1, 0] for pair in pairs]
         assert np.mean(np.array(p_values) < 0.05) < 0.09
 
     @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12))
     def test_holm_never_lowers_a_p_value(self, values):
-        found = holm(np.array([[np.nan, 0.01], [0.04, 0.03]]))
-        np.testing.assert_allclose(found, [[np.nan, 0.03], [0.06, 0.06]])
+        corrected = holm(np.array([[np.nan, 0.01], [0.04, 0.03]]))
+        np.testing.assert_allclose(corrected, [[np.nan, 0.03], [0.06, 0.06]])
         adjusted = holm(np.array(values))
         assert np.all(adjusted >= values) and adjusted.max() <= 1.0
         assert np.all(np.diff(adjusted[np.argsort(values, kind="stable")]) >= 0.0)

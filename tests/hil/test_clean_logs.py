@@ -50,10 +50,12 @@ def arm(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 
 def test_nothing_is_wrong(arm: IdentifiedArm) -> None:
     """Positions are not coarse, an error of 0.0 % has no outliers and has not grown."""
-    findings = [one for one in arm.verdict.findings if one.level != "good"]
-    assert arm.verdict.good and not [one for one in findings if one.level == "wrong"]
-    assert not COMPLAINTS & {one.check for one in findings}
-    assert not [one for one in findings if "order" in one.words or "coarse" in one.words]
+    findings = [finding for finding in arm.verdict.findings if finding.level != "good"]
+    assert arm.verdict.good and not [finding for finding in findings if finding.level == "wrong"]
+    assert not COMPLAINTS & {finding.check for finding in findings}
+    assert not [
+        finding for finding in findings if "order" in finding.words or "coarse" in finding.words
+    ]
 
 
 def test_it_is_exported(arm: IdentifiedArm, tmp_path: Path) -> None:

@@ -52,7 +52,11 @@ def test_help_lists_every_command() -> None:
 def leaves(command: Any) -> Iterator[Any]:
     """Commands without commands below them."""
     below = getattr(command, "commands", None)
-    yield from [leaf for one in below.values() for leaf in leaves(one)] if below else [command]
+    yield from (
+        [leaf for subcommand in below.values() for leaf in leaves(subcommand)]
+        if below
+        else [command]
+    )
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -60,7 +64,11 @@ def test_each_option_is_explained(command: str) -> None:
     """By its help text or in the docstring of the command."""
     for leaf in leaves(COMMANDS[command]):
         assert all(option.help for option in leaf.params), leaf.name
-        assert not [one for one in leaf.params if getattr(one, "is_flag", False) and one.metavar]
+        assert not [
+            parameter
+            for parameter in leaf.params
+            if getattr(parameter, "is_flag", False) and parameter.metavar
+        ]
         assert "Options:" not in leaf.help
         entries = re.findall(r"^        (\w+): ", leaf.callback.__doc__, re.MULTILINE)
         assert {*entries} <= {option.name for option in leaf.params}
@@ -187,8 +195,8 @@ def test_a_stopped_demo_is_resumed(campaign: Campaign, tmp_path: Path) -> None:
 def test_a_resumed_demo_ignores_no_option(campaign: Campaign, tmp_path: Path, option: str) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(campaign.folder.root, folder)
-    words = ["demo", "--output", str(folder), "--resume", option, "77"]
-    refused = CliRunner().invoke(app, words)
+    arguments = ["demo", "--output", str(folder), "--resume", option, "77"]
+    refused = CliRunner().invoke(app, arguments)
     assert f"was begun with {option} " in str(refused.exception)
     assert f"omit {option} with --resume" in str(refused.exception)
 
@@ -198,10 +206,10 @@ def test_force_removes_only_a_campaign(campaign: Campaign, tmp_path: Path) -> No
     shutil.copytree(campaign.folder.root, folder)
     (folder / "my_notes.txt").write_text("mine")
     link.symlink_to(folder)
-    for place, words in ((folder, "my_notes.txt"), (link, "is not a folder")):
+    for place, message in ((folder, "my_notes.txt"), (link, "is not a folder")):
         refused = CliRunner().invoke(app, ["demo", "--output", str(place), "--force"])
         assert isinstance(refused.exception, InputError)
-        assert words in str(refused.exception)
+        assert message in str(refused.exception)
     assert (folder / "my_notes.txt").exists()
 
 

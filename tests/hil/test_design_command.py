@@ -44,10 +44,12 @@ DRAW = design_picture.draw_design
 @pytest.fixture(scope="module")
 def invoke():
     def invoke(*arguments: object, draw=lambda *_: Figure()):
-        words = [*arguments, *([] if "--workers" in arguments else ["--workers", 1])]
+        with_workers = [*arguments, *([] if "--workers" in arguments else ["--workers", 1])]
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(design_picture, "draw_design", draw)
-            return CliRunner().invoke(app, ["design", *map(str, words)], catch_exceptions=False)
+            return CliRunner().invoke(
+                app, ["design", *map(str, with_workers)], catch_exceptions=False
+            )
 
     return invoke
 
@@ -125,8 +127,10 @@ def test_the_motion_satisfies_the_constraints_and_is_closed(made):
 def test_the_result_does_not_depend_on_the_number_of_processes(invoke, made, settings, tmp_path):
     arguments = ("--settings", settings, "--seed", 3, "-o", tmp_path / "out", "--workers", 3)
     assert invoke(CELL_PATH, *arguments).exit_code == 0
-    one, three = (folder / "excitation.toml" for folder in (made[0], tmp_path / "out"))
-    assert one.read_bytes() == three.read_bytes()
+    by_one_process, by_three_processes = (
+        folder / "excitation.toml" for folder in (made[0], tmp_path / "out")
+    )
+    assert by_one_process.read_bytes() == by_three_processes.read_bytes()
 
 
 def test_an_earlier_design_is_only_overwritten_with_force(invoke, settings, copied):
@@ -180,8 +184,8 @@ def test_a_result_that_cannot_be_written_names_file_and_remedy(invoke, copied, m
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
     monkeypatch.setattr("hil.design.result.write_atomically", full)
-    words = r"excitation\.toml: cannot be written \(No space.*--resume"
-    with pytest.raises(InputError, match=words):
+    message = r"excitation\.toml: cannot be written \(No space.*--resume"
+    with pytest.raises(InputError, match=message):
         invoke(CELL_PATH, "--resume", "-o", copied)
 
 
@@ -198,12 +202,12 @@ def test_a_picture_that_cannot_be_written_is_a_warning(invoke, copied):
 
 
 def test_json_agrees_with_the_file(bare):
-    printed, found = json.loads(bare[1]), DesignResult.load(bare[0])
+    printed, result = json.loads(bare[1]), DesignResult.load(bare[0])
     for name in ("log10_det", "coupling_index", "condition"):
-        assert printed[name] == getattr(found.excitation.criteria, name)
+        assert printed[name] == getattr(result.excitation.criteria, name)
     assert printed["complete"] is True
     assert Path(printed["file"]) == bare[0] / "excitation.toml"
-    given = found.settings.constraints
+    given = result.settings.constraints
     assert not (given.closed or given.collision or given.current)
 
 
@@ -220,8 +224,8 @@ def test_what_was_not_checked_is_reported(invoke, bare, copied, tmp_path):
 
 def test_no_feasible_motion_names_constraints_and_remedies(invoke, settings, tmp_path):
     settings.write_text(SETTINGS + "[constraints]\nmax_duration = 0.5\n")
-    words = r"duration excludes 16.* 0\.5 s.*\[constraints\] max_duration"
-    with pytest.raises(NoExcitationError, match=words) as caught:
+    message = r"duration excludes 16.* 0\.5 s.*\[constraints\] max_duration"
+    with pytest.raises(NoExcitationError, match=message) as caught:
         invoke(CELL_PATH, "--settings", settings, "--limits-only", "-o", tmp_path / "out")
     assert caught.value.exit_code == 3
     assert not (tmp_path / "out" / "excitation.toml").exists()
@@ -230,14 +234,14 @@ def test_no_feasible_motion_names_constraints_and_remedies(invoke, settings, tmp
 def test_a_contact_at_home_is_reported_before_the_search(invoke, settings, tmp_path):
     wall = "walls = [{lower = [0.3, -2.0, 0.8], upper = [0.4, 2.0, 2.5]}]"
     path = edited(tmp_path, "walls = []", wall)
-    words = r"begin at home: collision of link_\d and box 0: -0\.\d+ m.*home_deg.*cell\.toml"
-    with pytest.raises(NoExcitationError, match=words):
+    message = r"begin at home: collision of link_\d and box 0: -0\.\d+ m.*home_deg.*cell\.toml"
+    with pytest.raises(NoExcitationError, match=message):
         invoke(path, "--settings", settings, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "message"),
     [
         ([], "no cell file"),
         (
@@ -251,12 +255,12 @@ def test_a_contact_at_home_is_reported_before_the_search(invoke, settings, tmp_p
         ([CELL_PATH, "-o", "SETTINGS"], "cannot be created"),
     ],
 )
-def test_invalid_arguments_are_refused(invoke, settings, tmp_path, arguments, words):
+def test_invalid_arguments_are_refused(invoke, settings, tmp_path, arguments, message):
     names = {"SETTINGS": settings, "NOWHERE": tmp_path / "nowhere"}
     given = [names.get(argument, argument) for argument in arguments]
     if "-o" not in given:
         given += ["-o", tmp_path / "out"]
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=message):
         invoke(*given)
     assert not (tmp_path / "out").exists()
 
@@ -290,8 +294,8 @@ def test_settings_are_read_from_a_result_file(invoke, bare, tmp_path):
     out = tmp_path / "out"
     given = ("--settings", bare[0] / "excitation.toml", "-o", out)
     assert invoke(CELL_PATH, *given).exit_code == 0
-    one, two = (folder / "excitation.toml" for folder in (bare[0], out))
-    assert one.read_bytes() == two.read_bytes()
+    first, second = (folder / "excitation.toml" for folder in (bare[0], out))
+    assert first.read_bytes() == second.read_bytes()
 
 
 def interrupted(command: list[str], journal: Path) -> tuple[int, str]:

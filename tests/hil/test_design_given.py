@@ -73,9 +73,9 @@ def test_a_design_counts_all_recordings_together(campaign, given, tmp_path):
     """And the settings of its file name them, so that a design from it counts them again."""
     (tmp_path / "my.toml").write_text(SETTINGS)
     out = tmp_path / "out"
-    words = ["design", str(CELL_PATH), "--settings", str(tmp_path / "my.toml"), "--limits-only"]
-    words += ["--given", str(campaign.folder.root), "-o", str(out), "--workers", "1"]
-    result = CliRunner().invoke(app, words, catch_exceptions=False)
+    arguments = ["design", str(CELL_PATH), "--settings", str(tmp_path / "my.toml"), "--limits-only"]
+    arguments += ["--given", str(campaign.folder.root), "-o", str(out), "--workers", "1"]
+    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert f"{given.duration:.3g} s of motion in the given recordings" in result.output
     excitation = load_design(out)
@@ -94,7 +94,14 @@ def test_settings_that_name_recordings_need_their_information():
 @pytest.mark.parametrize("name", ["nothing.mcap", "text.mcap"])
 def test_no_archive_is_refused_before_the_search(name, tmp_path):
     (tmp_path / "text.mcap").write_text("no archive")
-    words = ["design", str(CELL_PATH), "--given", str(tmp_path / name), "-o", str(tmp_path / "o")]
+    arguments = [
+        "design",
+        str(CELL_PATH),
+        "--given",
+        str(tmp_path / name),
+        "-o",
+        str(tmp_path / "o"),
+    ]
     with pytest.raises(ArchiveError, match=name):
-        CliRunner().invoke(app, words, catch_exceptions=False)
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert not (tmp_path / "o").exists()

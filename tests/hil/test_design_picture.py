@@ -58,15 +58,15 @@ OTHER = Criterion(lambda *_: 1.0, "κ", -1.0, "Spread of Φ", "of all", 3, relat
 def design_of(cell: Cell, trajectory: Trajectory, chosen: int | None = 1) -> Design:
     """A design with three motions on its front, of which the second is chosen or polished."""
     criteria = Objective(cell.model).criteria(trajectory, 0.008)
-    found = Excitation(trajectory, criteria, "front", seed=1, tried=1, rejected={})
+    excitation = Excitation(trajectory, criteria, "front", seed=1, tried=1, rejected={})
     measures = np.array([[100.0, 70.0], [105.7, 80.0], [108.0, 110.0]])
     return Design(
         genes=np.zeros(1),
-        excitation=found,
+        excitation=excitation,
         front=Front(np.zeros((3, 1)), measures, np.zeros(3), np.ones(3)),
         chosen=chosen,
         origin=1,
-        origin_criteria=found.criteria,
+        origin_criteria=excitation.criteria,
         generations=1,
         complete=True,
         exhausted=False,
@@ -117,9 +117,9 @@ class TestPage:
         measures = np.column_stack((design.front.measures, [9.0, 8.0, 7.0]))
         names = ("condition", "coupling_index")
         front = Front(np.zeros((3, 1)), measures, np.zeros(3), np.ones(3), names)
-        words = texts(draw_design(replace(design, front=front), two_link))
-        assert {"Spread of Φ (lower is better)", "chosen (8.000, 80.0)"} <= set(words)
-        assert any(f", κ {design.excitation.criteria.condition:.3f}" in text for text in words)
+        page_texts = texts(draw_design(replace(design, front=front), two_link))
+        assert {"Spread of Φ (lower is better)", "chosen (8.000, 80.0)"} <= set(page_texts)
+        assert any(f", κ {design.excitation.criteria.condition:.3f}" in text for text in page_texts)
 
     def test_warnings_are_red(self, two_link):
         design = replace(design_of(two_link, wandering(two_link)), complete=False)
@@ -150,7 +150,9 @@ class TestPage:
         assert {"front, 1 motion", "shoulder_\npan_joint"} <= set(texts(figure))
         figure.draw_without_rendering()
         page = figure.bbox
-        for text in figure.findobj(lambda one: isinstance(one, Text) and len(one.get_text()) > 9):
+        for text in figure.findobj(
+            lambda artist: isinstance(artist, Text) and len(artist.get_text()) > 9
+        ):
             box = text.get_window_extent()
             assert page.x0 <= box.x0 and box.x1 <= page.x1, text.get_text()
             assert page.y0 <= box.y0 and box.y1 <= page.y1, text.get_text()

@@ -72,7 +72,7 @@ def test_a_motion_that_was_changed_is_refused(made, text, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "message"),
     [
         ('format = "designed excitation"', 'format = "joint motion plan"', "format is"),
         ("version = 1", "version = 2", "version is 2, this reads 1"),
@@ -85,18 +85,18 @@ def test_a_motion_that_was_changed_is_refused(made, text, tmp_path):
         (r"(?m)^complete = .*$", "complete = 1", "not a designed excitation"),
     ],
 )
-def test_another_file_is_refused(text, tmp_path, old, new, words):
+def test_another_file_is_refused(text, tmp_path, old, new, message):
     changed, count = re.subn(old, new, text, count=1)
     assert count == 1
     if old.startswith("(?m)"):
         changed = re.sub(r'(?m)^sha256 = "\w+"', f'sha256 = "{_seal(changed)}"', changed)
-    with pytest.raises(InputError, match=words) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         load_design(written(tmp_path, changed))
     assert "excitation.toml: " in str(caught.value) and "design it again" in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "message"),
     [
         (r"(positions_deg = \[\[)[^,]+", r"\g<1>45.0", "do not plan to the motion"),
         (r"(?s)positions_deg = \[\[.*\]\]", 'positions = "x"', "is not a designed excitation"),
@@ -104,10 +104,10 @@ def test_another_file_is_refused(text, tmp_path, old, new, words):
          "is not a designed excitation"),
     ],
 )  # fmt: skip
-def test_the_planned_motion_is_compared_with_the_designed_one(text, tmp_path, old, new, words):
+def test_the_planned_motion_is_compared_with_the_designed_one(text, tmp_path, old, new, message):
     changed, count = re.subn(old, new, text)
     assert count == 1
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=message):
         load_design(written(tmp_path, changed))
 
 

@@ -66,7 +66,7 @@ def test_missing_settings_are_those_of_the_preset():
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "named"),
     [
         ('method = "gradient"\n[sines]', ["gradient = 180", "not [sines]", "make it 0"]),
         ('metod = "b"', ["metod", "is not a field", "valid fields", "method"]),
@@ -93,13 +93,13 @@ def test_missing_settings_are_those_of_the_preset():
         ("[search\n", ["is not TOML", "--show-settings"]),
     ],
 )
-def test_invalid_settings_name_file_field_value_and_remedy(text, words, tmp_path):
+def test_invalid_settings_name_file_field_value_and_remedy(text, named, tmp_path):
     path = tmp_path / "my.toml"
     path.write_text(text)
     with pytest.raises(SettingsError) as caught:
         load_settings(path)
     text = str(caught.value)
-    for word in ["my.toml", *words]:
+    for word in ["my.toml", *named]:
         assert word in text
     for word in ("Value error", "value error", "dictionary", "instance of"):
         assert word not in text
@@ -139,7 +139,7 @@ def test_named_parameters_are_in_the_criteria(cell):
 
 
 @pytest.mark.parametrize(
-    ("method", "changes", "words"),
+    ("method", "changes", "message"),
     [
         ("a", {"sines": {"fastest": [1.0, 2.0]}}, r"sines\.fastest.*2 entries.*6 joints.*joint_6"),
         # as it was written, in the angles of the teach pendant
@@ -150,8 +150,8 @@ def test_named_parameters_are_in_the_criteria(cell):
         ("b", {"objective": {"parameters": ["I1yy"] * 2}}, "named twice"),
     ],
 )  # fmt: skip
-def test_settings_that_do_not_fit_the_cell_are_refused(cell, method, changes, words):
-    with pytest.raises(SettingsError, match=words):
+def test_settings_that_do_not_fit_the_cell_are_refused(cell, method, changes, message):
+    with pytest.raises(SettingsError, match=message):
         problem_of(cell, preset(method).kinematic().replaced(**changes))
 
 
@@ -168,7 +168,7 @@ VIA, SINES = preset("b"), preset("a")
 
 
 @pytest.mark.parametrize(
-    ("settings", "rejected", "words"),
+    ("settings", "rejected", "remedies"),
     [
         # kinds that exclude more than half, else the most frequent one
         (VIA, {"collision": 900, "current": 501}, {"range_share", "current limits"}),
@@ -179,22 +179,22 @@ VIA, SINES = preset("b"), preset("a")
         (SINES, {}, {"more harmonics"}),
     ],
 )
-def test_frequent_violations_have_remedies(cell, settings, rejected, words):
+def test_frequent_violations_have_remedies(cell, settings, rejected, remedies):
     nearest = {kind: Violation(kind, "it", 0.01, 0.05, 1.0, (0.0,) * 6) for kind in rejected}
     unexciting = 1000 * (not rejected)
     error = NoFeasibleMotionError(rejected, nearest, tried=1000, unexciting=unexciting)
     text = str(no_excitation(error, AngleFrame.of(cell), None, settings))
     advice = text.partition("Possible changes: ")[2]
-    known = {"range_share", "current limits", "max_duration"} | words
-    assert {word for word in known if word in advice} == words
+    possible_remedies = {"range_share", "current limits", "max_duration"} | remedies
+    assert {word for word in possible_remedies if word in advice} == remedies
 
 
 def test_too_large_currents_at_home_are_reported(cell):
     limits = cell.drive_train.current_limit.tolist()
     limits[1] = 0.1
     weak = cell.with_values({"drive_train.current_limit": limits})
-    words = r"at home: at rest there, .* of motor of joint_2: [\d.]+ A, must be at most 0\.08 A"
-    with pytest.raises(NoExcitationError, match=words) as caught:
+    message = r"at home: at rest there, .* of motor of joint_2: [\d.]+ A, must be at most 0\.08 A"
+    with pytest.raises(NoExcitationError, match=message) as caught:
         problem_of(weak, VIA)
     assert re.search(r"correct \[drive_train\].*home_deg in \[campaign\]", str(caught.value))
     with pytest.raises(NoExcitationError, match=r"mean posture of the sines.*\[sines\] offset"):

@@ -100,30 +100,34 @@ PORT = DoctorCheck("UDP port 1000", Status.BAD, "in use [by] a", ("sudo ss -lunp
 def diagnosis(
     *checks: DoctorCheck, fit: bool = True, fit_at_2: bool = True, seconds: float = 60.0
 ) -> Diagnosis:
-    one, two = (
+    one_ms, two_ms = (
         Fitness(cycle, is_fit, 0, 0.1, 0.0, "for a reason")
         for cycle, is_fit in ((1, fit), (2, fit_at_2))
     )
     measured = (latency(50e-6, 3e-3, length=seconds),)
-    return Diagnosis(checks, measured, (one, two), 1, seconds)
+    return Diagnosis(checks, measured, (one_ms, two_ms), 1, seconds)
 
 
-def page(found: Diagnosis) -> str:
+def page(diagnosed: Diagnosis) -> str:
     console = Console(record=True, width=100, file=io.StringIO())
-    show(found, console)
+    show(diagnosed, console)
     return console.export_text()
 
 
-@pytest.mark.parametrize(("one", "two"), [(True, True), (False, True), (False, False)])
-def test_a_cycle_of_2_ms_is_advised_only_where_it_is_fit(one: bool, two: bool) -> None:
-    assert ("use 2 ms" in page(diagnosis(fit=one, fit_at_2=two))) is (two and not one)
+@pytest.mark.parametrize(("fit_at_1", "fit_at_2"), [(True, True), (False, True), (False, False)])
+def test_a_cycle_of_2_ms_is_advised_only_where_it_is_fit(fit_at_1: bool, fit_at_2: bool) -> None:
+    assert ("use 2 ms" in page(diagnosis(fit=fit_at_1, fit_at_2=fit_at_2))) is (
+        fit_at_2 and not fit_at_1
+    )
 
 
 def test_a_bad_check_makes_a_fast_pc_unfit_and_is_named() -> None:
-    assert diagnosis(*(DoctorCheck("x", one, "y") for one in Status if one is not Status.BAD)).fit
-    found = diagnosis(PORT)
-    assert not found.fit
-    assert "UDP port 1000" in found.line
+    assert diagnosis(
+        *(DoctorCheck("x", status, "y") for status in Status if status is not Status.BAD)
+    ).fit
+    unfit = diagnosis(PORT)
+    assert not unfit.fit
+    assert "UDP port 1000" in unfit.line
 
 
 @pytest.mark.parametrize(("fit", "seconds", "status"), [
@@ -136,21 +140,21 @@ def test_the_exit_status_is_0_only_for_a_reliable_fit(
     monkeypatch.setattr("hil.cli.doctor.examine", lambda *_, **__: made_up)
     ran = CliRunner().invoke(app, ["doctor", "--json"])
     assert ran.exit_code == status
-    found = json.loads(ran.stdout)
-    assert found["provisional"] is ("Provisional" in found["verdict"]) is (seconds < 60)
+    printed = json.loads(ran.stdout)
+    assert printed["provisional"] is ("Provisional" in printed["verdict"]) is (seconds < 60)
 
 
 def test_page_and_json_agree_and_remedies_come_worst_first() -> None:
     slow = DoctorCheck("slow", Status.WARN, "", ("make it fast",))
     made = diagnosis(slow, PORT, PORT)
-    text, found = page(made), json.loads(json.dumps(as_json(made)))
+    text, document = page(made), json.loads(json.dumps(as_json(made)))
     assert "in use [by] a" in text
     assert "p50 50" in text and "max 3000" in text
     commands = [line.strip() for line in text.splitlines() if line.startswith("    ")]
     assert commands == ["sudo ss -lunp", "make it fast"]  # each once
-    assert found["fit"] is False
-    assert found["checks"][1]["remedy"] == ["sudo ss -lunp"]
-    assert found["latency"]["turnaround"]["late_cycles_1ms"] == 3
+    assert document["fit"] is False
+    assert document["checks"][1]["remedy"] == ["sudo ss -lunp"]
+    assert document["latency"]["turnaround"]["late_cycles_1ms"] == 3
     nothing = judge([], 1)
     assert (nothing.fit, nothing.late_per_hour_upper_95) == (False, None)
 
@@ -232,19 +236,19 @@ def test_the_command_sends_the_controller_nothing(tmp_path: Path) -> None:
         controller.settimeout(0.0)
         with pytest.raises(BlockingIOError):
             controller.recv(1500)
-    found = json.loads(ran.stdout)
+    printed = json.loads(ran.stdout)
     assert ran.exit_code == 5
-    assert found["fit"] is False
-    by_name = {check["name"]: check for check in found["checks"]}
+    assert printed["fit"] is False
+    by_name = {check["name"]: check for check in printed["checks"]}
     assert by_name[f"UDP port {port}"]["status"] == "bad"
     assert by_name["route to the controller"]["status"] == "ok"
-    assert found["latency"]["turnaround"]["samples"] > 100
+    assert printed["latency"]["turnaround"]["samples"] > 100
     assert os.sched_getscheduler(0) == scheduling
 
 
 def test_every_remedy_is_valid_shell(tmp_path: Path) -> None:
-    found = examine(UdpSpec("10.99.99.99", 999), 1, 0.1, tmp_path, Silent())
-    for check in found.checks:
+    examined = examine(UdpSpec("10.99.99.99", 999), 1, 0.1, tmp_path, Silent())
+    for check in examined.checks:
         for command in check.remedy:
             checked = subprocess.run(["bash", "-n", "-c", command], capture_output=True, text=True)
             assert checked.returncode == 0, (command, checked.stderr)
@@ -300,7 +304,7 @@ OK, WARN, BAD, UNKNOWN = Status
 
 def of(judge: Judge, *cases: tuple[Any, ...]) -> list[Case]:
     """Cases of one judgement: files, outcome, a word of it or of its remedy, and commands."""
-    return [(judge, one[0], one[3] if len(one) > 3 else {}, one[1], one[2]) for one in cases]
+    return [(judge, case[0], case[3] if len(case) > 3 else {}, case[1], case[2]) for case in cases]
 
 
 def port(error: int) -> Judge:
@@ -373,9 +377,9 @@ def test_what_is_found_is_judged(
     status: Status,
     word: str,
 ) -> None:
-    found = judge(MadeUp(tmp_path, files, commands))
-    assert found.status is status
-    assert word in "\n".join([found.found, *found.remedy])
+    check = judge(MadeUp(tmp_path, files, commands))
+    assert check.status is status
+    assert word in "\n".join([check.found, *check.remedy])
 
 
 @pytest.mark.parametrize(
@@ -396,10 +400,10 @@ def test_room_and_write_time_are_judged_apart(
 
 def test_missing_and_hanging_commands_give_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(system_checks, "COMMAND_TIMEOUT", 0.05)
-    found = [System().run(*command.split()) for command in ("no-such-command", "sleep 5", "true")]
-    assert found == [None, None, ""]
+    outputs = [System().run(*command.split()) for command in ("no-such-command", "sleep 5", "true")]
+    assert outputs == [None, None, ""]
 
 
 def test_ports_are_tried() -> None:
-    found = [try_port(FreePort(host, 0, "UDP")) for host in ("127.0.0.1", "192.0.2.77")]
-    assert found == [0, errno.EADDRNOTAVAIL]
+    errors = [try_port(FreePort(host, 0, "UDP")) for host in ("127.0.0.1", "192.0.2.77")]
+    assert errors == [0, errno.EADDRNOTAVAIL]

@@ -70,18 +70,18 @@ def parameters_of(arm: IdentifiedArm, folder: Path) -> dict[str, Any]:
     return json.loads((folder / "parameters.json").read_text())
 
 
-def command(*words: object) -> Any:
+def command(*arguments: object) -> Any:
     """Run `hil` with these arguments, with any verdict."""
-    result = CliRunner().invoke(app, [str(word) for word in words])
+    result = CliRunner().invoke(app, [str(word) for word in arguments])
     assert result.exit_code in (0, 5), result.output
     return result
 
 
 def test_files_with_provenance_are_written(arm: IdentifiedArm, tmp_path: Path) -> None:
-    found = exported(arm, tmp_path)
+    written = exported(arm, tmp_path)
     assert ALL == set(FILES) == {path.name for path in tmp_path.iterdir()}
-    assert not found.withheld
-    assert set(found.result.written) == ALL
+    assert not written.withheld
+    assert set(written.result.written) == ALL
     assert json.loads((tmp_path / "parameters.json").read_text())["provenance"] == PROVENANCE
     for name in ALL - {"parameters.json"}:
         assert "sha256 0a1b" in (tmp_path / name).read_text(), name
@@ -96,16 +96,16 @@ def test_only_consistent_parameters_become_a_urdf(arm: IdentifiedArm, tmp_path: 
     """Otherwise an old URDF is removed."""
     exported(arm, tmp_path)
     (tmp_path / "mine.urdf").write_text("mine")
-    found = write_exports(tmp_path, arm.cell, arm.estimate, "no convergence")
-    assert set(found.withheld) == {"identified.urdf"}
-    assert "no convergence" in found.withheld["identified.urdf"]
+    written = write_exports(tmp_path, arm.cell, arm.estimate, "no convergence")
+    assert set(written.withheld) == {"identified.urdf"}
+    assert "no convergence" in written.withheld["identified.urdf"]
     left = {path.name for path in tmp_path.iterdir()}
-    assert left == (ALL - set(found.withheld)) | {"mine.urdf"}
+    assert left == (ALL - set(written.withheld)) | {"mine.urdf"}
     broken = arm.consistency.consistent.standard.copy()
     broken[arm.cell.model.layout.links[1, 9]] = -1.0
     impossible = replace(arm.consistency.consistent, standard=broken)
-    found = write_exports(tmp_path, arm.cell, arm.estimate, impossible)
-    assert "not physically consistent" in found.withheld["identified.urdf"]
+    written = write_exports(tmp_path, arm.cell, arm.estimate, impossible)
+    assert "not physically consistent" in written.withheld["identified.urdf"]
     assert not (tmp_path / "identified.urdf").exists()
 
 
@@ -119,8 +119,8 @@ def test_names_cannot_break_a_file(arm: IdentifiedArm, tmp_path: Path) -> None:
     evil = "a---&gt;'&quot;&quot;&quot; &lt;script&gt;alert(1)&lt;/script&gt;#"
     urdf = TWO_LINK.replace("shoulder", evil).replace('"upper"', f'"{evil}"')
     arm = identified_arm(urdf)
-    found = exported(arm, tmp_path)
-    assert not found.withheld
+    written = exported(arm, tmp_path)
+    assert not written.withheld
     chain = chain_from_urdf((tmp_path / "identified.urdf").read_text())
     assert chain.joint_names == arm.cell.joint_names
     assert len(table(tmp_path / "parameters.csv")) == arm.cell.model.n_parameters
@@ -139,8 +139,8 @@ def test_a_joint_at_rest_keeps_its_description(tmp_path: Path) -> None:
     assert {p["name"] for p in rows if not p["determined"]} == set(arm.estimate.undetermined)
     arm = identified_arm(TWO_LINK, still=(1,))
     consistent = arm.consistency.consistent
-    known = np.isfinite(arm.estimate.std)
-    assert np.all(np.abs(consistent.shift[known]) < 1.0)
+    determined = np.isfinite(arm.estimate.std)
+    assert np.all(np.abs(consistent.shift[determined]) < 1.0)
     assert np.abs(consistent.standard).max() < 100.0
 
 
@@ -172,8 +172,8 @@ def fields(model: type[BaseModel]) -> Iterator[str]:
 
 
 def test_every_file_and_field_is_explained(text: str, arm: IdentifiedArm) -> None:
-    found = parameters_json(arm.cell.model, arm.estimate, consistent=arm.consistency.consistent)
-    content, explained = json.loads(found), named(text)
+    document = parameters_json(arm.cell.model, arm.estimate, consistent=arm.consistency.consistent)
+    content, explained = json.loads(document), named(text)
     assert set(fields(Results)) <= explained
     assert set(content) | set(content["parameters"][0]) | set(content["standard"]) <= explained
     tensor = {"Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz"}
@@ -189,8 +189,8 @@ def test_the_python_example_predicts_the_torque_of_the_model(
     folder.mkdir(parents=True)
     write_exports(folder, arm.cell, arm.estimate, arm.consistency.consistent)
     (program,) = (code for language, code in CODE.findall(text) if language == "python")
-    words = [sys.executable, "-I", "-c", program]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
+    command_line = [sys.executable, "-I", "-c", program]
+    done = subprocess.run(command_line, cwd=tmp_path, capture_output=True, text=True, check=True)
     shown = np.fromstring(done.stdout.strip().strip("[]"), sep=" ")
     zero, speed = np.zeros((1, 2)), np.full((1, 2), 0.5)
     values = arm.consistency.consistent.estimate.values
@@ -222,10 +222,10 @@ class TestCommand:
 
     def test_an_arm(self, log: Path, tmp_path: Path) -> None:
         output = tmp_path / "deep" / "arm.urdf"
-        found = json.loads(command("export", log, "--to", "urdf", "-o", output, "--json").stdout)
-        assert found["path"] == str(output)
-        assert found["read_back"] < 1e-6
-        assert "rotor inertias" in found["left_out"]
+        printed = json.loads(command("export", log, "--to", "urdf", "-o", output, "--json").stdout)
+        assert printed["path"] == str(output)
+        assert printed["read_back"] < 1e-6
+        assert "rotor inertias" in printed["left_out"]
         text = output.read_text()
         assert "verdict: " in text
         assert "log.mcap sha256" in text

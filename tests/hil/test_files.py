@@ -34,8 +34,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def unchanged(folder: Path) -> bool:
-    found = {path.name: path.read_text() for path in folder.iterdir() if path.is_file()}
-    return found == dict.fromkeys("abd", "old") and not any(folder.glob(".*"))
+    texts = {path.name: path.read_text() for path in folder.iterdir() if path.is_file()}
+    return texts == dict.fromkeys("abd", "old") and not any(folder.glob(".*"))
 
 
 @contextmanager
@@ -90,8 +90,8 @@ def test_time_is_read_in_any_zone(at: datetime, minutes: int) -> None:
 
 @given(st.one_of(st.text(), st.datetimes().map(datetime.isoformat)))
 def test_any_text_is_a_time_in_range_or_none(text: str) -> None:
-    found = parse_time(text)
-    assert found is None or 1970 <= found.year < 2200
+    time = parse_time(text)
+    assert time is None or 1970 <= time.year < 2200
 
 
 @pytest.mark.parametrize(
@@ -106,8 +106,8 @@ def test_invalid_times(text: str) -> None:
 
 @given(st.one_of(st.text(), st.text("0123456789²٣-+_ ."), st.integers(4000, 6000).map("7".__mul__)))
 def test_any_text_is_a_count_or_none(text: str) -> None:
-    found = parse_count(text)
-    assert found is None or (0 <= found < 2**63 and text.lstrip("0") in (str(found), ""))
+    count = parse_count(text)
+    assert count is None or (0 <= count < 2**63 and text.lstrip("0") in (str(count), ""))
 
 
 def test_invalid_ports_and_counts() -> None:

@@ -25,8 +25,8 @@ WIDTH = "100"
 MOST_LINES = 3
 
 
-def invoke(*words: str) -> Any:
-    return CliRunner().invoke(app, [*words], env={"COLUMNS": WIDTH, "NO_COLOR": "1"})
+def invoke(*arguments: str) -> Any:
+    return CliRunner().invoke(app, [*arguments], env={"COLUMNS": WIDTH, "NO_COLOR": "1"})
 
 
 def paths(name: str) -> Iterator[tuple[str, ...]]:
@@ -41,16 +41,16 @@ EVERY = [path for name in COMMANDS for path in paths(name)]
 
 def entries(text: str) -> dict[str, list[str]]:
     """The lines of each option in a help text, by its long name."""
-    found: dict[str, list[str]] = {}
+    lines_of: dict[str, list[str]] = {}
     lines: list[str] = []
     for line in text.splitlines():
         if not line.startswith("│"):
             lines = []
         elif start := re.match(r"│ [* ]{0,3}\s*(--[a-z][\w-]*|-\w\b)", line):
-            lines = found[start[1]] = [line]
+            lines = lines_of[start[1]] = [line]
         else:
             lines.append(line)
-    return found
+    return lines_of
 
 
 @pytest.mark.parametrize("path", EVERY, ids=" ".join)
@@ -89,18 +89,18 @@ def test_alternatives_are_in_the_page_of_commands(path: tuple[str, ...]) -> None
             assert not missing, option.name
     assert all(f"`{term.strip()}`" in page for term in FRICTION_TERMS.split(","))
     descriptions = ESTIMATORS | {name: method.help for name, method in METHODS.items()}
-    for name, words in descriptions.items():
-        assert f"| `{name}` | {words} |" in page
+    for name, description in descriptions.items():
+        assert f"| `{name}` | {description} |" in page
 
 
 class TestMissing:
     def test_identify_says_what_it_takes_with_two_examples(self) -> None:
         refused = invoke("identify")
         assert refused.exit_code == 2
-        for words in ("Logs or bags, with --urdf", "archives (*.mcap)", "campaign folder",
+        for phrase in ("Logs or bags, with --urdf", "archives (*.mcap)", "campaign folder",
                       "Example: hil identify log.csv --urdf arm.urdf",
                       "Example: hil identify runs/demo"):  # fmt: skip
-            assert words in refused.stderr
+            assert phrase in refused.stderr
 
     def test_as_json_too(self) -> None:
         assert "hil identify log.csv --urdf arm.urdf" in invoke("identify", "--json").stdout
@@ -114,7 +114,7 @@ class TestMissing:
 
 class TestMisspelt:
     @pytest.mark.parametrize(
-        ("words", "meant"),
+        ("arguments", "meant"),
         [
             (("move", "cell.toml", "--override", "10"), "--speed"),
             (("identify", "a.csv", "--urfd", "arm.urdf"), "--urdf"),
@@ -125,8 +125,8 @@ class TestMisspelt:
             (("import", "log", "a.csv", "--rate", "100"), "--sample-rate"),
         ],
     )
-    def test_an_option(self, words: tuple[str, ...], meant: str) -> None:
-        refused = invoke(*words)
+    def test_an_option(self, arguments: tuple[str, ...], meant: str) -> None:
+        refused = invoke(*arguments)
         assert refused.exit_code == 2
         assert f"Did you mean {meant}?" in " ".join(refused.stderr.split())
 
@@ -173,7 +173,7 @@ class TestFormerNames:
     """Of version 0.1; they work in 0.2 and say so."""
 
     @pytest.mark.parametrize(
-        ("words", "notes"),
+        ("arguments", "notes"),
         [
             (("gains", "none.mcap"), ["hil gains is now called hil torque-constants"]),
             (("reidentify", "none", "--standstill=slow"),
@@ -186,22 +186,22 @@ class TestFormerNames:
              ["--kinematic is now called --limits-only"]),
         ],
     )  # fmt: skip
-    def test_they_are_the_present_ones(self, words: tuple[str, ...], notes: list[str]) -> None:
-        done = invoke(*words)
+    def test_they_are_the_present_ones(self, arguments: tuple[str, ...], notes: list[str]) -> None:
+        done = invoke(*arguments)
         assert [line for line in done.stderr.splitlines() if "now called" in line] == [
             f"note: {note}" for note in notes
         ]
-        present = invoke(*with_present_names(words)[0])
+        present = invoke(*with_present_names(arguments)[0])
         assert (str(done.exception), done.stdout) == (str(present.exception), present.stdout)
         assert "none" in str(present.exception)
 
     def test_an_import_has_a_standstill_speed(self) -> None:
-        words = ("import", "log", "a.csv", "--standstill", "0.02")
-        assert with_present_names(words) == (list(words), [])
+        arguments = ("import", "log", "a.csv", "--standstill", "0.02")
+        assert with_present_names(arguments) == (list(arguments), [])
 
     def test_what_follows_two_dashes_is_no_option(self) -> None:
-        words = ("identify", "--", "--in-sample")
-        assert with_present_names(words) == (list(words), [])
+        arguments = ("identify", "--", "--in-sample")
+        assert with_present_names(arguments) == (list(arguments), [])
 
     def test_they_are_not_in_the_help(self) -> None:
         assert "gains" not in invoke("--help").stdout

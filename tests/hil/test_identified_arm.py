@@ -53,7 +53,7 @@ class TestResult:
         truth = np.repeat([0.4, 0.2], 3)
         assert ((friction["lower"] < truth) & (truth < friction["upper"])).all()
         assert table.loc["f0_1", "unit"] == "N·m"
-        assert [*table.index] == [one.name for one in result.results.parameters]
+        assert [*table.index] == [parameter.name for parameter in result.results.parameters]
 
     def test_prediction_is_the_torque_that_was_simulated(self, result: Any) -> None:
         """Of Newton and Euler with the friction that was planted, at 100 random states."""
@@ -123,8 +123,8 @@ class TestSaved:
     def test_it_is_what_the_command_writes(self, folder: Path, result: Any, tmp_path: Path) -> None:
         saved = result.save(tmp_path / "python")
         arguments = ("identify", "a.csv", "--urdf", "three.urdf", "--predict", "b.csv", "--quiet")
-        words = [str(folder / word) if "." in word else word for word in arguments]
-        done = CliRunner().invoke(app, [*words, "--output", str(tmp_path / "command")])
+        command_line = [str(folder / word) if "." in word else word for word in arguments]
+        done = CliRunner().invoke(app, [*command_line, "--output", str(tmp_path / "command")])
         assert done.exit_code == 0, done.output
         assert saved == tmp_path / "python"
         for name in ("a.mcap", "b.mcap", "map.toml", "sources.json", "report_series.npz"):

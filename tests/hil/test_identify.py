@@ -62,13 +62,13 @@ def raiser(error):
 
 
 @pytest.fixture(scope="module")
-def found(campaign):
+def identification(campaign):
     return identify_campaign(campaign.folder.root, Silent())
 
 
 @pytest.fixture(scope="module")
-def judgement(found):
-    return found.results.judgement
+def judgement(identification):
+    return identification.results.judgement
 
 
 def imported(path, names=None, *, torque=True, noise=0.0, **spoilt):
@@ -102,11 +102,11 @@ def imported_ur5(folder, time, late, still=0):
     """Import a UR5 at rest for `still` samples, then moving, with torques `late` by a time [s]."""
     made = simulate("ur5_robot.urdf", time, noise=0.3)
     lags = zip(np.broadcast_to(late, 6), made.torque.T, strict=True)
-    torque = np.column_stack([np.interp(time - lag, time, one) for lag, one in lags])
+    torque = np.column_stack([np.interp(time - lag, time, column) for lag, column in lags])
     rows = slice(0 if still else 10, None)
     t, q, tau = time[rows], made.position[rows], torque[rows]
     before = t[0] + (time[1] - time[0]) * np.arange(-still, 0)
-    resting = (np.repeat(one[:1], still, axis=0) for one in (q, tau))
+    resting = (np.repeat(channel[:1], still, axis=0) for channel in (q, tau))
     q, tau = (np.concatenate(both) for both in zip(resting, (q, tau), strict=True))
     arrays = {"t": np.concatenate([before, t]), "q": q, "tau": tau}
     return archive_of(folder / "log.mcap", made.urdf, **arrays)
@@ -115,35 +115,40 @@ def imported_ur5(folder, time, late, still=0):
 class TestCampaign:
     """Results of a campaign."""
 
-    def test_has_58_parameters_near_the_planted_ones(self, found):
+    def test_has_58_parameters_near_the_planted_ones(self, identification):
         """More than 3 of 58 normal deviates beyond 3 sigma have a probability of 1e-5."""
-        results = found.results
+        results = identification.results
         assert sorted(p.table2_id or 0 for p in results.parameters) == list(range(1, 59))
         assert results.coverage.within_3 >= 55
         assert results.calibration.inside >= 0.93  # held-out torque inside its intervals
         assert None not in results.calibration.joint_inside
 
-    def test_planned_criteria_are_those_that_were_executed(self, found):
+    def test_planned_criteria_are_those_that_were_executed(self, identification):
         """At equal times; stiction and noise change the columns by per mille."""
-        planned, executed = found.results.excitation.planned, found.results.excitation.executed
+        planned, executed = (
+            identification.results.excitation.planned,
+            identification.results.excitation.executed,
+        )
         assert executed.n_samples == pytest.approx(3 * planned.n_samples, abs=6)
         assert executed.log10_det == pytest.approx(planned.log10_det, abs=58 * np.log10(1.01))
         assert executed.coupling_index == pytest.approx(planned.coupling_index, rel=0.02)
         assert executed.scaled_condition == pytest.approx(planned.scaled_condition, rel=0.02)
 
-    def test_needs_the_archives_only(self, campaign, found, tmp_path):
+    def test_needs_the_archives_only(self, campaign, identification, tmp_path):
         """Copied without their folder, they give the same numbers."""
         moved = [Path(shutil.copy(path, tmp_path)) for path in paths(campaign)]
-        again = identify_archives(moved, Silent(), name=found.results.name)
+        again = identify_archives(moved, Silent(), name=identification.results.name)
         # The conduct of the campaign is recorded in its folder.
-        assert found.results.conduct is not None
-        assert again.results == found.results.model_copy(update={"conduct": None})
+        assert identification.results.conduct is not None
+        assert again.results == identification.results.model_copy(update={"conduct": None})
 
     @pytest.mark.slow
-    def test_has_the_same_parameters_by_the_papers_filters(self, campaign, found):
+    def test_has_the_same_parameters_by_the_papers_filters(self, campaign, identification):
         paper = identify_campaign(campaign.folder.root, Silent(), Options(method="paper"))
         assert paper.verdict.good, paper.verdict.line
-        for ours, theirs in zip(found.results.parameters, paper.results.parameters, strict=True):
+        for ours, theirs in zip(
+            identification.results.parameters, paper.results.parameters, strict=True
+        ):
             both = np.hypot(ours.std, theirs.std)
             assert abs(ours.estimate - theirs.estimate) < 5.0 * both, ours.name
 
@@ -153,28 +158,30 @@ class TestCampaign:
             monkeypatch.setattr(f"hil.identify.validation.{name}", failing)
         without = identify_campaign(campaign.folder.root, Silent(), FIXED)
         warnings = without.results.verdict.warnings
-        assert sum("the solver failed" in one for one in warnings) == 2
+        assert sum("the solver failed" in warning for warning in warnings) == 2
         assert without.results.consistency is without.results.essential is None
 
 
 class TestOutcome:
     """Files of a result."""
 
-    def test_is_replaced_completely_or_not_at_all(self, found, tmp_path):
-        write_outcome(tmp_path, found, Silent())
+    def test_is_replaced_completely_or_not_at_all(self, identification, tmp_path):
+        write_outcome(tmp_path, identification, Silent())
         first = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
         assert {"results.json", "report.html", "parameters.csv", "identified.urdf"} <= set(first)
         written = Results.load(tmp_path / "results.json")
-        assert written == found.results.model_copy(
+        assert written == identification.results.model_copy(
             update={
                 "exports": written.exports,
                 "occasion": written.occasion,
-                "settings": settings_result(found),
+                "settings": settings_result(identification),
             }
         )
         (tmp_path / "report.html").unlink()
         (tmp_path / "report.html").mkdir()
-        other = replace(found, results=found.results.model_copy(update={"name": "other"}))
+        other = replace(
+            identification, results=identification.results.model_copy(update={"name": "other"})
+        )
         with pytest.raises(OutputError, match=r"report\.html is a folder"):
             write_outcome(tmp_path, other, Silent())
         del first["report.html"]
@@ -225,9 +232,9 @@ class TestSources:
 
     def test_at_rest_are_no_test(self, campaign):
         """At the end of a recording the arm rests for 0.2 s."""
-        found = identified(paths(campaign)[0], split=0.985)
-        assert not found.verdict.good
-        assert "moved in fewer than" in found.verdict.line
+        identification = identified(paths(campaign)[0], split=0.985)
+        assert not identification.verdict.good
+        assert "moved in fewer than" in identification.verdict.line
 
     @pytest.mark.parametrize(
         ("spoilt", "sentence"),
@@ -247,30 +254,35 @@ class TestSources:
             identified(imported(tmp_path / "bad.mcap", **spoilt))
 
     def test_alone_are_split_and_repeated_stamps_averaged(self, tmp_path):
-        found = identified(imported(tmp_path / "one.mcap", repeat=300))
-        assert any("1 samples had the time stamp" in note for note in found.results.notes)
-        assert any("the rest was predicted" in one for one in found.results.verdict.warnings)
-        assert [run.archive for run in found.results.validation] == ["one.mcap (last part)"]
-        assert "unseen" not in found.verdict.line.split(":")[0]
+        identification = identified(imported(tmp_path / "one.mcap", repeat=300))
+        assert any("1 samples had the time stamp" in note for note in identification.results.notes)
+        assert any(
+            "the rest was predicted" in warning
+            for warning in identification.results.verdict.warnings
+        )
+        assert [run.archive for run in identification.results.validation] == [
+            "one.mcap (last part)"
+        ]
+        assert "unseen" not in identification.verdict.line.split(":")[0]
 
     def test_that_repeat_the_fitted_motion_are_not_unseen(self, campaign):
-        found = identified(*campaign.folder.completed("excitation"))
+        identification = identified(*campaign.folder.completed("excitation"))
         line = "The model predicts a repetition of the fitted motion"
-        assert found.verdict.line.startswith(line)
+        assert identification.verdict.line.startswith(line)
 
     @pytest.mark.parametrize("noise", [0.0, 0.01])
     def test_with_a_noiseless_torque_are_named(self, tmp_path, noise):
         """It was filtered by a low-pass, or computed."""
-        found = identified(imported(tmp_path / "smooth.mcap", noise=noise))
-        named = [one.check for one in found.results.judgement.findings]
+        identification = identified(imported(tmp_path / "smooth.mcap", noise=noise))
+        named = [finding.check for finding in identification.results.judgement.findings]
         assert ("torque bandwidth" in named) == (noise == 0.0)
 
 
 class TestJudgement:
     """Numbers behind a verdict: in `results.json`, on the terminal and in the report."""
 
-    def test_compares_joints_with_limit_and_other_models(self, judgement, found):
-        assert [joint.joint for joint in judgement.joints] == found.results.joint_names
+    def test_compares_joints_with_limit_and_other_models(self, judgement, identification):
+        assert [joint.joint for joint in judgement.joints] == identification.results.joint_names
         for joint in judgement.joints:
             assert joint.share_of_limit == pytest.approx(joint.rms / joint.limit)
             # An error of r of the torque leaves at most 1 - r² unexplained of what varies in it.
@@ -280,26 +292,26 @@ class TestJudgement:
             assert joint.nominal_relative > 2.0 * joint.relative
             assert 0.01 < joint.controller_relative < 0.15
 
-    def test_is_a_table_sentences_and_json(self, found, judgement):
-        rows, lines = table(found.results), sentences(found.results)
+    def test_is_a_table_sentences_and_json(self, identification, judgement):
+        rows, lines = table(identification.results), sentences(identification.results)
         heading = "joint RMS error relative fitted of limit R² nominal controller"
         assert rows[0].split() == heading.split()
-        for row, name in zip(rows[1:], found.results.joint_names, strict=True):
+        for row, name in zip(rows[1:], identification.results.joint_names, strict=True):
             assert row.startswith(name) and row.count("%") == 6
         assert len({len(row) for row in rows}) == 1
         for finding in judgement.findings:
             assert sum(finding.words in line for line in lines) == 1
-        read, verdict = json.loads(as_json(found.results)), found.results.verdict
+        read, verdict = json.loads(as_json(identification.results)), identification.results.verdict
         assert (read["good"], read["line"]) == (verdict.good, verdict.line)
         assert {finding["check"] for finding in read["findings"]} >= {"excitation", "delay"}
         assert len(read["joints"]) == 6
         assert read["in_sample"] is False and read["undetermined"] == []
 
     @pytest.mark.parametrize("good", [True, False])
-    def test_ends_with_its_line_and_a_status(self, found, good, capsys):
-        verdict = found.results.verdict.model_copy(update={"good": good})
+    def test_ends_with_its_line_and_a_status(self, identification, good, capsys):
+        verdict = identification.results.verdict.model_copy(update={"good": good})
         with nullcontext() if good else pytest.raises(typer.Exit) as left:
-            finish(found.results.model_copy(update={"verdict": verdict}), json=False)
+            finish(identification.results.model_copy(update={"verdict": verdict}), json=False)
         assert good or left.value.exit_code == NOT_GOOD
         assert capsys.readouterr().out == verdict.line + "\n"
 
@@ -329,22 +341,26 @@ class TestEstimators:
     @pytest.mark.parametrize("name", ESTIMATORS)
     def test_find_the_planted_arm(self, name, estimations, prepared):
         """Compared by torque on the fitted motion."""
-        found = estimations[name]
-        pooled = found.result.pooled
+        estimation = estimations[name]
+        pooled = estimation.result.pooled
         error = pooled.values - planted_values(prepared.sources.cell)
-        assert torque_share(error, found.result.factor) < 0.005
+        assert torque_share(error, estimation.result.factor) < 0.005
         # Expected by chance: 0.03 of 58, and three of a single motion.
         assert np.count_nonzero(np.abs(error) / pooled.std > 3.5) <= 3
-        assert found.estimator == name
-        assert len(found.result.repetitions) == len(prepared.fitted)
+        assert estimation.estimator == name
+        assert len(estimation.result.repetitions) == len(prepared.fitted)
 
     @pytest.mark.parametrize("name", ["auto", "wls", "ols", "prior", "consistent"])
     def test_refit_of_all_rows_is_the_estimate(self, name, estimations):
         """So that the calibration is that of the estimator; others need the samples."""
-        found = estimations[name]
-        values = found.with_prior.estimate.values if name == "prior" else found.result.pooled.values
-        difference = found.refit(found.result.factor) - values
-        assert torque_share(difference, found.result.factor) < 1e-4
+        estimation = estimations[name]
+        values = (
+            estimation.with_prior.estimate.values
+            if name == "prior"
+            else estimation.result.pooled.values
+        )
+        difference = estimation.refit(estimation.result.factor) - values
+        assert torque_share(difference, estimation.result.factor) < 1e-4
 
     def test_need_commands_as_instruments(self, prepared):
         sources = prepared.sources
@@ -439,12 +455,12 @@ def split(log):
 )
 def test_a_delay_that_was_applied_is_in_the_results(wide, applied, stated):
     """Also one with an interval too wide to be called determined, or without an estimate."""
-    found = DelayEstimate(
+    estimate = DelayEstimate(
         delay=0.004, std=1e-3, assumed=0.0, cycle=1e-3, interval_factor=2.0,
         reason="95 % interval of ± 2 ms", significant=True,
     )  # fmt: skip
     prepared = SimpleNamespace(
-        delays=found if wide else None,
+        delays=estimate if wide else None,
         assumed_delay=applied,
         settings=SimpleNamespace(stated_delay=0.0),
         sources=SimpleNamespace(cell=SimpleNamespace(joint_names=("a", "b"))),
@@ -458,8 +474,8 @@ def test_delays_of_the_torque_are_compensated(log, split):
     np.testing.assert_allclose(split.results.delays.applied, LATE, atol=1e-3)
     applied = json.loads(as_json(split.results))["delays"]["applied"]
     np.testing.assert_allclose(applied, LATE, atol=1e-3)
-    found = [one for one in split.verdict.findings if one.check == "delay"]
-    assert [one.level for one in found] == ["doubtful"]
+    delay_findings = [finding for finding in split.verdict.findings if finding.check == "delay"]
+    assert [finding.level for finding in delay_findings] == ["doubtful"]
     options = replace(UNFILTERED, delay=0.0)
     prepared = prepare_sources(gather_sources([log], 0.7), options, Silent())
     assert prepared.assumed_delay == 0.0
@@ -496,8 +512,8 @@ def test_series_of_figures_have_fitted_rows_and_friction(tmp_path):
     assert 0.3 < series.excitation_fitted.mean() < 1.0
     assert set(np.unique(series.example_used)) <= {0.0, 1.0}
     for j, noise in enumerate(rested.results.noise_std):
-        known = np.isfinite(series.friction_speed[:, j])
-        assert known.sum() > 100
-        speed, torque = series.friction_speed[known, j], series.friction_torque[known, j]
+        drawn = np.isfinite(series.friction_speed[:, j])
+        assert drawn.sum() > 100
+        speed, torque = series.friction_speed[drawn, j], series.friction_torque[drawn, j]
         law = np.interp(speed, series.law_speed[:, j], series.law_torque[:, j])
         assert np.std((torque - law)[np.abs(speed) > 0.05]) < 2.0 * noise

@@ -103,12 +103,12 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("run", "wide"):
         (root / name).mkdir()
     for joint in range(3):
-        run, one = root / "run", joint + 1
-        np.savetxt(run / f"q_{one}.txt", VALUES[:, [0, one]], fmt="%.17g")
+        run, number = root / "run", joint + 1
+        np.savetxt(run / f"q_{number}.txt", VALUES[:, [0, number]], fmt="%.17g")
         np.savetxt(run / f"tau{joint}.dat", TAU[:, joint], fmt="%.17g")
-        np.savetxt(run / f"late_{one}.txt", VALUES[:, [0, one]] + [0.001 * joint, 0.0])
-        np.save(run / f"q{one}.npy", Q[:, joint])
-        log(run / f"{one}.csv", VALUES[:, [0, one]], f"t,angle{one}")
+        np.savetxt(run / f"late_{number}.txt", VALUES[:, [0, number]] + [0.001 * joint, 0.0])
+        np.save(run / f"q{number}.npy", Q[:, joint])
+        log(run / f"{number}.csv", VALUES[:, [0, number]], f"t,angle{number}")
     np.savetxt(run / "t.txt", TIME)
     np.savetxt(run / "short.dat", TAU[:5, 0])
     for k in range(4):
@@ -203,14 +203,14 @@ class TestMaps:
     def test_columns_files_and_arrays_are_found(
         self, place, robot, source, entries, position, torque
     ):
-        found = read(place / source, robot, **entries)
-        assert np.array_equal(found["position"], position)
-        assert ("torque" in found) == (torque is not None)
+        columns = read(place / source, robot, **entries)
+        assert np.array_equal(columns["position"], position)
+        assert ("torque" in columns) == (torque is not None)
         if torque is not None:
-            assert np.array_equal(found["torque"], torque)
+            assert np.array_equal(columns["torque"], torque)
         if "time" in entries:
-            assert found["stamp"] / 1e9 == pytest.approx(TIME)
-        assert "motor_current" not in found
+            assert columns["stamp"] / 1e9 == pytest.approx(TIME)
+        assert "motor_current" not in columns
 
     @pytest.mark.parametrize(("source", "entries", "sentence"), REFUSED)
     def test_a_map_that_does_not_fit_is_refused(self, place, robot, source, entries, sentence):
@@ -248,16 +248,16 @@ class TestTime:
 
 class TestUnitsAndGears:
     def test_units_are_converted_to_si(self, file, robot):
-        found = read(
+        columns = read(
             file,
             robot,
             position={"columns": "q{}", "unit": "deg", "scale": (1, -1, 2)},
             motor_current={"columns": "tau{}", "unit": "mA"},
         )
         expected = np.radians(VALUES[:, 1:4]) * [1, -1, 2]
-        assert found["position"] == pytest.approx(expected, rel=1e-15)
-        assert found["motor_current"] == pytest.approx(VALUES[:, 4:] / 1000)
-        assert "torque" not in found
+        assert columns["position"] == pytest.approx(expected, rel=1e-15)
+        assert columns["motor_current"] == pytest.approx(VALUES[:, 4:] / 1000)
+        assert "torque" not in columns
         assert 3000 * UNITS["velocity"]["rpm"] == pytest.approx(2 * np.pi * 50)
 
     def test_motor_side_is_converted_with_power_conserved(self, tmp_path, robot):
@@ -286,10 +286,10 @@ class TestUnitsAndGears:
 
     def test_constants_and_gears_follow_the_joints_of_the_log(self, file, robot):
         drive = {"gear_ratio": (100, -80, 50), "torque_constant": (0.1, 0.2, 0.3)}
-        found = read(file, robot, motor_current={"columns": "tau{}"}, drive=drive)
-        assert np.array_equal(found["motor_current"], VALUES[:, 4:])
-        assert found["torque"] == pytest.approx(VALUES[:, 4:] * [10.0, -16.0, 15.0])
-        found = read(
+        columns = read(file, robot, motor_current={"columns": "tau{}"}, drive=drive)
+        assert np.array_equal(columns["motor_current"], VALUES[:, 4:])
+        assert columns["torque"] == pytest.approx(VALUES[:, 4:] * [10.0, -16.0, 15.0])
+        columns = read(
             file,
             robot,
             position={"columns": "q{}", "side": "motor"},
@@ -297,12 +297,12 @@ class TestUnitsAndGears:
             drive={"gear_ratio": (10, 20, 40), "joint_offset": (1, 2, 3)},
         )
         expected = (VALUES[:, 1:4] / [10, 20, 40] + [1, 2, 3])[:, [1, 2, 0]]
-        assert found["position"] == pytest.approx(expected)
+        assert columns["position"] == pytest.approx(expected)
 
 
 class TestBadInput:
     @pytest.mark.parametrize(
-        ("line", "found"),
+        ("line", "problem"),
         [
             ("0.1,1,x,3,4,5,6", "'x' in column q2, not a number"),
             ("0.1,1", "nothing in column q2"),
@@ -311,10 +311,10 @@ class TestBadInput:
             (",1,2,3,4,5,6", "nothing for the time"),
         ],
     )
-    def test_an_invalid_cell_is_named_by_line(self, file, robot, line, found):
+    def test_an_invalid_cell_is_named_by_line(self, file, robot, line, problem):
         lines = file.read_text().splitlines()
         file.write_text("\n".join([*lines[:11], line, *lines[12:]]))
-        with pytest.raises(SourceError, match=f"line 12 has {found}"):
+        with pytest.raises(SourceError, match=f"line 12 has {problem}"):
             read(file, robot, time={"column": "t"})
 
     def test_unusable_files_are_refused(self, tmp_path, file, robot):
@@ -377,19 +377,19 @@ class TestArrays:
     def test_stamps_of_any_kind(self, tmp_path, robot, stamps, unit):
         np.savez(tmp_path / "a.npz", q=Q, t=stamps)
         time = {"column": "t", "unit": unit}
-        found = read(tmp_path / "a.npz", robot, position={"columns": "q"}, time=time)
-        elapsed = (found["stamp"] - found["stamp"][0]) * 1e-9
+        columns = read(tmp_path / "a.npz", robot, position={"columns": "q"}, time=time)
+        elapsed = (columns["stamp"] - columns["stamp"][0]) * 1e-9
         assert elapsed == pytest.approx(TIME, abs=1e-9)
 
     def test_matlab_files_and_text(self, tmp_path, robot):
         savemat(tmp_path / "a.mat", {"q": Q.T, "t": TIME[None, :]})
         entries = {"position": {"columns": "q"}, "time": {"column": "t"}}
-        found = read(tmp_path / "a.mat", robot, **entries)
-        assert np.array_equal(found["position"], Q)
+        columns = read(tmp_path / "a.mat", robot, **entries)
+        assert np.array_equal(columns["position"], Q)
         rows = ";\n  ".join(" ".join(f"{cell:.17e}" for cell in row) for row in Q)
         (tmp_path / "a.m").write_text(f"% a log\nT = [0.01];\nq = [ {rows} ]; % rad\n")
-        found = read_arrays(tmp_path / "a.m", robot, position={"columns": "q"})
-        assert np.array_equal(found["position"], Q)
+        columns = read_arrays(tmp_path / "a.m", robot, position={"columns": "q"})
+        assert np.array_equal(columns["position"], Q)
 
 
 def opaque(name: str) -> bytes:
@@ -427,9 +427,9 @@ class TestStructs:
     def test_field_by_path(self, tmp_path, robot, columns):
         savemat(tmp_path / "a.mat", {"log": LOG, "k": 3.0}, do_compression=True)
         entries = {"time": {"column": "log.t"}}
-        found = read_arrays(tmp_path / "a.mat", robot, position={"columns": columns}, **entries)
-        assert np.array_equal(found["position"], STRUCTS[columns])
-        assert (found["stamp"] / 1e9) == pytest.approx(TIME)
+        arrays = read_arrays(tmp_path / "a.mat", robot, position={"columns": columns}, **entries)
+        assert np.array_equal(arrays["position"], STRUCTS[columns])
+        assert (arrays["stamp"] / 1e9) == pytest.approx(TIME)
 
     def test_columns_of_a_field(self, tmp_path, robot):
         savemat(tmp_path / "a.mat", {"log": {"all": np.column_stack([TIME, Q])}})
@@ -448,8 +448,8 @@ class TestStructs:
         savemat(tmp_path / "a.mat", {"log": LOG, "q": Q})
         with (tmp_path / "a.mat").open("ab") as file:
             file.write(opaque("table"))
-        found = read_arrays(tmp_path / "a.mat", robot, position={"columns": position})
-        assert np.array_equal(found["position"], Q)
+        arrays = read_arrays(tmp_path / "a.mat", robot, position={"columns": position})
+        assert np.array_equal(arrays["position"], Q)
 
     def test_number_of_elements_is_limited(self, tmp_path, robot, monkeypatch):
         monkeypatch.setattr(array_files, "MOST_NUMBERS", 50)
@@ -467,12 +467,12 @@ def save_73(path: Path, **values: object) -> Path:
             if isinstance(value, dict):
                 inner = group.create_group(name)
                 inner.attrs["MATLAB_class"] = np.bytes_("struct")
-                for key, one in value.items():
-                    put(inner, key, one)
+                for key, member in value.items():
+                    put(inner, key, member)
             elif isinstance(value, list):
                 names = [f"{name}{k}" for k in range(len(value))]
-                for key, one in zip(names, value, strict=True):
-                    put(refs, key, one)
+                for key, member in zip(names, value, strict=True):
+                    put(refs, key, member)
                 data = np.array([[refs[key].ref] for key in names], h5py.ref_dtype)
                 group.create_dataset(name, data=data).attrs["MATLAB_class"] = np.bytes_("cell")
             else:
@@ -492,9 +492,9 @@ class TestMatlab73:
     def test_arrays_structs_and_cells(self, tmp_path, robot, columns):
         log = {"q": Q.T, "each": [column[:, None] for column in Q.T]}
         path = save_73(tmp_path / "a.mat", q=Q, t=TIME, log=log)
-        found = read(path, robot, position={"columns": columns}, time={"column": "t"})
-        assert np.array_equal(found["position"], Q)
-        assert found["stamp"] / 1e9 == pytest.approx(TIME)
+        arrays = read(path, robot, position={"columns": columns}, time={"column": "t"})
+        assert np.array_equal(arrays["position"], Q)
+        assert arrays["stamp"] / 1e9 == pytest.approx(TIME)
 
     def test_a_file_without_contents_is_refused(self, tmp_path, robot):
         head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
@@ -581,8 +581,8 @@ class TestTextMatrices:
         lines = [" ".join([name, *(repr(float(v)) for v in values)]) for name, values in rows]
         (tmp_path / "a.txt").write_text("\n".join(lines))
         time, form = {"column": "time"}, {"transposed": True}
-        found = read(tmp_path / "a.txt", robot, time=time, format=form)
-        assert np.array_equal(found["position"], Q)
+        arrays = read(tmp_path / "a.txt", robot, time=time, format=form)
+        assert np.array_equal(arrays["position"], Q)
 
     @given(
         values=arrays(np.float64, (7, 3), elements=st.floats(-1e6, 1e6, width=32)),
@@ -612,8 +612,8 @@ class TestTextMatrices:
         with pytest.raises(SourceError, match=r"line 10 is empty; .*skip_empty = true.*skip_rows"):
             read_arrays(tmp_path / "q.txt", robot)
         (tmp_path / "q.txt").write_text("\n\n".join(["", "q1 q2 q3", *lines, " "]))
-        found = read_arrays(tmp_path / "q.txt", robot, format={"skip_empty": True})
-        assert np.array_equal(found["position"], Q)
+        arrays = read_arrays(tmp_path / "q.txt", robot, format={"skip_empty": True})
+        assert np.array_equal(arrays["position"], Q)
 
     @pytest.mark.parametrize("hole", ["nan", "NULL"])
     def test_rows_with_missing_numbers_are_dropped_on_request(self, tmp_path, robot, hole):
@@ -623,9 +623,9 @@ class TestTextMatrices:
         time = {"column": "t"}
         with pytest.raises(SourceError, match=r"line 9 has .* in column q1"):
             read(tmp_path / "a.csv", robot, time=time)
-        found = read(tmp_path / "a.csv", robot, time=time, format={"missing": "drop"})
-        assert np.array_equal(found["position"], np.delete(Q, 7, axis=0))
-        assert 70_000_000 not in found["stamp"]
+        columns = read(tmp_path / "a.csv", robot, time=time, format={"missing": "drop"})
+        assert np.array_equal(columns["position"], np.delete(Q, 7, axis=0))
+        assert 70_000_000 not in columns["stamp"]
 
     @pytest.mark.parametrize("suffix", [".csv", ".npz"])
     @pytest.mark.parametrize(("column", "named"), [(0, "time"), (2, "position|q2")])
@@ -645,9 +645,9 @@ class TestTextMatrices:
         with pytest.raises(SourceError, match=named) as refused:
             read(path, robot, **entries)
         assert 'missing = "drop"' in str(refused.value)
-        found = read(path, robot, format={"missing": "drop"}, **entries)
-        assert np.array_equal(found["position"], np.delete(Q, 7, axis=0))
-        assert len(found["stamp"]) == len(Q) - 1
+        columns = read(path, robot, format={"missing": "drop"}, **entries)
+        assert np.array_equal(columns["position"], np.delete(Q, 7, axis=0))
+        assert len(columns["stamp"]) == len(Q) - 1
 
 
 def test_joints_are_those_of_the_robot_or_locked(tmp_path, robot):
@@ -655,9 +655,9 @@ def test_joints_are_those_of_the_robot_or_locked(tmp_path, robot):
     np.savez(tmp_path / "a.npz", q=columns, two=Q[:, :2])
     position = {"columns": "q", "scale": (2.0, 1.0, 1.0, 1.0), "offset": (0.5, 0, 0, 0)}
     joints = (JOINTS[2], "gripper", *JOINTS[:2])
-    found = read(tmp_path / "a.npz", robot, joints=joints, position=position)
+    read_columns = read(tmp_path / "a.npz", robot, joints=joints, position=position)
     expected = np.column_stack([Q[:, :2], 2.0 * (Q[:, 2] + 0.5)])
-    assert found["position"] == pytest.approx(expected)
+    assert read_columns["position"] == pytest.approx(expected)
     entries = {"joints": JOINTS[:2], "position": {"columns": "two"}}
     with pytest.raises(SourceError, match="--locked NAME, or all: --lock-others"):
         read(tmp_path / "a.npz", robot, **entries)
@@ -737,7 +737,7 @@ def placement(model: pin.Model, q: Floats, frame: str) -> Floats:
     """Return a frame of a URDF in its base; joints without limits have cosine and sine."""
     joints = zip(model.joints[1:], q, strict=True)
     full = np.concatenate(
-        [[np.cos(one), np.sin(one)] if joint.nq == 2 else [one] for joint, one in joints]
+        [[np.cos(angle), np.sin(angle)] if joint.nq == 2 else [angle] for joint, angle in joints]
     )
     data = model.createData()
     pin.framesForwardKinematics(model, data, full)
@@ -919,8 +919,8 @@ class TestWarnings:
     @pytest.mark.parametrize("what", ERRORS)
     def test_error_is_named(self, arm: Simulated, what: str) -> None:
         error, sentence = ERRORS[what]
-        found = warnings(arm, **error)
-        assert any(sentence in warning for warning in found), found
+        sentences = warnings(arm, **error)
+        assert any(sentence in warning for warning in sentences), sentences
 
     def test_velocities_have_factors_by_joint(self, arm: Simulated, panda: Simulated) -> None:
         for factor in (DEGREES, -1.0):
@@ -941,12 +941,12 @@ class TestWarnings:
         assert sentence.startswith("as mapped, every row leaves the limits of the URDF")
         assert 'as degrees read as radians, none would: write [position] unit = "deg"' in sentence
         assert all("degrees" in other for other in others)
-        found = warnings(replace(panda, position=panda.position[:, ORDER]))
+        sentences = warnings(replace(panda, position=panda.position[:, ORDER]))
         names = ", ".join(panda.joint_names[j] for j in ORDER)
-        assert f"those of {names}, none would" in found[0]
-        found = warnings(replace(panda, position=panda.position + 20.0 * (np.arange(7) == 3)))
-        assert "check unit, sign and zero in the column map" in found[0]
-        assert "order" not in found[0]
+        assert f"those of {names}, none would" in sentences[0]
+        sentences = warnings(replace(panda, position=panda.position + 20.0 * (np.arange(7) == 3)))
+        assert "check unit, sign and zero in the column map" in sentences[0]
+        assert "order" not in sentences[0]
 
 
 TOO_SMALL = "the torques are too small for this arm: measured over "
@@ -997,8 +997,8 @@ class TestReplacing:
             (tmp_path / f"{name}.toml").write_text(
                 f"joints = {json.dumps(panda.joint_names)}\n{text}"
             )
-        words = ["import", "log", str(tmp_path / "log.npz"), "-o", str(tmp_path / "a.mcap")]
-        return [*words, "--urdf", str(panda.urdf), "--lock-others", "--map"]
+        arguments = ["import", "log", str(tmp_path / "log.npz"), "-o", str(tmp_path / "a.mcap")]
+        return [*arguments, "--urdf", str(panda.urdf), "--lock-others", "--map"]
 
     def test_only_with_force(self, command: list[str], tmp_path: Path) -> None:
         right = [*command, str(tmp_path / "q.toml")]
@@ -1114,8 +1114,8 @@ class TestImportCommand:
         """Its metadata have another name for them."""
         stored = json.dumps({"lines": ["a"], "doubts": ["b"]})
         entries = {"kind": "imported", "joint_names": '["a"]', "attachments": "[]"}
-        found = ArchiveHeader.of({**entries, "findings": stored}).findings
-        assert found == Findings(lines=("a",), warnings=("b",))
+        findings = ArchiveHeader.of({**entries, "findings": stored}).findings
+        assert findings == Findings(lines=("a",), warnings=("b",))
 
 
 LOADED = "torque-constants a.mcap --loaded b.mcap --mass 4"
@@ -1259,12 +1259,12 @@ class TestReadyMaps:
         path.write_text("\n".join([delimiter.join(titles), *body]) + "\n")
         columns = ColumnMap.load(name)
         import_log(path, tmp_path / "a.mcap", robot=robot, columns=columns, outside_limits=True)
-        found = open_archive(tmp_path / "a.mcap").columns
-        assert found["position"] == pytest.approx(Q)
-        assert found["motor_current" if quantity == "motor_current" else "torque"] == (
+        stored = open_archive(tmp_path / "a.mcap").columns
+        assert stored["position"] == pytest.approx(Q)
+        assert stored["motor_current" if quantity == "motor_current" else "torque"] == (
             pytest.approx(TAU)
         )
-        assert np.diff(found["stamp"]) == pytest.approx(1e7, abs=300)
+        assert np.diff(stored["stamp"]) == pytest.approx(1e7, abs=300)
 
     def test_listed_and_printed(self) -> None:
         listing = CliRunner().invoke(app, ["import", "maps"]).stdout

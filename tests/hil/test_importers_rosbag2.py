@@ -347,7 +347,7 @@ BARE = ("enable_crcs", "use_statistics", "repeat_schemas", "repeat_channels")
 
 
 OPTIONS: list[dict[str, Any]] = [
-    *({"compression": one, "chunk_size": 20_000} for one in CompressionType),
+    *({"compression": compression, "chunk_size": 20_000} for compression in CompressionType),
     {"use_chunking": False, "use_summary_offsets": False},
     dict.fromkeys(("enable_crcs", "use_statistics", "repeat_schemas", "repeat_channels"), False),
 ]
@@ -455,10 +455,10 @@ def drives(path: Path, *, firmware: str = "2.1", with_states: bool = False) -> P
 def test_messages_of_any_type_are_imported_with_a_map(tmp_path, robot):
     source = drives(tmp_path / "x.mcap")
     out = import_log(source, tmp_path / "out.mcap", robot=robot, columns=by_map())
-    found = open_archive(out).columns
-    assert found["stamp"].tolist() == STAMPS.tolist()
-    np.testing.assert_allclose(found["position"], POSITION, rtol=0, atol=1e-12)
-    assert found["motor_current"].tobytes() == EFFORT.tobytes()
+    stored = open_archive(out).columns
+    assert stored["stamp"].tolist() == STAMPS.tolist()
+    np.testing.assert_allclose(stored["position"], POSITION, rtol=0, atol=1e-12)
+    assert stored["motor_current"].tobytes() == EFFORT.tobytes()
     columns = by_map(
         position={"columns": "/joint_states/position"},
         time={"column": "/joint_states/stamp", "unit": "ns"},
@@ -471,15 +471,15 @@ def test_messages_of_any_type_are_imported_with_a_map(tmp_path, robot):
 
 
 def test_numbers_of_messages_are_arrays_by_path(tmp_path: Path) -> None:
-    found = read_mcap(drives(tmp_path / "x.mcap"))
-    assert set(found) == {
+    arrays = read_mcap(drives(tmp_path / "x.mcap"))
+    assert set(arrays) == {
         "/drives/stamp", "/drives/enabled", "/drives/temperature",
         *(f"/drives/drives/{i}/{name}" for i in range(2) for name in ("mode", "angle", "current")),
     }  # fmt: skip
-    assert found["/drives/temperature"].shape == (COUNT, 3)
-    assert found["/drives/temperature"].dtype == np.float32
-    assert found["/drives/temperature"][7].tolist() == [40.0, 48.0, 42.0]
-    assert set(found["/drives/drives/1/mode"].tolist()) == {4}
+    assert arrays["/drives/temperature"].shape == (COUNT, 3)
+    assert arrays["/drives/temperature"].dtype == np.float32
+    assert arrays["/drives/temperature"][7].tolist() == [40.0, 48.0, 42.0]
+    assert set(arrays["/drives/drives/1/mode"].tolist()) == {4}
 
 
 @pytest.mark.parametrize("firmware", ["2.2", "2.10-beta"])

@@ -89,8 +89,8 @@ def test_json_of_an_error_has_its_parts_and_status() -> None:
         "problem": "is empty",
         "remedy": "fill it",
     }
-    found = [exit_code_of(error) for error in (ControllerError(""), PlannerError(), OSError())]
-    assert found == [4, 2, 1]
+    exit_codes = [exit_code_of(error) for error in (ControllerError(""), PlannerError(), OSError())]
+    assert exit_codes == [4, 2, 1]
 
 
 @pytest.mark.parametrize(

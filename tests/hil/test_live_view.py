@@ -92,7 +92,7 @@ def test_all_channels_and_events_are_sent() -> None:
     with served() as publisher, Viewer(publisher.port) as viewer:
         assert viewer.socket.subprotocol == SUBPROTOCOL
         assert viewer.info["capabilities"] == []  # clients cannot publish
-        kinds = {topic: one["schemaName"] for topic, one in viewer.channels.items()}
+        kinds = {topic: channel["schemaName"] for topic, channel in viewer.channels.items()}
         state = "sensor_msgs/msg/JointState"
         assert kinds == {
             "/hil/cycle": "hil_msgs/msg/Cycle2", "/hil/events": "rcl_interfaces/msg/Log",

@@ -288,10 +288,10 @@ TYPED = re.compile(r'\[(\w+)\] (\w+) = ("[^"]*"|true|\d+)')
 
 def remedy(message: str) -> dict[str, dict[str, Any]]:
     """The entries of a column map that a message prints."""
-    found: dict[str, dict[str, Any]] = {}
+    entries: dict[str, dict[str, Any]] = {}
     for table, key, value in TYPED.findall(message):
-        found.setdefault(table, {})[key] = True if value == "true" else value.strip('"')
-    return found
+        entries.setdefault(table, {})[key] = True if value == "true" else value.strip('"')
+    return entries
 
 
 class TestRemedies:
@@ -383,12 +383,12 @@ def test_cases_have_the_samples_of_plain(tmp_path: Path, cases: Path, name: str)
 
     expected = read("plain")
     try:
-        found = read(name)
+        samples = read(name)
     except SourceError as error:
-        found = read(name, **remedy(str(error)))
+        samples = read(name, **remedy(str(error)))
         line = int(re.search(r"line (\d+)", str(error))[1])  # type: ignore[index]
         expected = {key: np.delete(array, line - 2, axis=0) for key, array in expected.items()}
-    elapsed = found["stamp"] - found["stamp"][0]
+    elapsed = samples["stamp"] - samples["stamp"][0]
     assert np.abs(elapsed - expected["stamp"] + expected["stamp"][0]).max() < 1000  # ns
     for quantity in ("position", "torque"):
-        assert found[quantity] == pytest.approx(expected[quantity], abs=2e-6)
+        assert samples[quantity] == pytest.approx(expected[quantity], abs=2e-6)

@@ -52,19 +52,19 @@ def look(urdf: Path, log: Path, table: Mapping[str, Floats], **planted: Floats) 
     return look_at(log, lambda _: Robot.from_urdf(urdf), ImportOptions())
 
 
-def reading(found: Look, aspect: str) -> tuple[str, str]:
-    row = next(row for row in found.rows if row.aspect == aspect)
+def reading(looked: Look, aspect: str) -> tuple[str, str]:
+    row = next(row for row in looked.rows if row.aspect == aspect)
     return row.reading, row.certainty
 
 
 def test_a_log_as_it_is(tmp_path: Path, urdf: Path, table: Mapping[str, Floats]) -> None:
-    found = look(urdf, tmp_path / "a.csv", table)
-    assert not found.questions
-    assert reading(found, "signs") == ("as the URDF's axes", "sure")
-    assert reading(found, "angle unit") == ("unit as read", "sure")
-    assert reading(found, "side") == ("joint side, a torque", "sure")
-    assert reading(found, "velocity")[0] == "q1 .. q3: rad" or reading(found, "motion")
-    assert {group.body for group in found.groups} == set(JOINTS)
+    looked = look(urdf, tmp_path / "a.csv", table)
+    assert not looked.questions
+    assert reading(looked, "signs") == ("as the URDF's axes", "sure")
+    assert reading(looked, "angle unit") == ("unit as read", "sure")
+    assert reading(looked, "side") == ("joint side, a torque", "sure")
+    assert reading(looked, "velocity")[0] == "q1 .. q3: rad" or reading(looked, "motion")
+    assert {group.body for group in looked.groups} == set(JOINTS)
 
 
 def negated(table: Mapping[str, Floats]) -> dict[str, Floats]:
@@ -90,7 +90,7 @@ def late(table: Mapping[str, Floats]) -> dict[str, Floats]:
 
 
 @pytest.mark.parametrize(
-    ("plant", "aspect", "words"),
+    ("plant", "aspect", "phrase"),
     [
         (negated, "signs", "torque negated: all joints"),
         (exchanged, "order", f"torque columns are of {JOINTS[1]}, {JOINTS[0]}, {JOINTS[2]}"),
@@ -104,10 +104,10 @@ def test_a_planted_meaning_is_named(
     table: Mapping[str, Floats],
     plant: Callable[[Mapping[str, Floats]], dict[str, Floats]],
     aspect: str,
-    words: str,
+    phrase: str,
 ) -> None:
-    found = look(urdf, tmp_path / "a.csv", table, **plant(table))
-    assert words in reading(found, aspect)[0]
+    looked = look(urdf, tmp_path / "a.csv", table, **plant(table))
+    assert phrase in reading(looked, aspect)[0]
 
 
 def test_a_delay_that_other_parts_do_not_confirm_is_open() -> None:
@@ -124,8 +124,8 @@ def test_a_delay_that_other_parts_do_not_confirm_is_open() -> None:
 
 
 def test_degrees_are_concluded(tmp_path: Path, urdf: Path, table: Mapping[str, Floats]) -> None:
-    found = look(urdf, tmp_path / "a.csv", table, **in_degrees(table))
-    says = [reading(found, "angle unit")[0], reading(found, "position")[0]]
+    looked = look(urdf, tmp_path / "a.csv", table, **in_degrees(table))
+    says = [reading(looked, "angle unit")[0], reading(looked, "position")[0]]
     assert any("deg" in text for text in says)
 
 

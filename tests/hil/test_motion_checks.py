@@ -137,14 +137,14 @@ def test_a_missing_mesh_gets_file_mesh_and_remedy(tmp_path: Path) -> None:
     (folder / "a.stl").write_text(f"solid a\n{solid}endsolid a\n", "utf-8")
     text = with_values(BARE_CELL, {"cell.mesh_folders": ["meshes"]})
     path.write_text(text, "utf-8")
-    found = Cell.load(path)
-    assert ("a", "c") in collision_checker(found).pairs
+    cell = Cell.load(path)
+    assert ("a", "c") in collision_checker(cell).pairs
     # A copy elsewhere finds them too, and a list over several lines is replaced whole.
     path.write_text(text.replace('["meshes"]', '[\n  "meshes", # here\n]'), "utf-8")
     (tmp_path / "copy").mkdir()
     moved = Cell.load(path).with_urdf(tmp_path / "copy" / "cell.toml", "wrist.urdf")
     assert moved.file.cell.mesh_folders == ["../meshes"]
-    assert collision_checker(moved).pairs == collision_checker(found).pairs
+    assert collision_checker(moved).pairs == collision_checker(cell).pairs
 
 
 HELD = 2

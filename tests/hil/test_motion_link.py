@@ -151,7 +151,7 @@ def test_an_end_whose_event_was_lost_is_that_of_the_archive(cell: Cell, lost: An
 
 
 @pytest.mark.parametrize(
-    ("state", "after", "words"),
+    ("state", "after", "message"),
     [
         (State.DRIVE_OFF, OFF_TIMEOUT, "the drive went off before the motion began"),
         (State.FAULTED, OFF_TIMEOUT, "a refusal came before the motion began"),
@@ -159,18 +159,18 @@ def test_an_end_whose_event_was_lost_is_that_of_the_archive(cell: Cell, lost: An
     ],
 )
 def test_a_motion_that_does_not_begin_is_dropped(
-    cell: Cell, state: State, after: float, words: str
+    cell: Cell, state: State, after: float, message: str
 ) -> None:
     """First its archive is closed, without which nothing can begin any more; then it is stopped."""
     port = ScriptedPort((TURN, is_set("state", state)))
-    with pytest.raises(ControllerError, match=f"{words}.*; nothing was sent"):
+    with pytest.raises(ControllerError, match=f"{message}.*; nothing was sent"):
         run(cell, port)
     assert port.diary == ["open", "submit", "void", "stop"]
     assert port.now == pytest.approx(after, abs=3 * TURN)
 
 
 @pytest.mark.parametrize(
-    ("fault", "error", "words"),
+    ("fault", "error", "message"),
     [
         (is_set("broken", ArchiveWriteError(Path("a.mcap"), "cannot be written", remedy="")),
          ArchiveWriteError, "cannot be written"),
@@ -179,11 +179,11 @@ def test_a_motion_that_does_not_begin_is_dropped(
     ],
 )  # fmt: skip
 def test_without_an_archive_the_arm_rests_before_the_error(
-    cell: Cell, fault: Happens, error: type[Exception], words: str
+    cell: Cell, fault: Happens, error: type[Exception], message: str
 ) -> None:
     rests = ended("stopped", "a stop was requested")
     port = ScriptedPort((0.1, started), (0.5, fault), (0.8, rests))
-    with pytest.raises(error, match=words):
+    with pytest.raises(error, match=message):
         run(cell, port)
     assert port.diary == ["open", "submit", "stop"]
     assert port.now >= 0.8
@@ -216,18 +216,18 @@ def test_a_stop_for_want_of_heartbeats_names_the_disk(cell: Cell) -> None:
 
 
 @pytest.mark.parametrize(
-    ("refuses", "words", "outcome"),
+    ("refuses", "message", "outcome"),
     [
         (RequestError("closed", "open mode is being left"), "see the outcome of a.mcap", "refused"),
         (ExchangeError("it did not answer within 5 s"), "within 5 s; a.mcap is void", "void"),
     ],
 )
 def test_a_motion_that_is_not_accepted_moves_nothing(
-    cell: Cell, refuses: Exception, words: str, outcome: str
+    cell: Cell, refuses: Exception, message: str, outcome: str
 ) -> None:
     port = ScriptedPort()
     port.refuses = refuses
-    with pytest.raises(ControllerError, match=words):
+    with pytest.raises(ControllerError, match=message):
         run(cell, port)
     assert [entry for entry in port.diary if entry != "stop"] == ["open", "submit", outcome]
 

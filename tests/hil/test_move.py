@@ -71,7 +71,7 @@ def test_one_axis_alone_moves_over_a_real_link(ns16: Cell, tmp_path: Path) -> No
     """As `docs/connect.md` types it; the others stay in mode 0 and where they are."""
     out = str(tmp_path / "one.mcap")
     page = ROOT / "docs" / "connect.md"
-    simulate, moved = (words for words in commands(page) if "--only-axis" in words)
+    simulate, moved = (command for command in commands(page) if "--only-axis" in command)
     options = simulate[simulate.index("--only-axis") :]
     with UdpController.started(ns16, tmp_path, options=options) as controller:
         way = [str(controller.cell_path), *moved[3:], "-o", out]
@@ -203,6 +203,6 @@ def test_on_a_terminal_a_move_is_shown_and_can_be_declined(tmp_path: Path, answe
             while end.process.poll() is None and time.monotonic() < until:
                 end.look()
         assert end.end() == 130
-        for words in (b"joint_5", b"peak speed", b"nothing was sent"):
-            assert words in end.seen
+        for phrase in (b"joint_5", b"peak speed", b"nothing was sent"):
+            assert phrase in end.seen
     assert not list(tmp_path.iterdir())

@@ -170,16 +170,16 @@ def test_an_archive_gives_its_cell_and_init_packet(campaign: Campaign, tmp_path:
     summary = new(URDF_PATH, tmp_path / "cell.toml", "--from-archive", str(archive))
     assert summary["unknown"] == []
     assert any("simulated" in note for note in summary["notes"])
-    found, original = Cell.load(tmp_path / "cell.toml"), campaign.cell
-    assert found.file.drive_train == original.file.drive_train
-    assert found.file.limits == original.file.limits
-    assert found.file.simulation == original.file.simulation
-    np.testing.assert_array_equal(found.home, original.home)
+    written, original = Cell.load(tmp_path / "cell.toml"), campaign.cell
+    assert written.file.drive_train == original.file.drive_train
+    assert written.file.limits == original.file.limits
+    assert written.file.simulation == original.file.simulation
+    np.testing.assert_array_equal(written.home, original.home)
 
 
-def refused(*words: object) -> Exception:
+def refused(*arguments: object) -> Exception:
     """The error of `hil new`."""
-    error = CliRunner().invoke(app, ["new", *map(str, words)]).exception
+    error = CliRunner().invoke(app, ["new", *map(str, arguments)]).exception
     assert isinstance(error, Exception)
     return error
 
@@ -188,8 +188,8 @@ def test_an_archive_of_another_arm_is_refused(
     campaign: Campaign, two_joints: Path, tmp_path: Path
 ) -> None:
     archive = campaign.folder.completed("excitation")[0]
-    words = ("--urdf", two_joints, "-o", tmp_path / "c.toml", "--from-archive", archive)
-    error = refused(*words)
+    arguments = ("--urdf", two_joints, "-o", tmp_path / "c.toml", "--from-archive", archive)
+    error = refused(*arguments)
     assert isinstance(error, ArchiveError)
     assert "the URDF has hip, knee" in str(error)
     assert not (tmp_path / "c.toml").exists()
@@ -294,8 +294,8 @@ def test_an_archive_without_a_valid_arm_is_of_arm_1(arm: str, tmp_path: Path) ->
         metadata={},
         attachments={"cell.toml": cell, "init_packet.bin": packet},
     )
-    known = from_archive(path, ("shoulder", "elbow"))
-    assert list(known.values["drive_train.gear_ratio"]) == [100.0, -80.0]
+    stated = from_archive(path, ("shoulder", "elbow"))
+    assert list(stated.values["drive_train.gear_ratio"]) == [100.0, -80.0]
 
 
 def test_prismatic_joints_are_fixed_with_a_note(tmp_path: Path) -> None:

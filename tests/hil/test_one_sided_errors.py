@@ -54,9 +54,9 @@ def verdict(campaign):
 
 
 def swapped(values, i, j):
-    found = list(values)
-    found[i], found[j] = found[j], found[i]
-    return tuple(found)
+    exchanged = list(values)
+    exchanged[i], exchanged[j] = exchanged[j], exchanged[i]
+    return tuple(exchanged)
 
 
 ERRORS = {
@@ -71,14 +71,14 @@ ERRORS = {
 
 
 def test_a_correct_cell_is_good(correct_campaign):
-    found = verdict(correct_campaign)
-    assert found.good, found.line
+    judged = verdict(correct_campaign)
+    assert judged.good, judged.line
 
 
 @slow
 def test_usual_unmodelled_effects_stay_good(ran):
-    found = verdict(ran(effects=True))
-    assert found.good, found.line
+    judged = verdict(ran(effects=True))
+    assert judged.good, judged.line
 
 
 @pytest.mark.parametrize(
@@ -89,8 +89,8 @@ def test_usual_unmodelled_effects_stay_good(ran):
     ],
 )
 def test_a_robot_other_than_the_cell_is_wrong(ran, error):
-    found = verdict(ran(ERRORS[error]))
-    assert not found.good, found.line
+    judged = verdict(ran(ERRORS[error]))
+    assert not judged.good, judged.line
 
 
 @pytest.mark.parametrize("joint", [0, *(pytest.param(joint, marks=slow) for joint in range(1, 6))])
@@ -101,16 +101,16 @@ def test_a_negative_torque_constant_is_wrong(correct_campaign, monkeypatch, join
         return replace(recording, torque=recording.torque * signs)
 
     monkeypatch.setattr(hil.identify.sources, "recording_of", turned)
-    found = verdict(correct_campaign)
-    assert not found.good, found.line
+    judged = verdict(correct_campaign)
+    assert not judged.good, judged.line
 
 
 def test_negated_friction_columns_are_wrong(correct_campaign, monkeypatch):
     """The prediction is equal, but negative friction is impossible."""
     monkeypatch.setitem(vars(COULOMB), "value", lambda v, s, _: -s)
-    found = verdict(correct_campaign)
-    assert not found.good, found.line
-    assert any("Coulomb friction of" in reason for reason in found.reasons)
+    judged = verdict(correct_campaign)
+    assert not judged.good, judged.line
+    assert any("Coulomb friction of" in reason for reason in judged.reasons)
 
 
 LAWS = {"joint_1": "quadratic", "joint_2": "cubic"}
@@ -138,13 +138,13 @@ class TestInertiaScale:
     def test_the_demo_has_table_2_and_other_nominal_values(self):
         cell = Cell.load(CELL_PATH)
         table = base_from_standard(standard_parameters())
-        planted, known = planted_values(cell), cell.nominal_values()
+        planted, nominal = planted_values(cell), cell.nominal_values()
         b = cell.model.base.rank
         large = np.abs(planted) > 1e-6
         # Table 2 has other signs and another order.
-        found, printed = np.sort(np.abs(planted[:b])), np.sort(np.abs(table))
-        np.testing.assert_allclose(found, printed, rtol=1e-9, atol=1e-12)
-        errors = np.abs(known[large] / planted[large] - 1.0)
+        sizes, printed = np.sort(np.abs(planted[:b])), np.sort(np.abs(table))
+        np.testing.assert_allclose(sizes, printed, rtol=1e-9, atol=1e-12)
+        errors = np.abs(nominal[large] / planted[large] - 1.0)
         assert errors.max() < 0.25
         assert np.median(errors) > 0.1
 

@@ -22,12 +22,12 @@ def following_error(*, growing: float, noise: float = 1e-6) -> NDArray[np.float6
 
 
 def test_it_is_named() -> None:
-    found = growing_oscillation(following_error(growing=1.5), PERIOD)
-    assert found is not None
-    assert found.joint == 1
-    assert found.frequency == pytest.approx(110.0, abs=5.0)
-    assert found.growth > 100.0
-    text = found.sentence(("shoulder", "elbow"))
+    oscillation = growing_oscillation(following_error(growing=1.5), PERIOD)
+    assert oscillation is not None
+    assert oscillation.joint == 1
+    assert oscillation.frequency == pytest.approx(110.0, abs=5.0)
+    assert oscillation.growth > 100.0
+    text = oscillation.sentence(("shoulder", "elbow"))
     assert text.startswith("elbow oscillates at 110 Hz")
 
 

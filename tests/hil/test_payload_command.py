@@ -66,8 +66,8 @@ def printed(folder: Path) -> dict[str, object]:
         folder, "empty.mcap", "--loaded", "full.mcap", "--json", "--check", "mass=4.5"
     )
     assert status == 5
-    found: dict[str, object] = json.loads(text)
-    return found
+    document: dict[str, object] = json.loads(text)
+    return document
 
 
 SHORTER = {"design": ("--seed", "1"), "run": ("--accept-dry-run",)}
@@ -86,12 +86,12 @@ class TestPage:
         for file in ("cell.toml", "robot.urdf"):
             (folder / file).write_bytes((ROOT / "examples" / "two_joints" / file).read_bytes())
         (folder / "quick.toml").write_text(QUICK)
-        for program, *words in commands(ROOT / "docs" / "payload.md"):
+        for program, *arguments in commands(ROOT / "docs" / "payload.md"):
             assert program == "hil"
-            if "--dry-run" not in words and "--accept-dry-run" not in words:
-                words += SHORTER.get(words[0], ())
-            result = CliRunner().invoke(app, words)
-            assert result.exit_code == 0, (shlex.join(words), result.output, result.exception)
+            if "--dry-run" not in arguments and "--accept-dry-run" not in arguments:
+                arguments += SHORTER.get(arguments[0], ())
+            result = CliRunner().invoke(app, arguments)
+            assert result.exit_code == 0, (shlex.join(arguments), result.output, result.exception)
 
 
 class TestFigures:
@@ -130,7 +130,7 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def found(folder: Path, arm: Path) -> dict[str, Any]:
+def by_model(folder: Path, arm: Path) -> dict[str, Any]:
     """The payload against the model of the arm."""
     status, text = run(folder, "--model", str(arm), "full.mcap", "--json")
     assert status == 0
@@ -141,21 +141,23 @@ def found(folder: Path, arm: Path) -> dict[str, Any]:
 class TestByModel:
     """`hil payload --model`: loaded recordings alone, against the model of the arm."""
 
-    def test_the_mass_is_within_two_percent(self, found: dict[str, Any]) -> None:
-        mass = found["figures"]["mass"]
+    def test_the_mass_is_within_two_percent(self, by_model: dict[str, Any]) -> None:
+        mass = by_model["figures"]["mass"]
         assert mass["value"] == pytest.approx(MASS, rel=0.02)
         assert mass["interval"][0] < MASS < mass["interval"][1]
-        assert found["bare"] == [] and found["loaded"] == ["full.mcap"]
-        assert "against the model of the arm" in found["method"]
+        assert by_model["bare"] == [] and by_model["loaded"] == ["full.mcap"]
+        assert "against the model of the arm" in by_model["method"]
 
     def test_it_agrees_with_a_bare_recording_and_is_not_surer(
-        self, found: dict[str, Any], printed: dict[str, Any]
+        self, by_model: dict[str, Any], printed: dict[str, Any]
     ) -> None:
         for name in ("mass", "cx", "cy", "cz"):
-            alone, both = found["figures"][name], printed["figures"][name]
+            alone, both = by_model["figures"][name], printed["figures"][name]
             low, high = alone["interval"]
             assert low <= both["interval"][1] and both["interval"][0] <= high
-        widths = [np.diff(result["figures"]["mass"]["interval"])[0] for result in (found, printed)]
+        widths = [
+            np.diff(result["figures"]["mass"]["interval"])[0] for result in (by_model, printed)
+        ]
         assert widths[0] > 0.5 * widths[1]
 
     def test_another_arm_and_nothing_carried_are_refused(self, folder: Path, arm: Path) -> None:
@@ -240,15 +242,15 @@ class TestTorqueScale:
     def weighed(self, folder: Path, kind: str) -> dict[str, Any]:
         status, text = run(folder, f"empty_{kind}.mcap", "--loaded", f"full_{kind}.mcap", "--json")
         assert status == 0
-        found: dict[str, Any] = json.loads(text)
-        return found
+        document: dict[str, Any] = json.loads(text)
+        return document
 
     def test_the_interval_says_what_it_assumes(self, wrong: Path) -> None:
-        found = self.weighed(wrong, "assumed")
-        assert found["torque_uncertainty"]["std"] == [0.03] * 6
-        low, high = found["figures"]["mass"]["interval"]
+        document = self.weighed(wrong, "assumed")
+        assert document["torque_uncertainty"]["std"] == [0.03] * 6
+        low, high = document["figures"]["mass"]["interval"]
         # Two joints of independent scale bear the weight, so that it is known to 2 to 3 %.
-        assert 0.05 < (high - low) / found["figures"]["mass"]["value"] < 0.13
+        assert 0.05 < (high - low) / document["figures"]["mass"]["value"] < 0.13
         text = run(wrong, "empty_assumed.mcap", "--loaded", "full_assumed.mcap")[1]
         assert "assuming torque constants to 3 %" in text
 
@@ -266,9 +268,9 @@ class TestTorqueScale:
         )
         assert status == 5
         (line,) = [line for line in text.splitlines() if "hil torque-constants" in line]
-        program, *words = shlex.split(line[line.index("hil torque-constants") :])
+        program, *arguments = shlex.split(line[line.index("hil torque-constants") :])
         assert program == "hil"
-        result = CliRunner().invoke(app, [*words, "--quiet"])
+        result = CliRunner().invoke(app, [*arguments, "--quiet"])
         assert result.exit_code == 0, result.output
         table = tomllib.loads(result.output)
         assert table["torque_constant"] == pytest.approx(TYPE, rel=0.03)
@@ -299,8 +301,8 @@ class TestRefused:
 
     def test_equal_loads_are_no_contradiction(self, folder: Path, tmp_path: Path) -> None:
         again = record(tmp_path, "again.mcap", MASS, 4)
-        found = find_payload([folder / "empty.mcap"], [folder / "full.mcap", again], Silent())
-        assert found.body.mass == pytest.approx(MASS, rel=0.01)
+        weighed = find_payload([folder / "empty.mcap"], [folder / "full.mcap", again], Silent())
+        assert weighed.body.mass == pytest.approx(MASS, rel=0.01)
 
     def test_a_bare_recording_with_a_tool_is_named(self, folder: Path, tmp_path: Path) -> None:
         tool = record(tmp_path, "tool.mcap", 1.5, 5)
@@ -328,10 +330,10 @@ class TestMounting:
             made = simulate("ur5_robot.urdf", time, seed=seed, load=load, gravity=WALL)
             archived(tmp_path / f"{name}.mcap", made)
         status, text = run(tmp_path, "empty.mcap", "--loaded", "full.mcap", "--json")
-        found = json.loads(text)
+        document = json.loads(text)
         assert status == 5
-        assert "set gravity of [robot]" in found["mounting"]
-        assert found["controllers"] == {}
+        assert "set gravity of [robot]" in document["mounting"]
+        assert document["controllers"] == {}
 
     def test_a_right_one_is_not_doubted(self, printed: dict[str, object]) -> None:
         assert printed["mounting"] is None
@@ -346,38 +348,38 @@ def test_an_inertia_that_is_not_determined_is_not_typed_in(tmp_path: Path) -> No
         noise = 0.1 * np.random.default_rng(seed).standard_normal(slow.torque.shape)  # N·m
         archived(tmp_path / f"{name}.mcap", replace(slow, torque=slow.torque + noise))
     status, text = run(tmp_path, "empty.mcap", "--loaded", "full.mcap", "--json")
-    found = json.loads(text)
+    document = json.loads(text)
     assert status == 0
-    assert found["figures"]["Ixx"]["value"] is None
-    for typed in found["controllers"].values():
+    assert document["figures"]["Ixx"]["value"] is None
+    for typed in document["controllers"].values():
         commands_only = [
             line for line in typed.splitlines() if not line.startswith(("#", "//", "--", ";", "!"))
         ]
         assert not any("INERTIA" in line or "0.00000" in line for line in commands_only)
         assert "not determined: enter the maker's, or record faster motion" in typed
-    assert "set_target_payload(" in found["controllers"]["UR"]
+    assert "set_target_payload(" in document["controllers"]["UR"]
 
 
 def gains(folder: Path, *arguments: str) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(
+    document: dict[str, Any] = json.loads(
         run(folder, *arguments, "--json", command="torque-constants")[1]
     )
-    return found
+    return document
 
 
 def test_the_constants_lie_in_their_intervals(currents: Path) -> None:
-    found = gains(currents, "empty.mcap", *BOTH)
-    assert found["side"] == "motor"
-    assert found["payload_kg"] == {"empty.mcap": None, "full.mcap": 4.0}
-    known = 0
-    for motor, truth in zip(found["motors"], CONSTANTS, strict=True):
+    document = gains(currents, "empty.mcap", *BOTH)
+    assert document["side"] == "motor"
+    assert document["payload_kg"] == {"empty.mcap": None, "full.mcap": 4.0}
+    determined = 0
+    for motor, truth in zip(document["motors"], CONSTANTS, strict=True):
         if motor["not_determined"] is None:
-            known += 1
+            determined += 1
             # Smoothing leaves a bias of half a percent.
             error = abs(motor["torque_constant"] - truth)
             assert error < 2.0 * motor["half_interval"] + 0.005 * truth
             assert motor["half_interval"] < 0.1 * truth
-    assert known >= 5
+    assert determined >= 5
 
 
 def test_a_load_without_centre_is_assumed_at_the_flange_and_said(currents: Path) -> None:

@@ -37,8 +37,8 @@ def cell() -> Cell:
 
 
 def run(*arguments: object) -> str:
-    words = ["plan", str(CELL_PATH), *map(str, arguments)]
-    result = CliRunner().invoke(app, words, catch_exceptions=False)
+    command_line = ["plan", str(CELL_PATH), *map(str, arguments)]
+    result = CliRunner().invoke(app, command_line, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result.output
 
@@ -60,10 +60,10 @@ def test_via_points_are_reported_in_controller_angles(via, tmp_path):
     assert [row[9].rstrip(",") for row in rows] == ["start", "flown", "flown", "stopped"]
     times = [float(row[7]) for row in rows]
     assert times == sorted(times) and times[0] == 0.0
-    found, slow = (json.loads(run("--via", via, "--json", "--speed", one)) for one in (100, 20))
-    assert found["angles"] == "controller"
-    np.testing.assert_allclose(found["targets"][0]["target_deg"], [40, 30, -60, 50, 40, 10])
-    assert slow["duration"] > 2.0 * found["duration"]
+    fast, slow = (json.loads(run("--via", via, "--json", "--speed", speed)) for speed in (100, 20))
+    assert fast["angles"] == "controller"
+    np.testing.assert_allclose(fast["targets"][0]["target_deg"], [40, 30, -60, 50, 40, 10])
+    assert slow["duration"] > 2.0 * fast["duration"]
     # A byte order mark and the lines of a header are ignored.
     marked = tmp_path / "marked.csv"
     marked.write_bytes(b"\xef\xbb\xbf" + VIA.split("\n", 2)[2].encode())

@@ -39,7 +39,7 @@ def cell(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def motions(cell):
-    return [one.trajectory for one in validation_motions(cell, MotionChecks.of(cell))]
+    return [motion.trajectory for motion in validation_motions(cell, MotionChecks.of(cell))]
 
 
 def promise(cell, motions, *texts: str) -> PrecisionDesign:
@@ -103,27 +103,27 @@ class TestPromise:
         noisy = replace(made, error=1e-3 * made.noise)
         wrong = replace(made, noise=1e-3 * made.error)
         excitation = _Excitation(motions[0])
-        one, nine = (noisy.forecasts(excitation, count)[0].half for count in (1, 9))
-        assert nine == pytest.approx(one / 3.0, rel=0.02)
-        one, nine = (wrong.forecasts(excitation, count)[0].half for count in (1, 9))
-        assert nine == pytest.approx(one, rel=0.01)
+        after_one, after_nine = (noisy.forecasts(excitation, count)[0].half for count in (1, 9))
+        assert after_nine == pytest.approx(after_one / 3.0, rel=0.02)
+        after_one, after_nine = (wrong.forecasts(excitation, count)[0].half for count in (1, 9))
+        assert after_nine == pytest.approx(after_one, rel=0.01)
 
     def test_the_promised_repetitions_are_the_least(self, cell, motions) -> None:
         made = promise(cell, motions, "torque 2")
         noisy = replace(made, error=1e-3 * made.noise, noise=1e3 * made.noise)
         excitation = _Excitation(motions[0])
-        (found,) = noisy.forecasts(excitation, 1)
-        assert found.repetitions is not None and found.repetitions > 2
-        halves = [noisy.forecasts(excitation, found.repetitions - k)[0].half for k in (0, 1)]
+        (forecast,) = noisy.forecasts(excitation, 1)
+        assert forecast.repetitions is not None and forecast.repetitions > 2
+        halves = [noisy.forecasts(excitation, forecast.repetitions - k)[0].half for k in (0, 1)]
         assert halves[0] <= 2.0 < halves[1]
 
     def test_the_scale_of_the_torque_is_a_limit(self, tmp_path, motions) -> None:
         """Torque constants to 4 % leave at least 8 % of some parameter; the remedy is named."""
-        known = fast_cell(tmp_path).with_values({"drive_train.torque_uncertainty": 0.04})
-        made = promise(known, motions, "parameters 5%")
-        (found,) = made.forecasts(_Excitation(motions[0]), 30)
-        assert found.limit > 1.96 * 0.04
-        message = found.message(30, made.scale)
+        uncertain_cell = fast_cell(tmp_path).with_values({"drive_train.torque_uncertainty": 0.04})
+        made = promise(uncertain_cell, motions, "parameters 5%")
+        (forecast,) = made.forecasts(_Excitation(motions[0]), 30)
+        assert forecast.limit > 1.96 * 0.04
+        message = forecast.message(30, made.scale)
         assert "no motion of this arm can meet it" in message
         assert "torque constants to 4 %" in message and "torque_uncertainty" in message
 
@@ -153,51 +153,51 @@ class TestCommand:
     def test_a_design_states_what_it_promises(self, cell, tmp_path: Path) -> None:
         (tmp_path / "my.toml").write_text(SETTINGS)
         out = tmp_path / "out"
-        words = ["design", str(cell.path), "--settings", str(tmp_path / "my.toml")]
-        words += ["--precision", "parameters 5%, torque 5", "-o", str(out), "--workers", "1"]
-        result = CliRunner().invoke(app, words, catch_exceptions=False)
+        arguments = ["design", str(cell.path), "--settings", str(tmp_path / "my.toml")]
+        arguments += ["--precision", "parameters 5%, torque 5", "-o", str(out), "--workers", "1"]
+        result = CliRunner().invoke(app, arguments, catch_exceptions=False)
         assert result.exit_code == 0, result.output
         assert "torque error: assumed, 3 % of each joint's torque" in result.output
         assert "parameters 5 %: " in result.output
         assert "torque 5 N·m: torque of shoulder " in result.output
         promised = DesignResult.load(out).data["precision"]
-        assert [one["requirement"] for one in promised] == ["parameters 5 %", "torque 5 N·m"]
+        assert [entry["requirement"] for entry in promised] == ["parameters 5 %", "torque 5 N·m"]
         requirements = load_settings(out / "excitation.toml").objective.precision
         assert requirements == ["parameters 5 %", "torque 5 N·m"]
 
     def test_json_has_the_promise(self, cell, tmp_path: Path) -> None:
-        words = ["design", str(cell.path), "--quick", "--precision", "friction 5%", "--json"]
+        arguments = ["design", str(cell.path), "--quick", "--precision", "friction 5%", "--json"]
         result = CliRunner().invoke(
-            app, [*words, "-o", str(tmp_path / "o"), "--workers", "1"], catch_exceptions=False
+            app, [*arguments, "-o", str(tmp_path / "o"), "--workers", "1"], catch_exceptions=False
         )
-        (found,) = json.loads(result.stdout)["precision"]
-        assert found["requirement"] == "friction 5 %"
-        assert 0.0 < found["half"] < 0.05
-        assert found["repetitions"] == 1
+        (entry,) = json.loads(result.stdout)["precision"]
+        assert entry["requirement"] == "friction 5 %"
+        assert 0.0 < entry["half"] < 0.05
+        assert entry["repetitions"] == 1
 
     def test_a_motion_for_a_payload_lasts_ten_seconds_at_most(self, cell, tmp_path: Path) -> None:
         out = tmp_path / "out"
-        words = ["design", str(cell.path), "--for", "payload", "--payload-mass", "2"]
-        words += ["-o", str(out), "--workers", "1"]
-        result = CliRunner().invoke(app, words, catch_exceptions=False)
+        arguments = ["design", str(cell.path), "--for", "payload", "--payload-mass", "2"]
+        arguments += ["-o", str(out), "--workers", "1"]
+        result = CliRunner().invoke(app, arguments, catch_exceptions=False)
         assert result.exit_code == 0, result.output
         assert "mass of payload 1 %: mass " in result.output
         assert "after 2 repetitions" in result.output
-        found = DesignResult.load(out)
-        assert found.excitation.trajectory.duration <= 10.0
-        assert found.data["precision"][0]["half"] > 0.0
+        design = DesignResult.load(out)
+        assert design.excitation.trajectory.duration <= 10.0
+        assert design.data["precision"][0]["half"] > 0.0
 
     @pytest.mark.parametrize("more", [[], ["--for", "payload"]])
     def test_arm_and_payload_need_different_motions(self, cell, tmp_path: Path, more) -> None:
         mixed = "mass of payload 1%, parameters 5%"
-        words = ["design", str(cell.path), "--precision", mixed, *more]
+        arguments = ["design", str(cell.path), "--precision", mixed, *more]
         with pytest.raises(InputError, match=r"add --for payload, with no other requirement"):
-            CliRunner().invoke(app, [*words, "-o", str(tmp_path / "o")], catch_exceptions=False)
+            CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "o")], catch_exceptions=False)
 
     def test_methods_without_gradient_are_refused(self, cell, tmp_path) -> None:
-        words = ["design", str(cell.path), "--method", "b", "--precision", "parameters 5%"]
+        arguments = ["design", str(cell.path), "--method", "b", "--precision", "parameters 5%"]
         with pytest.raises(InputError, match="choose the method gradient"):
-            CliRunner().invoke(app, [*words, "-o", str(tmp_path / "o")], catch_exceptions=False)
+            CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "o")], catch_exceptions=False)
         assert not (tmp_path / "o").exists()
 
 

@@ -97,9 +97,9 @@ def test_every_cycle_is_archived_with_its_source(recorded: Path) -> None:
         "cell.toml", "robot.urdf", "drive_train.json", "init_packet.bin"
     }  # fmt: skip
     assert len(archive.attachments["init_packet.bin"]) == INIT_LENGTH
-    found = identify_archives([recorded], Silent())
-    assert found.verdict.good, found.verdict.line
-    coverage = found.results.coverage
+    identification = identify_archives([recorded], Silent())
+    assert identification.verdict.good, identification.verdict.line
+    coverage = identification.results.coverage
     # 95 % of 58 parameters are within two standard deviations where the model is the plant's;
     # what smoothing leaves of the controller's jerk costs some of them.
     assert coverage.within_3 >= 0.9 * coverage.total
@@ -258,7 +258,11 @@ def test_ctrl_c_ends_the_recording_a_second_one_replies(on_udp: tuple[Path, int]
 def test_an_arm_at_rest_is_left_after_a_second(on_udp: tuple[Path, int]) -> None:
     path, port = on_udp
     # It opens its axes, which are held where they are; only a PC that leaves ends the interval.
-    still = [one for one in own_motion(path, port, "--intervals", "1") if one != "--own-motion"]
+    still = [
+        argument
+        for argument in own_motion(path, port, "--intervals", "1")
+        if argument != "--own-motion"
+    ]
     with running(*still), recorder_of(path, "--duration", "1.5", "--json") as recorder:
         output, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 0, errors

@@ -67,7 +67,7 @@ def test_lost_packets_and_replies_not_accepted_are_gaps(tmp_path: Path) -> None:
     rows = np.delete(rows, [118, 119, 300, 301])  # the second hole was never reported
     recording = open_recording(archive(tmp_path / NAME, rows, lost=unaccepted))
     assert np.flatnonzero(recording.gap_before).tolist() == [118, 148, 298]
-    parts = [(one.start, one.stop) for one in recording.segments()]
+    parts = [(segment.start, segment.stop) for segment in recording.segments()]
     assert parts == [(0, 118), (118, 148), (148, 298), (298, 396)]
     assert recording.time[118] == pytest.approx(0.240)
 

@@ -68,10 +68,10 @@ def designed(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
 
 def test_a_good_plan_on_a_right_cell_passes_every_criterion(designed: Campaign) -> None:
     """With noise and a faulty link."""
-    found = Rehearsal.load(designed.folder)
-    assert found is not None and found.passed and not found.failures
-    assert found.plan_hash == designed.folder.plan_hash
-    assert [one.name for one in found.criteria] == [*CRITERIA]
+    rehearsal = Rehearsal.load(designed.folder)
+    assert rehearsal is not None and rehearsal.passed and not rehearsal.failures
+    assert rehearsal.plan_hash == designed.folder.plan_hash
+    assert [criterion.name for criterion in rehearsal.criteria] == [*CRITERIA]
     require_rehearsed(designed.folder)
     twin = Campaign.open(designed.folder.rehearsed / "plain")
     assert twin.plan.to_text() == designed.plan.to_text()
@@ -86,12 +86,12 @@ def test_a_good_plan_on_a_right_cell_passes_every_criterion(designed: Campaign) 
 def test_simulated_parameters_are_within_a_tenth_of_nominal(designed: Campaign, seed: int) -> None:
     twin = Twin.of(designed.cell, seed=seed, repetitions=3)
     nominal = designed.cell.nominal_values()
-    known = nominal != 0.0
-    apart = np.abs(twin.truth[known] / nominal[known] - 1.0)
+    stated = nominal != 0.0
+    apart = np.abs(twin.truth[stated] / nominal[stated] - 1.0)
     # Each base parameter of this arm is a sum of figures of one sign, or of one figure.
     assert np.all(apart <= SPREAD + 1e-12)
     assert np.all(apart > 0.0)
-    assert np.all(twin.truth[~known] == 0.0)
+    assert np.all(twin.truth[~stated] == 0.0)
     other = Twin.of(designed.cell, seed=seed + 10, repetitions=3)
     assert not np.array_equal(other.truth, twin.truth)
 
@@ -127,7 +127,9 @@ def test_a_wrong_cell_or_plan_fails(
             # The residuals are so large that the intervals of the parameters become wide.
             expected, honest = {"unseen motion"}, DriveTrain.joint_torque
             monkeypatch.setattr(
-                DriveTrain, "joint_torque", lambda one, current: honest(one, current) * [1.0, -1.0]
+                DriveTrain,
+                "joint_torque",
+                lambda train, current: honest(train, current) * [1.0, -1.0],
             )
         case "tiny and slow" | "one joint only":
             poor = ((1.0, 1.0), 0.02) if wrong == "tiny and slow" else ((0.0, 40.0), 1.0)
@@ -140,10 +142,10 @@ def test_a_wrong_cell_or_plan_fails(
         case _:
             cell, expected = cell_of(tmp_path, CELL.replace(right, wrong, 1) + GEARS), set()
     campaign = Campaign.create(tmp_path / "campaign", cell, plan)
-    found = campaign.rehearse()
-    failed = {one.name for one in found.criteria if not one.passed}
-    assert not found.passed
-    assert failed & expected if expected else failed, found.failures
+    rehearsal = campaign.rehearse()
+    failed = {criterion.name for criterion in rehearsal.criteria if not criterion.passed}
+    assert not rehearsal.passed
+    assert failed & expected if expected else failed, rehearsal.failures
     if wrong == "nearly too weak":
         assert failed == expected
     with pytest.raises(NotRehearsedError, match="failed its rehearsal"):
@@ -155,8 +157,8 @@ def test_it_passes_at_any_cycle(tmp_path: Path, designed: Campaign, cycle_ms: in
     """At 2 ms: above."""
     assert designed.cell.controller.cycle_ms == 2
     cell = cell_of(tmp_path, CELL.replace("cycle_ms = 2", f"cycle_ms = {cycle_ms}"))
-    found = Campaign.create(tmp_path / "campaign", cell, designed.plan).rehearse()
-    assert found.passed, found.failures
+    rehearsal = Campaign.create(tmp_path / "campaign", cell, designed.plan).rehearse()
+    assert rehearsal.passed, rehearsal.failures
 
 
 @pytest.mark.parametrize(
@@ -203,9 +205,9 @@ def test_a_motion_beyond_a_speed_limit_is_no_completed_one(designed: Campaign) -
     assert of_motions(designed.cell, plain, "plain", "").passed
     velocity = [0.7 * speed for speed in designed.cell.file.limits.velocity_deg]
     slow = designed.cell.with_values({"limits.velocity_deg": velocity})
-    found = of_motions(slow, plain, "plain", "")
-    assert not found.passed
-    assert "of its speed limit" in found.sentence and "hil plot" in found.sentence
+    criterion = of_motions(slow, plain, "plain", "")
+    assert not criterion.passed
+    assert "of its speed limit" in criterion.sentence and "hil plot" in criterion.sentence
 
 
 def test_a_cell_of_hardware_is_rehearsed_from_nominal_figures(
@@ -213,19 +215,23 @@ def test_a_cell_of_hardware_is_rehearsed_from_nominal_figures(
 ) -> None:
     text = CELL[: CELL.index("[simulation]")].replace('"simulated"', '"udp"')
     campaign = Campaign.create(tmp_path / "campaign", cell_of(tmp_path, text), designed.plan)
-    found = campaign.rehearse()
-    assert found.passed, found.failures
-    assert any("noise of" in sentence for sentence in found.assumed)
-    assert any("joint_sign" in sentence for sentence in found.not_seen)
+    rehearsal = campaign.rehearse()
+    assert rehearsal.passed, rehearsal.failures
+    assert any("noise of" in sentence for sentence in rehearsal.assumed)
+    assert any("joint_sign" in sentence for sentence in rehearsal.not_seen)
     assert campaign.cell.controller.transport == "udp"
 
 
 def test_a_report_of_the_archives_has_the_true_parameters(
     designed: Campaign,
 ) -> None:
-    found = identify_campaign(designed.folder.rehearsed / "plain", Silent())
+    identification = identify_campaign(designed.folder.rehearsed / "plain", Silent())
     twin = Twin.of(designed.cell, seed=1, repetitions=3)
-    truths = [one.truth for one in found.results.parameters if one.truth is not None]
+    truths = [
+        parameter.truth
+        for parameter in identification.results.parameters
+        if parameter.truth is not None
+    ]
     assert truths == twin.truth.tolist()
 
 

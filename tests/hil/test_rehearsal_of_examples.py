@@ -26,6 +26,6 @@ def test_it_passes_with_and_without_effects(tmp_path: Path, name: str, cycle_ms:
     """One plan of a short search, found at the cycle of the rehearsal."""
     cell = Cell.load(CELLS[name]).with_values({"controller.cycle_ms": cycle_ms})
     cell = cell.with_campaign(repetitions=3, validation_runs=2)
-    found = Campaign.create(tmp_path / "campaign", cell, design(cell, Silent())).rehearse()
-    assert found.passed, found.failures
-    assert [criterion.name for criterion in found.criteria] == [*CRITERIA]
+    rehearsal = Campaign.create(tmp_path / "campaign", cell, design(cell, Silent())).rehearse()
+    assert rehearsal.passed, rehearsal.failures
+    assert [criterion.name for criterion in rehearsal.criteria] == [*CRITERIA]

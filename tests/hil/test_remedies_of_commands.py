@@ -33,8 +33,8 @@ FOURTH = (
 )
 
 
-def typed(*words: object) -> Result:
-    return CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": "200"})
+def typed(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in arguments], env={"COLUMNS": "200"})
 
 
 def message(result: Result) -> str:
@@ -62,7 +62,7 @@ def log(
     states = zip(position, velocity, acceleration, strict=True)
     rigid = np.array([pin.rnea(model, data, *state) for state in states])
     torque = rigid + (DRY + load * np.abs(rigid)) * np.tanh(velocity / 1e-3) + 0.2 * velocity
-    torque = np.column_stack([np.interp(time - late, time, one) for one in torque.T])
+    torque = np.column_stack([np.interp(time - late, time, column) for column in torque.T])
     torque += 0.01 * torque.std(axis=0) * random.standard_normal(torque.shape)
     hit = random.random(torque.shape) < 0.005
     torque += spikes * hit * random.standard_normal(torque.shape)
@@ -89,8 +89,12 @@ def archive(folder: Path) -> Path:
 
 def findings(result: Path) -> dict[str, dict[str, Any]]:
     """What is not good in the results of an identification, by name of the check."""
-    found = json.loads((result / "results.json").read_text())
-    return {one["check"]: one for one in found["judgement"]["findings"] if one["level"] != "good"}
+    results = json.loads((result / "results.json").read_text())
+    return {
+        finding["check"]: finding
+        for finding in results["judgement"]["findings"]
+        if finding["level"] != "good"
+    }
 
 
 def steps(result: Path) -> str:
@@ -181,8 +185,8 @@ class TestIdentify:
         (option,) = {*re.findall(r"`hil identify (--delay \w+)`", steps(tmp_path / "result"))}
         option = option.replace("SECONDS", "0.03")
         assert typed(*line, *option.split()).exit_code == 0
-        found = json.loads((tmp_path / "result" / "results.json").read_text())
-        assert found["delays"]["applied"] == pytest.approx([0.03] * 3, abs=1e-3)
+        results = json.loads((tmp_path / "result" / "results.json").read_text())
+        assert results["delays"]["applied"] == pytest.approx([0.03] * 3, abs=1e-3)
 
     def test_friction_that_grows_with_the_load(self, folder: Path, tmp_path: Path) -> None:
         line = ["identify", log(tmp_path / "worm.csv", load=0.2), "--urdf", folder / "arm.urdf"]
@@ -199,8 +203,8 @@ class TestIdentify:
         (option,) = {*re.findall(r"identify (--estimator \w+)", steps(tmp_path / "result"))}
         robust = typed(*line, *option.split())
         assert robust.exit_code in (0, 5), message(robust)
-        found = json.loads((tmp_path / "result" / "results.json").read_text())
-        assert found["estimator"]["name"] == option.split()[1]
+        results = json.loads((tmp_path / "result" / "results.json").read_text())
+        assert results["estimator"]["name"] == option.split()[1]
 
 
 class TestExport:
@@ -230,9 +234,9 @@ class TestArchive:
         path.write_bytes(archive.read_bytes()[:-400])
         return path
 
-    @pytest.mark.parametrize("words", [("archive", "check"), ("archive", "info")])
-    def test_a_truncated_one_is_repaired(self, words: Sequence[str], truncated: Path) -> None:
-        printed = message(typed(*words, truncated))
+    @pytest.mark.parametrize("arguments", [("archive", "check"), ("archive", "info")])
+    def test_a_truncated_one_is_repaired(self, arguments: Sequence[str], truncated: Path) -> None:
+        printed = message(typed(*arguments, truncated))
         (line,) = {*re.findall(r"hil (archive repair [^`\n]*)", printed)}
         repaired = typed(*shlex.split(line))
         assert repaired.exit_code in (0, 3), message(repaired)

@@ -394,8 +394,8 @@ class TestPage:
         assert sum(tag == "h1" for tag, _ in whole.tags) == 1
         assert sum(tag == "caption" for tag, _ in whole.tags) == len(whole.tables)
         for kind, count in (("Figure", 8), ("Table", len(whole.tables))):
-            found = re.findall(rf"<b>{kind} (\d+)\.</b>", html)
-            assert found == [str(k) for k in range(1, count + 1)]
+            numbers = re.findall(rf"<b>{kind} (\d+)\.</b>", html)
+            assert numbers == [str(k) for k in range(1, count + 1)]
 
     def test_bytes_do_not_depend_on_thread_or_settings(self):
         settings = {"lines.linestyle": ":", "svg.fonttype": "path", "text.usetex": True}
@@ -416,10 +416,10 @@ class TestPage:
             return value + HOSTILE if hostile else value
 
         spoilt = Results.model_validate(spoil(results.model_dump()))
-        found = Page(render(spoilt, make_series(samples=200, name="v" + HOSTILE)))
-        assert_inert(found)
-        assert "{{7*7}}" in found.text
-        assert "<script>alert(1)</script>" in found.text
+        rendered_page = Page(render(spoilt, make_series(samples=200, name="v" + HOSTILE)))
+        assert_inert(rendered_page)
+        assert "{{7*7}}" in rendered_page.text
+        assert "<script>alert(1)</script>" in rendered_page.text
         # Also characters that change the direction of text.
         text = environment().from_string("{{ name }}|{{ same }}|{{ number }}")
         name, same = "a\u202eb\x1b[31m\u2066c\x7f", "1\u2009234\u00a0N\n\té"
@@ -430,8 +430,8 @@ class TestPage:
         whole = real_recording()
 
         def first(section):
-            found = section.model_dump().items()
-            return {key: value[:1] if isinstance(value, list) else value for key, value in found}
+            fields = section.model_dump().items()
+            return {key: value[:1] if isinstance(value, list) else value for key, value in fields}
 
         alone = whole.model_dump() | {
             "joint_names": ["q"], "parameters": [whole.parameters[5].model_dump()], "n_base": 1,
@@ -441,8 +441,8 @@ class TestPage:
             "excitation": whole.excitation.model_dump()
             | {"executed": _criteria(1.0, 1.0) | {"condition": math.inf}},
         }  # fmt: skip
-        found = Page(render(Results.model_validate(alone), make_series(joints=1)))
-        assert "Nothing was held out" in found.text
+        rendered_page = Page(render(Results.model_validate(alone), make_series(joints=1)))
+        assert "Nothing was held out" in rendered_page.text
 
     def test_shows_every_criterion_and_the_words_of_the_method(self, monkeypatch):
         """Rows of `CRITERIA` and `METHODS`."""
@@ -457,8 +457,8 @@ class TestPage:
 
     def test_shows_the_chosen_candidate_and_the_best(self, results, whole):
         estimator = results.choices[1]
-        words = [estimator.candidates[k] for k in page.shown_candidates(estimator)]
-        assert words == ["least squares", *(f"ridge {k}" for k in range(5))]
+        shown = [estimator.candidates[k] for k in page.shown_candidates(estimator)]
+        assert shown == ["least squares", *(f"ridge {k}" for k in range(5))]
         worst = Choice(name="x", candidates=list("abcdefgh"), errors=[0.1] * 7 + [0.9], chosen=7)
         assert 7 in page.shown_candidates(worst) and len(page.shown_candidates(worst)) == 6
         assert "✓ 10 Hz 6.12" in whole.text and "5 Hz 6.55" in whole.text
@@ -492,8 +492,8 @@ class TestPage:
     def test_ranks_warnings_and_names_the_first_beside_the_verdict(self):
         roles = {"few runs": "condition", "wrist off": "symptom", "negated": "cause"}
         findings = [
-            {"check": "x", "level": "doubtful", "words": words, "role": role}
-            for words, role in roles.items()
+            {"check": "x", "level": "doubtful", "words": sentence, "role": role}
+            for sentence, role in roles.items()
         ]
         warnings = ["a note on the source", *roles]
         verdict = {"good": True, "line": "Good.", "reasons": [], "warnings": warnings}
@@ -524,12 +524,12 @@ class TestPage:
             "notes": "wet",
         }
         text = rendered(make_results(occasion=occasion)).text
-        for words in ("2026-11-02 08:15 UTC", "2026-11-26 12:30 UTC", "ada", "4711", "wet"):
-            assert words in text
+        for phrase in ("2026-11-02 08:15 UTC", "2026-11-26 12:30 UTC", "ada", "4711", "wet"):
+            assert phrase in text
 
     def test_shows_steps_of_the_campaign_if_known(self, whole):
-        for words in ("Execution", "6 of 6 criteria passed", "Accepted by ada", "2 late"):
-            assert words in whole.text
+        for phrase in ("Execution", "6 of 6 criteria passed", "Accepted by ada", "2 late"):
+            assert phrase in whole.text
         assert "▲ Not warm" in whole.text and "still 1.3 %" in whole.text
         assert "Execution" not in rendered(make_results()).text
 
@@ -624,14 +624,14 @@ class TestParameters:
 
     def test_essential_and_consistent_ones_are_explained(self):
         page = rendered(make_results(essential=ESSENTIAL, consistency=CONSISTENCY))
-        for words in (
+        for phrase in (
             "2 of 58 are essential",
             "left out: f0_2",
             "needed for held-out motion",
             "by more than three standard deviations: mc2x, f0_1.",
             *CONSISTENCY["bounds"],
         ):
-            assert words in page.text
+            assert phrase in page.text
         assert_inert(page)
         names = [row["Name"] for row in page.table("With all parameters")]
         assert names == ["f1_1 joint_1"]
@@ -671,9 +671,9 @@ class TestFigures:
             (figures.friction_charts(series, joints), [*JOINTS[:2], *JOINTS[3:]]),
         ):
             panels = [chart_panel(chart) for chart in panels]
-            assert [one.title for one in panels] == expected
-            assert all(one.svg.count("<path") >= 4 for one in panels)
-            assert [one.joint for one in panels] == [JOINTS.index(name) for name in expected]
+            assert [drawn.title for drawn in panels] == expected
+            assert all(drawn.svg.count("<path") >= 4 for drawn in panels)
+            assert [drawn.joint for drawn in panels] == [JOINTS.index(name) for name in expected]
 
     def test_show_the_nominal_model_where_it_is_known(self, results):
         series = make_series(samples=200)

@@ -108,7 +108,7 @@ class TestCharts:
         drag(page, "t0", 0.4, 0.6)
         zoomed = x_ranges(page)
         assert zoomed[0][0] > before[0][0] and zoomed[0][1] < before[0][1]
-        assert all(one == zoomed[0] for one in zoomed) and len(zoomed) == 2 * len(JOINTS)
+        assert all(x_range == zoomed[0] for x_range in zoomed) and len(zoomed) == 2 * len(JOINTS)
         page.locator("label:has(#view-parts)").click()
         wait_for(page, "parts")
         assert x_ranges(page, "parts")[0] == pytest.approx(zoomed[0])

@@ -54,13 +54,13 @@ def run(*arguments: str):
 def test_a_rollout_is_better_than_the_nominal_arm(folder: Path) -> None:
     done = run("rollout", folder, "--samples", "3", "--json")
     assert done.exit_code in (0, 5), done.output
-    found = RolloutResult.load(folder / ROLLOUT)
-    assert json.loads(done.stdout)["windows"] == found.windows
-    assert found.ratio is not None
-    assert found.ratio[2] <= 0.5  # at 0.5 s
-    assert found.identified.unstable == 0
-    assert "is better than the nominal one up to 1 s" in found.message
-    assert all(np.isfinite(at).all() for at in found.identified.joints)
+    result = RolloutResult.load(folder / ROLLOUT)
+    assert json.loads(done.stdout)["windows"] == result.windows
+    assert result.ratio is not None
+    assert result.ratio[2] <= 0.5  # at 0.5 s
+    assert result.identified.unstable == 0
+    assert "is better than the nominal one up to 1 s" in result.message
+    assert all(np.isfinite(at).all() for at in result.identified.joints)
     assert "nan" not in (folder / ROLLOUT).read_text().lower()
 
 
@@ -87,13 +87,13 @@ class TestSectionOfTheReport:
     def test_the_rollout_writes_it(self, folder: Path) -> None:
         assert "Simulated motion" not in (folder / REPORT).read_text()
         run("rollout", folder, "--samples", "3")
-        page, found = (folder / REPORT).read_text(), RolloutResult.load(folder / ROLLOUT)
-        assert found.message in page
+        page, result = (folder / REPORT).read_text(), RolloutResult.load(folder / ROLLOUT)
+        assert result.message in page
         assert "arms drawn from the posterior" in page
-        assert page.count('<div class="panel" data-chart="rollout-') == len(found.joint_names) + 1
+        assert page.count('<div class="panel" data-chart="rollout-') == len(result.joint_names) + 1
         section = page.split('<section id="rollout">')[1].split("</section>")[0]
         assert "nan" not in section.lower()
-        assert section.count(">0.2</text>") >= len(found.joint_names)  # ticks at the horizons
+        assert section.count(">0.2</text>") >= len(result.joint_names)  # ticks at the horizons
 
     def test_the_picture_has_errors_and_shares(self, folder: Path) -> None:
         run("rollout", folder, "--samples", "3")
@@ -111,21 +111,21 @@ class TestSectionOfTheReport:
 
     def test_it_counts_an_arm_that_explodes(self, folder: Path) -> None:
         run("rollout", folder, "--samples", "3")
-        found = RolloutResult.load(folder / ROLLOUT)
-        count, others = found.windows, len(found.joint_names) - 1
+        result = RolloutResult.load(folder / ROLLOUT)
+        count, others = result.windows, len(result.joint_names) - 1
         lost = ArmErrors(
-            joints=[[np.pi] * (others + 1)] * len(found.horizons),
-            tool=[None] * len(found.horizons),
+            joints=[[np.pi] * (others + 1)] * len(result.horizons),
+            tool=[None] * len(result.horizons),
             unstable=count,
             unstable_joints=[count, *[0] * others],
         )
         path = folder / ROLLOUT
-        path.write_text(found.model_copy(update={"identified": lost}).to_json())
+        path.write_text(result.model_copy(update={"identified": lost}).to_json())
         run("report", folder)
         section = (folder / REPORT).read_text().split('<section id="rollout">')[1]
         section = section.split("</section>")[0]
         assert f"makes {count} of {count} windows unstable" in section
-        assert f"unstable in {count} of {count} windows (first {found.joint_names[0]}" in section
+        assert f"unstable in {count} of {count} windows (first {result.joint_names[0]}" in section
         assert "nan" not in section.lower()
 
     def test_another_identification_removes_it(self, folder: Path) -> None:
@@ -149,14 +149,14 @@ def test_to_identify_imports_nothing_of_mujoco() -> None:
 def test_a_polish_is_judged_on_held_out_windows(folder: Path) -> None:
     done = run("rollout", folder, "--samples", "3", "--polish")
     assert done.exit_code in (0, 5), done.exception
-    found = RolloutResult.load(folder / ROLLOUT)
-    assert found.polish is not None
-    assert found.polish.accepted == (found.polish.change < 0.0)
-    assert (folder / POLISHED).exists() == found.polish.accepted
-    verdict = "used." if found.polish.accepted else "not used."
-    assert verdict in found.message
-    assert f"held-out position error by {percentage(abs(np.expm1(found.polish.change)), 1)}" in (
-        found.message
+    result = RolloutResult.load(folder / ROLLOUT)
+    assert result.polish is not None
+    assert result.polish.accepted == (result.polish.change < 0.0)
+    assert (folder / POLISHED).exists() == result.polish.accepted
+    verdict = "used." if result.polish.accepted else "not used."
+    assert verdict in result.message
+    assert f"held-out position error by {percentage(abs(np.expm1(result.polish.change)), 1)}" in (
+        result.message
     )
 
 

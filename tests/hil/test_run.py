@@ -176,8 +176,8 @@ def run_pushed(campaign: Campaign, fault: Push) -> RunResult:
 
 def cycles_of(campaign: Campaign, archive: str) -> Array:
     """The cycles of a motion (k,)."""
-    found = open_archive(campaign.folder.archives / archive, fields=["cycle"])
-    return np.asarray(found.columns["cycle"])
+    opened = open_archive(campaign.folder.archives / archive, fields=["cycle"])
+    return np.asarray(opened.columns["cycle"])
 
 
 def middle_of(campaign: Campaign, archive: str) -> int:
@@ -227,16 +227,16 @@ def test_a_plan_is_not_run_before_it_was_rehearsed(make: Make) -> None:
 
 
 @pytest.mark.parametrize(
-    ("real", "words"),
+    ("real", "message"),
     [
         (False, r"was not done, and there is no .*--dry-run`"),
         (True, "cannot be accepted before it was done"),
     ],
 )
-def test_a_dry_run_that_was_not_done_is_asked_for(make: Make, real: bool, words: str) -> None:
+def test_a_dry_run_that_was_not_done_is_asked_for(make: Make, real: bool, message: str) -> None:
     """Before anything moves; where an arm may move, it cannot be accepted beforehand."""
     campaign = make(real=real)
-    with pytest.raises(DryRunError, match=words) as refused:
+    with pytest.raises(DryRunError, match=message) as refused:
         campaign.run(accept_dry_run=real)
     assert refused.value.exit_code == 3
     assert not list(campaign.folder.archives.iterdir())
@@ -250,11 +250,11 @@ def test_the_dry_run_is_every_motion_slowly(make: Make) -> None:
     assert not done.complete
     motions = [
         campaign.plan.excitation.trajectory,
-        *(one.trajectory for one in campaign.plan.validation),
+        *(validation.trajectory for validation in campaign.plan.validation),
     ]
-    found = DryRunRecord.load(campaign.folder)
-    assert (found.warnings, found.gravity_not_seen) == ((), ()), "torques of a right cell"
-    for name, motion in zip(sorted(found.archives), motions, strict=True):
+    record = DryRunRecord.load(campaign.folder)
+    assert (record.warnings, record.gravity_not_seen) == ((), ()), "torques of a right cell"
+    for name, motion in zip(sorted(record.archives), motions, strict=True):
         planned = np.abs(motion.sample(np.arange(0, motion.duration, campaign.cell.period))[1])
         limits = campaign.cell.joint_limits.velocity
         speed = peak_speed(campaign, name)
@@ -263,10 +263,10 @@ def test_the_dry_run_is_every_motion_slowly(make: Make) -> None:
 
     with pytest.raises(DryRunError, match=r"was done, but is not accepted; .*--accept-dry-run`"):
         campaign.run()
-    rest = campaign.run(accept_dry_run=True)
-    assert kinds(rest) == ["move", "standstill", "excitation", "validation", "move"]
+    second_run = campaign.run(accept_dry_run=True)
+    assert kinds(second_run) == ["move", "standstill", "excitation", "validation", "move"]
     assert DryRunRecord.load(campaign.folder).accepted.by
-    assert rest.complete
+    assert second_run.complete
     assert campaign.run().archives == (), "accepted once, and nothing is missing"
 
 
@@ -323,12 +323,12 @@ def test_the_time_left_is_right_and_counts_down(
 
     campaign.run(link, operator=Clock(), durable=False)
     now, left = np.array(estimates).T
-    true, known = now[-1] - now, now - now[0] > 0.1 * (now[-1] - now[0])
-    assert known.sum() >= 10
-    off = np.abs(left - true)[known] / (0.2 * true[known] + 1.0)
-    assert off.max() < 1.0, (true[known][off.argmax()], left[known][off.argmax()])
+    true, settled = now[-1] - now, now - now[0] > 0.1 * (now[-1] - now[0])
+    assert settled.sum() >= 10
+    off = np.abs(left - true)[settled] / (0.2 * true[settled] + 1.0)
+    assert off.max() < 1.0, (true[settled][off.argmax()], left[settled][off.argmax()])
     learned = np.diff(now).max()  # since the last update: it arrives at once
-    assert np.diff(left[known]).max() < 0.1 * true[0] + learned
+    assert np.diff(left[settled]).max() < 0.1 * true[0] + learned
 
 
 def test_a_mirrored_joint_is_accepted_by_its_name_only(tmp_path: Path, designed: Campaign) -> None:
@@ -366,9 +366,9 @@ def test_a_torque_is_judged_by_weight_beside_friction() -> None:
     friction = 20.0 * np.sign(speed) + 5.0 * speed + noise
     moving = np.abs(speed) > 0.05
     for sign in (1.0, -1.0):
-        found = agreement(weight, sign * 1.3 * weight + friction, speed, moving)
-        assert np.all(sign * found[:2] > 0.9)
-        assert np.isnan(found[2:]).all(), "light beside friction, and without weight"
+        correlation = agreement(weight, sign * 1.3 * weight + friction, speed, moving)
+        assert np.all(sign * correlation[:2] > 0.9)
+        assert np.isnan(correlation[2:]).all(), "light beside friction, and without weight"
     assert np.isnan(agreement(weight, friction, speed, np.zeros_like(moving))).all()
 
 
@@ -434,8 +434,8 @@ def test_a_simulated_dry_run_opens_no_gate_to_a_real_arm(make: Make) -> None:
     did = make("did", real=True)
     simulated = simulated_link(did.cell, instead_of_hardware=True)
     did.run(simulated, dry_run_only=True, operator=Operator())
-    found = DryRunRecord.load(did.folder)
-    for name, claimed in (("copied", found), ("edited", replace(found, simulated=False))):
+    record = DryRunRecord.load(did.folder)
+    for name, claimed in (("copied", record), ("edited", replace(record, simulated=False))):
         mine = make(name, real=True)
         claimed.accepted_now().save(mine.folder.dry_run)
         with pytest.raises(DryRunError, match="was not done"):
@@ -522,7 +522,7 @@ def test_wider_limits_change_nothing_and_narrower_ones_are_noted(copied: Campaig
     checks = MotionChecks.of(copied.cell)
     assert active_checks(copied.cell, wider.connection, checks) is checks
     narrower = link_to_controller_with(copied, drive_train__current_limit=[19.5, 12.0])
-    (note,) = [one for one in copied.run(narrower).notes if "limits" in one]
+    (note,) = [run_note for run_note in copied.run(narrower).notes if "limits" in run_note]
     assert "counted (shoulder: 19.5 A in the controller, 20 in the cell file)" in note
 
 
@@ -609,7 +609,9 @@ def test_a_slowed_repetition_is_rejected_and_run_again(make: Make) -> None:
     # Whoever names all files of the folder does not pool it either.
     loose = sorted(campaign.folder.archives.glob("excitation_*"))
     sources = gather_sources(loose, split=0.5)
-    assert rejected.archive not in {one.name for one in (*sources.training, *sources.held_out)}
+    assert rejected.archive not in {
+        source.name for source in (*sources.training, *sources.held_out)
+    }
     assert any("rejected and left out: it was held or slowed" in text for text in sources.warnings)
 
 
@@ -639,7 +641,11 @@ def test_a_disturbed_first_repetition_rejects_no_others(make: Make, undisturbed:
     campaign = make(repetitions=3)
     result = run_pushed(campaign, Push(middle_of(undisturbed, "excitation_000_a1.mcap")))
     assert result.complete
-    assert [one.archive[11:-5] for one in result.rejected] == ["001_a1", "001_a2", "000_a1"]
+    assert [rejection.archive[11:-5] for rejection in result.rejected] == [
+        "001_a1",
+        "001_a2",
+        "000_a1",
+    ]
     assert "agree with each other, not with this" in result.rejected[2].reason
     assert any("excitation_000_a1.mcap was the only repetition" in note for note in result.notes)
     good = [path.name[11:-5] for path in campaign.folder.completed("excitation")]
@@ -670,7 +676,9 @@ def test_a_repetition_with_lost_replies_is_as_planned(
     link = VirtualLink.over(SimulatedTransport(controller, lost), cell, controller.finish)
     campaign = Campaign.create(tmp_path / "campaign", cell, designed.plan)
     campaign.run(link, unrehearsed=True, durable=False)
-    sent, intended = (one.folder.archives / name for one in (campaign, undisturbed))
+    sent, intended = (
+        run_campaign.folder.archives / name for run_campaign in (campaign, undisturbed)
+    )
     assert len(set_points(open_archive(sent))) == len(set_points(open_archive(intended))) + 2
     both = [played(path).commanded for path in (sent, intended)]
     np.testing.assert_allclose(*both, atol=1e-5)
@@ -689,9 +697,9 @@ def test_the_check_lets_noise_pass_and_names_what_differs(
 ) -> None:
     check = RepetitionCheck(undisturbed.cell, undisturbed.plan.excitation.trajectory)
     *earlier, last = (played(path) for path in undisturbed.folder.completed("excitation"))
-    for one in earlier:
-        assert check.problem(one) is None
-        check.accept(one)
+    for repetition in earlier:
+        assert check.problem(repetition) is None
+        check.accept(repetition)
     assert check.problem(last) is None
     values = getattr(last, channel).copy()
     values[:, joint] += 0.2 * np.std(values[:, joint])
@@ -709,7 +717,7 @@ def test_a_truncated_stuck_or_saturated_motion_is_named(undisturbed: Campaign) -
     limit = undisturbed.cell.drive_train.current_limit[1]
     current[100:102, 1], saturated[100:105, 1] = limit, -limit
     few, many = (round(share * len(good.position)) for share in (0.005, 0.03))
-    for changes, words in (
+    for changes, message in (
         ({}, None),
         (short, "cycles are archived"),
         ({"missed": few}, None),
@@ -718,8 +726,8 @@ def test_a_truncated_stuck_or_saturated_motion_is_named(undisturbed: Campaign) -
         ({"current": current}, None),
         ({"current": saturated}, "current of elbow was at its limit for 10 ms"),
     ):
-        found = check.problem(replace(good, **changes))
-        assert found is None if words is None else words in str(found)
+        problem = check.problem(replace(good, **changes))
+        assert problem is None if message is None else message in str(problem)
 
 
 def test_an_amended_archive_keeps_its_content(tmp_path: Path, undisturbed: Campaign) -> None:
@@ -757,16 +765,18 @@ def test_an_archive_that_was_not_checked_is_not_pooled(
     slowed = campaign.folder.archives / "excitation_001_a1.mcap"
     assert open_archive(slowed, fields=()).outcome.outcome == "completed"
     cache = CacheLocation(str(tmp_path / "cache"))
-    found = discover([str(campaign.folder.root)], cache, Here(), Silent())
-    assert slowed.as_posix() not in {ref.location for ref in found.refs}
-    (skipped,) = (one for one in found.skipped if one.path == slowed.as_posix())
+    discovery = discover([str(campaign.folder.root)], cache, Here(), Silent())
+    assert slowed.as_posix() not in {ref.location for ref in discovery.refs}
+    (skipped,) = (unused for unused in discovery.skipped if unused.path == slowed.as_posix())
     assert "not listed in its campaign's manifest.json" in skipped.reason
     good = campaign.folder.completed("excitation")
     warnings = gather_sources([*good, slowed], 0.5).warnings
     assert any(text.startswith(f"{slowed.name} is not in its campaign") for text in warnings)
     again = campaign.run(unrehearsed=True)
     assert again.repetitions == (2, 2)
-    assert [one.archive for one in again.rejected] == [slowed.name], "judged by the next run"
+    assert [rejection.archive for rejection in again.rejected] == [slowed.name], (
+        "judged by the next run"
+    )
 
 
 def test_an_archive_that_was_not_entered_is_adopted(tmp_path: Path, undisturbed: Campaign) -> None:
@@ -808,25 +818,25 @@ def test_friction_is_measured_without_knowing_the_arm_exactly(
     truth = planted_truth(cell)
     more = replace(truth, coulomb=1.1 * truth.coulomb, viscous=1.1 * truth.viscous)
     meter = FrictionMeter(cell, designed.plan.excitation.trajectory)
-    found: list[Array] = []
+    frictions: list[Array] = []
     for name, planted in (("as it is", truth), ("more", more)):
         campaign = Campaign.create(tmp_path / name, cell, designed.plan)
         campaign.run(simulated_link(cell, truth=planted), unrehearsed=True, durable=False)
-        found.append(meter.measure(campaign.folder.completed("excitation")[0]))
-    assert found[1] / found[0] == pytest.approx(np.full(2, 1.1), abs=0.01)
+        frictions.append(meter.measure(campaign.folder.completed("excitation")[0]))
+    assert frictions[1] / frictions[0] == pytest.approx(np.full(2, 1.1), abs=0.01)
 
 
 def warm_up_of(campaign: Campaign) -> WarmUpRecord:
-    found = WarmUpRecord.load(campaign.folder.warmup, campaign.folder.plan_hash)
-    assert found is not None
-    return found
+    record = WarmUpRecord.load(campaign.folder.warmup, campaign.folder.plan_hash)
+    assert record is not None
+    return record
 
 
 def rested(campaign: Campaign, seconds: float) -> None:
     """The arm moved last so many seconds ago."""
-    found = warm_up_of(campaign)
-    assert found.moved_at == pytest.approx(time.time(), abs=60.0)
-    replace(found, moved_at=time.time() - seconds).save(campaign.folder.warmup)
+    record = warm_up_of(campaign)
+    assert record.moved_at == pytest.approx(time.time(), abs=60.0)
+    replace(record, moved_at=time.time() - seconds).save(campaign.folder.warmup)
 
 
 def test_the_arm_warms_up_and_again_when_it_has_cooled_down(make: Make) -> None:
@@ -840,11 +850,11 @@ def test_the_arm_warms_up_and_again_when_it_has_cooled_down(make: Make) -> None:
     assert first.warm_up == "warm"
     assert kinds(first)[1:] == [*["warmup"] * 5, "standstill", *["excitation"] * 2, "validation",
                                 "move"]  # fmt: skip
-    found = warm_up_of(campaign)
-    friction = np.array([one.friction for one in found.motions])
+    record = warm_up_of(campaign)
+    friction = np.array([motion.friction for motion in record.motions])
     assert friction.shape == (5, 2)
     assert np.all(friction[-1] < friction[0]), "friction falls as the gears warm up"
-    assert found.changes[-1] <= 0.004
+    assert record.changes[-1] <= 0.004
 
     (campaign.folder.archives / "excitation_001_a1.mcap").unlink()
     again = run()
@@ -896,8 +906,8 @@ def test_a_slowed_warm_up_motion_gives_no_friction(make: Make) -> None:
     campaign = make(warmup_drift=1e-9, warmup_least=3, warmup_most=3)
     operator = Operator(slowing(range(1, 4), "warm-up"))
     result = campaign.run(operator=operator, unrehearsed=True)
-    assert [one.archive for one in result.rejected] == ["warmup_000_a1.mcap"]
-    assert [one.archive for one in warm_up_of(campaign).motions] == [
+    assert [rejection.archive for rejection in result.rejected] == ["warmup_000_a1.mcap"]
+    assert [motion.archive for motion in warm_up_of(campaign).motions] == [
         "warmup_000_a2.mcap", "warmup_001_a1.mcap", "warmup_002_a1.mcap"
     ]  # fmt: skip
     assert any("not warm" in note for note in result.notes)
@@ -956,8 +966,8 @@ def summary_of(result: Result, exit_code: int = 0) -> dict[str, Any]:
     error = result.exception
     status = error.exit_code if isinstance(error, HilError) else result.exit_code
     assert status == exit_code, error
-    found: dict[str, Any] = json.loads(result.stdout)
-    return found
+    summary: dict[str, Any] = json.loads(result.stdout)
+    return summary
 
 
 @pytest.mark.parametrize(

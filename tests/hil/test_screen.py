@@ -83,20 +83,20 @@ class TestPicture:
         screen._keyboard.attached = True
         rows = screen_lines(80, 24, screen)
         text = "\n".join(rows)
-        for words in (
+        for phrase in (
             "10.2.12.150", "repetition 7 of 30", "19:05 left", "6.2 of 18.6 s",
             "override 80 %", "now 75 %", "cycles 123456, 2 missed, 1 late, 0 not accepted",
             "repetition 5 rejected: its current differs", layout.HELP,
         ):  # fmt: skip
-            assert words in text
+            assert phrase in text
         (second,) = [line for line in rows if line.startswith("joint_2")]
         assert second.split() == ["joint_2", "0.150°", "31", "%", "-7.10", "A", "72", "%"]
         line = layout.status_line(status())
-        for words in (
+        for phrase in (
             "repetition 7 of 30", "6.2 of 18.6 s", "override 80 %", "2 missed", "1 late",
             "following error 130 % of its limit", "current 88 % of its limit", ", 19:05 left",
         ):  # fmt: skip
-            assert words in line
+            assert phrase in line
 
     @pytest.mark.parametrize(("width", "height"), [(20, 3), (80, 24), (300, 60)])
     def test_fits_the_terminal(self, width: int, height: int) -> None:
@@ -122,8 +122,12 @@ class TestPicture:
         held.press("h")
         stopping.press("s")
         silent._came -= 30.0
-        for screen, words in ((held, "HELD"), (stopping, "STOPPING"), (silent, "no news for 3")):
-            assert words in screen_lines(80, 24, screen)[1]
+        for screen, state_text in (
+            (held, "HELD"),
+            (stopping, "STOPPING"),
+            (silent, "no news for 3"),
+        ):
+            assert state_text in screen_lines(80, 24, screen)[1]
 
     def test_a_drive_that_is_off_has_no_following_error(self) -> None:
         names = ("following_error", "following_share", "current", "current_share")
@@ -440,9 +444,9 @@ def test_a_full_pipe_blocks_nothing() -> None:
             file.close()
 
 
-def await_text(out: StringIO, words: str) -> None:
+def await_text(out: StringIO, phrase: str) -> None:
     until = time.monotonic() + 5.0
-    while words not in out.getvalue():
+    while phrase not in out.getvalue():
         assert time.monotonic() < until
         time.sleep(0.02)
 

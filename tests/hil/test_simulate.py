@@ -127,8 +127,8 @@ def cabinet_at(port: int, *options: str) -> Iterator[Forked]:
 
 
 def last_json(text: str) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(text.strip().splitlines()[-1])
-    return found
+    document: dict[str, Any] = json.loads(text.strip().splitlines()[-1])
+    return document
 
 
 def session(

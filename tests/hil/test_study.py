@@ -53,18 +53,22 @@ def test_a_form_gives_the_error_of_an_estimate() -> None:
     random = np.random.default_rng(1)
     phi, tau, values = (random.standard_normal(shape) for shape in ((50, 3), 50, (4, 3)))
     table = np.column_stack([phi, tau])
-    found = relative_errors((table.T @ table / (tau @ tau))[None], values)
+    errors = relative_errors((table.T @ table / (tau @ tau))[None], values)
     expected = np.linalg.norm(tau - values @ phi.T, axis=1) / np.linalg.norm(tau)
-    np.testing.assert_allclose(found, [expected])
+    np.testing.assert_allclose(errors, [expected])
 
 
 def test_true_values_in_printed_units_are_the_manufacturers() -> None:
     cell = Cell.load(CELL_PATH)
-    printed = [one for one in parameters_of(cell, planted_values(cell)) if one.printed_id]
-    known = [one for one in printed if one.printed_c is not None]
-    assert len(printed) == 58 and len(known) == 52
-    for one in known:
-        assert one.printed_factor * one.truth == pytest.approx(one.printed_c, abs=6e-4), one
+    printed = [
+        parameter for parameter in parameters_of(cell, planted_values(cell)) if parameter.printed_id
+    ]
+    with_figure = [parameter for parameter in printed if parameter.printed_c is not None]
+    assert len(printed) == 58 and len(with_figure) == 52
+    for parameter in with_figure:
+        assert parameter.printed_factor * parameter.truth == pytest.approx(
+            parameter.printed_c, abs=6e-4
+        ), parameter
 
 
 class TestCompared:
@@ -75,10 +79,10 @@ class TestCompared:
         forms = np.zeros((12, 3, 3))
         forms[:, 0, 0], forms[:, 1, 1] = 1.0, np.exp(2.0 * logs)
         first, second = np.tile([1.0, 0.0], (13, 1)), np.tile([0.0, 1.0], (13, 1))
-        found = compared(forms, first, second)
-        assert found.ratio == pytest.approx(np.exp(logs.mean()))
-        assert (found.wins, found.motions) == (np.count_nonzero(logs < 0.0), 12)
-        width = np.log(found.high / found.ratio)
+        comparison = compared(forms, first, second)
+        assert comparison.ratio == pytest.approx(np.exp(logs.mean()))
+        assert (comparison.wins, comparison.motions) == (np.count_nonzero(logs < 0.0), 12)
+        width = np.log(comparison.high / comparison.ratio)
         # A standard deviation of 4000 draws is known to about 1 %.
         sizes = stats.sem(logs) * stats.t.ppf(0.975, [5, 11])
         assert 0.95 * sizes[1] < width < 1.05 * sizes[0]
@@ -87,7 +91,7 @@ class TestCompared:
         random = np.random.default_rng(2)
         values = [np.eye(6)[k] + 0.2 * random.standard_normal((5, 6)) for k in (0, 1)]
         few, many = (compared(random_forms(m, 6), *values) for m in (10, 160))
-        widths = [np.log(one.high / one.low) for one in (few, many)]
+        widths = [np.log(comparison.high / comparison.low) for comparison in (few, many)]
         assert widths[1] > 0.5 * widths[0]  # over motions alone it would fall to a quarter
 
     @pytest.mark.parametrize("repetitions", [3, 10, 30])
@@ -100,25 +104,25 @@ class TestCompared:
             noise = random.standard_normal((2, repetitions, 12))
             for k in range(1, repetitions if repetitions >= 10 else 0):
                 noise[:, k] += memory * noise[:, k - 1]
-            found = compared(forms, *(3.0 + noise))
-            differ += found.verdict not in ("none", "too few")
+            comparison = compared(forms, *(3.0 + noise))
+            differ += comparison.verdict not in ("none", "too few")
         # At 5 %, or less, so many are exceeded once in 1000 times.
         assert differ <= stats.binom(trials, 0.05).ppf(0.999)
 
     def test_a_difference_that_exists_is_found(self) -> None:
         forms, random = random_forms(10, 12), np.random.default_rng(5)
         near, far = (off + 0.02 * random.standard_normal((10, 12)) for off in (1.0, 1.2))
-        one = compared(forms, near, far)
-        assert one.ratio == pytest.approx(1.2, rel=0.02)
-        assert one.low > 1.15
-        assert one.verdict == "worse"
+        comparison = compared(forms, near, far)
+        assert comparison.ratio == pytest.approx(1.2, rel=0.02)
+        assert comparison.low > 1.15
+        assert comparison.verdict == "worse"
         assert compared(forms, far, near).verdict == "better"
 
     @pytest.mark.parametrize(("repetitions", "motions"), [(MIN_UNITS - 1, 10), (1, 10), (5, 1)])
     def test_too_few_repetitions_or_motions(self, repetitions: int, motions: int) -> None:
         values = np.random.default_rng(6).standard_normal((2, repetitions, 4))
-        one = compared(random_forms(motions, 4), *values)
-        assert (one.verdict, one.low, one.high) == ("too few", None, None)
+        comparison = compared(random_forms(motions, 4), *values)
+        assert (comparison.verdict, comparison.low, comparison.high) == ("too few", None, None)
 
     @pytest.mark.parametrize(
         ("ratio", "low", "high", "verdict"),
@@ -158,7 +162,7 @@ class TestCompared:
 def test_the_sines_of_largest_determinant_are_chosen(
     log10_det: dict[str, float | None], best: dict[str, str] | None
 ) -> None:
-    found: list[Any] = [
+    searches: list[Any] = [
         SimpleNamespace(
             key=key,
             words=key,
@@ -168,9 +172,9 @@ def test_the_sines_of_largest_determinant_are_chosen(
     ]
     if best is None:
         with pytest.raises(NoExcitationError, match="found no motion"):
-            chosen(found)
+            chosen(searches)
     else:
-        assert {key: one.key for key, one in chosen(found).items()} == best
+        assert {key: search.key for key, search in chosen(searches).items()} == best
 
 
 # A whole study on an arm of two joints
@@ -192,10 +196,10 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Cell:
 def short_sines() -> Iterator[None]:
     """Sines of 6 s instead of 20: the simulation of sines is what takes longest."""
     with pytest.MonkeyPatch.context() as patch:
-        words, choices = SINES["a-middle-fast"]
+        description, choices = SINES["a-middle-fast"]
         for key in list(SINES):
             patch.delitem(SINES, key)
-        patch.setitem(SINES, "a-middle-fast", (words, choices | {"length": 6.0, "ramp": 1.0}))
+        patch.setitem(SINES, "a-middle-fast", (description, choices | {"length": 6.0, "ramp": 1.0}))
         yield
 
 
@@ -220,29 +224,35 @@ class TestWhole:
     """Searches, campaigns, estimates, tables and page."""
 
     def test_it_writes_results_and_one_self_contained_page(self, whole: Whole) -> None:
-        root, found = whole
-        assert StudyResults.load(root / "results.json") == found
+        root, results = whole
+        assert StudyResults.load(root / "results.json") == results
         page = (root / "report.html").read_text("utf-8")
         for part in ("Fig. 1", "Fig. 2", "Fig. 3", "Fig. 4", "Table 1", "Table 2"):
             assert f"paper, {part}" in page
         assert_stands_alone(page)
-        assert "SIMULATED ARM" in page and "nan" not in " ".join(found.conclusion)
-        assert all(sentence.split(";")[0] in page for sentence in found.conclusion)
+        assert "SIMULATED ARM" in page and "nan" not in " ".join(results.conclusion)
+        assert all(sentence.split(";")[0] in page for sentence in results.conclusion)
 
     def test_estimates_predict_and_effects_are_another_condition(self, whole: Whole) -> None:
-        _, found = whole
-        rigid, effects = found.conditions
+        _, results = whole
+        rigid, effects = results.conditions
         assert (rigid.key, effects.key) == ("no-effects", "effects")
-        assert effects.effects and "too few" not in {one.comparison.verdict for one in (effects,)}
-        for one in (rigid, effects):
-            assert len(one.held_out.archives) == 3
-            assert all(name.startswith("validation") for name in one.held_out.archives)
-            assert set(one.held_out.overall) == set(one.held_out.all_rows) == {"a", "b", "planted"}
-            assert all(len(method.values) == 4 for method in one.methods)
-        medians = [np.median(one.held_out.overall["b"]) for one in (rigid, effects)]
+        assert effects.effects and "too few" not in {
+            condition.comparison.verdict for condition in (effects,)
+        }
+        for condition in (rigid, effects):
+            assert len(condition.held_out.archives) == 3
+            assert all(name.startswith("validation") for name in condition.held_out.archives)
+            assert (
+                set(condition.held_out.overall)
+                == set(condition.held_out.all_rows)
+                == {"a", "b", "planted"}
+            )
+            assert all(len(method.values) == 4 for method in condition.methods)
+        medians = [np.median(condition.held_out.overall["b"]) for condition in (rigid, effects)]
         assert medians[1] > medians[0]
         # Estimates of a rigid arm are near the true values.
-        truth = np.array([one.truth for one in found.parameters])
+        truth = np.array([parameter.truth for parameter in results.parameters])
         for method in rigid.methods:
             assert not method.undetermined
             distance = np.abs(np.array(method.pooled) - truth)
@@ -253,24 +263,27 @@ class TestWhole:
         self, whole: Whole, small: StudySettings, arm: Cell, tmp_path: Path
     ) -> None:
         """Of searches that is tested where they are."""
-        root, found = whole
+        root, results = whole
         again = tmp_path / "study"
         shutil.copytree(root / "designs", again / "designs")
         shutil.copy(root / "study.json", again)
         straight = run_study(again, small, Silent(), workers=2, cell=arm)
         not_the_same: dict[str, object] = {"software": {}}
-        texts = [one.model_copy(update=not_the_same).to_json() for one in (found, straight)]
+        texts = [
+            study_results.model_copy(update=not_the_same).to_json()
+            for study_results in (results, straight)
+        ]
         assert texts[0] == texts[1]
 
     def test_a_restart_repeats_nothing_complete(
         self, whole: Whole, small: StudySettings, arm: Cell, tmp_path: Path
     ) -> None:
-        root, found = whole
+        root, results = whole
         copy = shutil.copytree(root, tmp_path / "copy")
         patterns = ("designs/*/excitation.toml", "campaigns/*/*/archives/*.mcap")
 
         def written() -> dict[Path, int]:
-            return {p: p.stat().st_mtime_ns for one in patterns for p in copy.glob(one)}
+            return {p: p.stat().st_mtime_ns for pattern in patterns for p in copy.glob(pattern)}
 
         before = written()
         assert len(before) > 25
@@ -279,7 +292,7 @@ class TestWhole:
         again = run_study(copy, small, Silent(), workers=1, cell=arm)
         new = {path for path, when in written().items() if when != before.get(path)}
         assert new and {path.parents[1] for path in new} == {lost.parents[1]}
-        methods = zip(again.conditions[0].methods, found.conditions[0].methods, strict=True)
+        methods = zip(again.conditions[0].methods, results.conditions[0].methods, strict=True)
         assert [now.mean == then.mean for now, then in methods] == [True, False]
 
     def test_other_settings_are_refused_in_the_same_folder(

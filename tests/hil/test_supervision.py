@@ -241,17 +241,17 @@ class Clock:
 
 
 @pytest.mark.parametrize(
-    ("state", "waits", "words"),
+    ("state", "waits", "reason"),
     [
         (State.DRIVE_OFF, 1.9, "the drive went off before the motion began"),
         (State.FAULTED, 1.9, "a refusal came before the motion began"),
         (State.CLOSED, 59.0, r"did not begin within 60 s"),
     ],
 )
-def test_a_motion_that_does_not_begin_ends(state: State, waits: float, words: str) -> None:
+def test_a_motion_that_does_not_begin_ends(state: State, waits: float, reason: str) -> None:
     start = StartTimeout(now := 100.0)
     assert start.no_start(state, now + waits) is None
-    assert words in (start.no_start(state, now + waits + 2.0) or "")
+    assert reason in (start.no_start(state, now + waits + 2.0) or "")
 
 
 @pytest.mark.parametrize("event", [MotionStarted(0, 10), EventsLost(1)])
@@ -346,13 +346,13 @@ SECOND = round(1.0 / PERIOD)
 
 
 def records(
-    first: int, count: int, velocity: float = 0.0, noise: float = 0.0, *, known: bool = True
+    first: int, count: int, velocity: float = 0.0, noise: float = 0.0, *, measured: bool = True
 ) -> NDArray[np.void]:
     rows = np.zeros(count, cycle_dtype(2))
     rows["cycle"] = first + np.arange(count)
     rows["target_position"][:, 1] = velocity * PERIOD * rows["cycle"]
     rows["position"] = rows["target_position"] + noise * (-1.0) ** rows["cycle"][:, None]
-    if not known:
+    if not measured:
         rows["position"][:, 0] = np.nan
     return rows
 
@@ -371,7 +371,7 @@ LONG = records(0, SECOND)
                      id="motion between"),
         pytest.param([records(SECOND - 5, 10, 0.5), records(SECOND + 5, SECOND + 10)], True,
                      id="a second after motion"),
-        pytest.param([records(0, 5 * SECOND, known=False)], False, id="not seen"),
+        pytest.param([records(0, 5 * SECOND, measured=False)], False, id="not seen"),
         pytest.param([records(10_000, 10), records(0, 10)], False, id="another session"),
     ],
 )  # fmt: skip

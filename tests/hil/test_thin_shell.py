@@ -32,14 +32,14 @@ def imported(tree: ast.AST) -> Iterator[str]:
 
 def violations(source: str) -> list[str]:
     """Return operations that a module of the command line must not contain."""
-    tree, found = ast.parse(source), []
+    tree, operations = ast.parse(source), []
     for name in imported(tree):
         top = name.lstrip(".").split(".")[0]
         if top in WIRE or (top in ALGEBRA and not name.startswith("numpy")):
-            found.append(f"imports {name}")
+            operations.append(f"imports {name}")
         if top in OURS and any(part.startswith("_") for part in name.split(".")):
-            found.append(f"imports {name}, which is private")
-    found += [
+            operations.append(f"imports {name}, which is private")
+    operations += [
         f"calls numpy.{node.attr}"
         for node in ast.walk(tree)
         if isinstance(node, ast.Attribute)
@@ -48,7 +48,7 @@ def violations(source: str) -> list[str]:
         and node.attr not in OF_NUMPY
     ]
     loops = (node for node in ast.walk(tree) if isinstance(node, LOOPS))
-    return found + [f"computes {what} in a loop" for loop in loops for what in computed(loop)]
+    return operations + [f"computes {what} in a loop" for loop in loops for what in computed(loop)]
 
 
 def computed(loop: ast.AST) -> Iterator[str]:

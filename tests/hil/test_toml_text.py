@@ -60,20 +60,20 @@ class TestWritten:
     @given(
         angles=st.lists(st.floats(-1e3, 1e3), max_size=8),
         numbers=st.lists(st.floats(allow_nan=False), max_size=4),
-        words=st.text(st.characters(exclude_categories=["Cs"]), max_size=12),
+        name=st.text(st.characters(exclude_categories=["Cs"]), max_size=12),
         key=st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=6).filter(
             lambda name: not name.endswith("_deg")
         ),
     )
     def test_angles_among_all_else_are_restored_to_the_bit(
-        self, angles: list[float], numbers: list[float], words: str, key: str
+        self, angles: list[float], numbers: list[float], name: str, key: str
     ) -> None:
         data = {
             "turn": Angles(angles),
             "rows": Angles([angles, angles]),
             "numbers": numbers,
-            "inner": {key: words, "below": {"yes": True, "count": 3}},
-            "many": [{"angle": Angles(angle), "name": words} for angle in angles],
+            "inner": {key: name, "below": {"yes": True, "count": 3}},
+            "many": [{"angle": Angles(angle), "name": name} for angle in angles],
         }
         text = to_text(data, {"inner": "what it is"})
         tomllib.loads(text)
@@ -81,7 +81,7 @@ class TestWritten:
         assert repr(back["turn"]) == repr(angles) and repr(back["rows"]) == repr([angles, angles])
         assert repr(back["numbers"]) == repr(numbers)
         assert back["inner"] == data["inner"]
-        assert [row["name"] for row in back["many"]] == [words] * len(angles)
+        assert [row["name"] for row in back["many"]] == [name] * len(angles)
 
 
 class TestDegrees:
@@ -94,7 +94,7 @@ class TestDegrees:
         assert isinstance(tomllib.loads(f"x = {text}")["x"], float)
 
     @pytest.mark.parametrize(
-        ("text", "words"),
+        ("text", "message"),
         [
             ("a = 1.0\na_deg = 2.0", "both 'a' and 'a_deg'"),
             ("a_deg = [1.0, true]", "a_deg: True is not a number of degrees"),
@@ -102,8 +102,8 @@ class TestDegrees:
             ("a = " + "[" * 5000 + "]" * 5000, "nested too deep"),
         ],
     )
-    def test_other_texts_are_refused(self, text: str, words: str) -> None:
-        with pytest.raises(ValueError, match=words):
+    def test_other_texts_are_refused(self, text: str, message: str) -> None:
+        with pytest.raises(ValueError, match=message):
             from_text(text)
 
 

@@ -44,20 +44,20 @@ def recording(provenance: dict[str, str] | None = None) -> Recording:
 
 class TestWhichCounts:
     def test_without_a_statement_that_of_a_data_sheet(self) -> None:
-        found = torque_scale(example(), [recording()], simulated=False)
-        assert found.std.tolist() == [0.03, 0.03]
-        assert found.message.startswith("assuming torque constants to 3 %")
+        scale = torque_scale(example(), [recording()], simulated=False)
+        assert scale.std.tolist() == [0.03, 0.03]
+        assert scale.message.startswith("assuming torque constants to 3 %")
 
     def test_a_simulated_arm_has_the_constants_of_its_cell(self) -> None:
-        found = torque_scale(example(), [recording()], simulated=True)
-        assert found.std.tolist() == [0.0, 0.0]
-        assert found.message.startswith("assuming exact torques")
+        scale = torque_scale(example(), [recording()], simulated=True)
+        assert scale.std.tolist() == [0.0, 0.0]
+        assert scale.message.startswith("assuming exact torques")
 
     def test_the_cell_comes_before_the_default(self) -> None:
         cell = example(drive_train="[0.01, 0.02]")
         for simulated in (False, True):
-            found = torque_scale(cell, [recording()], simulated=simulated)
-            assert found.std.tolist() == [0.01, 0.02]
+            scale = torque_scale(cell, [recording()], simulated=simulated)
+            assert scale.std.tolist() == [0.01, 0.02]
 
     def test_the_column_map_comes_before_the_cell(self) -> None:
         mapped = [

@@ -34,9 +34,17 @@ def new_cell(folder: Path, urdf: str) -> tuple[Path, dict[str, Any]]:
     """Cell and summary of `hil new --design-only`."""
     (folder / "arm.urdf").write_text(urdf)
     cell = folder / "cell.toml"
-    words = ["new", "--design-only", "--urdf", str(folder / "arm.urdf"), "-o", str(cell), "--json"]
-    words += ["--force"]
-    result = CliRunner().invoke(app, words, catch_exceptions=False)
+    arguments = [
+        "new",
+        "--design-only",
+        "--urdf",
+        str(folder / "arm.urdf"),
+        "-o",
+        str(cell),
+        "--json",
+    ]
+    arguments += ["--force"]
+    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return cell, json.loads(result.stdout)
 
@@ -52,19 +60,22 @@ def test_a_cell_for_designs_asks_only_for_missing_speeds(tmp_path: Path) -> None
     assert {"workspace.floor", "limits.jerk_deg", "nominal.coulomb"} <= {*cell.file.cell.assumed}
     assert np.degrees(cell.joint_limits.upper)[1] == pytest.approx(180.0)
     still = np.zeros((1, 2))
-    found = current_model(cell).check(Motion(np.zeros(1), still, still, np.full((1, 2), 1e4)))
-    assert {(one.kind, one.bound) for one in found} == {("torque", 150.0), ("torque", 60.0)}
+    violations = current_model(cell).check(Motion(np.zeros(1), still, still, np.full((1, 2), 1e4)))
+    assert {(violation.kind, violation.bound) for violation in violations} == {
+        ("torque", 150.0),
+        ("torque", 60.0),
+    }
 
 
 @pytest.mark.parametrize(
-    ("words", "problem"),
+    ("command_line", "problem"),
     [
         ("new --design-only --from-controller h --urdf a.urdf", "--design-only and --from-cont"),
         (f"design {CELL_PATH} --quick --method b", "--method and --quick"),
     ],
 )
-def test_contradicting_options_are_refused(words: str, problem: str) -> None:
-    result = CliRunner().invoke(app, words.split())
+def test_contradicting_options_are_refused(command_line: str, problem: str) -> None:
+    result = CliRunner().invoke(app, command_line.split())
     assert problem in str(result.exception) and "exclude each other" in str(result.exception)
 
 
@@ -93,8 +104,8 @@ def test_each_file_is_the_motion_for_the_programs_that_read_it() -> None:
     assert time[0] == 0.0 and np.all(np.diff(time) > 0.0)
     assert time[-1] == pytest.approx(motion.duration, abs=1e-8)
     for key, expected in zip(("positions", "velocities"), motion.sample(time), strict=False):
-        found = np.array([point[key] for point in read["points"]])
-        np.testing.assert_allclose(found, expected, atol=1e-4)
+        rows_read = np.array([point[key] for point in read["points"]])
+        np.testing.assert_allclose(rows_read, expected, atol=1e-4)
     assert all(len(point["accelerations"]) == 6 for point in read["points"])
 
     text = files["excitation.script"]
@@ -105,9 +116,9 @@ def test_each_file_is_the_motion_for_the_programs_that_read_it() -> None:
     opened = len(re.findall(r"^\s*(?:def|while)\b", text, re.MULTILINE))
     assert opened == len(re.findall(r"^\s*end$", text, re.MULTILINE))
 
-    one = JointLimits(*np.array([[-1.0], [1.0], [1.0], [5.0], [50.0]]))
+    limits = JointLimits(*np.array([[-1.0], [1.0], [1.0], [5.0], [50.0]]))
     small = SimpleNamespace(joint_names=("one",), name="small")
-    assert {*files_of(small, one)} == {*names, "README.txt"}, "no URScript"
+    assert {*files_of(small, limits)} == {*names, "README.txt"}, "no URScript"
 
 
 def test_each_file_is_slow_at_first_and_says_what_it_is() -> None:
@@ -165,8 +176,8 @@ def test_the_program_asks_first_and_its_speed_scales_time() -> None:
 def test_a_short_search_leaves_the_files(tmp_path: Path) -> None:
     path, _ = new_cell(tmp_path, WITH_SPEED)
     path.write_text(with_values(path.read_text(), {"campaign.candidates": 8}))
-    words = [str(path), "--quick", "--repetitions", "3", "-o", str(tmp_path / "out"), "--json"]
-    result = CliRunner().invoke(app, ["design", *words], catch_exceptions=False)
+    arguments = [str(path), "--quick", "--repetitions", "3", "-o", str(tmp_path / "out"), "--json"]
+    result = CliRunner().invoke(app, ["design", *arguments], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     summary = json.loads(result.stdout)
     assert summary["campaign"] is summary["no_campaign"] is None

@@ -172,20 +172,20 @@ class TestRefusals:
 
     def test_precision_alone_is_refused(self, tmp_path) -> None:
         campaign = campaign_of(tmp_path)
-        words = ["run", str(campaign.folder.root), "--precision", "parameters 5%"]
+        arguments = ["run", str(campaign.folder.root), "--precision", "parameters 5%"]
         with pytest.raises(InputError, match="add --until-precise"):
-            CliRunner().invoke(app, words, catch_exceptions=False)
+            CliRunner().invoke(app, arguments, catch_exceptions=False)
 
 
 def test_the_command_prints_what_was_reached(tmp_path) -> None:
     campaign = campaign_of(tmp_path)
     pass_rehearsal(campaign.folder)
-    words = ["run", str(campaign.folder.root), "--accept-dry-run", "--no-identify"]
-    words += ["--until-precise", "--precision", ", ".join(LOOSE), "--json"]
-    result = CliRunner().invoke(app, words, catch_exceptions=False)
+    arguments = ["run", str(campaign.folder.root), "--accept-dry-run", "--no-identify"]
+    arguments += ["--until-precise", "--precision", ", ".join(LOOSE), "--json"]
+    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
-    found = json.loads(
+    printed = json.loads(
         result.stdout.splitlines()[-1] if "\n}" not in result.stdout else result.stdout
     )
-    assert "all requirements are met" in found["precision"]
-    assert found["repetitions"] == [2, 2]
+    assert "all requirements are met" in printed["precision"]
+    assert printed["repetitions"] == [2, 2]

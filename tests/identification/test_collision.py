@@ -60,11 +60,11 @@ def brute(arm):
     data, places = arm.createData(), pin.GeometryData(shapes)
 
     def least(q):
-        found = []
+        distances = []
         for row in q:
             pin.computeDistances(arm, data, shapes, places, row)
-            found.append(min(result.min_distance for result in places.distanceResults))
-        return np.array(found)
+            distances.append(min(result.min_distance for result in places.distanceResults))
+        return np.array(distances)
 
     return least
 

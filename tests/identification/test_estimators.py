@@ -92,17 +92,17 @@ class TestRepeatedRecordings:
             recording(repeated + 0.1 * NOISE * rng.standard_normal(repeated.shape), motion)
             for _ in range(16)
         ]
-        one, many = estimate_repetitions(MODEL, runs[:1]), estimate_repetitions(MODEL, runs)
+        single_run, many = estimate_repetitions(MODEL, runs[:1]), estimate_repetitions(MODEL, runs)
         # Sixteen repetitions of one error count as one, unlike their scatter.
-        np.testing.assert_allclose(many.pooled.std, one.pooled.std, rtol=0.35)
+        np.testing.assert_allclose(many.pooled.std, single_run.pooled.std, rtol=0.35)
         assert np.median(many.std / 4.0 / many.pooled.std) < 0.1
         error = np.abs(many.pooled.values - truth())
         assert np.mean(error < many.pooled.interval_factor * many.pooled.std) > 0.85
 
 
-def posterior_of(factor, model=MODEL, **known):
+def posterior_of(factor, model=MODEL, **stated):
     """Posterior of the bodies' prior."""
-    return fit_posterior(model, factor, body_prior(model, factor, known=known).gaussian)
+    return fit_posterior(model, factor, body_prior(model, factor, stated=stated).gaussian)
 
 
 PIECES = {
@@ -137,13 +137,13 @@ class TestParts:
     @settings(max_examples=6, deadline=None)
     def test_they_add_up(self, name, places):
         samples, plan = whole()
-        one, many = (
+        undivided, many = (
             self.found(name, [(samples.between(*part), plan.rows(slice(*part))) for part in parts])
             for parts in ([(0, 1000)], list(pairwise(sorted({0, *places, 1000}))))
         )
-        assert np.max(np.abs(one.values - many.values) / one.std) < 1e-9
-        np.testing.assert_allclose(many.std, one.std, rtol=1e-9)
-        assert many.method.rpartition(", ")[2] == one.method.rpartition(", ")[2]  # the blocks
+        assert np.max(np.abs(undivided.values - many.values) / undivided.std) < 1e-9
+        np.testing.assert_allclose(many.std, undivided.std, rtol=1e-9)
+        assert many.method.rpartition(", ")[2] == undivided.method.rpartition(", ")[2]  # the blocks
 
     def found(self, name, pieces):
         if name in PIECES:
@@ -195,9 +195,9 @@ class TestBlocks:
         scores = white[1:] + weight * white[:-1]
         information = np.tile(np.eye(k) / blocks, (blocks, 1, 1))
         solution = solve(NormalEquations(np.eye(k), scores.sum(axis=0)))
-        found = cluster_covariance(information, scores, solution)
-        assert found.blocks == blocks // 2
-        assert np.trace(found.covariance) / k == pytest.approx(1.0 + 2.0 * shared, rel=0.05)
+        clustered = cluster_covariance(information, scores, solution)
+        assert clustered.blocks == blocks // 2
+        assert np.trace(clustered.covariance) / k == pytest.approx(1.0 + 2.0 * shared, rel=0.05)
 
     def test_blocks_grow_with_the_correlation_of_the_scores(self):
         white = np.random.default_rng(5).standard_normal((400, 30))
@@ -224,7 +224,7 @@ class TestBlocks:
         """The elbow moves for 0.2 s only, in two blocks with almost no residual."""
         motion = a_motion()
         at = np.clip((motion.time - 5.0) / 0.2, 0.0, 1.0)
-        for array, own in zip(
+        for array, elbow_rate in zip(
             motion[1:4],
             (
                 0.6 * (10 * at**3 - 15 * at**4 + 6 * at**5),
@@ -233,7 +233,7 @@ class TestBlocks:
             ),
             strict=True,
         ):
-            array[:, 1] = own
+            array[:, 1] = elbow_rate
         inside, alone, classical = [], [], []
         for seed in range(150):
             noise = coloured(np.random.default_rng(seed), len(motion.time), 5e-3, 0.05)
@@ -270,9 +270,9 @@ class TestLosses:
     @pytest.mark.parametrize("loss", [Loss(), *LOSSES, Huber(0.7), Tukey(3.0)])
     @given(x=st.floats(-1e6, 1e6))
     def test_weights_decrease_from_one_to_zero(self, loss, x):
-        one, further = loss.weight(np.array([x])), loss.weight(np.array([1.1 * x]))
-        assert 0.0 <= further[0] <= one[0] <= 1.0
-        assert loss.weight(np.array([-x])) == one
+        weight, further = loss.weight(np.array([x])), loss.weight(np.array([1.1 * x]))
+        assert 0.0 <= further[0] <= weight[0] <= 1.0
+        assert loss.weight(np.array([-x])) == weight
         assert loss.weight(np.zeros(1)) == 1.0
         assert not Tukey().weight(np.array([np.inf])).any()
 
@@ -341,8 +341,8 @@ class TestRobustEstimate:
         deviations = result.estimate.std
         assert np.abs(gradient * deviations).max() < 1e-3
         away = start + 0.5 * deviations * rng.standard_normal(P)
-        found = minimize(cost, away, jac=True, method="L-BFGS-B", options={"maxiter": 3000})
-        assert best <= found.fun + 1e-6 * abs(best)
+        minimum = minimize(cost, away, jac=True, method="L-BFGS-B", options={"maxiter": 3000})
+        assert best <= minimum.fun + 1e-6 * abs(best)
         middle = [
             np.median(np.abs((samples.torque - rows @ start)[usable[:, j], j])) for j in (0, 1)
         ]
@@ -413,9 +413,9 @@ def noisy(held_elbow=False):
     return simulated(MODEL, truth(), one_sine_each(held_elbow=held_elbow), NOISE)
 
 
-def prior_of(known):
+def prior_of(stated):
     """Prior of the two links with known parameters."""
-    return body_prior(MODEL, Factor.of(MODEL, noisy()), known=known).gaussian
+    return body_prior(MODEL, Factor.of(MODEL, noisy()), stated=stated).gaussian
 
 
 def independent(mean, std):
@@ -431,8 +431,8 @@ class TestGaussianPrior:
         std[random.permutation(7)[:flat]] = np.inf
         prior = GaussianPrior.of_combinations(combinations, np.zeros(7), std)
         # Woodbury's identity in the limit of infinite variances.
-        known, endless = combinations[:, np.isfinite(std)], combinations[:, np.isinf(std)]
-        finite = np.linalg.inv((known * std[np.isfinite(std)] ** 2) @ known.T)
+        bounded, endless = combinations[:, np.isfinite(std)], combinations[:, np.isinf(std)]
+        finite = np.linalg.inv((bounded * std[np.isfinite(std)] ** 2) @ bounded.T)
         seen = finite @ endless
         expected = finite - seen @ np.linalg.inv(endless.T @ seen) @ seen.T
         size = np.abs(finite).max()
@@ -453,11 +453,15 @@ class TestPosterior:
         root = np.linalg.cholesky(covariance)
         prior = GaussianPrior.of_combinations(root, np.linalg.solve(root, mean), np.ones(P))
         for kind in (factor, Factor.of(MODEL, noisy(), "qr")):
-            found = with_prior(MODEL, kind, prior, weights)
-            np.testing.assert_allclose(found.estimate.values, expected, rtol=1e-6, atol=1e-7)
-            np.testing.assert_allclose(found.estimate.std, np.sqrt(np.diag(posterior)), rtol=1e-6)
-            assert found.estimate.undetermined == ()
-            assert (found.ratio < 1.0).all()
+            fitted_posterior = with_prior(MODEL, kind, prior, weights)
+            np.testing.assert_allclose(
+                fitted_posterior.estimate.values, expected, rtol=1e-6, atol=1e-7
+            )
+            np.testing.assert_allclose(
+                fitted_posterior.estimate.std, np.sqrt(np.diag(posterior)), rtol=1e-6
+            )
+            assert fitted_posterior.estimate.undetermined == ()
+            assert (fitted_posterior.ratio < 1.0).all()
 
     @pytest.mark.parametrize("storage", ["gram", "qr"])
     def test_an_infinite_prior_is_weighted_least_squares(self, storage):
@@ -465,48 +469,50 @@ class TestPosterior:
         expected = estimate(MODEL, Factor.of(MODEL, noisy()))
         for std in (1e7, np.inf):
             prior = independent(np.full(P, 3.0), np.full(P, std))
-            found = with_prior(MODEL, factor, prior)
-            np.testing.assert_allclose(found.estimate.values, expected.values, rtol=1e-8)
-            np.testing.assert_allclose(found.estimate.std, expected.std, rtol=1e-8)
-            np.testing.assert_allclose(found.estimate.noise_std, expected.noise_std, rtol=1e-8)
-            assert found.learned.all()
+            posterior = with_prior(MODEL, factor, prior)
+            np.testing.assert_allclose(posterior.estimate.values, expected.values, rtol=1e-8)
+            np.testing.assert_allclose(posterior.estimate.std, expected.std, rtol=1e-8)
+            np.testing.assert_allclose(posterior.estimate.noise_std, expected.noise_std, rtol=1e-8)
+            assert posterior.learned.all()
 
     @pytest.mark.parametrize("storage", ["gram", "qr"])
     def test_without_data_it_is_the_prior(self, storage):
         nothing = Factor.zero(MODEL, storage=storage)
         prior = prior_of(KNOWN)
-        found = with_prior(MODEL, nothing, prior)
-        np.testing.assert_allclose(found.estimate.values, prior.mean)
-        np.testing.assert_allclose(found.estimate.std, prior.std, rtol=1e-9)
-        np.testing.assert_allclose(found.ratio, 1.0, rtol=1e-9)
+        posterior = with_prior(MODEL, nothing, prior)
+        np.testing.assert_allclose(posterior.estimate.values, prior.mean)
+        np.testing.assert_allclose(posterior.estimate.std, prior.std, rtol=1e-9)
+        np.testing.assert_allclose(posterior.ratio, 1.0, rtol=1e-9)
         np.testing.assert_allclose(posterior_values(nothing, prior)[0], prior.mean)
-        assert not found.learned.any()
-        assert found.estimate.undetermined == ()
+        assert not posterior.learned.any()
+        assert posterior.estimate.undetermined == ()
 
     def test_undetermined_parameters_keep_the_prior(self):
         prior = prior_of(KNOWN)
-        found = with_prior(MODEL, Factor.of(MODEL, noisy(held_elbow=True)), prior)
-        at = {name: index for index, name in enumerate(found.estimate.names)}
+        posterior = with_prior(MODEL, Factor.of(MODEL, noisy(held_elbow=True)), prior)
+        at = {name: index for index, name in enumerate(posterior.estimate.names)}
         for name in ("f0_2", "f1_2"):  # the elbow stands still
-            assert found.ratio[at[name]] == pytest.approx(1.0, rel=1e-9)
-            assert found.estimate.values[at[name]] == pytest.approx(FRICTION[name][0], rel=1e-9)
-            assert not found.learned[at[name]]
-        assert found.ratio[at["f0_1"]] < 0.2
-        assert found.learned[at["f0_1"]]
-        assert found.estimate.undetermined == ()
-        assert np.isfinite(found.estimate.std).all()
+            assert posterior.ratio[at[name]] == pytest.approx(1.0, rel=1e-9)
+            assert posterior.estimate.values[at[name]] == pytest.approx(FRICTION[name][0], rel=1e-9)
+            assert not posterior.learned[at[name]]
+        assert posterior.ratio[at["f0_1"]] < 0.2
+        assert posterior.learned[at["f0_1"]]
+        assert posterior.estimate.undetermined == ()
+        assert np.isfinite(posterior.estimate.std).all()
         # No parameter is less certain than before.
-        assert (found.ratio <= 1.0 + 1e-9).all()
+        assert (posterior.ratio <= 1.0 + 1e-9).all()
 
     def test_parameters_without_data_and_prior_stay_at_its_mean(self):
         factor = Factor.of(MODEL, noisy(held_elbow=True))
         unstated = dict.fromkeys(FRICTION, (0.0, np.inf))
-        found = with_prior(MODEL, factor, prior_of(ROTORS | unstated))
-        assert set(found.estimate.undetermined) == {"f0_2", "f1_2"}
-        unknown = np.array([name in found.estimate.undetermined for name in found.estimate.names])
-        assert np.isinf(found.estimate.std[unknown]).all()
-        np.testing.assert_array_equal(found.ratio[unknown], 1.0)
-        np.testing.assert_array_equal(found.estimate.values[unknown], 0.0)
+        posterior = with_prior(MODEL, factor, prior_of(ROTORS | unstated))
+        assert set(posterior.estimate.undetermined) == {"f0_2", "f1_2"}
+        unknown = np.array(
+            [name in posterior.estimate.undetermined for name in posterior.estimate.names]
+        )
+        assert np.isinf(posterior.estimate.std[unknown]).all()
+        np.testing.assert_array_equal(posterior.ratio[unknown], 1.0)
+        np.testing.assert_array_equal(posterior.estimate.values[unknown], 0.0)
 
     def test_few_rows_require_weights(self):
         chosen = np.arange(len(noisy().torque)) % 200 == 7
@@ -531,11 +537,13 @@ class TestPosterior:
             samples = simulated(MODEL, values, motion)
             samples.torque[:] += coloured(rng, len(motion.time), 5e-3, correlation)
             result = fit_posterior(MODEL, Factor.by_time(MODEL, samples), prior)
-            found, white = (
+            estimate, white = (
                 result.estimate,
                 with_prior(MODEL, Factor.of(MODEL, samples), prior).estimate,
             )
-            inside.append(np.abs(found.values - values) < found.interval_factor * found.std)
+            inside.append(
+                np.abs(estimate.values - values) < estimate.interval_factor * estimate.std
+            )
             naive.append(np.abs(white.values - values) < 1.96 * white.std)
             surprise.append(result.normalized_change[np.isfinite(result.normalized_change)])
         assert 0.90 <= np.mean(inside) <= 0.99
@@ -551,17 +559,17 @@ class TestPosterior:
     def test_rows_that_count_less_are_less_information(self, effect):
         """At the weights of the joints' own residuals."""
         prior, factor = prior_of(KNOWN), Factor.by_time(MODEL, noisy())
-        found = fit_posterior(MODEL, factor, prior, effect)
+        posterior = fit_posterior(MODEL, factor, prior, effect)
         values, weights = posterior_values(factor, prior, effect)
         equations = factor.weighted(weights)
         expected = np.linalg.solve(
             equations.A / effect + prior.information,
             equations.b / effect + prior.information @ prior.mean,
         )
-        np.testing.assert_allclose(found.estimate.values, expected, rtol=1e-8)
+        np.testing.assert_allclose(posterior.estimate.values, expected, rtol=1e-8)
         variance = factor.squared_errors(values) / factor.samples
         np.testing.assert_allclose(weights, 1.0 / variance, rtol=2e-3)  # settled to one in 1000
-        assert found.design_effect == effect
+        assert posterior.design_effect == effect
 
     @given(seed=st.integers(0, 999))
     @settings(max_examples=10)
@@ -573,10 +581,10 @@ class TestPosterior:
         prior = prior_of(KNOWN)
         far = replace(prior, mean=prior.mean + 2.0 * prior.std * rng.standard_normal(P))
         free = fit_least_squares(MODEL, [samples])
-        found = fit_posterior(MODEL, factor, far)
-        assert found.ratio.max() < 1e-3
-        assert np.abs((found.estimate.values - free.values) / free.std).max() < 0.05
-        np.testing.assert_allclose(found.estimate.std, free.std, rtol=0.05)
+        posterior = fit_posterior(MODEL, factor, far)
+        assert posterior.ratio.max() < 1e-3
+        assert np.abs((posterior.estimate.values - free.values) / free.std).max() < 0.05
+        np.testing.assert_allclose(posterior.estimate.std, free.std, rtol=0.05)
 
     def test_a_wrong_prior_is_detected(self):
         wrong = KNOWN | {"f0_1": (20.0, 1.0)}
@@ -628,7 +636,7 @@ class TestBodyPrior:
     def test_it_is_that_of_sampled_arms(self):
         share, count = 0.3, 20_000
         factor = Factor.of(MODEL, noisy())
-        prior = body_prior(MODEL, factor, share, known=KNOWN).gaussian
+        prior = body_prior(MODEL, factor, share, stated=KNOWN).gaussian
         nominal = MODEL.nominal.reshape(2, 11)
         # Moments of the lower link about its joint: 3 (0.01² + 0.2²) + 0.1 and so on.
         gyration = np.sqrt((0.1 + 0.1 + 0.01) / 2.0 / 3.0 + 0.01**2 + 0.2**2)
@@ -708,12 +716,12 @@ class TestPlaceholders:
         return body_prior(model, factor), factor
 
     @pytest.mark.parametrize(
-        ("model", "words"), [(EQUAL, "have the same mass"), (BARE, "has no masses")]
+        ("model", "origin"), [(EQUAL, "have the same mass"), (BARE, "has no masses")]
     )
-    def test_equal_or_missing_masses_are_some(self, model, words):
+    def test_equal_or_missing_masses_are_some(self, model, origin):
         prior, _ = self.prior(model)
         assert prior.placeholder
-        assert words in prior.words
+        assert origin in prior.words
         assert not prior.mean[: model.layout.size].any()
 
     def test_masses_with_another_torque_are_some(self):
@@ -748,10 +756,10 @@ class TestPlaceholders:
     def test_the_estimate_has_the_unit_of_the_torque(self, model, unit):
         (prior, factor), (other, scaled) = self.prior(model), self.prior(model, unit)
         np.testing.assert_allclose(other.std, abs(unit) * prior.std, rtol=1e-9)
-        found = fit_posterior(model, factor, prior.gaussian, 3.0)
+        posterior = fit_posterior(model, factor, prior.gaussian, 3.0)
         same = fit_posterior(model, scaled, other.gaussian, 3.0)
-        size = np.abs(found.estimate.std)
-        off = same.estimate.values / unit - found.estimate.values
+        size = np.abs(posterior.estimate.std)
+        off = same.estimate.values / unit - posterior.estimate.values
         assert np.abs(off / size).max() < 1e-6
         np.testing.assert_allclose(same.estimate.std, abs(unit) * size, rtol=1e-6)
 
@@ -787,14 +795,14 @@ def fit_of(values, noise, seed, *, model=MODEL, samples=2000):
     return fitted(model, motion, measured(model, motion, values, noise, seed))
 
 
-def error_rise(found):
+def error_rise(consistent):
     """Return the rise of the relative error on the fitted rows."""
-    return found.relative_error - found.unconstrained_relative_error
+    return consistent.relative_error - consistent.unconstrained_relative_error
 
 
-def assert_consistent(model, found):
+def assert_consistent(model, consistent):
     """Check the definition of consistency by eigenvalues."""
-    rows = found.standard.reshape(model.n_joints, -1)
+    rows = consistent.standard.reshape(model.n_joints, -1)
     for xx, xy, xz, yy, yz, zz, hx, hy, hz, m, *rotor in rows:
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         h = np.array([hx, hy, hz])
@@ -804,7 +812,7 @@ def assert_consistent(model, found):
         assert moments[0] > 0.0
         assert moments[0] + moments[1] > moments[2]
         assert all(r >= 0.0 for r in rotor)
-    for name, value in zip(found.estimate.names, found.estimate.values, strict=True):
+    for name, value in zip(consistent.estimate.names, consistent.estimate.values, strict=True):
         assert value >= 0.0 or not name.startswith(("f0", "f1"))
 
 
@@ -839,14 +847,14 @@ class TestConsistentEstimate:
     @pytest.mark.parametrize(("noise", "samples"), [(0.5, 150), (0.3, 300), (0.02, 2000)])
     def test_base_parameters_follow_from_standard_ones(self, noise, samples):
         """These are consistent with poor data; good data are hardly changed."""
-        found, rank = fit_of(truth(), noise, 1, samples=samples), MODEL.base.rank
-        assert_consistent(MODEL, found)
-        assert found.status == "optimal" and np.all(found.margin > 0.0)
-        expected = MODEL.base.grouping @ found.standard
-        np.testing.assert_allclose(found.estimate.values[:rank], expected, atol=1e-12)
-        np.testing.assert_array_equal(found.estimate.values[rank:], found.friction)
+        consistent, rank = fit_of(truth(), noise, 1, samples=samples), MODEL.base.rank
+        assert_consistent(MODEL, consistent)
+        assert consistent.status == "optimal" and np.all(consistent.margin > 0.0)
+        expected = MODEL.base.grouping @ consistent.standard
+        np.testing.assert_allclose(consistent.estimate.values[:rank], expected, atol=1e-12)
+        np.testing.assert_array_equal(consistent.estimate.values[rank:], consistent.friction)
         if noise == 0.02:
-            assert np.abs(found.shift).max() < 0.1 and error_rise(found) < 1e-5
+            assert np.abs(consistent.shift).max() < 0.1 and error_rise(consistent) < 1e-5
 
     def test_exact_nominal_data_return_all_parameters(self):
         """Parameters without effect on the torque are nominal."""
@@ -854,11 +862,11 @@ class TestConsistentEstimate:
         np.testing.assert_allclose(fit_of(values, 0.0, 3).standard, MODEL.nominal, atol=1e-4)
 
     def test_negative_friction_becomes_zero(self):
-        found = fit_of(with_friction(-1.0, 2.0, 1.5, -0.3), 0.01, 4)
+        consistent = fit_of(with_friction(-1.0, 2.0, 1.5, -0.3), 0.01, 4)
         for name in ("f0_1", "f1_2"):
-            assert found.unconstrained.value(name) < 0.0
-            assert found.estimate.value(name) == pytest.approx(0.0, abs=1e-3)
-        assert_consistent(MODEL, found)
+            assert consistent.unconstrained.value(name) < 0.0
+            assert consistent.estimate.value(name) == pytest.approx(0.0, abs=1e-3)
+        assert_consistent(MODEL, consistent)
 
     @pytest.mark.parametrize("effect", [1.0, 30.0])
     def test_no_other_consistent_parameters_are_more_probable(self, effect):
@@ -868,18 +876,18 @@ class TestConsistentEstimate:
         torque = measured(MODEL, motion, values, 0.4, 6)
         factor = Factor.from_samples(MODEL, motion, torque)
         prior = body_prior(MODEL, factor)
-        found = fitted(MODEL, motion, torque, prior=prior, design_effect=effect)
+        consistent = fitted(MODEL, motion, torque, prior=prior, design_effect=effect)
         # The same objective from the samples, and its gradient.
         weights = joint_weights(factor)
         root, target = rows_of(factor.weighted(weights))
-        excess = float(np.sum((root @ found.estimate.values - target) ** 2))
+        excess = float(np.sum((root @ consistent.estimate.values - target) ** 2))
         assert excess > 100.0
         rank, s = MODEL.base.rank, len(MODEL.layout.names)
         mapping = np.zeros((MODEL.n_parameters, s + 4))
         mapping[:rank, :s] = MODEL.base.grouping
         mapping[rank:, s:] = np.eye(4)
         rows = MODEL.regressor(*motion[1:]).dense(MODEL.n_parameters) @ mapping
-        x = np.concatenate([found.standard, found.friction])
+        x = np.concatenate([consistent.standard, consistent.friction])
         error = rows @ x - torque
         gradient = 2.0 * np.einsum("tj,j,tjk->k", error, weights / effect, rows)
         gradient += 2.0 * (x - prior.mean) / prior.std**2
@@ -893,22 +901,24 @@ class TestConsistentEstimate:
         """As after a wrong sign of one torque, for any noise."""
         values = with_friction(-1.0, 2.0, 1.5, 0.8)
         values[MODEL.parameter_names.index("I2yy")] = -0.3
-        found = fit_of(values, noise, 6)
-        assert_consistent(MODEL, found)
-        assert "no consistent parameters fit" in found.status
-        assert error_rise(found) > 0.02
+        consistent = fit_of(values, noise, 6)
+        assert_consistent(MODEL, consistent)
+        assert "no consistent parameters fit" in consistent.status
+        assert error_rise(consistent) > 0.02
 
     def test_errors_and_covariance_are_correct(self):
         motion = five_sines(MODEL, 7, samples=300)
         torque = measured(MODEL, motion, truth(), 0.3, 7)
-        found = fitted(MODEL, motion, torque)
-        error = MODEL.torque(found.estimate.values, *motion[1:]) - torque
+        consistent = fitted(MODEL, motion, torque)
+        error = MODEL.torque(consistent.estimate.values, *motion[1:]) - torque
         rms = np.sqrt((error**2).mean(axis=0))
-        np.testing.assert_allclose(found.estimate.noise_std, rms, rtol=1e-6)
+        np.testing.assert_allclose(consistent.estimate.noise_std, rms, rtol=1e-6)
         relative = np.linalg.norm(error) / np.linalg.norm(torque)
-        assert found.relative_error == pytest.approx(relative, rel=1e-6)
-        assert "covariance of the unconstrained estimate" in found.estimate.method
-        np.testing.assert_array_equal(found.estimate.covariance, found.unconstrained.covariance)
+        assert consistent.relative_error == pytest.approx(relative, rel=1e-6)
+        assert "covariance of the unconstrained estimate" in consistent.estimate.method
+        np.testing.assert_array_equal(
+            consistent.estimate.covariance, consistent.unconstrained.covariance
+        )
 
     @pytest.mark.parametrize(
         "path", ["ur_description/urdf/ur10_robot.urdf", "panda_description/urdf/panda.urdf"]
@@ -921,19 +931,19 @@ class TestConsistentEstimate:
         factor = Factor.from_samples(model, motion, torque)
         prior = body_prior(model, factor)
         free, weights = posterior_values(factor, prior.gaussian)
-        found = consistent_estimate(model, factor, weights=weights, prior=prior)
-        assert_consistent(model, found)
+        consistent = consistent_estimate(model, factor, weights=weights, prior=prior)
+        assert_consistent(model, consistent)
         # The constraints cost next to nothing beside the prior.
-        assert found.relative_error - factor.relative_error(free) < 1e-3
+        assert consistent.relative_error - factor.relative_error(free) < 1e-3
 
     def test_missing_nominal_bodies_are_assumed(self):
         bare = re.sub(r"<inertial>.*?</inertial>", "", URDF, flags=re.DOTALL)
         empty = RobotModel.from_urdf(bare, friction=FrictionLaw(third=None))
         motion = five_sines(MODEL, 12)
-        found = fitted(empty, motion, measured(MODEL, motion, truth(), 0.02, 12))
-        assert all(words.startswith("assumed") for words in found.reference)
-        assert_consistent(empty, found)
-        assert error_rise(found) < 1e-3
+        consistent = fitted(empty, motion, measured(MODEL, motion, truth(), 0.02, 12))
+        assert all(origin.startswith("assumed") for origin in consistent.reference)
+        assert_consistent(empty, consistent)
+        assert error_rise(consistent) < 1e-3
 
     def test_a_resting_joint_keeps_its_nominal_link(self):
         law = FrictionLaw(third=None)
@@ -945,11 +955,11 @@ class TestConsistentEstimate:
         torque = measured(model, motion, values, 0.01, 10)
         mask = np.zeros(torque.shape, dtype=np.bool_)
         mask[:, 0] = True
-        found = consistent_estimate(model, Factor.from_samples(model, motion, torque, mask))
-        assert_consistent(model, found)
-        assert {"f0_2", "f1_2"} <= set(found.estimate.undetermined)
-        assert np.all(np.isfinite(found.standard))
-        np.testing.assert_allclose(found.standard[20], model.nominal[20], rtol=0.5)  # m2
+        consistent = consistent_estimate(model, Factor.from_samples(model, motion, torque, mask))
+        assert_consistent(model, consistent)
+        assert {"f0_2", "f1_2"} <= set(consistent.estimate.undetermined)
+        assert np.all(np.isfinite(consistent.standard))
+        np.testing.assert_allclose(consistent.standard[20], model.nominal[20], rtol=0.5)  # m2
 
 
 class TestDrives:
@@ -971,10 +981,10 @@ class TestDrives:
         model, standard = self.coupled(inertia)
         friction = np.full(len(model.friction.terms), 0.8)
         values = np.concatenate([model.base.grouping @ standard, friction])
-        found = fit_of(values, 0.01, 1, model=model)
-        assert np.linalg.eigvalsh(model.layout.rotor_matrix(found.standard))[0] > 0.0
-        assert np.all(found.margin > 0.0)
-        assert (error_rise(found) < 1e-4) == (inertia == 0.12)
+        consistent = fit_of(values, 0.01, 1, model=model)
+        assert np.linalg.eigvalsh(model.layout.rotor_matrix(consistent.standard))[0] > 0.0
+        assert np.all(consistent.margin > 0.0)
+        assert (error_rise(consistent) < 1e-4) == (inertia == 0.12)
 
     def test_inconsistent_coupling_inertias_raise(self):
         model, standard = self.coupled(0.3)
@@ -988,15 +998,15 @@ class TestDrives:
         terms = {"f0": 1.0, "f1": 0.3, "fd": 0.6, "fs": -2.0, "fo": 0.2}
         symbols = [term.symbol for term in model.friction.terms]
         values = values_of(model, [terms[symbol] for symbol in symbols])
-        found = fit_of(values, 0.01, 1, model=model)
-        for own in model.friction.table(found.friction):
-            assert own["f0"] >= 0.0
-            assert own["f0"] + own["fs"] >= -1e-12
-            assert abs(own["fd"]) <= own["f1"] + 1e-12
+        consistent = fit_of(values, 0.01, 1, model=model)
+        for joint_terms in model.friction.table(consistent.friction):
+            assert joint_terms["f0"] >= 0.0
+            assert joint_terms["f0"] + joint_terms["fs"] >= -1e-12
+            assert abs(joint_terms["fd"]) <= joint_terms["f1"] + 1e-12
         # Consistent parameters are recovered.
         friction = [(terms | {"f1": 0.9, "fs": 0.7})[symbol] for symbol in symbols]
-        found = fit_of(values_of(model, friction), 0.0, 1, model=model)
-        np.testing.assert_allclose(found.friction, friction, rtol=0.02)
+        consistent = fit_of(values_of(model, friction), 0.0, 1, model=model)
+        np.testing.assert_allclose(consistent.friction, friction, rtol=0.02)
 
 
 class TestConsistentValues:
@@ -1018,43 +1028,45 @@ class TestConsistentValues:
         factor, prior, values, weights = self.posterior(with_friction(-3.0, 2.0, 1.5, 0.8))
         assert not is_consistent(MODEL, prior.most_probable(values))
         changed = consistent_values(MODEL, factor, weights, values, prior, 2.0)
-        found = consistent_estimate(
+        consistent = consistent_estimate(
             MODEL, factor, weights=weights, prior=prior, design_effect=2.0
         ).estimate
-        np.testing.assert_allclose(changed, found.values, rtol=1e-12)
+        np.testing.assert_allclose(changed, consistent.values, rtol=1e-12)
         assert changed[MODEL.parameter_names.index("f0_1")] == pytest.approx(0.0, abs=1e-3)
 
     @pytest.mark.parametrize("effect", [1.0, 10.0])
     def test_the_program_is_the_posterior_where_no_constraint_acts(self, effect):
         factor, prior, values, weights = self.posterior(truth())
         values, weights = posterior_values(factor, prior.gaussian, effect)
-        found = consistent_estimate(
+        consistent = consistent_estimate(
             MODEL, factor, weights=weights, prior=prior, design_effect=effect
         )
         std = fit_posterior(MODEL, factor, prior.gaussian, effect).estimate.std
-        assert np.abs((found.estimate.values - values) / std).max() < 1e-3
-        bodies = np.concatenate([found.standard, found.friction])
+        assert np.abs((consistent.estimate.values - values) / std).max() < 1e-3
+        bodies = np.concatenate([consistent.standard, consistent.friction])
         expected = prior.most_probable(values)
-        known = prior.std > 0.0
-        assert np.abs((bodies - expected) / prior.std)[known].max() < 1e-3
+        with_prior_std = prior.std > 0.0
+        assert np.abs((bodies - expected) / prior.std)[with_prior_std].max() < 1e-3
 
     def test_bodies_without_prior_and_effect_are_possible(self):
         """The mass of the first link, which only turns about its axis."""
         factor, _, _, weights = self.posterior(truth())
         name = next(name for name in MODEL.layout.names if name.startswith("m"))
-        prior = body_prior(MODEL, factor, known={name: (0.0, np.inf)})
-        found = consistent_estimate(MODEL, factor, weights=weights, prior=prior)
-        assert_consistent(MODEL, found)
+        prior = body_prior(MODEL, factor, stated={name: (0.0, np.inf)})
+        consistent = consistent_estimate(MODEL, factor, weights=weights, prior=prior)
+        assert_consistent(MODEL, consistent)
         values, _ = posterior_values(factor, prior.gaussian)
         std = fit_posterior(MODEL, factor, prior.gaussian, 1.0).estimate.std
-        assert np.abs((found.estimate.values - values) / std).max() < 0.1
+        assert np.abs((consistent.estimate.values - values) / std).max() < 0.1
 
     def test_rows_that_hardly_count_leave_the_prior(self):
         factor, prior, _, weights = self.posterior(truth())
-        found = consistent_estimate(MODEL, factor, weights=weights, prior=prior, design_effect=1e12)
-        bodies = np.concatenate([found.standard, found.friction])
+        consistent = consistent_estimate(
+            MODEL, factor, weights=weights, prior=prior, design_effect=1e12
+        )
+        bodies = np.concatenate([consistent.standard, consistent.friction])
         assert np.abs((bodies - prior.mean) / prior.std).max() < 1e-3
-        assert_consistent(MODEL, found)
+        assert_consistent(MODEL, consistent)
 
 
 TRUTH = truth()
@@ -1079,7 +1091,10 @@ def delayed(
     rng = np.random.default_rng(seed)
     late = [four_sines_at(time - delay, speed) for delay in np.broadcast_to(delays, 2)]
     torque = np.column_stack(
-        [(model.torque(TRUTH, *one) + model.load_torque(*one))[:, j] for j, one in enumerate(late)]
+        [
+            (model.torque(TRUTH, *motion) + model.load_torque(*motion))[:, j]
+            for j, motion in enumerate(late)
+        ]
     )
     shape = torque.shape
     return Recording(
@@ -1104,38 +1119,38 @@ class TestDelay:
     )
     def test_it_is_found(self, planted, near, options):
         options = {"model": MODEL} | options
-        found = estimate_delay(delayed(delays=planted, **options), options["model"])
-        assert found.delay == pytest.approx(planted, abs=near)
-        assert found.applied == found.delay
+        estimate = estimate_delay(delayed(delays=planted, **options), options["model"])
+        assert estimate.delay == pytest.approx(planted, abs=near)
+        assert estimate.applied == estimate.delay
 
     def test_it_is_found_in_a_filtered_torque(self):
         time = np.arange(0.0, 8.0, 0.004)
         recording = delayed(delays=0.003, time=time, torque_noise=0.3)
         filtered = replace(recording, torque=low_pass(time, recording.torque, 8.0))
-        found = estimate_delay(filtered, MODEL, options=Preprocessing(torque_bandwidth=8.0))
-        assert found.delay == pytest.approx(0.003, abs=4e-4)
+        estimate = estimate_delay(filtered, MODEL, options=Preprocessing(torque_bandwidth=8.0))
+        assert estimate.delay == pytest.approx(0.003, abs=4e-4)
 
     def test_noise_does_not_bias_it_and_the_interval_covers(self):
         """Mean within its standard error, scatter over seeds as estimated."""
-        found = [estimate_delay(delayed(1.6e-3, seed=seed), MODEL) for seed in range(12)]
-        error = np.array([one.delay - 1.6e-3 for one in found])
-        claimed = np.sqrt(np.mean([one.std**2 for one in found]))
+        estimates = [estimate_delay(delayed(1.6e-3, seed=seed), MODEL) for seed in range(12)]
+        error = np.array([estimate.delay - 1.6e-3 for estimate in estimates])
+        claimed = np.sqrt(np.mean([estimate.std**2 for estimate in estimates]))
         scatter = error.std(ddof=1)
-        assert abs(error.mean()) < 3.0 * scatter / np.sqrt(len(found)) + 5e-6
+        assert abs(error.mean()) < 3.0 * scatter / np.sqrt(len(estimates)) + 5e-6
         # The standard deviation of 12 samples has an error of 21 %.
         assert abs(np.log(claimed / scatter)) < 3 * 0.21
-        assert all(one.significant for one in found)
+        assert all(estimate.significant for estimate in estimates)
 
     def test_a_delay_beyond_the_range_is_undetermined(self):
-        found = estimate_delay(delayed(0.06), MODEL)
-        assert found.reason == "the residual decreases up to the longest delay tested"
-        assert found.applied == 0.0
+        estimate = estimate_delay(delayed(0.06), MODEL)
+        assert estimate.reason == "the residual decreases up to the longest delay tested"
+        assert estimate.applied == 0.0
 
     def test_it_is_found_beside_an_assumed_delay(self):
         recording = delayed(0.004)
-        found = estimate_delay(recording, MODEL, options=Preprocessing(torque_delay=0.003))
-        assert found.delay == pytest.approx(0.004, abs=3e-4)
-        assert found.significant
+        estimate = estimate_delay(recording, MODEL, options=Preprocessing(torque_delay=0.003))
+        assert estimate.delay == pytest.approx(0.004, abs=3e-4)
+        assert estimate.significant
         right = estimate_delay(recording, MODEL, options=Preprocessing(torque_delay=0.004))
         assert not right.significant
         assert right.applied == 0.004
@@ -1205,10 +1220,10 @@ class TestUndeterminedDelay:
         assert replace(slow, std=1e-4).variance == pytest.approx(1e-8)
 
     def test_an_uncertain_significant_delay_is_applied(self):
-        found = estimate_delay(delayed(0.045, speed=0.2, seed=2), MODEL)
-        assert found.reason is not None and found.significant
-        assert found.applied == found.delay
-        line = found.describe()
+        estimate = estimate_delay(delayed(0.045, speed=0.2, seed=2), MODEL)
+        assert estimate.reason is not None and estimate.significant
+        assert estimate.applied == estimate.delay
+        line = estimate.describe()
         assert line.endswith("cycles), significantly different from the 0 ms assumed")
 
     def test_a_recording_without_motion_raises(self):

@@ -92,10 +92,10 @@ class TestViaPoints:
     def test_genes_reach_the_ends_of_range_and_speed(self, genome):
         lower, upper = LIMITS.lower, LIMITS.upper
         spare = (1.0 - genome.range_share) / 2.0 * (upper - lower)
-        own = slice(None) if genome.home is None else slice(1, -1)
+        free_points = slice(None) if genome.home is None else slice(1, -1)
         for gene, end, share in ((0.0, lower + spare, genome.slowest), (1.0, upper - spare, 1.0)):
             points, speed = genome.decode(np.full((1, genome.n_genes), gene))
-            np.testing.assert_array_equal(points[0, own], np.tile(end, (genome.n_via, 1)))
+            np.testing.assert_array_equal(points[0, free_points], np.tile(end, (genome.n_via, 1)))
             np.testing.assert_array_equal(speed, np.full((1, 6), share))
 
     @pytest.mark.parametrize("genome", [OPEN, CLOSED])
@@ -405,8 +405,8 @@ class TestViolations:
         constraints = Constraints(ROD_LIMITS, min_duration=shortest, max_duration=longest)
         (violation,) = constraints.violations(swing, sampled(swing))
         bound = shortest or longest
-        found = (violation.kind, violation.value, violation.bound)
-        assert found == ("duration", swing.duration, bound)
+        named = (violation.kind, violation.value, violation.bound)
+        assert named == ("duration", swing.duration, bound)
         assert violation.excess == pytest.approx(abs(swing.duration / bound - 1.0))
         assert f"at {side} {bound:g} s" in str(violation)
 
@@ -464,7 +464,7 @@ def rows_of(motion):
     return MODEL.regressor(*motion[1:]).dense(P).reshape(-1, P)
 
 
-def assert_measures(found, columns, n_samples):
+def assert_measures(criteria, columns, n_samples):
     """Eqs. 9 and 5 from numpy's QR of Phi itself, which squares no condition number."""
     r = np.linalg.qr(columns, mode="r")
     determinant = 2.0 * np.log10(np.abs(np.diag(r))).sum() - r.shape[1] * math.log10(n_samples)
@@ -472,8 +472,8 @@ def assert_measures(found, columns, n_samples):
     psi = inverse @ inverse.T
     deviation = np.sqrt(np.diag(psi))
     index = np.abs(np.triu(psi / deviation / deviation[:, None], 1)).sum()
-    assert found["log10_det"] == pytest.approx(determinant, abs=1e-8)
-    assert found["coupling_index"] == pytest.approx(index, rel=1e-8, abs=1e-12)
+    assert criteria["log10_det"] == pytest.approx(determinant, abs=1e-8)
+    assert criteria["coupling_index"] == pytest.approx(index, rel=1e-8, abs=1e-12)
 
 
 class TestSamples:
@@ -499,13 +499,13 @@ HAND = np.array([[2.0, 1.0], [1.0, 3.0]])  # det = 5, inverse [[3, -1], [-1, 2]]
 
 class TestCriteria:
     def test_a_small_case_by_hand(self):
-        found = Criteria.of_gram(HAND, 10)
-        assert found.log10_det == pytest.approx(math.log10(5.0 / 10.0**2), abs=1e-14)
-        assert found.coupling_index == pytest.approx(1.0 / math.sqrt(6.0), abs=1e-14)
+        criteria = Criteria.of_gram(HAND, 10)
+        assert criteria.log10_det == pytest.approx(math.log10(5.0 / 10.0**2), abs=1e-14)
+        assert criteria.coupling_index == pytest.approx(1.0 / math.sqrt(6.0), abs=1e-14)
         equation_7 = 0.7 * math.log10(5.0 / 100.0) + 0.3 * 1.0 * math.sqrt(6.0)
-        assert found.fitness == pytest.approx(equation_7, rel=1e-13)
-        assert fitness_eq7(*found.measures, 2, (1.0, 0.0)) == pytest.approx(found.log10_det)
-        assert found.measures == (log10_det(HAND, 10), coupling_index(HAND))
+        assert criteria.fitness == pytest.approx(equation_7, rel=1e-13)
+        assert fitness_eq7(*criteria.measures, 2, (1.0, 0.0)) == pytest.approx(criteria.log10_det)
+        assert criteria.measures == (log10_det(HAND, 10), coupling_index(HAND))
         assert tuple(CRITERIA) == ("log10_det", "coupling_index")
 
     def test_a_determinant_beyond_floats_has_a_logarithm(self):
@@ -621,8 +621,8 @@ class TestFront:
             for pair in sorted(nondominated)
         ]
         front = front_of_motions(rows)
-        found = zip(front.measure("coupling_index"), front.measure("log10_det"), strict=True)
-        assert list(found) == sorted(nondominated)
+        measures = zip(front.measure("coupling_index"), front.measure("log10_det"), strict=True)
+        assert list(measures) == sorted(nondominated)
         assert [tuple(row) for row in np.column_stack((front.duration, front.genes))] == expected
 
     @given(motions, motions, motions, st.randoms(use_true_random=False))
@@ -715,9 +715,9 @@ class TestValidationMotions:
         assert np.all((high - low) / (LIMITS.upper - LIMITS.lower) > 0.7)
 
     def test_their_moves_plan_to_them_bit_for_bit(self):
-        for one in found()[:2]:
-            again = plan_moves(one.via_points[0], one.moves, LIMITS)
-            assert again.trajectory.to_dict() == one.trajectory.to_dict()
+        for motion in found()[:2]:
+            again = plan_moves(motion.via_points[0], motion.moves, LIMITS)
+            assert again.trajectory.to_dict() == motion.trajectory.to_dict()
 
     def test_those_of_a_seed_never_change(self):
         """Recorded with the first campaigns; plans of old archives name these seeds."""

@@ -368,9 +368,9 @@ class TestWriting:
             expected = model.torque(
                 np.concatenate([base, np.zeros(4 * n)]), q[None], qd[None], qdd[None]
             )[0]
-            found = pin.rnea(read, data, pin.integrate(read, pin.neutral(read), q), qd, qdd)
+            torque = pin.rnea(read, data, pin.integrate(read, pin.neutral(read), q), qd, qdd)
             # The base parameters neglect the effect of rounded angles on dependent columns.
-            np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
+            np.testing.assert_allclose(torque, expected, atol=2e-5 * np.abs(expected).max())
         np.testing.assert_array_equal(read.damping, friction[n : 2 * n])
         np.testing.assert_allclose(
             [inertia.mass for inertia in list(read.inertias)[1:]], standard[9::11], rtol=1e-12
@@ -420,7 +420,7 @@ class TestWriting:
         np.testing.assert_allclose(again, standard.reshape(2, 11)[:, :10], atol=1e-12)
 
     @pytest.mark.parametrize(
-        ("standard", "friction", "error", "words"),
+        ("standard", "friction", "error", "message"),
         [
             # I2yy about the joint: less than the share of the centre of mass
             ({14: 0.0}, (), NotConsistentError, "'elbow'"),
@@ -434,18 +434,18 @@ class TestWriting:
             (..., (), ShapeError, "standard"),
         ],
     )
-    def test_inconsistent_parameters_are_refused(self, standard, friction, error, words):
+    def test_inconsistent_parameters_are_refused(self, standard, friction, error, message):
         model = RobotModel.from_urdf(TWO_LINK)
         values = model.nominal.copy()
         if standard is ...:
             values = values[:3]
         else:
             values[[*standard]] = [*standard.values()]
-        with pytest.raises(error, match=words):
+        with pytest.raises(error, match=message):
             write_urdf(TWO_LINK, model, values, *([friction] if len(friction) else []))
 
     @pytest.mark.parametrize(
-        ("text", "own", "error", "words"),
+        ("text", "model_text", "error", "message"),
         [
             (urdf_text(), TWO_LINK, WriteBackError, "no joint 'shoulder'"),
             (LONGER, TWO_LINK, WriteBackError, "differs by"),
@@ -453,9 +453,9 @@ class TestWriting:
             ("no xml", TWO_LINK, ModelError, "not XML"),
         ],
     )
-    def test_the_description_of_another_robot_is_refused(self, text, own, error, words):
-        model = RobotModel.from_urdf(own)
-        with pytest.raises(error, match=words):
+    def test_the_description_of_another_robot_is_refused(self, text, model_text, error, message):
+        model = RobotModel.from_urdf(model_text)
+        with pytest.raises(error, match=message):
             write_urdf(text, model, model.nominal)
 
     def test_other_elements_and_comments_are_unchanged(self):
@@ -489,8 +489,8 @@ def fit():
     values = np.concatenate([model.base.grouping @ model.nominal, [4.0, 2.0, 1.5, 0.8]])
     torque = model.torque(values, q, qd, qdd) + rng.normal(size=(300, 2))
     factor = Factor.from_samples(model, Motion(np.arange(300.0), q, qd, qdd), torque)
-    found = estimate(model, factor)
-    return model, found, consistent_estimate(model, factor, found)
+    estimated = estimate(model, factor)
+    return model, estimated, consistent_estimate(model, factor, estimated)
 
 
 def table(text):
@@ -499,13 +499,13 @@ def table(text):
 
 class TestParameters:
     def test_json_restores_every_number(self, fit):
-        model, found, consistent = fit
-        text = parameters_json(model, found, consistent=consistent, provenance=PROVENANCE)
+        model, estimated, consistent = fit
+        text = parameters_json(model, estimated, consistent=consistent, provenance=PROVENANCE)
         read = json.loads(text)
-        assert [p["value"] for p in read["parameters"]] == found.values.tolist()
-        assert [p["std"] for p in read["parameters"]] == found.std.tolist()
-        assert [p["unit"] for p in read["parameters"]] == list(found.units)
-        np.testing.assert_array_equal(read["covariance"], found.covariance)
+        assert [p["value"] for p in read["parameters"]] == estimated.values.tolist()
+        assert [p["std"] for p in read["parameters"]] == estimated.std.tolist()
+        assert [p["unit"] for p in read["parameters"]] == list(estimated.units)
+        np.testing.assert_array_equal(read["covariance"], estimated.covariance)
         assert read["provenance"] == PROVENANCE
         assert read["parameters"][0]["expression"] == "I1yy + I1m + 0.25 m2"
         links = read["standard"]["links"]
@@ -514,28 +514,30 @@ class TestParameters:
         assert links[1]["friction"] == {"f0": consistent.friction[1], "f1": consistent.friction[3]}
 
     def test_json_has_texts_for_undetermined_values(self, fit):
-        model, found, _ = fit
-        covariance = found.covariance.copy()
+        model, estimated, _ = fit
+        covariance = estimated.covariance.copy()
         covariance[0, :] = covariance[:, 0] = 0.0
         covariance[0, 0] = np.inf
-        unknown = replace(found, covariance=covariance, condition=np.inf, undetermined=("I1yy",))
+        unknown = replace(
+            estimated, covariance=covariance, condition=np.inf, undetermined=("I1yy",)
+        )
         read = json.loads(parameters_json(model, unknown))
         assert read["parameters"][0]["std"] == read["condition"] == "Infinity"
         assert (read["undetermined"], read["standard"]) == (["I1yy"], None)
 
     def test_csv_restores_values_and_covariance(self, fit):
-        model, found, _ = fit
-        text = parameters_csv(model, found, provenance=PROVENANCE)
+        model, estimated, _ = fit
+        text = parameters_csv(model, estimated, provenance=PROVENANCE)
         assert "# recording: run_1.mcap sha256 0a1b" in text.splitlines()
         rows = table(text)
-        assert [row["name"] for row in rows] == list(found.names)
-        assert [float(row["value"]) for row in rows] == found.values.tolist()
-        covariance = [[float(row[f"cov({name})"]) for name in found.names] for row in rows]
-        np.testing.assert_array_equal(covariance, found.covariance)
+        assert [row["name"] for row in rows] == list(estimated.names)
+        assert [float(row["value"]) for row in rows] == estimated.values.tolist()
+        covariance = [[float(row[f"cov({name})"]) for name in estimated.names] for row in rows]
+        np.testing.assert_array_equal(covariance, estimated.covariance)
 
     def test_no_remark_is_a_formula_or_breaks_its_row(self, fit):
-        model, found, _ = fit
-        text = parameters_csv(model, found, provenance={"archives": "a,=1+1.mcap;@b, -3"})
+        model, estimated, _ = fit
+        text = parameters_csv(model, estimated, provenance={"archives": "a,=1+1.mcap;@b, -3"})
         assert len(table(text)) == model.n_parameters
         assert "a,'=1+1.mcap;'@b, -3" in text
 
@@ -583,9 +585,9 @@ def dry_friction(form, text):
         return model.friction.tolist()
     root = ElementTree.fromstring(text)
     if form == "sdf":
-        return [float(one.text) for one in root.iter("friction")]
+        return [float(element.text) for element in root.iter("friction")]
     where = {"mjcf": "frictionloss", "urdf": "friction"}[form]
-    return [float(one.get(where)) for one in root.iter() if where in one.attrib]
+    return [float(element.get(where)) for element in root.iter() if where in element.attrib]
 
 
 class TestReadBack:
@@ -654,7 +656,7 @@ class TestTexts:
         assert joint.get("range") == "-1.0 2.0"
         assert joint.get("actuatorfrcrange") == "-40.0 40.0"
         assert (joint.get("stiffness"), joint.get("springref")) == ("50.0", "0.3")
-        assert [one.get("ctrlrange") for one in model.iter("motor")] == ["-40.0 40.0"] * n
+        assert [motor.get("ctrlrange") for motor in model.iter("motor")] == ["-40.0 40.0"] * n
         assert "gravcomp" not in mjcf(arm, "arm")
 
     @FORMS
@@ -687,15 +689,15 @@ class TestLoadFriction:
     def test_what_is_left_out_is_the_friction_beyond_that_load(self, form):
         arm = replace(an_arm(urdf_text(), friction=FrictionLaw(load=True)), load=self.LOAD)
         motion, model = random_states(arm, 60), arm.model
-        found = compared(form, arm, samples=60)
-        beyond = [torque for name, torque in found.left_out.items() if "grows" in name]
+        comparison = compared(form, arm, samples=60)
+        beyond = [torque for name, torque in comparison.left_out.items() if "grows" in name]
         shares = np.array(
             [row["fl"] for row in model.friction.table(arm.values[model.friction_part])]
         )
         sizes = np.abs(model.gear_torque(arm.values, *motion[1:4]))
         expected = np.sqrt(np.mean((shares * (sizes - self.LOAD)) ** 2, axis=0))
         np.testing.assert_allclose(beyond, [expected], rtol=1e-6)
-        assert found.difference < AGREES
+        assert comparison.difference < AGREES
 
     def test_a_joint_at_rest_has_the_friction_of_its_description(self):
         arm = an_arm(urdf_text(), friction=FrictionLaw(load=True))
@@ -703,9 +705,14 @@ class TestLoadFriction:
         names = arm.model.parameter_names[arm.model.friction_part]
         friction = np.where([name.endswith("_6") for name in names], np.nan, friction)
         text = write_urdf(arm.urdf, arm.model, arm.standard, friction, load=self.LOAD)
-        joints = {one.get("name"): one for one in ElementTree.fromstring(text).iter("joint")}
-        before = {one.get("name"): one for one in ElementTree.fromstring(arm.urdf).iter("joint")}
-        last, described = (one["joint_6"].find("dynamics") for one in (joints, before))
+        joints = {
+            element.get("name"): element for element in ElementTree.fromstring(text).iter("joint")
+        }
+        before = {
+            element.get("name"): element
+            for element in ElementTree.fromstring(arm.urdf).iter("joint")
+        }
+        last, described = (elements["joint_6"].find("dynamics") for elements in (joints, before))
         assert (None if last is None else last.attrib) == (
             None if described is None else described.attrib
         )
@@ -756,8 +763,8 @@ class TestNoise:
 
     @pytest.mark.parametrize("bandwidth", [2.0, 5.0, 10.0])
     def test_ends_above_a_low_pass(self, bandwidth):
-        found = self.above(low_passed(self.TIME, self.torque(0.5), bandwidth, self.SHAPE))
-        assert bandwidth < found < 2.5 * bandwidth
+        frequency = self.above(low_passed(self.TIME, self.torque(0.5), bandwidth, self.SHAPE))
+        assert bandwidth < frequency < 2.5 * bandwidth
 
     def test_of_one_joint_is_enough_for_the_channel(self):
         torque = self.torque(0.1)

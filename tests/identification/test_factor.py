@@ -87,8 +87,8 @@ def exact_solution(samples):
             gram[k] = [a - share * b for a, b in zip(gram[k], gram[i], strict=True)]
     values = [Fraction(0)] * P
     for i in reversed(range(P)):
-        rest = gram[i][P] - sum(gram[i][j] * values[j] for j in range(i + 1, P))
-        values[i] = rest / gram[i][i]
+        remainder = gram[i][P] - sum(gram[i][j] * values[j] for j in range(i + 1, P))
+        values[i] = remainder / gram[i][i]
     return np.array([float(v) for v in values])
 
 
@@ -125,13 +125,16 @@ class TestFactor:
         assert np.abs((many.gram - whole.gram) / size).max() < 1e-13
         np.testing.assert_array_equal(many.samples, whole.samples)
         np.testing.assert_allclose(joint_weights(many), joint_weights(whole), rtol=1e-9)
-        for own in (None, weights):
-            one, other = estimate(MODEL, many, own), estimate(MODEL, whole, own)
+        for joint_weights_or_none in (None, weights):
+            of_sum, other = (
+                estimate(MODEL, many, joint_weights_or_none),
+                estimate(MODEL, whole, joint_weights_or_none),
+            )
             for name in ("values", "std", "noise_std", "condition"):
-                np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-9)
-            scale = np.outer(one.std, one.std)
-            assert np.abs((one.covariance - other.covariance) / scale).max() < 1e-9
-            assert ("QR" in one.method) == (storage == "qr")
+                np.testing.assert_allclose(getattr(of_sum, name), getattr(other, name), rtol=1e-9)
+            scale = np.outer(of_sum.std, of_sum.std)
+            assert np.abs((of_sum.covariance - other.covariance) / scale).max() < 1e-9
+            assert ("QR" in of_sum.method) == (storage == "qr")
 
     def test_the_dense_regressor_is_not_allocated(self):
         model, motion, torque = some_samples(30_000)
@@ -166,10 +169,10 @@ class TestFactor:
 class TestConditioning:
     def test_qr_is_more_accurate_than_gram(self):
         samples, ordinary = ill(), np.ones(2)
-        exact, found = exact_solution(samples), Factor.of(MODEL, samples, "qr").solve(ordinary)
-        assert 3e6 < found.condition < 1e8
-        assert found.determined.all()
-        np.testing.assert_allclose(found.values, exact, rtol=1e-7)
+        exact, solution = exact_solution(samples), Factor.of(MODEL, samples, "qr").solve(ordinary)
+        assert 3e6 < solution.condition < 1e8
+        assert solution.determined.all()
+        np.testing.assert_allclose(solution.values, exact, rtol=1e-7)
         equations = Factor.of(MODEL, samples).weighted(ordinary)
         assert np.abs(np.linalg.solve(equations.A, equations.b) / exact - 1.0).max() > 1e-2
         # The estimate on Gram matrices reports this.
@@ -181,8 +184,8 @@ class TestConditioning:
         errors = []
         for storage in ("qr", "gram"):
             factor = Factor.of(MODEL, samples, storage)
-            found = factor.solve(ordinary)
-            variance = residual_variance(factor, found.values, found.root, ordinary)
+            solution = factor.solve(ordinary)
+            variance = residual_variance(factor, solution.values, solution.root, ordinary)
             errors.append(np.abs(np.sqrt(variance) / (1e-9 * NOISE) - 1.0).max())
         assert errors[0] < 0.05
         assert errors[1] > 1.0
@@ -194,9 +197,9 @@ class TestConditioning:
         assert factor.storage == "qr"
         assert factor.solve(np.ones(2)).condition > QR_CONDITION
         np.testing.assert_array_equal(factor.samples, 2 * np.count_nonzero(bad.usable, axis=0))
-        found = fit_least_squares(MODEL, [bad])
-        assert "by QR" in found.method
-        np.testing.assert_allclose(found.values, truth(), rtol=1e-4)
+        estimated = fit_least_squares(MODEL, [bad])
+        assert "by QR" in estimated.method
+        np.testing.assert_allclose(estimated.values, truth(), rtol=1e-4)
         assert "by QR" in robust_estimate(MODEL, [bad]).estimate.method
 
     @both
@@ -207,10 +210,10 @@ class TestConditioning:
         # The elbow rests: no friction column, no own acceleration.
         assert {"f0_2", "f1_2", "I2m"} <= set(result.undetermined)
         assert {"f0_1", "f1_1"}.isdisjoint(result.undetermined)
-        known = np.array([name not in result.undetermined for name in result.names])
-        assert np.isinf(result.std[~known]).all()
-        assert np.isfinite(result.std[known]).all()
-        np.testing.assert_allclose(result.values[known], truth()[known], rtol=1e-3)
+        determined = np.array([name not in result.undetermined for name in result.names])
+        assert np.isinf(result.std[~determined]).all()
+        assert np.isfinite(result.std[determined]).all()
+        np.testing.assert_allclose(result.values[determined], truth()[determined], rtol=1e-3)
         # It still predicts the fitted motion.
         predicted = MODEL.torque(result.values, *motion[1:])
         np.testing.assert_allclose(predicted, samples.torque, atol=1e-4)
@@ -252,13 +255,13 @@ class TestConditioning:
         random = np.random.default_rng(seed)
         rows, target = random.standard_normal((k, p)), random.standard_normal(k)
         scale = np.linalg.norm(rows, axis=0)
-        found = solve_rows(rows, target)
+        solution = solve_rows(rows, target)
         expected = np.linalg.pinv(rows / scale) @ target / scale
-        np.testing.assert_allclose(found.values, expected, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(solution.values, expected, rtol=1e-6, atol=1e-8)
         inverse = np.linalg.pinv((rows / scale).T @ (rows / scale)) / np.outer(scale, scale)
         atol = 1e-6 * np.abs(inverse).max()
-        np.testing.assert_allclose(found.inverse, inverse, rtol=1e-5, atol=atol)
-        assert found.determined.all() == (k >= p)
+        np.testing.assert_allclose(solution.inverse, inverse, rtol=1e-5, atol=atol)
+        assert solution.determined.all() == (k >= p)
 
 
 class TestEstimate:
@@ -288,13 +291,13 @@ class TestEstimate:
 
     def test_parameters_reduce_degrees_of_freedom(self):
         """With half as many parameters as rows."""
-        found, weights = [], np.ones(2)
+        variances, weights = [], np.ones(2)
         motion = a_motion(11, step=0.4)
         for seed in range(300):
             factor = Factor.from_samples(MODEL, motion, noisy(motion, 1.0, seed).torque)
             solution = factor.solve(weights)
-            found.append(residual_variance(factor, solution.values, solution.root, weights))
-        np.testing.assert_allclose(np.mean(found, axis=0), 1.0, rtol=0.15)
+            variances.append(residual_variance(factor, solution.values, solution.root, weights))
+        np.testing.assert_allclose(np.mean(variances, axis=0), 1.0, rtol=0.15)
 
     @pytest.mark.parametrize("weighting", ["ordinary", "weighted"])
     def test_covariance_from_rows_is_that_from_blocks(self, weighting):
@@ -303,8 +306,8 @@ class TestEstimate:
         factor = total_factor(MODEL, runs)
         weights = np.ones(2) if weighting == "ordinary" else joint_weights(factor)
         expected = with_block_covariance(estimate(MODEL, factor, weights), factor, weights)
-        found = fit_least_squares(MODEL, runs, weighting)
-        np.testing.assert_allclose(found.values, expected.values, rtol=1e-9)
-        np.testing.assert_allclose(found.std, expected.std, rtol=1e-6)
-        assert found.interval_factor == expected.interval_factor
-        assert found.method.startswith(f"{weighting} least squares, cluster-robust covariance")
+        fitted = fit_least_squares(MODEL, runs, weighting)
+        np.testing.assert_allclose(fitted.values, expected.values, rtol=1e-9)
+        np.testing.assert_allclose(fitted.std, expected.std, rtol=1e-6)
+        assert fitted.interval_factor == expected.interval_factor
+        assert fitted.method.startswith(f"{weighting} least squares, cluster-robust covariance")

@@ -83,12 +83,12 @@ def test_slopes_are_derivatives_by_the_information():
         np.testing.assert_allclose((above - below) / 2.0, expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("known", [False, True], ids=["alone", "beside-earlier-recordings"])
-def test_the_gradient_predicts_changes_of_the_criteria(population, start, known):
+@pytest.mark.parametrize("with_given", [False, True], ids=["alone", "beside-earlier-recordings"])
+def test_the_gradient_predicts_changes_of_the_criteria(population, start, with_given):
     """In random directions, along which no kink of the interpolator lies."""
     genes, _ = start
     problem_, random = population.problem, np.random.default_rng(2)
-    if known:
+    if with_given:
         root = random.standard_normal((13, 40))
         given = Given(root @ root.T / 40.0, 2.0)
         problem_ = replace(problem_, objective=replace(problem_.objective, given=given))
@@ -107,17 +107,19 @@ def test_the_gradient_predicts_changes_of_the_criteria(population, start, known)
 
 def test_margins_are_those_of_duration_and_currents(population, start):
     genes, _ = start
-    found = population.linearise(genes, WEIGHTS)
+    linear_model = population.linearise(genes, WEIGHTS)
     (motion,) = population.problem.genome.motions(genes[None])
     constraints = population.problem.constraints
     states = states_of(motion)
     loads = constraints.currents.loads(Motion(np.arange(states.shape[1]), *states)).max(axis=0)
-    np.testing.assert_allclose(found.left[0], 0.999 * constraints.max_duration - motion.duration)
+    np.testing.assert_allclose(
+        linear_model.left[0], 0.999 * constraints.max_duration - motion.duration
+    )
     followed = 0.999 - loads[loads > 0.75]
     assert len(followed) > 0
-    assert all(np.any(np.isclose(found.left[1:], margin)) for margin in followed)
-    assert np.all((found.left[1:] >= np.min(followed)) & (found.left[1:] < 0.25))
-    assert found.rows.shape == (len(found.left), len(genes))
+    assert all(np.any(np.isclose(linear_model.left[1:], margin)) for margin in followed)
+    assert np.all((linear_model.left[1:] >= np.min(followed)) & (linear_model.left[1:] < 0.25))
+    assert linear_model.rows.shape == (len(linear_model.left), len(genes))
 
 
 class Watched:
@@ -145,21 +147,21 @@ class Watched:
 
 def test_an_improvement_is_feasible_and_beats_random_motions(population, start):
     genes, scores = start
-    better, found = improve(Watched(population).ascent(), genes, scores, 15)
-    assert found.usable[0]
-    np.testing.assert_array_equal(population.score(better[None]).rows, found.rows)
+    better, better_scores = improve(Watched(population).ascent(), genes, scores, 15)
+    assert better_scores.usable[0]
+    np.testing.assert_array_equal(population.score(better[None]).rows, better_scores.rows)
     random = population.score(population.problem.genome.sample(np.random.default_rng(6), 300))
     most = np.max(np.where(random.usable, fitness(random), -np.inf))
-    assert fitness(found)[0] > max(most, fitness(scores)[0])
+    assert fitness(better_scores)[0] > max(most, fitness(scores)[0])
 
 
 @pytest.mark.parametrize("steps", [0, 1, 3])
 def test_stopped_early_the_motion_is_valid_and_not_worse(population, start, steps):
     genes, scores = start
     watched = Watched(population, steps)
-    better, found = improve(watched.ascent(), genes, scores, 15)
+    better, better_scores = improve(watched.ascent(), genes, scores, 15)
     assert len(watched.scored) == steps
-    assert found.usable[0] and fitness(found)[0] >= fitness(scores)[0]
+    assert better_scores.usable[0] and fitness(better_scores)[0] >= fitness(scores)[0]
     if steps == 0:
         assert better.tobytes() == genes.tobytes()
 
@@ -182,9 +184,9 @@ def test_several_starts_share_half_of_the_steps(monkeypatch, population):
     taken = []
 
     def recorded(ascent, genes, scores, steps):
-        found = improve(ascent, genes, scores, min(steps, 1))
-        taken.append((genes.tobytes(), fitness(scores)[0], steps, found[0].tobytes()))
-        return found
+        improved = improve(ascent, genes, scores, min(steps, 1))
+        taken.append((genes.tobytes(), fitness(scores)[0], steps, improved[0].tobytes()))
+        return improved
 
     monkeypatch.setattr(run, "improve", recorded)
     design = search(population, replace(SETTINGS, gradient=32, starts=4))

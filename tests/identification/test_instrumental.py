@@ -68,7 +68,7 @@ def dense(samples, plan=PLAN):
     """Return Z and W (m, n, p) and y (m, n), zero in unusable rows."""
     rows = samples.usable & MODEL.moving(plan.velocity)
     p = MODEL.n_parameters
-    z, w = (MODEL.regressor(*one[1:]).dense(p) for one in (plan, samples.motion))
+    z, w = (MODEL.regressor(*motion[1:]).dense(p) for motion in (plan, samples.motion))
     return (
         np.where(rows[..., None], z, 0.0),
         np.where(rows[..., None], w, 0.0),
@@ -116,7 +116,7 @@ class TestInstrumentalEstimate:
         runs = [fit(executed(s, position_noise=LARGE)) for s in range(30)]
         instrumental = np.array([run.estimate.values for _, run in runs]) - TRUTH
         rows = [measured_part(factor) for factor, _ in runs]
-        least = np.array([estimate(MODEL, one).values for one in rows]) - TRUTH
+        least = np.array([estimate(MODEL, measured).values for measured in rows]) - TRUTH
         inertias = [MODEL.parameter_names.index(name) for name in ("I1yy", "I2yy", "I2m")]
         # Least squares shrinks the coefficients of the acceleration, instruments do not, and their
         # total error is far smaller.
@@ -130,8 +130,10 @@ class TestInstrumentalEstimate:
         covered = []
         for seed in range(60):
             samples = executed(seed, position_noise=1e-4, correlation=correlation)
-            one = fit(samples)[1].estimate
-            covered.append(np.abs(one.values - TRUTH) < one.interval_factor * one.std)
+            estimated = fit(samples)[1].estimate
+            covered.append(
+                np.abs(estimated.values - TRUTH) < estimated.interval_factor * estimated.std
+            )
         assert 0.90 <= np.mean(covered) <= 0.99
 
     def test_a_resting_instrument_determines_nothing(self):
@@ -172,8 +174,8 @@ class TestPlannedMotion:
         instruments = planned_motion(samples, command)
         assert not instruments.usable[300:340].any()
         assert instruments.usable[400:-400].all()
-        for value, words in ((np.nan, "no commanded positions"), (1.0, "no joint is commanded")):
-            with pytest.raises(IdentificationError, match=words):
+        for value, message in ((np.nan, "no commanded positions"), (1.0, "no joint is commanded")):
+            with pytest.raises(IdentificationError, match=message):
                 planned_motion(samples, np.full_like(command, value))
 
     def test_repetitions_share_a_plan_for_any_clock(self):

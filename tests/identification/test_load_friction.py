@@ -80,8 +80,8 @@ class TestTorque:
         motion = a_motion()
         values = np.concatenate([VALUES, [7.0, 8.0]])
         expected = gravity_and_inertia(MODEL, truth(), motion) + model.load_torque(*motion[1:4])
-        found = model.gear_torque(values, *motion[1:4])
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+        torque = model.gear_torque(values, *motion[1:4])
+        np.testing.assert_allclose(torque, expected, rtol=1e-9, atol=1e-9)
 
     def test_coupled_motors_have_no_such_term(self):
         wrist = np.eye(6)
@@ -106,7 +106,7 @@ class TestSamples:
     def test_a_part_of_the_parameters_has_the_load_of_all(self):
         samples = simulated(LOADED, VALUES, a_motion())
         friction = LOADED.friction_columns
-        parts = [samples.predicted_torque(LOADED, VALUES, one) for one in (friction, ~friction)]
+        parts = [samples.predicted_torque(LOADED, VALUES, part) for part in (friction, ~friction)]
         assert np.abs(parts[0]).max() > 0.0
         np.testing.assert_allclose(np.add(*parts), samples.torque, rtol=1e-9, atol=1e-9)
 
@@ -130,7 +130,7 @@ class TestSamples:
     def test_other_models_do_not_depend_on_a_load(self):
         samples = simulated(LOADED, VALUES, a_motion())
         loaded = samples.with_load(LOADED, VALUES)
-        gram, same = (Factor.of(MODEL, one).gram for one in (samples, loaded))
+        gram, same = (Factor.of(MODEL, recording).gram for recording in (samples, loaded))
         np.testing.assert_array_equal(gram, same)
 
 
@@ -148,11 +148,11 @@ class TestFixedPoint:
     @pytest.mark.parametrize("seed", range(3))
     def test_planted_shares_are_found(self, seed):
         samples = simulated(LOADED, VALUES, a_motion(), NOISE, seed)
-        found = fit_with_load(LOADED, [samples], weighted_fit)
-        assert found.converged
-        error = np.abs(found.result.values - VALUES) / found.result.std
+        load_fit = fit_with_load(LOADED, [samples], weighted_fit)
+        assert load_fit.converged
+        error = np.abs(load_fit.result.values - VALUES) / load_fit.result.std
         assert error.max() < 3.5  # of 13 parameters
-        rms = np.sqrt(np.mean((samples.torque - _predicted(found, samples)) ** 2, axis=0))
+        rms = np.sqrt(np.mean((samples.torque - _predicted(load_fit, samples)) ** 2, axis=0))
         np.testing.assert_allclose(rms, NOISE, rtol=0.05)
 
     def test_intervals_cover_the_shares(self):
@@ -173,15 +173,15 @@ class TestFixedPoint:
     def test_a_large_share_converges(self):
         values = np.append(truth(), [0.3, 0.3])
         samples = simulated(LOADED, values, a_motion())
-        found = fit_with_load(LOADED, [samples], weighted_fit, most=20)
-        assert found.converged
-        np.testing.assert_allclose(found.result.values, values, rtol=0.02, atol=0.01)
+        load_fit = fit_with_load(LOADED, [samples], weighted_fit, most=20)
+        assert load_fit.converged
+        np.testing.assert_allclose(load_fit.result.values, values, rtol=0.02, atol=0.01)
 
     def test_it_ends_where_the_torque_stays(self):
         samples = simulated(LOADED, VALUES, a_motion(), NOISE, 5)
-        found = fit_with_load(LOADED, [samples], weighted_fit)
-        again = fit_with_load(LOADED, found.samples, weighted_fit, most=2)
-        before, after = (_predicted(one, samples) for one in (found, again))
+        load_fit = fit_with_load(LOADED, [samples], weighted_fit)
+        again = fit_with_load(LOADED, load_fit.samples, weighted_fit, most=2)
+        before, after = (_predicted(fixed_point, samples) for fixed_point in (load_fit, again))
         assert np.sqrt(np.mean((after - before) ** 2) / np.mean(after**2)) < CONVERGED
 
     def test_an_estimate_without_shares_saves_a_pass(self):
@@ -194,16 +194,18 @@ class TestFixedPoint:
 
     def test_passes_are_limited_and_reported(self):
         samples = simulated(LOADED, VALUES, a_motion(), NOISE, 7)
-        found = fit_with_load(LOADED, [samples], weighted_fit, most=2)
-        assert found.passes == 2
-        assert not found.converged
+        load_fit = fit_with_load(LOADED, [samples], weighted_fit, most=2)
+        assert load_fit.passes == 2
+        assert not load_fit.converged
 
     def test_a_model_without_shares_is_fitted_once(self):
         samples = simulated(MODEL, truth(), a_motion(), NOISE, 8)
-        found = fit_with_load(MODEL, [samples], lambda some: fit_least_squares(MODEL, list(some)))
-        assert (found.passes, found.converged) == (1, True)
-        assert found.samples == (samples,)
+        load_fit = fit_with_load(
+            MODEL, [samples], lambda some: fit_least_squares(MODEL, list(some))
+        )
+        assert (load_fit.passes, load_fit.converged) == (1, True)
+        assert load_fit.samples == (samples,)
 
 
-def _predicted(found, samples):
-    return samples.predicted_torque(LOADED, found.result.values)
+def _predicted(load_fit, samples):
+    return samples.predicted_torque(LOADED, load_fit.result.values)

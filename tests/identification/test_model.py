@@ -121,7 +121,7 @@ class TestRobotModel:
         assert np.abs(model.torque(values, q, qd, qdd) - expected).max() < 1e-10
 
     @pytest.mark.parametrize(
-        ("text", "locked", "words"),
+        ("text", "locked", "message"),
         [
             (one_joint("fixed"), {}, "no revolute or prismatic joint"),
             (TWO_LINK, BOTH, "no revolute or prismatic joint"),
@@ -139,10 +139,10 @@ class TestRobotModel:
             ),
         ],
     )
-    def test_invalid_descriptions_are_refused(self, text, locked, words):
-        with pytest.raises(ModelError, match=words) as caught:
+    def test_invalid_descriptions_are_refused(self, text, locked, message):
+        with pytest.raises(ModelError, match=message) as caught:
             RobotModel.from_urdf(text, locked=locked)
-        assert caught.value.joint == ("strange" if "'strange'" in words else caught.value.joint)
+        assert caught.value.joint == ("strange" if "'strange'" in message else caught.value.joint)
 
     def test_an_offset_equal_to_a_weight_is_no_parameter_of_its_own(self):
         law = FrictionLaw(offset=True)
@@ -275,11 +275,11 @@ class TestPseudoInertia:
     @given(seeds)
     def test_body_and_parameters_are_those_of_pinocchio(self, seed):
         inertial = of_points(*point_masses(seed))
-        found = body(inertial)
-        expected = pin.Inertia(found.mass, found.centre, found.inertia)
+        rigid_body = body(inertial)
+        expected = pin.Inertia(rigid_body.mass, rigid_body.centre, rigid_body.inertia)
         order = list(FROM_PINOCCHIO)
         np.testing.assert_allclose(expected.toDynamicParameters()[order], inertial, atol=1e-12)
-        np.testing.assert_allclose(inertial_parameters(found), inertial, atol=1e-12)
+        np.testing.assert_allclose(inertial_parameters(rigid_body), inertial, atol=1e-12)
 
 
 STEPS = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.4]])
@@ -294,28 +294,30 @@ SOUND, FLAT, POINT = (0.1, 0.1, 0.02), (0.001, 0.002, 0.02), (0.0, 0.0, 0.0)
 
 class TestReferenceBodies:
     @pytest.mark.parametrize(
-        ("moments", "words"), [(SOUND, AS_GIVEN), (FLAT, MADE_POSSIBLE), (POINT, MADE_POSSIBLE)]
+        ("moments", "origin"), [(SOUND, AS_GIVEN), (FLAT, MADE_POSSIBLE), (POINT, MADE_POSSIBLE)]
     )
-    def test_they_use_consistent_parts_of_a_link(self, moments, words):
+    def test_they_use_consistent_parts_of_a_link(self, moments, origin):
         """All of a consistent link, mass and centre of an inconsistent one."""
         links = np.array([a_link(moments), a_link(SOUND), np.zeros(10)])
-        found = reference_bodies(links, STEPS)
-        assert found.origins == (words, AS_GIVEN, ASSUMED)
-        possible = slice(None) if words == AS_GIVEN else slice(6, None)
-        np.testing.assert_allclose(found.inertial[0, possible], links[0, possible], atol=1e-14)
-        np.testing.assert_allclose(found.inertial[1], links[1], atol=1e-14)
-        assert np.all(margin(found.inertial) > 1e-6)
-        assert found.inertial[2, 9] == 2.0
+        references = reference_bodies(links, STEPS)
+        assert references.origins == (origin, AS_GIVEN, ASSUMED)
+        possible = slice(None) if origin == AS_GIVEN else slice(6, None)
+        np.testing.assert_allclose(references.inertial[0, possible], links[0, possible], atol=1e-14)
+        np.testing.assert_allclose(references.inertial[1], links[1], atol=1e-14)
+        assert np.all(margin(references.inertial) > 1e-6)
+        assert references.inertial[2, 9] == 2.0
 
     @given(st.integers(0, 2**32 - 1))
     def test_they_are_consistent(self, seed):
         rng = np.random.default_rng(seed)
         links = rng.normal(size=(3, 10)) * 10.0 ** rng.uniform(-3, 3, (3, 1))
         links[rng.random(3) < 0.3] = 0.0
-        found = reference_bodies(links, np.zeros((3, 3)))
-        assert np.all(margin(found.inertial) > 0.0)
-        squares = found.frames @ found.frames.transpose(0, 2, 1)
-        np.testing.assert_allclose(squares, pseudo_inertia(found.inertial), rtol=1e-9, atol=1e-12)
+        references = reference_bodies(links, np.zeros((3, 3)))
+        assert np.all(margin(references.inertial) > 0.0)
+        squares = references.frames @ references.frames.transpose(0, 2, 1)
+        np.testing.assert_allclose(
+            squares, pseudo_inertia(references.inertial), rtol=1e-9, atol=1e-12
+        )
 
 
 @pytest.fixture(scope="module")
@@ -364,12 +366,16 @@ class TestBaseParameters:
         """Coupled motors add three inertias by themselves."""
         model = RobotModel.from_urdf(urdf_text(), coupling=coupling)
         rows = {row.pivot: row for row in TABLE2[:N_ESSENTIAL]}
-        own = {"I45", "I46", "I56"} if coupling else set()
-        assert set(model.base.names) == set(rows) | own
+        coupled_inertias = {"I45", "I46", "I56"} if coupling else set()
+        assert set(model.base.names) == set(rows) | coupled_inertias
         assert model.base.largest_dropped < 1e-10 * model.base.smallest_pivot
         for name, group in zip(model.base.names, model.base.grouping, strict=True):
             # Rows 29 and 31 are printed for minus the pivot.
-            terms, sign = ({name: 1.0}, 1) if name in own else (rows[name].terms, rows[name].sign)
+            terms, sign = (
+                ({name: 1.0}, 1)
+                if name in coupled_inertias
+                else (rows[name].terms, rows[name].sign)
+            )
             expected = np.zeros(len(model.layout.names))
             for standard, factor in terms.items():
                 expected[model.layout.names.index(standard)] = sign * factor
@@ -493,11 +499,13 @@ class TestLawsOfJoints:
         values = np.concatenate([np.zeros(model.base.rank), friction])
         qd = random.choice([-2.0, -0.5, -0.1, -1e-3, 0.0, 1e-3, 0.1, 0.5, 2.0], (30, 6))
         torque = model.torque(values, random.normal(size=(30, 6)), qd, random.normal(size=(30, 6)))
-        own = [{} for _ in names]
+        coefficients = [{} for _ in names]
         for name, value in zip(model.parameter_names[model.base.rank :], friction, strict=True):
             symbol, joint = name.split("_")
-            own[int(joint) - 1][symbol] = value
-        expected = [[torque_of(laws[j], own[j], v) for j, v in enumerate(row)] for row in qd]
+            coefficients[int(joint) - 1][symbol] = value
+        expected = [
+            [torque_of(laws[j], coefficients[j], v) for j, v in enumerate(row)] for row in qd
+        ]
         np.testing.assert_allclose(torque, expected, atol=1e-11)
 
     def test_parameters_are_ordered_by_term(self):
@@ -540,9 +548,9 @@ class TestDissipation:
         g[~not_negative] = 0.0
         values = dict(zip(friction.names, combine @ g, strict=True))
         for joint, law in enumerate(laws, start=1):
-            own = {s: values[f"{s}_{joint}"] for s in law.symbols}
+            coefficients = {s: values[f"{s}_{joint}"] for s in law.symbols}
             for v in (-3.0, -0.01, 0.01, 3.0):
-                assert torque_of(law, own, v) * v >= -1e-12
+                assert torque_of(law, coefficients, v) * v >= -1e-12
 
     def test_all_dissipative_friction_is_allowed_and_no_other(self):
         law = FrictionLaw(third=None, asymmetric=True, stribeck=0.2)
@@ -568,9 +576,9 @@ class TestPreslidingState:
         for step in np.diff(position):
             state = np.sign(step) + (state - np.sign(step)) * np.exp(-abs(step) / distance)
             expected.append(state)
-        found = presliding_state(position, distance)
-        np.testing.assert_allclose(found, expected, atol=1e-12)
-        assert np.all(np.abs(found) <= 1.0)
+        states_of = presliding_state(position, distance)
+        np.testing.assert_allclose(states_of, expected, atol=1e-12)
+        assert np.all(np.abs(states_of) <= 1.0)
 
 
 class TestDirectionOfFriction:
@@ -634,19 +642,19 @@ class TestCoupling:
             urdf_text(), coupling=Coupling(np.diag(np.diag(NS16_TURNS)))
         )
         assert with_gears.parameter_names == uncoupled.parameter_names
-        blocks = [one.regressor(*states()).blocks for one in (with_gears, uncoupled)]
+        blocks = [model.regressor(*states()).blocks for model in (with_gears, uncoupled)]
         assert all(map(np.array_equal, *blocks))
 
     @pytest.mark.parametrize(
-        ("matrix", "words"),
+        ("matrix", "message"),
         [
             (np.array([[0.0, 1.0], [1.0, 0.0]]), "motor 1 .* does not turn with joint 1"),
             (np.array([[1.0, 0.0], [16.0, 1e-308]]), "motor 2 .* does not turn with joint 2"),
             (np.ones((2, 2)), "singular"),
         ],
     )
-    def test_an_invalid_one_is_refused(self, matrix, words):
-        with pytest.raises(ModelError, match=words):
+    def test_an_invalid_one_is_refused(self, matrix, message):
+        with pytest.raises(ModelError, match=message):
             Coupling(matrix)
 
 
@@ -713,12 +721,14 @@ class TestElementTorque:
     def test_a_given_preload_stays_known(self):
         """The preload of an identified spring is a parameter unless it is given."""
         both = replace(EXTENSION, preload=None, identified=True)
-        one = replace(EXTENSION, identified=True)
-        assert (both.symbols, one.symbols) == (("spring", "preload"), ("spring",))
+        with_preload = replace(EXTENSION, identified=True)
+        assert (both.symbols, with_preload.symbols) == (("spring", "preload"), ("spring",))
         assert JointElements.of([both], ["joint2"], [True]).units == ("N/m", "N")
         whole = EXTENSION.known(POSITIONS)
         np.testing.assert_allclose(both.columns(POSITIONS) @ [900.0, 60.0], whole)
-        np.testing.assert_allclose(one.columns(POSITIONS)[:, 0] * 900 + one.known(POSITIONS), whole)
+        np.testing.assert_allclose(
+            with_preload.columns(POSITIONS)[:, 0] * 900 + with_preload.known(POSITIONS), whole
+        )
 
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -754,32 +764,32 @@ class TestPublishedRecordings:
         model = RobotModel.from_urdf(urdf, friction=FrictionLaw(offset=True), coupling=coupling)
         options = Preprocessing(smooth_torque=True, torque_bandwidth=40.0)
         samples = prepare(recorded, model, options=options)
-        found = estimate(model, Factor.of(model, samples), np.ones(6))
-        (error,) = prediction_error(model, found.values, [samples], all_rows=True)
-        return found, error
+        estimated = estimate(model, Factor.of(model, samples), np.ones(6))
+        (error,) = prediction_error(model, estimated.values, [samples], all_rows=True)
+        return estimated, error
 
     @pytest.mark.slow
     def test_a_coupled_wrist_follows_the_published_parameters(self):
         """Comparators: 10.9 % with, 14.3 % without; joint 5 19 and 53 %; Iam6, fsm6, fvm6."""
         _, without = self.fitted(None)
-        found, coupled = self.fitted(Coupling(self.TURNS))
+        estimated, coupled = self.fitted(Coupling(self.TURNS))
         assert coupled.overall <= 0.109 < 0.12 < without.overall
         assert coupled.relative[4] <= 0.19 < 0.45 < without.relative[4]
-        values = [found.value(name) for name in ("I56", "f0_m6", "f1_m6")]
+        values = [estimated.value(name) for name in ("I56", "f0_m6", "f1_m6")]
         assert values == pytest.approx([0.00964, 1.95, 0.616], rel=0.05)
 
 
 class TestElementFigures:
     @pytest.mark.parametrize(
-        ("make", "words"),
+        ("make", "message"),
         [
             (lambda: TorsionSpring("a", 0.0), "neither a stiffness nor identified"),
             (lambda: Anchors(0.2, 0.2, 0.0), "distance is zero at one angle"),
             (lambda: replace(BALANCER, volume=5e-4), "the gas has -0.000168 m³ left"),
         ],
     )
-    def test_invalid_values_are_refused(self, make, words):
-        with pytest.raises(ModelError, match=words):
+    def test_invalid_values_are_refused(self, make, message):
+        with pytest.raises(ModelError, match=message):
             make()
 
     def test_joint_must_exist_and_be_revolute(self):
@@ -835,13 +845,13 @@ class TestElementModel:
         np.testing.assert_allclose(model.torque(values, *motion[1:]), expected, atol=1e-9)
 
     def test_known_elements_are_load(self):
-        known = with_elements(replace(SPRING, identified=False))
+        sprung_model = with_elements(replace(SPRING, identified=False))
         motion = two_link.a_motion(1.0)
-        assert known.parameter_names == two_link.MODEL.parameter_names
-        load = known.load_torque(*motion[1:4])
+        assert sprung_model.parameter_names == two_link.MODEL.parameter_names
+        load = sprung_model.load_torque(*motion[1:4])
         np.testing.assert_allclose(load[:, 0], 40.0 * (motion.position[:, 0] - 0.3))
         assert not load[:, 1].any()
-        assert known.has_load and not two_link.MODEL.has_load
+        assert sprung_model.has_load and not two_link.MODEL.has_load
 
     def test_equal_elements_are_refused(self):
         with pytest.raises(ElementError, match=r"spring_1b .* cannot be distinguished"):
@@ -871,16 +881,19 @@ def identified():
 class TestIdentifiedElements:
     def test_least_squares_finds_them(self, identified):
         model, values, factor = identified
-        found = estimate(model, factor)
-        assert np.all(np.abs(found.values - values) <= 4.5 * found.std)
+        estimated = estimate(model, factor)
+        assert np.all(np.abs(estimated.values - values) <= 4.5 * estimated.std)
 
     def test_the_consistent_solution_leaves_them_free(self, identified):
         """A stiffness may be negative and has no prior."""
         model, values, factor = identified
-        free, own = estimate(model, factor), model.element_part
-        found = consistent_estimate(model, factor, free)
-        assert len(found.friction) == len(model.friction.terms)
-        assert np.all(np.abs(found.estimate.values - values)[own] <= 4.5 * free.std[own])
+        free, element_columns = estimate(model, factor), model.element_part
+        consistent = consistent_estimate(model, factor, free)
+        assert len(consistent.friction) == len(model.friction.terms)
+        assert np.all(
+            np.abs(consistent.estimate.values - values)[element_columns]
+            <= 4.5 * free.std[element_columns]
+        )
 
 
 def some_states(m, seed=3):
@@ -972,7 +985,7 @@ class TestBlocksOfTime:
 
     def test_blocks_without_rows_change_nothing(self, samples):
         late = replace(samples, origin=samples.origin - 3.0)
-        phase, same = (Factor.by_time(MODEL, one) for one in (late, samples))
+        phase, same = (Factor.by_time(MODEL, recording) for recording in (late, samples))
         assert len(phase) == len(same) + 24
         assert len(phase.occupied()) == len(same)
         training = eliminate(MODEL, phase, same).estimate

@@ -114,9 +114,9 @@ def recordings(loads, *, noise=NOISE, drift=0.0, pace=1.0, seed=0):
     rng, motion = np.random.default_rng(seed), four_sines(TIME, pace)
     runs = []
     for k, load in enumerate(loads):
-        own = truth()
-        own[-4:] *= 1.0 + drift * np.tile(rng.standard_normal(2), 2)
-        torque = MODEL.torque(own, *motion[1:])
+        drifted = truth()
+        drifted[-4:] *= 1.0 + drift * np.tile(rng.standard_normal(2), 2)
+        torque = MODEL.torque(drifted, *motion[1:])
         if load is not None:
             torque += load_torque(MODEL, load, motion)
         torque += noise * rng.standard_normal(torque.shape)
@@ -131,17 +131,17 @@ def identified(loads, **options):
 
 class TestMass:
     def test_without_noise_the_body_comes_back(self):
-        found = identified([None, LOAD], noise=np.zeros(2))
-        assert found.body.mass == pytest.approx(4.0, rel=1e-6)
-        assert found.body.centre[[0, 2]] == pytest.approx([0.2, 0.1], abs=1e-6)
-        assert found.body.inertia[1, 1] == pytest.approx(0.03, rel=1e-4)
+        estimate = identified([None, LOAD], noise=np.zeros(2))
+        assert estimate.body.mass == pytest.approx(4.0, rel=1e-6)
+        assert estimate.body.centre[[0, 2]] == pytest.approx([0.2, 0.1], abs=1e-6)
+        assert estimate.body.inertia[1, 1] == pytest.approx(0.03, rel=1e-4)
 
     def test_no_load_is_no_body(self):
         """With the same load in all recordings."""
         model, runs = recordings([None, None])
-        found = identify_payload(model, [runs[0], replace(runs[1], loaded=True)])
-        assert found.body is None
-        assert found.intervals[0, 0] == 0.0
+        estimate = identify_payload(model, [runs[0], replace(runs[1], loaded=True)])
+        assert estimate.body is None
+        assert estimate.intervals[0, 0] == 0.0
 
     def test_exchanged_recordings_are_refused(self):
         model, runs = recordings([None, LOAD])
@@ -160,13 +160,13 @@ class TestIntervals:
         """Of 24 draws at 95 % fewer than 19 inside have a probability of 0.1 %."""
         truth = {"mass": 4.0, "cx": 0.2, "cz": 0.1, "Iyy": 0.03}
         for name, value in truth.items():
-            intervals = np.array([one.intervals[NAMES.index(name)] for one in many])
+            intervals = np.array([estimate.intervals[NAMES.index(name)] for estimate in many])
             inside = (intervals[:, 0] <= value) & (value <= intervals[:, 1])
             assert inside.sum() >= 19, name
 
     def test_they_are_not_wider_than_the_scatter(self, many):
-        masses = np.array([one.parameters[9] for one in many])
-        half = np.median([np.diff(one.intervals[0]) / 2.0 for one in many])
+        masses = np.array([estimate.parameters[9] for estimate in many])
+        half = np.median([np.diff(estimate.intervals[0]) / 2.0 for estimate in many])
         assert half < 1.5 * 1.96 * masses.std(ddof=1)
 
     def test_changed_friction_does_not_bias_the_mass(self):
@@ -186,21 +186,21 @@ class TestIntervals:
 class TestPossibleBody:
     @pytest.mark.parametrize("seed", range(5))
     def test_a_poor_motion_gives_a_consistent_body(self, seed):
-        found = identified([None, LOAD], noise=20.0 * NOISE, pace=0.4, seed=seed)
-        own = inertial_parameters(found.body)
-        assert margin(own) > -1e-9 * own[9]
+        estimate = identified([None, LOAD], noise=20.0 * NOISE, pace=0.4, seed=seed)
+        parameters = inertial_parameters(estimate.body)
+        assert margin(parameters) > -1e-9 * parameters[9]
 
     def test_undetermined_parameters_are_named(self):
         """Only mass, moments in the plane and Iyy act on two axes about y."""
-        found = identified([None, LOAD])
-        assert found.undetermined == ("cy", "Ixx", "Ixy", "Ixz", "Iyz", "Izz")
-        assert found.body.centre[1] == pytest.approx(0.0, abs=1e-6)
+        estimate = identified([None, LOAD])
+        assert estimate.undetermined == ("cy", "Ixx", "Ixy", "Ixz", "Iyz", "Izz")
+        assert estimate.body.centre[1] == pytest.approx(0.0, abs=1e-6)
 
     def test_undetermined_moments_are_zero(self):
         """In slow motion only the weight acts: a point mass."""
-        found = identified([None, LOAD], pace=0.1, noise=3.0 * NOISE)
-        assert {"Ixx", "Iyy", "Izz"} <= {*found.undetermined}
-        np.testing.assert_array_equal(found.body.inertia, np.zeros((3, 3)))
+        estimate = identified([None, LOAD], pace=0.1, noise=3.0 * NOISE)
+        assert {"Ixx", "Iyy", "Izz"} <= {*estimate.undetermined}
+        np.testing.assert_array_equal(estimate.body.inertia, np.zeros((3, 3)))
 
 
 class TestFrame:
@@ -218,9 +218,9 @@ class TestFrame:
             Run.of("run", model, as_samples(model, motion, torque), "tool", loaded=kind)
             for kind, torque in ((False, bare), (True, loaded))
         ]
-        found = identify_payload(model, runs)
-        assert found.body.centre[[0, 2]] == pytest.approx([0.2, 0.1], abs=1e-6)
-        assert found.body.inertia[1, 1] == pytest.approx(0.03, rel=1e-4)
+        estimate = identify_payload(model, runs)
+        assert estimate.body.centre[[0, 2]] == pytest.approx([0.2, 0.1], abs=1e-6)
+        assert estimate.body.inertia[1, 1] == pytest.approx(0.03, rel=1e-4)
 
 
 KNOWN = Payload(2.0, (0.03, 0.0, 0.45))
@@ -300,12 +300,12 @@ class TestGains:
     def test_95_percent_intervals_cover_without_bias(self):
         """Unlike least squares of the equation linear in gains and parameters."""
         draws = [gains_of(factors_of(seed=seed)) for seed in range(100)]
-        values = np.array([one.values for one in draws])
-        half = np.array([one.interval_factor * one.std for one in draws])
+        values = np.array([draw.values for draw in draws])
+        half = np.array([draw.interval_factor * draw.std for draw in draws])
         # Fewer than 89 of 100 have a probability of 0.5 %.
         assert np.all(np.sum(np.abs(values - PLANTED) <= half, axis=0) >= 89)
         scatter = values.std(axis=0, ddof=1)
-        claimed = np.sqrt(np.mean([one.std**2 for one in draws], axis=0))
+        claimed = np.sqrt(np.mean([draw.std**2 for draw in draws], axis=0))
         # The standard deviation of 100 samples has an error of 7 %.
         assert np.all(np.abs(np.log(claimed / scatter)) < 3 * 0.07)
         assert np.all(np.abs(values.mean(axis=0) - PLANTED) < 3.0 * scatter / 10.0)

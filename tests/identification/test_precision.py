@@ -60,9 +60,9 @@ class TestVariances:
         precision, data = wanted("load"), positive(12)
         load = precision.quantities
         assert isinstance(load, LoadQuantities)
-        known = np.linalg.inv(load.root @ load.root.T)
+        arm_information = np.linalg.inv(load.root @ load.root.T)
         d = load.change
-        both = np.block([[data + known, data @ d], [d.T @ data, d.T @ data @ d]])
+        both = np.block([[data + arm_information, data @ d], [d.T @ data, d.T @ data @ d]])
         covariance = np.linalg.inv(both)[12:, 12:]
         half = INTERVAL * np.sqrt(np.diag(load.directions @ covariance @ load.directions.T))
         np.testing.assert_allclose(precision.ratios(data), half / load.allowed, rtol=1e-6)

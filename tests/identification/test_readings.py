@@ -92,16 +92,18 @@ def test_it_is_found_and_nothing_else(case: str) -> None:
     samples = prepare(recording, model(), options=Preprocessing(14.0, left_out="rests"))
     gravities = {"": (0.0, 0.0, 0.0), "upside down": (0.0, 0.0, 9.81)}
     mountings = {name: model(gravity) for name, gravity in gravities.items()}
-    found = find_readings(model(), samples, mountings=mountings)
-    steps = [step.change for step in found.steps]
+    readings = find_readings(model(), samples, mountings=mountings)
+    steps = [step.change for step in readings.steps]
     expected = CASES[case]
     assert [step._replace(size=0.0) for step in steps] == [
-        one._replace(size=0.0) for one in expected
+        change._replace(size=0.0) for change in expected
     ]
-    assert [step.size for step in steps] == pytest.approx([one.size for one in expected], abs=0.05)
-    assert all(step.sure for step in found.steps)
+    assert [step.size for step in steps] == pytest.approx(
+        [change.size for change in expected], abs=0.05
+    )
+    assert all(step.sure for step in readings.steps)
     # The hand of the last joint is free: its zero turns with its bodies, which nothing else shows.
-    assert 2 in found.unseen_zeros
+    assert 2 in readings.unseen_zeros
 
 
 def test_one_joint_whose_friction_alone_speaks_is_not_sure() -> None:

@@ -96,7 +96,7 @@ def test_a_polish_finds_friction_rotor_and_delay() -> None:
     values[MODEL.friction_part] *= 1.4
     start = Driven(replace(true, values=values), replace(motion, delay=0.004), NOTHING)
     best = polished(start)
-    before, after = (np.sqrt(np.mean(one.residuals() ** 2)) for one in (start, best))
+    before, after = (np.sqrt(np.mean(driven.residuals() ** 2)) for driven in (start, best))
     assert after < 0.2 * before
     friction = best.arm.values[MODEL.friction_part] / true.values[MODEL.friction_part]
     assert friction[true.values[MODEL.friction_part] != 0.0] == pytest.approx(1.0, abs=0.15)
@@ -167,7 +167,7 @@ class TestServo:
 
         def late(values):
             at = motion.time - delay
-            return np.column_stack([np.interp(at, motion.time, one) for one in values.T])
+            return np.column_stack([np.interp(at, motion.time, column) for column in values.T])
 
         error = late(commanded) - motion.position
         rate = late(np.gradient(commanded, motion.time, axis=0)) - motion.velocity
@@ -184,6 +184,6 @@ class TestServo:
         assert servo.kd == pytest.approx(kd, rel=0.2)
 
     def test_needs_commanded_positions(self) -> None:
-        stretches = [replace(one, commanded=None) for one in self.stretches(1.0, 1.0, 0.0)]
+        stretches = [replace(stretch, commanded=None) for stretch in self.stretches(1.0, 1.0, 0.0)]
         with pytest.raises(NoServoError, match="no commanded positions"):
             identify_servo(stretches, 0.005)

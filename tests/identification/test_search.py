@@ -165,7 +165,9 @@ class TestChoice:
             assert polished.chosen is None, "the polish found a better one"
             assert np.all((after.measures - before.measures) * [1.0, -1.0] >= 0.0)
             criteria = polished.excitation.criteria, unpolished.excitation.criteria
-            assert np.all(np.subtract(*(one.measures for one in criteria)) * [1.0, -1.0] >= 0.0)
+            assert np.all(
+                np.subtract(*(evaluated.measures for evaluated in criteria)) * [1.0, -1.0] >= 0.0
+            )
         else:
             random = Scores.of_rows(population.rows[0])
             worth = [fitness_of(chosen, scores, random)[0] for scores in (before, after)]
@@ -419,9 +421,9 @@ class Bowl:
 
     def score(self, genes):
         self.scored.append(genes.copy())
-        found = scores_of(100.0 - bowl(genes), 80.0, self.excess(genes))
+        scores = scores_of(100.0 - bowl(genes), 80.0, self.excess(genes))
         genes.fill(np.nan)  # callers must pass copies
-        return found
+        return scores
 
 
 def size_of(scores):
@@ -472,10 +474,10 @@ class TestPolish:
         ],
     )
     def test_only_improvements_replace_the_start(self, score, start, fitness):
-        known = Bowl().score(start[None].copy())
-        genes, scores = polish(score, start, known, fitness, evaluations=200, seed=1)
+        start_scores = Bowl().score(start[None].copy())
+        genes, scores = polish(score, start, start_scores, fitness, evaluations=200, seed=1)
         assert genes.tobytes() == start.tobytes()
-        assert scores.rows.tobytes() == known.rows.tobytes()
+        assert scores.rows.tobytes() == start_scores.rows.tobytes()
 
     @pytest.mark.parametrize("corner", [0.0, 1.0])
     def test_genes_stay_within_bounds_from_a_corner_too(self, corner):
@@ -584,8 +586,8 @@ class TestRecall:
             damaged[offset] ^= 0x10
             again = io.BytesIO(bytes(damaged))
             opened_journal = opened(again)
-            found = [opened_journal.recall(generation(seed)[0]) is not None for seed in range(4)]
-            assert found == [True, False, False, False]
+            recalled = [opened_journal.recall(generation(seed)[0]) is not None for seed in range(4)]
+            assert recalled == [True, False, False, False]
             assert opened_journal.damaged == lengths[4] - lengths[1]
             opened_journal.record(*generation(1))
             assert known(again) == 2
@@ -623,7 +625,7 @@ FIRST_LINE = b"hil search journal 2\n"
 
 class TestOtherFiles:
     @pytest.mark.parametrize(
-        ("other", "words"),
+        ("other", "message"),
         [
             ({"settings": {"seed": 2, "population": 4}}, "settings seed was 1, is 2"),
             ({"cell": {"urdf": "b"}}, "cell urdf was 'a', is 'b'"),
@@ -631,14 +633,14 @@ class TestOtherFiles:
             ({}, "versions pymoo was .*, is '0.5.0'"),
         ],
     )
-    def test_the_journal_of_another_search_is_refused(self, monkeypatch, other, words):
+    def test_the_journal_of_another_search_is_refused(self, monkeypatch, other, message):
         """Or of another release."""
         file, _ = written(1)
         before = file.getvalue()
         if not other:
             ours = journal.versions()
             monkeypatch.setattr(journal, "versions", lambda: {**ours, "pymoo": "0.5.0"})
-        with pytest.raises(JournalError, match=words):
+        with pytest.raises(JournalError, match=message):
             Journal(file, SEARCH | other)
         assert file.getvalue() == before
 

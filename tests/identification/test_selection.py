@@ -173,13 +173,17 @@ class TestElimination:
         covered = []
         for seed in range(0, 60, 2):
             result = eliminate(ARM, *factors(ARM, TRUTH, seed))
-            one = result.estimate
-            true = TRUTH[[ARM.parameter_names.index(name) for name in one.names]]
-            covered.append(np.abs(one.values - true) < one.interval_factor * one.std)
+            estimated = result.estimate
+            true = TRUTH[[ARM.parameter_names.index(name) for name in estimated.names]]
+            covered.append(
+                np.abs(estimated.values - true) < estimated.interval_factor * estimated.std
+            )
         assert 0.88 <= np.mean(np.concatenate(covered)) <= 0.995
-        assert one.units == tuple(ARM.units[ARM.parameter_names.index(name)] for name in one.names)
-        assert "essential" in one.method
-        assert "cluster-robust" in one.method
+        assert estimated.units == tuple(
+            ARM.units[ARM.parameter_names.index(name)] for name in estimated.names
+        )
+        assert "essential" in estimated.method
+        assert "cluster-robust" in estimated.method
 
     def test_the_ns16_predicts_equally_with_fewer_parameters(self):
         model = RobotModel.from_urdf(urdf_text())
@@ -294,13 +298,13 @@ class TestChosenSettings:
         recording = a_recording()
         time, torque = recording.time, recording.torque
         if shape is None:
-            late = [np.interp(time - CAUSAL.lag(6.0), time, one) for one in torque.T]
+            late = [np.interp(time - CAUSAL.lag(6.0), time, column) for column in torque.T]
             changed = replace(recording, torque=np.column_stack(late))
         else:
             changed = replace(recording, torque=low_passed(time, torque, 6.0, shape))
         filtered = Preprocessing(torque_bandwidth=6.0, torque_shape=CAUSAL)
         settings, choices = chosen(changed, {"low-pass"}, low_passes=(filtered,))
-        assert name in [one.name for one in choices if one.chosen]
+        assert name in [choice.name for choice in choices if choice.chosen]
         assert (settings.preprocessing.torque_bandwidth is None) == (name == DELAY)
 
     def test_the_stated_term_stays_unless_another_is_clearly_better(self):
@@ -308,7 +312,7 @@ class TestChosenSettings:
         stated = MODEL.with_friction(third="quadratic")
         settings, choices = chosen(a_recording(), {"friction"}, model=stated)
         assert settings.friction["third"] == "quadratic"
-        errors = next(one.errors for one in choices if one.name == "friction at speed")
+        errors = next(choice.errors for choice in choices if choice.name == "friction at speed")
         assert min(errors) > (1.0 - WORTHWHILE) * errors[0]
 
     @pytest.mark.parametrize("shares", [(0.12, 0.06), (0.0, 0.0)])
@@ -317,13 +321,13 @@ class TestChosenSettings:
         recording = a_recording(loaded, np.append(truth(), shares), duration=LONG)
         settings, choices = chosen(recording, {"friction"})
         assert settings.friction["load"] == any(shares)
-        assert LOAD in [one.name for one in choices]
+        assert LOAD in [choice.name for choice in choices]
 
     def test_a_negative_share_of_load_is_none(self):
         loaded = MODEL.with_friction(load=True)
         recording = a_recording(loaded, np.append(truth(), (-0.12, -0.06)), duration=LONG)
         settings, choices = chosen(recording, {"friction"})
-        decision = next(one for one in choices if one.name == LOAD)
+        decision = next(choice for choice in choices if choice.name == LOAD)
         assert decision.errors[1] < 0.9 * decision.errors[0]
         assert not settings.friction["load"]
 
@@ -332,7 +336,7 @@ class TestChosenSettings:
         settings, choices = chosen(a_recording(duration=LONG), {"estimator"})
         assert settings.strength.weight == 1.0
         # That bodies can exist is no question where they fit as well.
-        assert [one.name for one in choices] == [STRENGTH]
+        assert [choice.name for choice in choices] == [STRENGTH]
         assert settings.strength.consistent
 
     def test_a_negative_friction_is_not_made_possible(self):
@@ -341,14 +345,14 @@ class TestChosenSettings:
         values[MODEL.parameter_names.index("f1_1")] = -15.0
         settings, choices = chosen(a_recording(values=values), {"estimator"})
         assert not settings.strength.consistent
-        decision = next(one for one in choices if one.name == CONSISTENT)
+        decision = next(choice for choice in choices if choice.name == CONSISTENT)
         assert decision.errors[1] < (1.0 - WORTHWHILE) * decision.errors[0]
 
     def test_a_short_recording_asks_fewer_questions(self):
         """The first candidates stay."""
         asked = {"bandwidth", "presliding", "rows", "velocity", "estimator"}
         names = {
-            duration: {one.name for one in chosen(a_recording(duration=duration), asked)[1]}
+            duration: {choice.name for choice in chosen(a_recording(duration=duration), asked)[1]}
             for duration in (0.9 * SHORT, LONG)
         }
         assert names[LONG] - names[0.9 * SHORT] == {STRENGTH}
@@ -361,8 +365,8 @@ class TestChosenSettings:
         position[:875, 0] = position[875, 0]
         rested = replace(recording, position=position)
         _, choices = chosen(rested, {"presliding", "rows", "estimator"})
-        assert [one.name for one in choices][-1] == STRENGTH
-        assert all(np.isfinite(one.errors).all() for one in choices)
+        assert [choice.name for choice in choices][-1] == STRENGTH
+        assert all(np.isfinite(choice.errors).all() for choice in choices)
 
 
 def decided(*errors):
@@ -400,7 +404,9 @@ class TestClearlyBetter:
         other = 0.9 * self.FIRST
         other[0] = 2.0 * self.FIRST[0]
         choice = decided(self.FIRST, other)
-        expected = [np.exp(np.mean(np.log(one))) for one in (self.FIRST, other)]
+        expected = [
+            np.exp(np.mean(np.log(segment_errors))) for segment_errors in (self.FIRST, other)
+        ]
         assert choice.errors == pytest.approx(expected)
         assert choice.chosen == 0  # its standard error is that of the hard one
 
@@ -445,12 +451,12 @@ class TestHeldOutRows:
     @staticmethod
     def corrupted(recording):
         torque = recording.torque.copy()
-        rest = slice(cut(recording), None)
-        torque[rest] += 40.0 * np.sign(np.sin(7.0 * recording.time[rest, None]))
+        held_out = slice(cut(recording), None)
+        torque[held_out] += 40.0 * np.sign(np.sin(7.0 * recording.time[held_out, None]))
         return replace(recording, torque=torque)
 
     def errors(self, recording, *, leaks):
-        return [one.errors for one in chosen(recording, set(self.QUESTIONS), leaks=leaks)[1]]
+        return [choice.errors for choice in chosen(recording, set(self.QUESTIONS), leaks=leaks)[1]]
 
     def test_changing_them_has_no_effect(self):
         recording = a_recording(duration=LONG)
@@ -469,10 +475,10 @@ def held_out_error(recording, settings):
     # Cut when filtered: a low-pass forwards that starts at the cut would not be that of the torque.
     samples = prepare(recording, model, options=settings.preprocessing)
     edges = 0, cut(recording), recording.n_samples
-    fitted, rest = (samples.between(*part) for part in pairwise(edges))
+    fitted, held_out = (samples.between(*part) for part in pairwise(edges))
     values = estimate(model, Factor.of(model, fitted)).values
-    error = rest.torque - rest.predicted_torque(model, values)
-    return float(np.linalg.norm(error) / np.linalg.norm(rest.torque))
+    error = held_out.torque - held_out.predicted_torque(model, values)
+    return float(np.linalg.norm(error) / np.linalg.norm(held_out.torque))
 
 
 def low_pass_of(shape, seed=0):
@@ -528,7 +534,11 @@ class TestPossibleLowPasses:
 
     @staticmethod
     def of_kind(possible, causal):
-        return [one for one in possible if one.torque_shape.causal == causal]
+        return [
+            preprocessing
+            for preprocessing in possible
+            if preprocessing.torque_shape.causal == causal
+        ]
 
     @pytest.mark.parametrize("shape", [*WITHOUT_PHASE[1:], *FORWARDS], ids=str)
     def test_bandwidth_and_poles_are_right(self, shape):
@@ -656,12 +666,12 @@ class TestLowPassShape:
     def test_uneven_times_are_interpolated(self):
         time = np.arange(4000) / RATE
         uneven = time + 0.3 / RATE * np.random.default_rng(3).uniform(-1.0, 1.0, len(time))
-        smooth, found = (
+        smooth, uneven_smooth = (
             low_passed(t, np.sin(4.0 * t)[:, None], BANDWIDTH, LowPassShape(2, causal=True))[:, 0]
             for t in (time, uneven)
         )
         expected = np.interp(uneven, time, smooth)
-        assert found[500:-10] == pytest.approx(expected[500:-10], abs=2e-3)
+        assert uneven_smooth[500:-10] == pytest.approx(expected[500:-10], abs=2e-3)
 
     def test_samples_filter_their_regressor_by_it(self):
         shape = LowPassShape(order=1, causal=True)

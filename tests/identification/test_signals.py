@@ -89,7 +89,7 @@ class TestChecks:
             changed(channel, sample, joint, value).checked()
 
     @pytest.mark.parametrize(
-        ("recording", "words"),
+        ("recording", "message"),
         [
             (leaping(50, np.nan), "time is nan at sample 50"),
             (leaping(50, 0.0), "repeats at sample 50"),
@@ -101,8 +101,8 @@ class TestChecks:
             (a_recording(1), "has 1 samples"),
         ],
     )
-    def test_invalid_recordings_raise(self, recording, words):
-        with pytest.raises(RecordingError, match=words):
+    def test_invalid_recordings_raise(self, recording, message):
+        with pytest.raises(RecordingError, match=message):
             recording.checked()
 
     @pytest.mark.parametrize(
@@ -245,15 +245,15 @@ class TestTrueTimes:
             joint_names=("a", "b"),
             gap_before=gap,
         )
-        found, words = true_times(recording)
+        corrected, sentences = true_times(recording)
         rows = slice(0, 3990)
-        np.testing.assert_allclose(np.diff(found.time[rows]), np.diff(true[rows]), atol=2e-5)
-        assert ("used: even times" if is_even else "used: the stamps") in words[0]
+        np.testing.assert_allclose(np.diff(corrected.time[rows]), np.diff(true[rows]), atol=2e-5)
+        assert ("used: even times" if is_even else "used: the stamps") in sentences[0]
 
     def test_a_resting_arm_confirms_neither(self):
         stamps = 1e-3 * np.arange(400.0) + np.random.default_rng(4).uniform(0.0, 3e-4, 400)
-        found, _ = true_times(Recording(stamps, np.ones((400, 2)), ("a", "b")))
-        np.testing.assert_array_equal(found.time, stamps)
+        corrected, _ = true_times(Recording(stamps, np.ones((400, 2)), ("a", "b")))
+        np.testing.assert_array_equal(corrected.time, stamps)
 
 
 class TestRepetitions:
@@ -261,7 +261,7 @@ class TestRepetitions:
     @given(
         seed=st.integers(0, 50),
         clock=st.floats(-1e3, 1e3),
-        start=st.floats(-0.4, 0.4).map(lambda one: round(one / STEP) * STEP),
+        start=st.floats(-0.4, 0.4).map(lambda second: round(second / STEP) * STEP),
     )
     def test_offsets_of_clocks_are_found(self, seed, clock, start):
         runs = [recorded(seed), recorded(seed, start=start, clock=clock, noise=1)]
@@ -317,9 +317,9 @@ class TestTimeBase:
         # Long steps after the repeat and the fall compensate the short ones.
         assert base.dropped == 3
         assert not base.uniform
-        words = " ".join(base.describe())
+        description = " ".join(base.describe())
         for part in ("repeat", "older", "missing", "gaps"):
-            assert part in words
+            assert part in description
         reported = np.arange(100) == 50  # without a time step
         assert time_base(np.arange(100) * 1e-3, reported).gaps == 1
         with pytest.raises(RecordingError, match="same time stamp"):
@@ -470,8 +470,8 @@ class TestNoise:
         rng = np.random.default_rng(seed)
         time = np.arange(5000) * 1e-3 + jitter * rng.uniform(-1.0, 1.0, 5000)
         values = motion(time)[0] + max(sigma, 0.03 * jitter) * rng.standard_normal((5000, 2))
-        found = difference_variance(time, values)
-        np.testing.assert_allclose(np.sqrt(found), max(sigma, 0.03 * jitter), rtol=0.1)
+        variance = difference_variance(time, values)
+        np.testing.assert_allclose(np.sqrt(variance), max(sigma, 0.03 * jitter), rtol=0.1)
 
     @pytest.mark.parametrize("creeps", [False, True])
     def test_variance_at_standstill_is_that_of_the_noise(self, creeps):
@@ -565,10 +565,10 @@ class TestSamples:
         gaps = np.isin(np.arange(6000), [3000, 3002])
         recording = replace(recording, velocity=exact[1] + 0.1, gap_before=gaps)
         options = Preprocessing(velocity="measured")
-        found = prepare(recording, MODEL, noise_variance=QUANTISATION, options=options).motion
+        smoothed = prepare(recording, MODEL, noise_variance=QUANTISATION, options=options).motion
         inner = np.flatnonzero(rows)[9:-9]
-        np.testing.assert_allclose(found.velocity[inner], exact[1][inner] + 0.1, atol=0.01)
-        assert not found.velocity[3000:3002].any()
+        np.testing.assert_allclose(smoothed.velocity[inner], exact[1][inner] + 0.1, atol=0.01)
+        assert not smoothed.velocity[3000:3002].any()
 
     def test_invalid_recordings_and_bandwidths_raise(self):
         valid = smooth_recording()
@@ -604,10 +604,10 @@ class TestClipping:
         _, whole = motion_and_recording()
         _, clipped = motion_and_recording(clip=15.0)
         true = np.abs(whole.torque) > 15.0
-        found = flat_topped(clipped.torque, EVERYWHERE)
-        assert not np.any(found & ~true)
+        clipped_rows = flat_topped(clipped.torque, EVERYWHERE)
+        assert not np.any(clipped_rows & ~true)
         # Noise interrupts the limit; short runs are not detected.
-        assert np.count_nonzero(found) > 0.9 * np.count_nonzero(true)
+        assert np.count_nonzero(clipped_rows) > 0.9 * np.count_nonzero(true)
         assert not flat_topped(whole.torque, EVERYWHERE).any()
 
     @given(
@@ -694,13 +694,13 @@ class TestExcludedRows:
 
         # By the bandwidth of the slower joint; the joints' own reversals as usual.
         for joint, reach in enumerate((1.0 / 40.0, 1.0 / 20.0)):
-            own = beside(motion.velocity[:, joint], reach)
-            expected = own | beside(motor, 1.0 / 20.0) if friction else own
+            joint_reversals = beside(motion.velocity[:, joint], reach)
+            expected = joint_reversals | beside(motor, 1.0 / 20.0) if friction else joint_reversals
             apart = np.flatnonzero(expected != reversals[:, joint])
             # Except the sample at the edge.
             assert len(apart) <= 2 * np.count_nonzero(np.diff(expected))
             assert np.count_nonzero(expected) > 10 * len(apart)
-            assert (np.count_nonzero(expected & ~own) > 50) == friction
+            assert (np.count_nonzero(expected & ~joint_reversals) > 50) == friction
 
     @pytest.mark.parametrize("delay", [-0.08, 0.0, 0.08])
     def test_delayed_rows_near_an_edge_are_excluded(self, delay):

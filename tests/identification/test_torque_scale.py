@@ -79,10 +79,10 @@ class TestScaleCovariance:
         factor = Factor.by_time(MODEL, as_samples(MODEL, motion, measured))
         weights = joint_weights(factor)
         inverse = factor.solve(weights).inverse
-        found = replace(estimate(MODEL, factor, weights), interval_factor=2.5)
-        wider = with_torque_scale(found, factor, weights, inverse, SCALE_STD)
+        estimated = replace(estimate(MODEL, factor, weights), interval_factor=2.5)
+        wider = with_torque_scale(estimated, factor, weights, inverse, SCALE_STD)
         added = scale_covariance(scale_sensitivity(factor, weights, inverse), SCALE_STD)
-        half = (2.5 * found.std) ** 2 + 1.96**2 * np.diag(added)
+        half = (2.5 * estimated.std) ** 2 + 1.96**2 * np.diag(added)
         np.testing.assert_allclose((2.5 * wider.std) ** 2, half)
         assert "3 to 5 %" in wider.method
 
@@ -90,17 +90,17 @@ class TestScaleCovariance:
         motion, measured = torque
         factor = Factor.by_time(MODEL, as_samples(MODEL, motion, measured))
         weights = joint_weights(factor)
-        found = estimate(MODEL, factor, weights)
-        open_ended = found.covariance.copy()
+        estimated = estimate(MODEL, factor, weights)
+        open_ended = estimated.covariance.copy()
         open_ended[0], open_ended[:, 0] = 0.0, 0.0
         open_ended[0, 0] = np.inf
         inverse = factor.solve(weights).inverse
         wider = with_torque_scale(
-            replace(found, covariance=open_ended), factor, weights, inverse, SCALE_STD
+            replace(estimated, covariance=open_ended), factor, weights, inverse, SCALE_STD
         )
         assert np.isinf(wider.covariance[0, 0])
         assert not wider.covariance[0, 1:].any()
-        assert np.all(wider.std[1:] > found.std[1:])
+        assert np.all(wider.std[1:] > estimated.std[1:])
 
 
 def test_what_is_assumed_is_said():
@@ -119,11 +119,11 @@ class TestPayload:
             Run.of(
                 name,
                 MODEL,
-                as_samples(MODEL, motion, (torque + 0.3 * own) * scales),
+                as_samples(MODEL, motion, (torque + 0.3 * run_noise) * scales),
                 None,
                 loaded=kind,
             )
-            for name, kind, torque, own in (
+            for name, kind, torque, run_noise in (
                 ("bare", False, bare, noise[0]),
                 ("loaded", True, carried, noise[1]),
             )

@@ -92,11 +92,11 @@ class TestPredictionError:
     @given(torques, torques, arrays(np.bool_, (20, 2)))
     def test_unusable_rows_have_no_effect(self, measured, predicted, usable):
         spoilt = np.where(usable, measured, np.nan)
-        one = PredictionError.between(measured, predicted, usable)
-        two = PredictionError.between(spoilt, predicted, usable)
-        np.testing.assert_array_equal(one.squared, two.squared)
-        np.testing.assert_array_equal(one.torque_squared, two.torque_squared)
-        assert (one.rows == usable.sum(axis=0)).all()
+        of_measured = PredictionError.between(measured, predicted, usable)
+        of_spoilt = PredictionError.between(spoilt, predicted, usable)
+        np.testing.assert_array_equal(of_measured.squared, of_spoilt.squared)
+        np.testing.assert_array_equal(of_measured.torque_squared, of_spoilt.torque_squared)
+        assert (of_measured.rows == usable.sum(axis=0)).all()
 
     @given(torques, torques, torques, torques)
     def test_errors_of_two_recordings_add(self, m1, p1, m2, p2):
@@ -168,19 +168,25 @@ def split(error):
     samples = recording(error, MOTION)
     parts = samples.between(0, CUT), samples.between(CUT, LENGTH)
     result = estimate_repetitions(MODEL, parts[:1])
-    means = [TorqueMeans.of(MODEL, [one]) for one in parts]
+    means = [TorqueMeans.of(MODEL, [part]) for part in parts]
     return calibrate(result.pooled, result.factor, means[0], means[1], least_squares)
 
 
 def shares(correlation, model_error=0.0, seeds=50):
     """Return share inside, with white residuals, and half width over noise."""
     systematic = model_error * NOISE * np.sin(6.0 * MOTION.position)
-    found = []
+    figures = []
     for seed in range(seeds):
         noise = coloured(np.random.default_rng(seed), LENGTH, 5e-3, correlation)
-        one = split(noise + systematic)
-        found.append((one.inside, one.white_inside, float(np.mean(one.half_width / NOISE))))
-    return tuple(np.mean(found, axis=0).tolist())
+        calibration = split(noise + systematic)
+        figures.append(
+            (
+                calibration.inside,
+                calibration.white_inside,
+                float(np.mean(calibration.half_width / NOISE)),
+            )
+        )
+    return tuple(np.mean(figures, axis=0).tolist())
 
 
 @pytest.mark.long
@@ -205,15 +211,19 @@ class TestIntervals:
     def test_repeated_errors_do_not_shrink_them(self):
         """An error equal in all repetitions counts once."""
         noise = coloured(np.random.default_rng(1), LENGTH, 5e-3, 0.05)
-        one = recording(noise, MOTION).between(0, CUT)
-        rest = TorqueMeans.of(MODEL, [recording(noise, MOTION).between(CUT, LENGTH)])
+        fitted_run = recording(noise, MOTION).between(0, CUT)
+        held_out_means = TorqueMeans.of(MODEL, [recording(noise, MOTION).between(CUT, LENGTH)])
         widths = []
-        for runs in ([one], [one] * 4):
+        for runs in ([fitted_run], [fitted_run] * 4):
             result = estimate_repetitions(MODEL, runs)
-            found = calibrate(
-                result.pooled, result.factor, TorqueMeans.of(MODEL, runs), rest, least_squares
+            calibration = calibrate(
+                result.pooled,
+                result.factor,
+                TorqueMeans.of(MODEL, runs),
+                held_out_means,
+                least_squares,
             )
-            widths.append(found.half_width)
+            widths.append(calibration.half_width)
         # Up to the degrees of freedom of the joints' weights.
         np.testing.assert_allclose(widths[1], widths[0], rtol=MODEL.n_parameters / CUT)
 
@@ -236,8 +246,8 @@ class TestInnerFolds:
         phase, means = Factor.by_time(MODEL, samples), TorqueMeans.of(MODEL, [samples])
         errors = inner_errors(phase, means, least_squares)
         first = LENGTH // FOLDS
-        rest = least_squares(Factor.of(MODEL, samples.between(first, LENGTH)))
-        left = samples.torque[:first] - samples.predicted_torque(MODEL, rest)[:first]
+        other_folds = least_squares(Factor.of(MODEL, samples.between(first, LENGTH)))
+        left = samples.torque[:first] - samples.predicted_torque(MODEL, other_folds)[:first]
         means = left.reshape(-1, 100, 2).mean(axis=1)  # of half a second
         np.testing.assert_allclose(errors[: len(means)], means, atol=1e-8)
 
@@ -292,28 +302,34 @@ class TestCorrelation:
     def test_its_time_is_that_of_theory(self, memory):
         rng = np.random.default_rng(2)
         residual = unit_noise(rng, (200_000, 2), memory)
-        found = autocorrelation([(residual, np.ones(residual.shape, dtype=bool))], STEP)
+        correlation = autocorrelation([(residual, np.ones(residual.shape, dtype=bool))], STEP)
         decay = np.exp(-STEP / memory)
         expected = 0.5 * STEP * (1.0 + decay) / (1.0 - decay)
-        np.testing.assert_allclose(found.time, expected, rtol=0.15)
+        np.testing.assert_allclose(correlation.time, expected, rtol=0.15)
         # White noise: half a step, all samples independent.
         rows = 0.5 * STEP * len(residual) / expected
-        np.testing.assert_allclose(found.effective_rows, rows, rtol=0.15)
+        np.testing.assert_allclose(correlation.effective_rows, rows, rtol=0.15)
 
     @given(st.integers(20, 60), st.integers(0, 2**32 - 1), st.integers(1, 3))
     @settings(max_examples=25, deadline=None)
     def test_it_is_that_of_counting_pairs(self, rows, seed, runs):
         rng = np.random.default_rng(seed)
         parts = [(rng.standard_normal((rows, 1)), rng.random((rows, 1)) > 0.3) for _ in range(runs)]
-        found = autocorrelation(parts, STEP, longest=10 * STEP)
+        correlation = autocorrelation(parts, STEP, longest=10 * STEP)
         masked = [np.where(usable, left, np.nan)[:, 0] for left, usable in parts]
         products = [
-            np.concatenate([one[: rows - lag] * one[lag:] for one in masked]) for lag in range(11)
+            np.concatenate(
+                [run_residual[: rows - lag] * run_residual[lag:] for run_residual in masked]
+            )
+            for lag in range(11)
         ]
-        expected = [np.nansum(one) / max(1, np.isfinite(one).sum()) for one in products]
+        expected = [
+            np.nansum(pair_products) / max(1, np.isfinite(pair_products).sum())
+            for pair_products in products
+        ]
         if expected[0] > 0.0:
             np.testing.assert_allclose(
-                found.correlation[:, 0], np.array(expected) / expected[0], atol=1e-9
+                correlation.correlation[:, 0], np.array(expected) / expected[0], atol=1e-9
             )
 
     def test_block_means_cover_unlike_independent_samples(self):
@@ -322,8 +338,8 @@ class TestCorrelation:
         for seed in range(seeds):
             noise = unit_noise(np.random.default_rng(seed), (blocks * per_block,))
             sums = noise.reshape(blocks, per_block).sum(axis=1, keepdims=True)
-            found = block_mean([np.array([sums, np.full((blocks, 1), float(per_block))])])
-            inside += abs(found.mean[0]) < 1.96 * found.std[0]
+            block_average = block_mean([np.array([sums, np.full((blocks, 1), float(per_block))])])
+            inside += abs(block_average.mean[0]) < 1.96 * block_average.std[0]
             naive += abs(noise.mean()) < 1.96 * noise.std() / np.sqrt(len(noise))
         assert 0.90 < inside / seeds < 0.98
         assert naive / seeds < 0.6
@@ -364,12 +380,12 @@ class TestResidualChecks:
         def ripple(motion, _):
             return np.asarray(planted * np.sin(harmonic * motion.position @ GEAR.T + 0.7))
 
-        found = patterns_of(ripple).ripple
-        assert found.significant.tolist() == [False, True]
-        assert found.strongest(1) == harmonic
-        amplitude = found.amplitude[1, HARMONICS.index(harmonic)]
+        detected = patterns_of(ripple).ripple
+        assert detected.significant.tolist() == [False, True]
+        assert detected.strongest(1) == harmonic
+        amplitude = detected.amplitude[1, HARMONICS.index(harmonic)]
         assert amplitude == pytest.approx(0.4, abs=0.05)
-        assert found.rms[1] == pytest.approx(0.4 / np.sqrt(2.0), abs=0.05)
+        assert detected.rms[1] == pytest.approx(0.4 / np.sqrt(2.0), abs=0.05)
 
     def test_friction_drift_is_measured(self):
         friction = np.where(MODEL.friction_columns, VALUES, 0.0)
@@ -386,9 +402,9 @@ class TestResidualChecks:
         assert drift.change_std[1] < 0.02
 
     def test_drift_is_measured_within_one_recording(self):
-        found = check_residuals(MODEL, VALUES, [a_run(1, duration=30.0)])
-        assert found.drift is not None and len(found.drift.share) >= 4
-        assert found.ripple is None  # without gear ratios
+        checks = check_residuals(MODEL, VALUES, [a_run(1, duration=30.0)])
+        assert checks.drift is not None and len(checks.drift.share) >= 4
+        assert checks.ripple is None  # without gear ratios
 
     def test_outliers_are_found_and_removed(self):
         random = np.random.default_rng(5)
@@ -398,14 +414,14 @@ class TestResidualChecks:
         residual[hit, 1] += 20.0
         usable = np.ones((5000, 2), dtype=np.bool_)
         usable[hit[:5], 1] = False  # unusable rows are no outliers
-        found = find_outliers(torque, residual, usable)
-        np.testing.assert_allclose(found.share, [0.0, 20 / 4995])
-        assert found.power[0] == 0.0 and found.power[1] > 0.9
-        np.testing.assert_allclose(found.without.rms, [0.1, 0.1], rtol=0.05)
-        assert found.without.rows.tolist() == [5000, 4975]
+        outliers = find_outliers(torque, residual, usable)
+        np.testing.assert_allclose(outliers.share, [0.0, 20 / 4995])
+        assert outliers.power[0] == 0.0 and outliers.power[1] > 0.9
+        np.testing.assert_allclose(outliers.without.rms, [0.1, 0.1], rtol=0.05)
+        assert outliers.without.rows.tolist() == [5000, 4975]
         noise = np.random.default_rng(6).standard_normal((20000, 3)) * [1e-6, 1.0, 1e6]
-        found = find_outliers(noise, noise, np.ones(noise.shape, dtype=np.bool_))
-        np.testing.assert_array_equal(found.share, 0.0)
+        outliers = find_outliers(noise, noise, np.ones(noise.shape, dtype=np.bool_))
+        np.testing.assert_array_equal(outliers.share, 0.0)
 
 
 def parameters(model=MODEL, **changes):
@@ -435,11 +451,11 @@ def with_value(name, value, std=0.01):
     return replace(known(parameters(), std=std), values=values)
 
 
-def signs(found, model=MODEL, *, error=0.1):
+def signs(estimated, model=MODEL, *, error=0.1):
     motion = one_sine(np.arange(2000) * 2e-3)
     return implausibilities(
         model,
-        found,
+        estimated,
         Factor.from_samples(model, motion, np.zeros((2000, 2))),
         np.full(2, error),
         speed=np.abs(motion.velocity).max(axis=0),
@@ -448,15 +464,15 @@ def signs(found, model=MODEL, *, error=0.1):
 
 class TestSigns:
     @pytest.mark.parametrize(
-        ("found", "words"),
+        ("estimated", "message"),
         [
             (with_value("f0_1", -4.0), "Coulomb friction of shoulder is negative"),
             (with_value("f1_2", -1.0), "friction of elbow is"),
             (with_value("I2m", -0.1), "I2m is negative"),
         ],
     )
-    def test_impossible_signs_are_named(self, found, words):
-        assert any(words in one for one in signs(found).impossible)
+    def test_impossible_signs_are_named(self, estimated, message):
+        assert any(message in sentence for sentence in signs(estimated).impossible)
 
     def test_signs_within_the_uncertainty_are_possible(self):
         """So are undetermined parameters, and friction that falls from 2 to 1.3 N·m."""
@@ -470,9 +486,9 @@ class TestSigns:
         assert signs(known(parameters())) == Implausible((), ())
 
     def test_signs_of_a_torque_below_the_error_are_doubtful(self):
-        found = signs(with_value("I2m", -0.01), error=5.0)
-        assert found.impossible == ()
-        assert any("I2m is negative" in words for words in found.doubtful)
+        implausible = signs(with_value("I2m", -0.01), error=5.0)
+        assert implausible.impossible == ()
+        assert any("I2m is negative" in sentence for sentence in implausible.doubtful)
 
     def test_a_term_that_nobody_stated_is_no_reason(self):
         """It follows friction within the fitted speeds; a stated one is."""
@@ -487,18 +503,18 @@ class TestSigns:
                 model, falling, factor, np.full(2, 0.1), speed=speed, added=added
             )
 
-        (words,) = found().impossible
-        assert "less than half of its Coulomb friction" in words
+        (message,) = found().impossible
+        assert "less than half of its Coulomb friction" in message
         assert found("f2").impossible == found("f2").doubtful == ()
-        (words,) = found("f2").added
-        assert "chosen by inner prediction" in words
+        (message,) = found("f2").added
+        assert "chosen by inner prediction" in message
 
     def test_negative_friction_of_a_coupled_motor_is_named(self):
         coupling = Coupling(np.array([[1.0, 0.0], [0.5, 1.0]]), inertia=False)
         coupled = RobotModel.from_urdf(URDF, friction=MODEL.friction.laws[0], coupling=coupling)
         arm = partial(parameters, coupled)
-        (words,) = signs(known(arm(f1_m2=-1.0), coupled), coupled).impossible
-        assert words.startswith("friction f1_m2 of motor 2 is negative: -1")
+        (message,) = signs(known(arm(f1_m2=-1.0), coupled), coupled).impossible
+        assert message.startswith("friction f1_m2 of motor 2 is negative: -1")
         assert signs(known(arm(), coupled), coupled) == Implausible((), ())
 
 
@@ -517,63 +533,64 @@ class TestConsistencyCheck:
     """Rise of the held-out error by physical consistency, and the active bounds."""
 
     def test_consistent_data_cost_nothing(self):
-        found = consistency_of(runs())
-        assert abs(found.cost) < 0.001
-        assert not found.costly and not found.impossible
-        assert found.bounds == () and np.all(found.room > 0.5)
-        assert "consistent parameters predict as well" in found.sentence
+        check = consistency_of(runs())
+        assert abs(check.cost) < 0.001
+        assert not check.costly and not check.impossible
+        assert check.bounds == () and np.all(check.room > 0.5)
+        assert "consistent parameters predict as well" in check.sentence
 
     def test_the_cost_is_the_rise_of_the_error(self):
         recordings = runs(I2m=-0.1)
-        found, run = consistency_of(recordings), recordings[1]
+        check, run = consistency_of(recordings), recordings[1]
         torque = np.where(run.usable, run.torque, 0.0)
-        both = found.consistent.estimate.values, found.consistent.unconstrained.values
+        both = check.consistent.estimate.values, check.consistent.unconstrained.values
         errors = [
-            torque - np.where(run.usable, MODEL.torque(one, *run.motion[1:]), 0.0) for one in both
+            torque - np.where(run.usable, MODEL.torque(values, *run.motion[1:]), 0.0)
+            for values in both
         ]
-        ours, free = (np.linalg.norm(one) / np.linalg.norm(torque) for one in errors)
-        assert found.cost == pytest.approx(ours - free, rel=1e-6)
+        ours, free = (np.linalg.norm(error) / np.linalg.norm(torque) for error in errors)
+        assert check.cost == pytest.approx(ours - free, rel=1e-6)
         size = np.linalg.norm(torque, axis=0)
-        ours, free = (np.linalg.norm(one, axis=0) / size for one in errors)
-        np.testing.assert_allclose(found.held_out_rise, ours - free, rtol=1e-6)
+        ours, free = (np.linalg.norm(error, axis=0) / size for error in errors)
+        np.testing.assert_allclose(check.held_out_rise, ours - free, rtol=1e-6)
 
     @pytest.mark.parametrize(
-        ("change", "words"),
+        ("change", "bound_text"),
         [
             ({"I2m": -0.6}, "elbow"),
             ({"f0_2": -2.0}, "Coulomb friction of elbow would be negative"),
             ({"f1_1": -1.5}, "viscous friction of shoulder would be negative"),
         ],
     )
-    def test_active_bounds_are_named_with_their_joint(self, change, words):
-        found = consistency_of(runs(**change))
-        assert found.costly and words in found.sentence
-        assert any(words in bound for bound in found.bounds)
+    def test_active_bounds_are_named_with_their_joint(self, change, bound_text):
+        check = consistency_of(runs(**change))
+        assert check.costly and bound_text in check.sentence
+        assert any(bound_text in bound for bound in check.bounds)
 
     def test_a_torque_of_the_wrong_sign_is_impossible(self):
-        found = consistency_of([replace(run, torque=run.torque * [-1.0, 1.0]) for run in runs()])
-        assert found.impossible and "shoulder" in found.sentence
-        assert found.sentence.startswith("no physically consistent parameters fit")
+        check = consistency_of([replace(run, torque=run.torque * [-1.0, 1.0]) for run in runs()])
+        assert check.impossible and "shoulder" in check.sentence
+        assert check.sentence.startswith("no physically consistent parameters fit")
 
     def test_a_spring_is_named_for_one_axis_that_gravity_loads(self):
         """Of 20 N·m/rad at the elbow."""
         sprung = [
             replace(run, torque=run.torque + [0.0, 20.0] * run.motion.position) for run in runs()
         ]
-        found = consistency_of(sprung)
-        assert found.impossible and found.overloaded == "elbow"
-        assert "[[robot.elements]]" in found.remedy and "elbow" in found.remedy
-        verdict = judged(consistency=found)
-        assert verdict.reasons == (f"{found.sentence}: {found.remedy}",)
+        check = consistency_of(sprung)
+        assert check.impossible and check.overloaded == "elbow"
+        assert "[[robot.elements]]" in check.remedy and "elbow" in check.remedy
+        verdict = judged(consistency=check)
+        assert verdict.reasons == (f"{check.sentence}: {check.remedy}",)
         assert "[[robot.elements]]" in verdict.next_steps[0]
         clean = consistency_of(runs())
         assert clean.remedy == "check signs, torque constants, coupling and URDF"
 
     def test_a_negative_second_moment_is_an_active_bound(self):
         """That of the elbow's link about its own centre."""
-        found = consistency_of(runs(I2yy=0.05, I2m=0.0))
-        assert found.room[1] < 0.01
-        assert any("link of elbow" in bound for bound in found.bounds)
+        check = consistency_of(runs(I2yy=0.05, I2m=0.0))
+        assert check.room[1] < 0.01
+        assert any("link of elbow" in bound for bound in check.bounds)
 
 
 def uneven(rate, *, jitter=0.0, seed=0):
@@ -584,10 +601,10 @@ def uneven(rate, *, jitter=0.0, seed=0):
     return Recording(time, q, ("hip", "knee"), torque=np.zeros_like(q))
 
 
-def with_jump(one, size, rows):
-    position = one.position.copy()
+def with_jump(recording, size, rows):
+    position = recording.position.copy()
     position[rows, 1] += size
-    return replace(one, position=position)
+    return replace(recording, position=position)
 
 
 def sudden_stop():
@@ -599,18 +616,18 @@ def sudden_stop():
 
 
 def jump_in_a_gap():
-    one = with_jump(uneven(500.0), 0.3, slice(2500, None))
-    return replace(one, gap_before=np.arange(len(one.time)) == 2500)
+    jumping = with_jump(uneven(500.0), 0.3, slice(2500, None))
+    return replace(jumping, gap_before=np.arange(len(jumping.time)) == 2500)
 
 
 class TestPositionJumps:
     @pytest.mark.parametrize("rate", [100.0, 125.0, 500.0, 1000.0])
     @pytest.mark.parametrize("size", [0.2, 0.02, -0.02])
     def test_a_lasting_jump_is_found(self, rate, size):
-        one, at = uneven(rate), int(5 * rate)
-        (jump,) = position_jumps(with_jump(one, size, slice(at, None)), "log.mcap")
+        smooth, at = uneven(rate), int(5 * rate)
+        (jump,) = position_jumps(with_jump(smooth, size, slice(at, None)), "log.mcap")
         assert (jump.recording, jump.joint) == ("log.mcap", "knee")
-        assert jump.time == pytest.approx(one.time[at] - one.time[0])
+        assert jump.time == pytest.approx(smooth.time[at] - smooth.time[0])
         assert jump.size == pytest.approx(size, abs=2e-3)
         finding = finding_of("position jumps", ("hip", "knee"), jumps=(jump,))
         assert finding.level == "wrong" and "knee" in finding.words and "knee" in finding.next_step
@@ -621,31 +638,33 @@ class TestPositionJumps:
         assert position_jumps(uneven(rate, jitter=jitter, seed=3)) == []
 
     @pytest.mark.parametrize(
-        "one",
+        "recording",
         [sudden_stop(), jump_in_a_gap(), with_jump(uneven(500.0), 0.2, slice(2500, 2501))],
         ids=["sudden stop", "gap", "glitch of one sample"],
     )
-    def test_other_steps_are_no_jumps(self, one):
-        assert position_jumps(one) == []
+    def test_other_steps_are_no_jumps(self, recording):
+        assert position_jumps(recording) == []
 
 
-def frozen(one, rows):
+def frozen(recording, rows):
     """The knee's samples repeat the last one before the rows, which are measured again after."""
-    position = one.position.copy()
+    position = recording.position.copy()
     position[rows, 1] = position[rows.start - 1, 1]
-    return replace(one, position=position)
+    return replace(recording, position=position)
 
 
-def slipping(one, rows):
+def slipping(recording, rows):
     """The knee's samples are one older from each of the rows on: one repeats."""
-    number = np.arange(len(one.time))
+    number = np.arange(len(recording.time))
     late = number - np.searchsorted(rows, number, side="right")
-    return replace(one, position=np.column_stack([one.position[:, 0], one.position[late, 1]]))
+    return replace(
+        recording, position=np.column_stack([recording.position[:, 0], recording.position[late, 1]])
+    )
 
 
-def without_rows(one, rows, rate):
+def without_rows(recording, rows, rate):
     """Rows are missing, and the stamps do not show it."""
-    remaining = one.rows(np.delete(np.arange(len(one.time)), rows))
+    remaining = recording.rows(np.delete(np.arange(len(recording.time)), rows))
     return replace(remaining, time=np.arange(len(remaining.time)) / rate)
 
 
@@ -653,7 +672,7 @@ class TestStepsOfTheLog:
     """Steps that a logger makes are not those of an encoder."""
 
     @pytest.mark.parametrize(
-        "one",
+        "recording",
         [
             frozen(uneven(1000.0), slice(5000, 5030)),
             slipping(uneven(1000.0), np.array([4000, 5200, 6100, 7003])),
@@ -661,14 +680,14 @@ class TestStepsOfTheLog:
         ],
         ids=["frozen samples", "repeated samples", "rows missing of all joints"],
     )
-    def test_they_are_separate(self, one):
-        found = position_steps(one, "log.mcap")
-        assert found.logged and found.jumps == ()
+    def test_they_are_separate(self, recording):
+        steps = position_steps(recording, "log.mcap")
+        assert steps.logged and steps.jumps == ()
 
     def test_an_encoder_that_slips_while_frozen_has_jumped(self):
-        one = frozen(uneven(1000.0), slice(5000, 5030))
-        found = position_steps(with_jump(one, 0.2, slice(5030, None)))
-        assert [jump.joint for jump in found.jumps] == ["knee"]
+        stalled = frozen(uneven(1000.0), slice(5000, 5030))
+        steps = position_steps(with_jump(stalled, 0.2, slice(5030, None)))
+        assert [jump.joint for jump in steps.jumps] == ["knee"]
 
 
 def arm_with(measured, seed=0, duration=20.0):
@@ -709,17 +728,17 @@ class TestChangesToUnseenMotion:
         [([1.0, 1.3], [1.0, 1.0], 1 / 1.3), ([1.0, 1.0], [1.0, 1.3], 1.3)],
     )
     def test_the_torque_of_one_joint(self, fitted, unseen, ratio):
-        (found,) = changes_between(
+        (change,) = changes_between(
             lambda _, torque: fitted * torque, lambda _, torque: unseen * torque
         )
-        assert (found.kind, found.joint) == ("gain", 1)
-        assert found.ratio == pytest.approx(ratio, abs=0.02)
+        assert (change.kind, change.joint) == ("gain", 1)
+        assert change.ratio == pytest.approx(ratio, abs=0.02)
 
     @pytest.mark.parametrize("factor", [0.5, 2.0])
     def test_friction(self, factor):
-        found = changes_between(as_it_is, with_friction(np.array([1.0, factor])))
-        assert [(one.kind, one.joint) for one in found] == [("friction", 1)]
-        assert found[0].ratio == pytest.approx(factor, abs=0.05)
+        changes = changes_between(as_it_is, with_friction(np.array([1.0, factor])))
+        assert [(change.kind, change.joint) for change in changes] == [("friction", 1)]
+        assert changes[0].ratio == pytest.approx(factor, abs=0.05)
 
     def test_another_error_is_no_change(self):
         def waved(motion, torque):
@@ -746,9 +765,9 @@ LOADED_AXES = range(1, 4)  # of the UR5, whose rigid torque exceeds their fricti
 def findings(model, **context):
     """Findings of a verdict with this context."""
     error = an_error(0.05, joints=model.n_joints)
-    known = judged(model.joint_names, held_out=error, training=error).findings
-    found = judged(model.joint_names, held_out=error, training=error, **context).findings
-    return [one for one in found if one not in known]
+    usual = judged(model.joint_names, held_out=error, training=error).findings
+    of_context = judged(model.joint_names, held_out=error, training=error, **context).findings
+    return [finding for finding in of_context if finding not in usual]
 
 
 @pytest.fixture(scope="module")
@@ -772,7 +791,10 @@ def runs_of(model, values, seed):
     truth = np.concatenate([model.base.grouping @ values, friction])
     motions = [sines(model.n_joints, 10 * seed + number) for number in range(2)]
     noise = [0.02 * model.torque(truth, *motion[1:]).std(axis=0) for motion in motions]
-    return [simulated(model, truth, *one, seed) for one in zip(motions, noise, strict=True)]
+    return [
+        simulated(model, truth, *motion_and_noise, seed)
+        for motion_and_noise in zip(motions, noise, strict=True)
+    ]
 
 
 def nominal(model):
@@ -782,22 +804,22 @@ def nominal(model):
 class TestNominalScale:
     @pytest.mark.parametrize("seed", range(10))
     def test_links_off_by_a_tenth_are_no_finding(self, model, seed):
-        found = nominal_scale(
+        scale = nominal_scale(
             model,
             nominal(model),
             runs_of(model, standard(model, 0.1, seed), seed),
             share=NOMINAL_SHARE,
         )
-        assert np.isfinite(found.scale[2])
-        assert findings(model, nominal_scale=found) == []
+        assert np.isfinite(scale.scale[2])
+        assert findings(model, nominal_scale=scale) == []
 
     @pytest.mark.parametrize("seed", range(10))
     def test_links_as_uncertain_as_a_makers_description_are_none(self, model, seed):
         """Masses and inertias of neighbouring links deviate by a quarter, in one direction."""
         heavier = standard(model, 0.1, seed) * np.where(seed % 2, 1.25, 0.75)
-        found = nominal_scale(model, nominal(model), runs_of(model, heavier, seed))
-        assert np.isfinite(found.scale[2])
-        assert findings(model, nominal_scale=found) == []
+        scale = nominal_scale(model, nominal(model), runs_of(model, heavier, seed))
+        assert np.isfinite(scale.scale[2])
+        assert findings(model, nominal_scale=scale) == []
 
     @pytest.mark.parametrize("axis", LOADED_AXES)
     @pytest.mark.parametrize("factor", [0.6, 1.5])
@@ -807,10 +829,10 @@ class TestNominalScale:
             torque = run.torque.copy()
             torque[:, axis] *= factor
             scaled.append(replace(run, torque=torque))
-        found = nominal_scale(model, nominal(model), scaled, share=NOMINAL_SHARE)
-        assert np.flatnonzero(found.off).tolist() == [axis]
-        assert found.scale[axis] == pytest.approx(factor, rel=0.1)
-        (finding,) = findings(model, nominal_scale=found)
+        scale = nominal_scale(model, nominal(model), scaled, share=NOMINAL_SHARE)
+        assert np.flatnonzero(scale.off).tolist() == [axis]
+        assert scale.scale[axis] == pytest.approx(factor, rel=0.1)
+        (finding,) = findings(model, nominal_scale=scale)
         name = model.joint_names[axis]
         assert finding.level == "doubtful" and name in finding.words and name in finding.next_step
 
@@ -853,10 +875,10 @@ class TestInertia:
         """A joint without one is not."""
         model, values, position, diagonal = arm()
         theirs = diagonal * np.array([1.0, 1.1, 0.9, 1.0, 0.0, 1.0 / 0.7])
-        found = inertia_ratio(model, values, position, theirs)
-        np.testing.assert_allclose(found.ratio, [1.0, 1.1, 0.9, 1.0, np.nan, 1.0 / 0.7], rtol=1e-9)
-        np.testing.assert_allclose(found.spread[:4], 0.0, atol=1e-9)
-        (finding,) = findings(model, controller_inertia=found)
+        ratio = inertia_ratio(model, values, position, theirs)
+        np.testing.assert_allclose(ratio.ratio, [1.0, 1.1, 0.9, 1.0, np.nan, 1.0 / 0.7], rtol=1e-9)
+        np.testing.assert_allclose(ratio.spread[:4], 0.0, atol=1e-9)
+        (finding,) = findings(model, controller_inertia=ratio)
         assert finding.level == "doubtful"
         assert "wrist_3_joint 1.43" in finding.words and "wrist_2_joint" not in finding.words
         assert inertia_ratio(model, values, position, 0.0 * diagonal) is None

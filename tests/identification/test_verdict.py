@@ -44,7 +44,7 @@ MODEL = RobotModel.from_urdf(urdf_text())
 
 def drive(wrong="", axis=0):
     """Return motor turns per joint turn (6, 6) and torque constants (6,), one sign wrong."""
-    own = {
+    figures = {
         "gear": np.array([-116.0, 116.0, -106.0, -50.0, 51.5, -33.0]),
         "constant": np.array([1.10, 1.10, 0.75, 0.36, 0.42, 0.42]),
         "k54": 0.03,
@@ -52,13 +52,13 @@ def drive(wrong="", axis=0):
         "k65": 0.035,
     }
     if wrong.startswith("k"):
-        own[wrong] = -own[wrong]
+        figures[wrong] = -figures[wrong]
     elif wrong:
-        own[wrong][axis] *= -1.0
+        figures[wrong][axis] *= -1.0
     coupling = np.eye(6)
-    coupling[4, 3] = -own["k54"]
-    coupling[5, 3:5] = own["k65"] * own["k54"] - own["k64"], -own["k65"]
-    return own["gear"][:, None] * coupling, own["constant"]
+    coupling[4, 3] = -figures["k54"]
+    coupling[5, 3:5] = figures["k65"] * figures["k54"] - figures["k64"], -figures["k65"]
+    return figures["gear"][:, None] * coupling, figures["constant"]
 
 
 def a_motion(seed, *, duration=8.0, step=0.01):
@@ -106,7 +106,7 @@ class TestValidCampaign:
         assert "predicts unseen motion well" in verdict.line
         assert percentage(evidence.held_out.overall, 1) in verdict.line
         assert evidence.systematic.max() < 0.5 * Thresholds().systematic
-        assert not {"gravity", "load", "outliers"} & {one.check for one in verdict.findings}
+        assert not {"gravity", "load", "outliers"} & {finding.check for finding in verdict.findings}
         assert np.degrees(evidence.gravity.angle) < 0.5
 
     def test_unmodelled_effects_stay_good(self):
@@ -138,13 +138,13 @@ class TestOneSidedErrors:
         assert not verdict.good and "must not be relied on" in verdict.line
         assert evidence.causes is not None
         assert evidence.load.explained < Thresholds().load or evidence.load.axes < 3
-        assert not {"gravity", "load"} & {one.check for one in verdict.findings}
+        assert not {"gravity", "load"} & {finding.check for finding in verdict.findings}
         if what == "gear" and axis < 3:
             first = evidence.causes[0]
             assert first.fault.kind == "axis sign"
             assert first.fault.joints in (((0,), (3,)) if axis == 0 else ((axis,),))
         if what.startswith("k"):
-            assert any("joint_4" in one or "joint_5" in one for one in verdict.reasons)
+            assert any("joint_4" in reason or "joint_5" in reason for reason in verdict.reasons)
 
     @pytest.mark.parametrize(
         ("term", "axis"),
@@ -155,7 +155,9 @@ class TestOneSidedErrors:
         values[axis] *= -1.0
         verdict, _ = campaign(truth=ns16_values(MODEL, **{term: values}))
         assert not verdict.good
-        assert any("friction" in one and f"joint_{axis + 1}" in one for one in verdict.reasons)
+        assert any(
+            "friction" in reason and f"joint_{axis + 1}" in reason for reason in verdict.reasons
+        )
 
 
 class TestUnseenMotion:
@@ -235,16 +237,18 @@ def an_estimate(**changes):
 
 def judged(names=AXES, **changes):
     """Return the verdict on good evidence with changes; those of the context by name."""
-    own = CellContext.__dataclass_fields__.keys() & changes.keys()
-    around = {name: changes.pop(name) for name in own}
+    context_fields = CellContext.__dataclass_fields__.keys() & changes.keys()
+    around = {name: changes.pop(name) for name in context_fields}
     evidence = Evidence(an_estimate(), held_out=an_error(0.05), training=an_error(0.04))
     return judge(names, replace(evidence, context=CellContext(**around), **changes))
 
 
 def finding_of(check, names=AXES, **changes):
     """Return the only finding of a check."""
-    (found,) = (one for one in judged(names, **changes).findings if one.check == check)
-    return found
+    (only_finding,) = (
+        finding for finding in judged(names, **changes).findings if finding.check == check
+    )
+    return only_finding
 
 
 def caused(kind, *joints, ratio=0.4):
@@ -269,7 +273,7 @@ class TestJudgement:
         )
 
     @pytest.mark.parametrize(
-        ("changes", "words"),
+        ("changes", "message"),
         [
             ({"held_out": an_error(0.2)}, "over all axes, limit 12 %"),
             ({"held_out": an_error(np.array([0.01, 0.4]))}, "exceeds 35 %: two 40 %"),
@@ -295,14 +299,14 @@ class TestJudgement:
             ),
         ],
     )
-    def test_wrong_findings_are_reasons(self, changes, words):
+    def test_wrong_findings_are_reasons(self, changes, message):
         verdict = judged(**changes)
         assert not verdict.good
-        assert any(words in reason for reason in verdict.reasons)
+        assert any(message in reason for reason in verdict.reasons)
         assert verdict.reasons[0] in verdict.line
 
     @pytest.mark.parametrize(
-        ("changes", "words"),
+        ("changes", "message"),
         [
             ({"causes": caused("gain", 1, ratio=0.85)}, "torque of two is 1.01"),
             ({"controller": an_error(0.02)}, "controller's own dynamic model predicts better"),
@@ -315,16 +319,18 @@ class TestJudgement:
             ({}, "cannot be distinguished from noise"),
         ],
     )
-    def test_doubtful_findings_are_warnings(self, changes, words):
+    def test_doubtful_findings_are_warnings(self, changes, message):
         verdict = judged(**changes)
-        assert verdict.good and any(words in one for one in verdict.warnings)
+        assert verdict.good and any(message in warning for warning in verdict.warnings)
 
     @pytest.mark.parametrize("kind", get_args(Kind))
     def test_each_kind_of_cause_has_a_message_and_a_step(self, kind):
-        (found,) = (
-            one for one in judged(causes=caused(kind, 0, 1)).findings if one.role == "cause"
+        (cause,) = (
+            finding
+            for finding in judged(causes=caused(kind, 0, 1)).findings
+            if finding.role == "cause"
         )
-        assert not {"{", "}"} & {*found.words, *found.next_step} and found.next_step
+        assert not {"{", "}"} & {*cause.words, *cause.next_step} and cause.next_step
 
     @pytest.mark.parametrize("error", [0.05, 0.5])
     def test_steps_of_wrong_findings_replace_doubtful_ones(self, error):
@@ -346,14 +352,14 @@ class TestJudgement:
 
         assert not axes(0.03).good
         assert axes(0.01).good
-        assert any("two 60 % of 0.1 N·m" in one for one in axes(0.01).warnings)
+        assert any("two 60 % of 0.1 N·m" in warning for warning in axes(0.01).warnings)
         assert axes(0.03, noise_floor=np.array([0.1, 0.2])).good
         assert axes(0.03, torque_limit=np.array([30.0, 100.0])).good
 
     def test_an_error_of_rounding_does_not_grow(self):
         tiny = {"training": an_error(1e-7), "held_out": an_error(1e-6)}
         assert not {"generalisation", "outliers"} & {
-            one.check for one in judged(**tiny).findings if one.level != "good"
+            finding.check for finding in judged(**tiny).findings if finding.level != "good"
         }
 
     def test_a_joint_several_times_worse_than_its_fit_is_not_good(self):
@@ -375,7 +381,7 @@ class TestJudgement:
         assert judged(**changes, noise_floor=np.array([0.1, 0.1])).good
 
     @pytest.mark.parametrize(
-        ("change", "error", "level", "words"),
+        ("change", "error", "level", "message"),
         [
             (Change("gain", 1, 0.91, 0.001, 0.01), 0.1, "wrong", "two 0.91 ± 0.002"),
             (Change("gain", 1, 0.95, 0.001, 0.01), 0.05, "doubtful", "two 0.95 ± 0.002"),
@@ -383,33 +389,43 @@ class TestJudgement:
             (Change("friction", 0, 0.92, 0.01, 0.01), 0.1, "doubtful", "one -8 %"),
         ],
     )
-    def test_what_changed_is_named(self, change, error, level, words):
+    def test_what_changed_is_named(self, change, error, level, message):
         changes = {"changes": (change,), "held_out": an_error(error), "training": an_error(error)}
-        (found,) = (one for one in judged(**changes).findings if one.role == "cause")
-        assert found.level == level and words in found.words
+        (cause,) = (finding for finding in judged(**changes).findings if finding.role == "cause")
+        assert cause.level == level and message in cause.words
 
     def test_a_body_that_explains_the_error_is_not_unexplained(self):
         changes = {"held_out": an_error(0.1), "noise_floor": np.full(2, 0.1), "causes": ()}
         load = CarriedLoad(mass=2.0, explained=0.98, axes=2, half_interval=0.1)
-        words = " ".join(judged(**changes, load=load).reasons)
-        assert "explains 98 %" in words and "none of the tested faults" not in words
+        reasons = " ".join(judged(**changes, load=load).reasons)
+        assert "explains 98 %" in reasons and "none of the tested faults" not in reasons
 
     def test_a_motion_in_one_direction_is_said(self):
         verdict = judged(one_way=np.array([False, True]))
-        (found,) = (one for one in verdict.findings if "one direction" in one.words)
-        assert found.level == "doubtful" and found.words.startswith("two moved in one direction")
-        assert found.next_step == "record a motion in which two moves in both directions"
+        (direction_finding,) = (
+            finding for finding in verdict.findings if "one direction" in finding.words
+        )
+        assert direction_finding.level == "doubtful" and direction_finding.words.startswith(
+            "two moved in one direction"
+        )
+        assert (
+            direction_finding.next_step == "record a motion in which two moves in both directions"
+        )
 
     def test_springs_and_balancers_are_named_before_faults(self):
         verdict = judged(held_out=an_error(0.2), training=an_error(0.2))
-        (step,) = (one for one in verdict.next_steps if "[[robot.elements]]" in one)
+        (step,) = (
+            next_step for next_step in verdict.next_steps if "[[robot.elements]]" in next_step
+        )
         assert step.startswith("describe a spring, a balancer or a hydraulic counterweight")
         assert "signs" in step
 
     def test_it_explains_what_is_not_determined(self):
         estimate = an_estimate(undetermined=("f0_2", "fo_2", "m1"))
         verdict = judged(estimate=estimate, one_way=np.array([False, True]))
-        direction, others = (one for one in verdict.findings if one.check == "excitation")
+        direction, others = (
+            finding for finding in verdict.findings if finding.check == "excitation"
+        )
         if "m1" in direction.words:
             direction, others = others, direction
         assert direction.level == others.level == "wrong"
@@ -422,8 +438,8 @@ class TestJudgement:
         signs = Implausible(("m1 is negative", "I2m is negative"), ())
         nominal = NominalScale(np.full(2, -1.0), np.full(2, 0.1))
         driving = Dissipation(np.full(2, -3.0), np.full(2, 0.1))
-        for known in ({"nominal_scale": nominal}, {"dissipation": driving}):
-            verdict = judged(implausible=signs, causes=caused("axis sign", 0), **known)
+        for symptom in ({"nominal_scale": nominal}, {"dissipation": driving}):
+            verdict = judged(implausible=signs, causes=caused("axis sign", 0), **symptom)
             (reason,) = verdict.reasons
             assert "all torques have the opposite sign" in reason
             assert verdict.next_steps[0].startswith("set scale = -1")
@@ -438,10 +454,13 @@ class TestJudgement:
         assert judged(dissipation=dissipation).good
 
     def test_good_findings(self):
-        found = finding_of("against the controller's model", controller=an_error(0.09))
-        assert found.level == "good" and "is 9.0 %, of the identified model 5.0 %" in found.words
+        comparison = finding_of("against the controller's model", controller=an_error(0.09))
+        assert (
+            comparison.level == "good"
+            and "is 9.0 %, of the identified model 5.0 %" in comparison.words
+        )
         verdict = judged(systematic=np.array([0.019, 0.0]))
-        assert not any("beyond noise" in one for one in verdict.warnings)
+        assert not any("beyond noise" in warning for warning in verdict.warnings)
 
     def test_a_delay_comes_before_torque_constants(self):
         verdict = judged(systematic=np.array([0.1, 0.1]), delays=LATE)
@@ -456,7 +475,9 @@ class TestJudgement:
     def test_joint_names_may_contain_braces(self):
         verdict = judged(("{one}", "<two>"), held_out=an_error(0.4), training=an_error(0.4))
         assert "{one} 40 %, <two> 40 %" in " ".join(verdict.reasons)
-        assert any("torque constant of {one}, <two>," in one for one in verdict.next_steps)
+        assert any(
+            "torque constant of {one}, <two>," in next_step for next_step in verdict.next_steps
+        )
 
 
 def ripple(size):
@@ -481,15 +502,15 @@ def clean():
         two_link.simulated(model, values, four_sines(time, seed=seed), two_link.NOISE, seed)
         for seed in range(6)
     ]
-    found = check_residuals(model, values, runs[:5], runs[5:])
-    return replace(found, ripple=None, drift=None, rms=np.full(2, 0.01))
+    checks = check_residuals(model, values, runs[:5], runs[5:])
+    return replace(checks, ripple=None, drift=None, rms=np.full(2, 0.01))
 
 
 class TestPatternsOfTheResidual:
     """Those that were found by chance alone are no finding, small ones no doubt."""
 
     def test_untested_ones_have_no_finding(self, clean):
-        checks = {one.check for one in judged(residuals=clean).findings}
+        checks = {finding.check for finding in judged(residuals=clean).findings}
         assert "whiteness" in checks
         assert not {"torque ripple", "friction over time"} & checks
 
@@ -497,7 +518,7 @@ class TestPatternsOfTheResidual:
     def test_an_error_of_zero_has_no_outliers(self, clean, error, named):
         few = Outliers(np.full(2, 0.001), np.full(2, 0.95), an_error(0.2 * error))
         verdict = judged(held_out=an_error(error), residuals=replace(clean, outliers=few))
-        assert ("outliers" in {one.check for one in verdict.findings}) == named
+        assert ("outliers" in {finding.check for finding in verdict.findings}) == named
 
     @pytest.mark.parametrize(
         ("share", "level"), [(0.0, "good"), (0.9, "information"), (1.1, "doubtful")]
@@ -505,14 +526,14 @@ class TestPatternsOfTheResidual:
     def test_large_ripple_is_doubtful(self, clean, share, level):
         size = share * Thresholds().ripple
         changed = replace(clean, ripple=ripple(size * clean.torque_rms[1]))
-        found = finding_of("torque ripple", residuals=changed)
-        assert found.level == level
-        assert "one" not in found.words
+        finding = finding_of("torque ripple", residuals=changed)
+        assert finding.level == level
+        assert "one" not in finding.words
         expected = f"two (4 per motor turn, {percentage(size, 1)} of its torque)"
-        assert (expected in found.words) == (level != "good")
+        assert (expected in finding.words) == (level != "good")
 
     @pytest.mark.parametrize(
-        ("change", "share", "level", "words"),
+        ("change", "share", "level", "message"),
         [
             ((1e-5, -1e-5), 1.0, "good", "did not change"),
             ((0.02, 0.0), 1.0, "information", "one by +2.0 %, at most 2.0 % of an axis"),
@@ -520,12 +541,12 @@ class TestPatternsOfTheResidual:
             ((0.02, -0.2), 1.0, "doubtful", "during the recordings: two by -20.0 %"),
         ],
     )
-    def test_drift_is_judged_by_its_torque(self, clean, change, share, level, words):
+    def test_drift_is_judged_by_its_torque(self, clean, change, share, level, message):
         changed = replace(clean, drift=drift(*change), friction_share=np.array([share, 1.0]))
-        found = finding_of("friction over time", residuals=changed)
-        assert found.level == level
-        assert words in found.words
-        assert (found.role == "cause") == (level == "doubtful")
+        finding = finding_of("friction over time", residuals=changed)
+        assert finding.level == level
+        assert message in finding.words
+        assert (finding.role == "cause") == (level == "doubtful")
 
 
 # Causes
@@ -561,7 +582,7 @@ def of_one_kilogram(motion):
 
 
 def causes(recordings):
-    factors = (Factor.of(MODEL, one) for one in recordings)
+    factors = (Factor.of(MODEL, samples) for samples in recordings)
     values = estimate(MODEL, sum(factors, Factor.zero(MODEL))).values
     names = [f"{k}.mcap" for k in range(len(recordings))]
     return find_causes(MODEL, recordings, values, names)
@@ -569,7 +590,7 @@ def causes(recordings):
 
 def late(samples):
     time = samples.motion.time
-    torque = [np.interp(time - DELAY, time, one) for one in samples.torque.T]
+    torque = [np.interp(time - DELAY, time, column) for column in samples.torque.T]
     return replace(samples, torque=np.column_stack(torque))
 
 
@@ -583,7 +604,7 @@ def turned(values):
 
 def moved(samples, change, *, torque=True):
     """Return samples with another motion, and with another torque by default."""
-    motion = Motion(samples.motion.time, *(change(one) for one in samples.motion[1:4]))
+    motion = Motion(samples.motion.time, *(change(channel) for channel in samples.motion[1:4]))
     if not torque:
         return replace(samples, motion=motion)
     usable = np.abs(change(samples.usable.astype(np.float64))) > 0.0
@@ -593,12 +614,12 @@ def moved(samples, change, *, torque=True):
 GAIN = np.array([1.0, 1.15, 1.0, 1.0, 1.0, 1.0])
 FAULTS = {
     "delay": ((), late),
-    "gain": ((1,), lambda one: replace(one, torque=GAIN * one.torque)),
-    "torque sign": ((2,), lambda one: replace(one, torque=turned(one.torque))),
-    "torque order": ((1, 2), lambda one: replace(one, torque=swapped(one.torque))),
-    "axis sign": ((2,), lambda one: moved(one, turned)),
-    "position order": ((1, 2), lambda one: moved(one, swapped, torque=False)),
-    "joint order": ((1, 2), lambda one: moved(one, swapped)),
+    "gain": ((1,), lambda samples: replace(samples, torque=GAIN * samples.torque)),
+    "torque sign": ((2,), lambda samples: replace(samples, torque=turned(samples.torque))),
+    "torque order": ((1, 2), lambda samples: replace(samples, torque=swapped(samples.torque))),
+    "axis sign": ((2,), lambda samples: moved(samples, turned)),
+    "position order": ((1, 2), lambda samples: moved(samples, swapped, torque=False)),
+    "joint order": ((1, 2), lambda samples: moved(samples, swapped)),
 }
 SIZES = {"delay": DELAY, "gain": 0.15}
 
@@ -632,34 +653,34 @@ class TestErrorsWithoutCause:
         )
         torque[:, 1] = np.random.default_rng(4).permutation(torque[:, 1])
         samples = as_samples(MODEL, motion, torque, usable=np.ones(torque.shape, dtype=np.bool_))
-        assert not any(4 in one.fault.joints for one in causes([samples]))
+        assert not any(4 in cause.fault.joints for cause in causes([samples]))
 
     @pytest.mark.parametrize("seed", [1, 2])
     def test_friction_that_grows_with_the_load_is_named(self, seed):
         """By a tenth of the rigid torque; no torque constant and no turned axis."""
-        one = recorded(seed)
+        samples = recorded(seed)
         rigid = np.where(MODEL.friction_columns, 0.0, ns16_values(MODEL))
-        direction = np.sign(one.motion.velocity)
-        load = np.abs(MODEL.torque(rigid, *one.motion[1:4], direction))
-        (cause,) = causes([replace(one, torque=one.torque + 0.2 * load * direction)])
+        direction = np.sign(samples.motion.velocity)
+        load = np.abs(MODEL.torque(rigid, *samples.motion[1:4], direction))
+        (cause,) = causes([replace(samples, torque=samples.torque + 0.2 * load * direction)])
         assert cause.fault.kind == "load friction"
         assert cause.size == pytest.approx(0.2, abs=0.03)
 
     def test_an_error_that_no_fault_explains_has_none(self):
         """A spring on one axis that the model lacks."""
-        one = recorded(1)
-        torque = one.torque.copy()
-        torque[:, 2] += 400.0 * np.sin(3.0 * one.motion.position[:, 2])
-        assert causes([replace(one, torque=torque)]) == ()
+        samples = recorded(1)
+        torque = samples.torque.copy()
+        torque[:, 2] += 400.0 * np.sin(3.0 * samples.motion.position[:, 2])
+        assert causes([replace(samples, torque=torque)]) == ()
 
     def test_extreme_torques_raise_no_warning(self):
         """In a block without rows, and with torques near the limits of numbers."""
-        one = recorded(1)
-        torque = one.torque * np.where(np.arange(6) == 5, 1e-150, 1.0)
-        usable = one.usable & (np.arange(len(torque)) > 300)[:, None]
+        samples = recorded(1)
+        torque = samples.torque * np.where(np.arange(6) == 5, 1e-150, 1.0)
+        usable = samples.usable & (np.arange(len(torque)) > 300)[:, None]
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            causes([replace(one, torque=torque, usable=usable)])
+            causes([replace(samples, torque=torque, usable=usable)])
 
 
 class TestCausesOfParts:
@@ -668,14 +689,14 @@ class TestCausesOfParts:
     @pytest.mark.parametrize("count", [1, 4])
     def test_a_changed_load_is_measured(self, count):
         """In the second half of one recording, or in two of four."""
-        words = "0.mcap from 5 s on" if count == 1 else "1.mcap, 3.mcap"
+        part_name = "0.mcap from 5 s on" if count == 1 else "1.mcap, 3.mcap"
         half, whole = LOAD * (np.arange(1250) >= 625), np.full(1250, LOAD)
         runs = [recorded(1, half)]
         if count == 4:
             runs = [recorded(k, whole if k in (1, 3) else None) for k in range(4)]
         (cause,) = causes(runs)
         assert cause.fault.kind == "payload"
-        assert cause.fault.part.name == words
+        assert cause.fault.part.name == part_name
         assert cause.size == pytest.approx(LOAD, abs=4.0 * cause.std + 0.1)
 
     def test_friction_of_one_recording(self):
@@ -690,7 +711,7 @@ class TestCausesOfParts:
     def test_another_arm_in_the_second_half(self):
         runs = [recorded(k) for k in range(4)]
         scale = np.array([1.4, 0.8, 1.3, 0.7, 1.5, 0.8])
-        runs[2:] = [replace(one, torque=scale * one.torque) for one in runs[2:]]
+        runs[2:] = [replace(samples, torque=scale * samples.torque) for samples in runs[2:]]
         first = causes(runs)[0]
         assert first.fault.kind == "changed arm"
         assert first.fault.part.name == "2.mcap and what follows it"

@@ -13,8 +13,8 @@ from identification.signals.samples import Samples
 
 def sine_motion(time, size, pace, phase, centre=0.0):
     """Sums of sines about a centre, of sizes, paces and phases (k, n) or (n,)."""
-    a, w, own = np.broadcast_arrays(*map(np.atleast_2d, (size, pace, phase)))
-    angle = w * time[:, None, None] + own
+    a, w, phases = np.broadcast_arrays(*map(np.atleast_2d, (size, pace, phase)))
+    angle = w * time[:, None, None] + phases
     return Motion(
         time,
         centre + (a * np.sin(angle)).sum(axis=1),

@@ -64,6 +64,6 @@ class TestDefaultSettings:
 @pytest.mark.parametrize("load", [0.02, 0.1])
 def test_friction_that_grows_with_load_is_no_delay(load: float) -> None:
     """The law without it has a delay of some ms as its least error."""
-    found = run("panda", 0.0, 1, DEFAULTS._replace(load=load))
-    assert found.delay_error == [0.0] * 7 and not found.blamed
-    assert found.good and found.dropped == 0
+    outcome = run("panda", 0.0, 1, DEFAULTS._replace(load=load))
+    assert outcome.delay_error == [0.0] * 7 and not outcome.blamed
+    assert outcome.good and outcome.dropped == 0

@@ -154,21 +154,21 @@ def model_of(arm):
     return RobotModel.from_urdf(arm.urdf, locked=arm.locked, friction=FrictionLaw(third=None))
 
 
-def coverage(arm, model, recording, found):
+def coverage(arm, model, recording, delay):
     """Return the share of parameters in their 95 % intervals, with the delay compensated."""
     standard = model.nominal
     standard[10::11] = arm.model.armature
     truth = np.concatenate([model.base.grouping @ standard, arm.coulomb, arm.viscous])
     # Rows at a reversal depend on presliding.
-    options = Preprocessing(torque_delay=found.applied, left_out="slow")
+    options = Preprocessing(torque_delay=delay.applied, left_out="slow")
     samples = prepare(recording, model, options=options)
     phase = Factor.by_time(model, samples)
     fitted = fit_least_squares(model, [samples], factor=phase)
     products = rate_products(model, samples)
-    fitted = with_uncertain_delay(fitted, phase, products, found.variance)
-    known = np.isfinite(fitted.std)
+    fitted = with_uncertain_delay(fitted, phase, products, delay.variance)
+    determined = np.isfinite(fitted.std)
     inside = np.abs(fitted.values - truth) <= fitted.interval_factor * fitted.std
-    return float(np.mean(inside[known]))
+    return float(np.mean(inside[determined]))
 
 
 class TestDelayOfABriskMotion:
@@ -183,10 +183,10 @@ class TestDelayOfABriskMotion:
     )
     def test_it_is_found(self, name, noise, delay):
         arm = ARMS[name]()
-        found = estimate_delay(recorded(arm, 0, noise, delay, BRISK), model_of(arm))
-        assert found.determined
-        assert found.delay == pytest.approx(delay, abs=NEAR)
-        assert found.significant == (delay > 0.0)
+        estimate = estimate_delay(recorded(arm, 0, noise, delay, BRISK), model_of(arm))
+        assert estimate.determined
+        assert estimate.delay == pytest.approx(delay, abs=NEAR)
+        assert estimate.significant == (delay > 0.0)
 
     @pytest.mark.slow
     @pytest.mark.parametrize("name", ARMS)
@@ -199,9 +199,9 @@ class TestDelayOfABriskMotion:
         near, shares = 0, []
         for seed in range(SEEDS):
             recording = recorded(arm, seed, noise, delay, BRISK)
-            found = estimate_delay(recording, model)
-            near += found.determined and abs(found.delay - delay) < NEAR
-            shares.append(coverage(arm, model, recording, found))
+            estimate = estimate_delay(recording, model)
+            near += estimate.determined and abs(estimate.delay - delay) < NEAR
+            shares.append(coverage(arm, model, recording, estimate))
         # Within two standard errors of the share.
         share, unsure = np.mean(shares), 2.0 * np.std(shares, ddof=1) / np.sqrt(SEEDS)
         assert near >= 0.95 * SEEDS
@@ -215,7 +215,7 @@ class TestDelayBesideOtherSettings:
         """On all rows 1e-5 rad without delay predicts better than 1e-6 rad with the true one."""
         arm = ns16()
         model, recording = model_of(arm), recorded(arm, seed, "coloured", 0.0013, BRISK)
-        found = estimate_delay(recording, model)
+        estimate = estimate_delay(recording, model)
 
         def ready(model, how):
             return [prepare(recording, model, options=how)]
@@ -226,15 +226,15 @@ class TestDelayBesideOtherSettings:
             Settings(Preprocessing()),
             {"delay", "bandwidth", "presliding", "rows"},
             lambda *_: (),
-            (found.delay,),
+            (estimate.delay,),
         )
-        assert best.preprocessing.torque_delay == found.delay
+        assert best.preprocessing.torque_delay == estimate.delay
 
 
 class TestDelayOfASlowMotion:
     @pytest.mark.parametrize("name", ARMS)
     def test_it_is_not_determined(self, name):
         arm = ARMS[name]()
-        found = estimate_delay(recorded(arm, 0, "coloured", 0.0, SLOW), model_of(arm))
-        assert not found.determined
-        assert found.applied == 0.0
+        estimate = estimate_delay(recorded(arm, 0, "coloured", 0.0, SLOW), model_of(arm))
+        assert not estimate.determined
+        assert estimate.applied == 0.0

@@ -76,9 +76,13 @@ def identified(name: str, seed: int, fault: str, joint: int, folder: Path) -> Id
     return identify_archives(archives[:1], Silent(), predict=archives[1:])
 
 
-def findings(found: Identification, *checks: str) -> list[Finding]:
+def findings(identification: Identification, *checks: str) -> list[Finding]:
     """Those of some checks that are not good."""
-    return [one for one in found.verdict.findings if one.check in checks and one.level != "good"]
+    return [
+        finding
+        for finding in identification.verdict.findings
+        if finding.check in checks and finding.level != "good"
+    ]
 
 
 @pytest.mark.parametrize("name", ARM_TYPES)
@@ -88,14 +92,14 @@ class TestFaultOfOnePart:
         """Of the last joint as well, whose torque is small and mostly friction."""
         n = len(ARM_TYPES[name].rotor)
         joint = (3, 1, n - 1)[seed % 3]
-        found = identified(name, seed, "gain", joint, tmp_path)
-        assert not found.verdict.good
-        planted = found.results.joint_names[joint]
-        named = findings(found, "sameness", "generalisation")
-        assert any(f"{planted} " in one.words for one in named)
+        identification = identified(name, seed, "gain", joint, tmp_path)
+        assert not identification.verdict.good
+        planted = identification.results.joint_names[joint]
+        named = findings(identification, "sameness", "generalisation")
+        assert any(f"{planted} " in finding.words for finding in named)
 
     def test_friction_of_the_held_out_motion(self, name: str, seed: int, tmp_path: Path) -> None:
-        found = identified(name, seed, "friction", 0, tmp_path)
-        assert not found.verdict.good
-        (friction,) = findings(found, "friction")
+        identification = identified(name, seed, "friction", 0, tmp_path)
+        assert not identification.verdict.good
+        (friction,) = findings(identification, "friction")
         assert friction.level == "wrong" and "springs" not in friction.next_step

@@ -30,7 +30,10 @@ def random_points(seed: int, count: int = 6) -> np.ndarray:
 def rows_of(*limits: JointLimits) -> Allowance:
     """Limits as the rows of one table."""
     return Allowance(
-        *(np.array([getattr(one, name) for one in limits]) for name in Allowance._fields)
+        *(
+            np.array([getattr(joint_limits, name) for joint_limits in limits])
+            for name in Allowance._fields
+        )
     )
 
 
@@ -43,5 +46,5 @@ def legs_between(points: np.ndarray, limits: JointLimits) -> Legs:
 def join(start, end, limits: JointLimits, time: float) -> PiecewiseCubic | None:
     """Join two states (n, 3) within limits in about a time [s], as a corner does."""
     bounds = rows_of(limits)
-    found = solve_many(start[None], end[None], np.array([time]), bounds)
-    return finish_many(found, bounds)[0] if found.found[0] is not None else None
+    solutions = solve_many(start[None], end[None], np.array([time]), bounds)
+    return finish_many(solutions, bounds)[0] if solutions.found[0] is not None else None

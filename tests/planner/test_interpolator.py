@@ -133,14 +133,14 @@ def test_targets_set_on_request_give_the_same_motion(fly):
     queue(at_once, points[1:])
     one_by_one = ready(SIX_AXES, points[0], fly=fly)
     waiting = list(enumerate(points[1:], 1))
-    steps, one = [], steps_to_rest(at_once)
+    steps, expected = [], steps_to_rest(at_once)
     one_by_one.set_next_target(*waiting.pop(0))
     while not steps or steps[-1].status != Status.FINAL_STEP:
         steps.append(one_by_one.get_next_step())
         if steps[-1].status == Status.NEED_MORE_DATA and waiting:
             one_by_one.set_next_target(*waiting.pop(0))
-    np.testing.assert_array_equal(positions(steps), positions(one))
-    assert events(steps) == events(one)
+    np.testing.assert_array_equal(positions(steps), positions(expected))
+    assert events(steps) == events(expected)
 
 
 @given(st.integers(0, 10**6), st.floats(0.0, 1.0))
@@ -183,7 +183,7 @@ def test_data_are_requested_while_few_targets_are_ahead(advance):
     interpolator = ready(SIX_AXES, points[0], fly=50.0, advance=advance)
     statuses = [interpolator.set_next_target(k, point) for k, point in enumerate(points[1:])]
     requested = [status == Status.NEED_MORE_DATA for status in statuses]
-    assert requested == [known <= advance for known in range(1, 6)]
+    assert requested == [targets_set <= advance for targets_set in range(1, 6)]
     ahead = 5
     for step in steps_to_rest(interpolator)[:-1]:
         ahead -= len(step.events)

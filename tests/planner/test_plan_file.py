@@ -79,18 +79,18 @@ def damaged(row, quantity, by):
 
 
 @pytest.mark.parametrize(
-    ("edit", "words"),
+    ("edit", "message"),
     [
         (slower, "delete the motion"),
         (damaged(0, 3, 1.1), "stored motion"),
         (damaged(5, 0, 1.0 + 1e-6), "stored motion"),
     ],
 )
-def test_a_stored_motion_must_be_that_of_the_moves(planned, edit, words):
+def test_a_stored_motion_must_be_that_of_the_moves(planned, edit, message):
     data = PlanFile.of(planned, NAMES).to_dict()
     edit(data)
     edited = PlanFile.from_dict(data)
-    with pytest.raises(InvalidPlanFile, match=words):
+    with pytest.raises(InvalidPlanFile, match=message):
         edited.plan()
     without = replace(edited, trajectory=None).plan().trajectory.duration
     assert (without > planned.trajectory.duration) == (edit is slower)

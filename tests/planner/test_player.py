@@ -200,8 +200,8 @@ class TestResumeFrom:
         player, before, last = begun(closed, round(closed.duration / PERIOD) - left)
         step = last - before
         guard = Arm(closed, SIX_AXES).guard
-        for one in (guard, player):
-            one.resume_from(last + 8 * step, step / PERIOD, 15)
+        for resumable in (guard, player):
+            resumable.resume_from(last + 8 * step, step / PERIOD, 15)
         assert player.motion_time > 0.5 * closed.duration
         player.stop()
         for cycle in range(100):

@@ -70,8 +70,8 @@ def test_samples_agree_with_an_independent_polynomial(table, t):
         np.testing.assert_allclose(q[:, joint], polynomial(t), atol=1e-10)
         np.testing.assert_allclose(qd[:, joint], polynomial(t, 1), atol=1e-10)
         np.testing.assert_allclose(qdd[:, joint], polynomial(t, 2), atol=1e-10)
-    one = [table.sample_one(x) for x in t.tolist()]
-    for ours, scalar in zip((q, qd, qdd), zip(*one, strict=True), strict=True):
+    single_samples = [table.sample_one(x) for x in t.tolist()]
+    for ours, scalar in zip((q, qd, qdd), zip(*single_samples, strict=True), strict=True):
         np.testing.assert_allclose(ours, scalar, atol=1e-12)
 
 
@@ -82,9 +82,9 @@ def test_it_rests_at_its_ends_outside_its_time(table):
     np.testing.assert_array_equal(q[3:], q[[2, 2]])
     assert not np.any(qd[[0, 3, 4]]) and not np.any(qdd[[0, 3, 4]])
     for t, row in ((-1.0, 0), (2.5, 4)):
-        one = table.sample_one(t)
-        np.testing.assert_allclose(one[0], q[row], atol=1e-12)
-        assert not np.any(one[1]) and not np.any(one[2])
+        sample = table.sample_one(t)
+        np.testing.assert_allclose(sample[0], q[row], atol=1e-12)
+        assert not np.any(sample[1]) and not np.any(sample[2])
 
 
 @given(tables())
@@ -526,10 +526,10 @@ def test_the_motion_stops_if_the_solver_raises(monkeypatch, error):
 def test_a_corner_slower_than_a_stop_is_not_used(monkeypatch):
     points, asked = random_points(1, 3), []
 
-    def slow(starts, *rest):
+    def slow(starts, *arguments):
         asked.extend(starts)
-        found = solve_many(starts, *rest)
-        return found._replace(durations=np.full(len(starts), 10.0))
+        solutions = solve_many(starts, *arguments)
+        return solutions._replace(durations=np.full(len(starts), 10.0))
 
     monkeypatch.setattr("planner.corners.solve_many", slow)
     assert flown(points, SIX_AXES) is STOP
@@ -541,10 +541,10 @@ def test_a_corner_slower_than_a_stop_is_not_used(monkeypatch):
 @pytest.mark.parametrize("missed", [1.2, np.inf], ids=["too slow", "unknown"])
 def test_a_join_without_solution_is_replaced_by_its_neighbour(monkeypatch, missed):
     def misses_the_first(*asked):
-        found = solve_many(*asked)
+        solutions = solve_many(*asked)
         # Observed: a join much longer than necessary, still shorter than a stop.
-        found.durations[0] *= missed
-        return found
+        solutions.durations[0] *= missed
+        return solutions
 
     monkeypatch.setattr("planner.corners.solve_many", misses_the_first)
     passed = flown(random_points(1, 3), SIX_AXES)

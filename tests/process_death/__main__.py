@@ -57,15 +57,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
     try:
-        known = rounds(given.journal, "broken", "seconds", "processor")
+        recorded = rounds(given.journal, "broken", "seconds", "processor")
         journal = Journal(given.journal)
     except JournalError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
     numbers = range(given.start, given.start + given.rounds)
     wanted = [n for n in numbers if given.only in (None, round_of(n).victims[0])]
-    results = [known[n] for n in wanted if n in known]
-    missing = [n for n in wanted if n not in known]
+    results = [recorded[n] for n in wanted if n in recorded]
+    missing = [n for n in wanted if n not in recorded]
     began = time.monotonic()
     folder = Path(tempfile.mkdtemp(prefix="process_death_"))
     interrupted = False
@@ -131,19 +131,21 @@ def _print(result: dict[str, Any], done: int, of: int, folder: Path, *, quiet: b
 
 
 def summary(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    failed = sorted(one["round"] for one in results if one["broken"])
-    lost = sorted(one["lost"] for one in results if "lost" in one)
+    failed = sorted(result["round"] for result in results if result["broken"])
+    lost = sorted(result["lost"] for result in results if "lost" in result)
     return {
         "ran": len(results),
         "failed": len(failed),
         "seeds_failed": failed,
-        "killed": dict(Counter(victim for one in results for victim in one.get("killed", ()))),
-        "nobody_killed": sum(not one.get("killed") for one in results),
+        "killed": dict(
+            Counter(victim for result in results for victim in result.get("killed", ()))
+        ),
+        "nobody_killed": sum(not result.get("killed") for result in results),
         "archives_torn": len(lost),
         "lost_at_most": lost[-1] if lost else 0,
         "lost_within_promise": sum(count <= PROMISED for count in lost),
-        "seconds": sum(one["seconds"] for one in results),
-        "processor_seconds": sum(one["processor"] for one in results),
+        "seconds": sum(result["seconds"] for result in results),
+        "processor_seconds": sum(result["processor"] for result in results),
     }
 
 

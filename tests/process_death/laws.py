@@ -77,10 +77,10 @@ def broken_by(
             continue
         cycles = archive.columns.get("cycle", np.zeros(0))
         recorded.append(Recorded(path, name, archive, np.asarray(cycles, np.int64)))
-    for one in recorded:
-        problems += _readable(one, seen)
-        problems += _as_exchanged(one, seen.records)
-        problems += _outcome(one, seen)
+    for recording in recorded:
+        problems += _readable(recording, seen)
+        problems += _as_exchanged(recording, seen.records)
+        problems += _outcome(recording, seen)
     problems += _archived(recorded, seen, figures)
     problems += _motions(recorded, seen, campaign)
     return problems, figures
@@ -94,8 +94,8 @@ def _supervisor(seen: Seen) -> Iterator[str]:
         yield f"the supervisor ended with status {seen.status} and reported {seen.report}"
     text = seen.report.get("text", "")
     if seen.deaths and text:
-        words = [word for victim in seen.killed for word in NAMED.get(victim, ())]
-        if not any(word in text for word in words):
+        names = [word for victim in seen.killed for word in NAMED.get(victim, ())]
+        if not any(word in text for word in names):
             yield f"{' and '.join(seen.killed)} died, and the supervisor reported: {text}"
 
 
@@ -169,51 +169,59 @@ def sha256(path: Path) -> str:
 
 
 def _is_newest(path: Path) -> bool:
-    return path == max(path.parent.iterdir(), key=lambda one: one.stat().st_mtime_ns)
+    return path == max(path.parent.iterdir(), key=lambda sibling: sibling.stat().st_mtime_ns)
 
 
-def _readable(one: Recorded, seen: Seen) -> Iterator[str]:
+def _readable(recording: Recorded, seen: Seen) -> Iterator[str]:
     """An archive is a gap-free prefix, also for the second reader."""
-    if one.cycles.size and (np.diff(one.cycles) != 1).any():
-        yield f"{one.path.name} has gaps"
-    if not one.archive.complete and not ("archive" in seen.killed and _is_newest(one.path)):
-        yield f"{one.path.name} is not complete: {one.archive.missing}"
-    found = len(read(one.path).cycles)
-    if found != one.cycles.size:
-        yield f"{one.path.name}: {one.cycles.size} cycles, but {found} for the second reader"
-    outcome = one.archive.outcome
+    if recording.cycles.size and (np.diff(recording.cycles) != 1).any():
+        yield f"{recording.path.name} has gaps"
+    if not recording.archive.complete and not (
+        "archive" in seen.killed and _is_newest(recording.path)
+    ):
+        yield f"{recording.path.name} is not complete: {recording.archive.missing}"
+    second_count = len(read(recording.path).cycles)
+    if second_count != recording.cycles.size:
+        yield (
+            f"{recording.path.name}: {recording.cycles.size} cycles, but {second_count} for the "
+            f"second reader"
+        )
+    outcome = recording.archive.outcome
     if outcome is not None and outcome.records_lost:
-        yield f"{one.path.name} states that {outcome.records_lost} records were lost"
+        yield f"{recording.path.name} states that {outcome.records_lost} records were lost"
 
 
-def _as_exchanged(one: Recorded, records: Records) -> Iterator[str]:
+def _as_exchanged(recording: Recorded, records: Records) -> Iterator[str]:
     """An archive contains what was exchanged."""
-    if not one.cycles.size:
+    if not recording.cycles.size:
         return
-    rows = _rows_of(one, records)
+    rows = _rows_of(recording, records)
     if rows is None:
-        yield f"{one.path.name} holds cycles that were never exchanged"
+        yield f"{recording.path.name} holds cycles that were never exchanged"
         return
-    columns = one.archive.columns
+    columns = recording.archive.columns
     for name in COMPARED:
         if not np.array_equal(columns[name], rows[name], equal_nan=name != "state"):
-            yield f"{name} in {one.path.name} is not what was exchanged"
+            yield f"{name} in {recording.path.name} is not what was exchanged"
 
 
-def _outcome(one: Recorded, seen: Seen) -> Iterator[str]:
+def _outcome(recording: Recorded, seen: Seen) -> Iterator[str]:
     """A completed archive has the outcome of its motion."""
-    if one.archive.outcome is None:
+    if recording.archive.outcome is None:
         return
-    outcome = one.archive.outcome.entries["outcome"]
-    if int(one.archive.outcome.entries["samples"]) != one.cycles.size:
-        yield f"{one.path.name} has {one.cycles.size} cycles and states {one.archive.outcome}"
+    outcome = recording.archive.outcome.entries["outcome"]
+    if int(recording.archive.outcome.entries["samples"]) != recording.cycles.size:
+        yield (
+            f"{recording.path.name} has {recording.cycles.size} cycles and states "
+            f"{recording.archive.outcome}"
+        )
     if outcome not in ("completed", "stopped", "void", "lost", "refused"):
-        yield f"the outcome of {one.path.name} is {outcome}"
+        yield f"the outcome of {recording.path.name} is {outcome}"
     alone = "exchange" not in seen.killed and "controller" not in seen.killed
     if outcome == "lost" and alone:
-        yield f"{one.path.name} is marked lost, and neither end of the link had died"
-    if outcome == "void" and one.cycles.size and _moving(one.archive.columns).any():
-        yield f"{one.path.name} is marked void, and holds motion"
+        yield f"{recording.path.name} is marked lost, and neither end of the link had died"
+    if outcome == "void" and recording.cycles.size and _moving(recording.archive.columns).any():
+        yield f"{recording.path.name} is marked void, and holds motion"
 
 
 def _moving(columns: Mapping[str, NDArray[Any]] | Records) -> NDArray[np.bool_]:
@@ -223,13 +231,13 @@ def _moving(columns: Mapping[str, NDArray[Any]] | Records) -> NDArray[np.bool_]:
     return moving
 
 
-def _rows_of(one: Recorded, records: Records) -> Records | None:
+def _rows_of(recording: Recorded, records: Records) -> Records | None:
     """The exchange's records of the cycles of an archive."""
     if not len(records):
         return None
-    first = int(one.cycles[0] - records["cycle"][0])
-    rows = records[max(first, 0) : first + one.cycles.size]
-    return rows if len(rows) == one.cycles.size else None
+    first = int(recording.cycles[0] - records["cycle"][0])
+    rows = records[max(first, 0) : first + recording.cycles.size]
+    return rows if len(rows) == recording.cycles.size else None
 
 
 def _archived(recorded: list[Recorded], seen: Seen, figures: dict[str, int]) -> Iterator[str]:
@@ -238,17 +246,17 @@ def _archived(recorded: list[Recorded], seen: Seen, figures: dict[str, int]) -> 
     if not len(records):
         return
     moving = records["cycle"][_moving(records)]
-    there = np.concatenate([np.zeros(0, np.int64), *(one.cycles for one in recorded)])
+    there = np.concatenate([np.zeros(0, np.int64), *(recording.cycles for recording in recorded)])
     if np.unique(there).size != there.size:
         yield "a cycle is in two archives"
     missing = np.setdiff1d(moving, there)
-    death = next((one for one in seen.deaths if one.victim == "archive"), None)
+    death = next((candidate for candidate in seen.deaths if candidate.victim == "archive"), None)
     if death is None:
         if missing.size:
             yield f"{missing.size} cycles of motion are in no archive"
         return
     lost = int(np.count_nonzero(missing < records["cycle"][0] + death.written))
-    if any(not one.archive.complete for one in recorded) or lost:
+    if any(not recording.archive.complete for recording in recorded) or lost:
         figures["lost"] = lost
     # Records that the system gave it no time to read are not its loss.
     if lost > PROMISED + death.behind:
@@ -257,20 +265,20 @@ def _archived(recorded: list[Recorded], seen: Seen, figures: dict[str, int]) -> 
 
 def _motions(recorded: list[Recorded], seen: Seen, campaign: Campaign) -> Iterator[str]:
     """Every set-point of a repetition or validation motion lies on its planned path."""
-    for one in recorded:
+    for recording in recorded:
         plan = campaign.plan
-        match one.name.kind:
+        match recording.name.kind:
             case "excitation":
                 motion: Any = plan.excitation.trajectory
             case "validation":
-                motion = plan.validation[one.name.index].trajectory
+                motion = plan.validation[recording.name.index].trajectory
             case _:
                 continue
-        rows = _rows_of(one, seen.records) if one.cycles.size else None
+        rows = _rows_of(recording, seen.records) if recording.cycles.size else None
         if rows is None:
             continue
         # An archive that is closed late may hold the begin of the next interval as well.
-        began = [event.time for event in one.archive.events if event.name == "MotionStarted"]
+        began = [event.time for event in recording.archive.events if event.name == "MotionStarted"]
         cycles = rows["cycle"] * campaign.cell.period
         last = int(rows["interval"].argmax())
         first = int(np.searchsorted(cycles, began[-1] - 1e-6)) if began else last
@@ -283,11 +291,11 @@ def _motions(recorded: list[Recorded], seen: Seen, campaign: Campaign) -> Iterat
         if not len(commanded):
             continue
         if not _on_path(motion, commanded):
-            yield f"the motion of {one.path.name} left its path"
+            yield f"the motion of {recording.path.name} left its path"
         ends = motion.sample(np.array([0.0, motion.duration]))[0]
         short = np.abs(commanded[-1] - commanded[0] - (ends[1] - ends[0])).max() > 1e-6
-        if short and (one.archive.outcome or ArchiveOutcome()).outcome == "completed":
-            yield f"{one.path.name} is marked completed, and its motion was not"
+        if short and (recording.archive.outcome or ArchiveOutcome()).outcome == "completed":
+            yield f"{recording.path.name} is marked completed, and its motion was not"
 
 
 def _on_path(motion: Any, commanded: NDArray[np.float64]) -> bool:

@@ -59,13 +59,13 @@ def started_by(supervisor: int, module: str) -> int:
 
 def marked(name: str, value: str) -> list[int]:
     """Processes that were started with a variable in their environment, zombies left out."""
-    mark, found = f"{name}={value}".encode(), []
+    mark, pids = f"{name}={value}".encode(), []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             with suppress(OSError):
                 if mark in (entry / "environ").read_bytes().split(b"\0"):
-                    found.append(int(entry.name))
-    return found
+                    pids.append(int(entry.name))
+    return pids
 
 
 def _words(pid: int) -> list[str]:
@@ -76,10 +76,10 @@ def _words(pid: int) -> list[str]:
 
 def _descriptor(exchange: int, place: int) -> int:
     """One of the exchange's descriptors, opened here; OSError if it is gone."""
-    words = _words(exchange)
-    if EXCHANGE not in words:
+    arguments = _words(exchange)
+    if EXCHANGE not in arguments:
         raise ProcessLookupError(f"{exchange} is no exchange process any more")
-    number = words[words.index(EXCHANGE) + 1 + place]
+    number = arguments[arguments.index(EXCHANGE) + 1 + place]
     return os.open(f"/proc/{exchange}/fd/{number}", os.O_RDWR)
 
 
@@ -283,7 +283,7 @@ class Watched:
         with suppress(ProcessLookupError):
             if how == "full disk":
                 archives = self.campaign.folder.archives.iterdir()
-                newest = max(archives, key=lambda one: one.stat().st_mtime_ns)
+                newest = max(archives, key=lambda path: path.stat().st_mtime_ns)
                 most = newest.stat().st_size + 1000
                 resource.prlimit(pid, resource.RLIMIT_FSIZE, (most, most))
             elif how in ("SIGINT", "SIGHUP"):  # as a terminal sends them
@@ -329,9 +329,9 @@ def made(folder: Path, cell: Cell, plan: CampaignPlan) -> Campaign:
 def supervise(campaign: Path, report: Path, planted: Path | None) -> int:
     """Run what is missing; return the exit status, and write the result to `report`."""
     os.setsid()
-    words = os.open(report.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    log = os.open(report.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     nothing = os.open(os.devnull, os.O_RDONLY)
-    for ours, standard in ((nothing, 0), (words, 1), (words, 2)):
+    for ours, standard in ((nothing, 0), (log, 1), (log, 2)):
         os.dup2(ours, standard)
     os.environ[MARK] = str(campaign)
     if planted is not None:  # what this process can import, those that it starts can
@@ -404,7 +404,7 @@ def run(
         records = np.zeros(0, cycle_dtype(JOINTS)) if memory is None else memory.records()
         watched.page.abandoned = 1
         watched.wait("controller")
-        killed = "supervisor" in {one.victim for one in deaths}
+        killed = "supervisor" in {death_of.victim for death_of in deaths}
         return Seen(
             deaths,
             None if killed else watched.status["supervisor"],

@@ -82,7 +82,7 @@ def round_of(number: int) -> Round:
     """Return the round of that number; the first victims alternate, everything else is random."""
     chance = random.Random(f"process death {number}")
     first = VICTIMS[number % len(VICTIMS)]
-    others = [one for one in VICTIMS if one != first]
+    others = [victim for victim in VICTIMS if victim != first]
     more = chance.choices((0, 1, 2), (8, 2, 1))[0]
     victims = (first, *chance.sample(others, more))
     trigger = _trigger(chance)

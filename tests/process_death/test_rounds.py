@@ -120,7 +120,7 @@ def test_an_exchange_ends_with_closed_axes(
     rows["replied"][10:] = False
     rows["replied"][10] = deserted_answered
     problems = list(_arm(Seen([Death("supervisor", 20)], None, {}, rows, rows, [])))
-    assert any("ended by itself" in one for one in problems) is broken
+    assert any("ended by itself" in problem for problem in problems) is broken
 
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -150,27 +150,32 @@ def test_the_arm_rests_and_the_campaign_is_completed(first: int) -> None:
 def test_rounds_are_known_by_number_and_kill_all_at_all_moments() -> None:
     assert round_of(417) == round_of(417)
     rounds = [round_of(number) for number in range(1000)]
-    assert len({str(one) for one in rounds[:200]}) > 190
-    assert [one.victims[0] for one in rounds[:4]] == list(VICTIMS)
-    assert all(len(set(one.victims)) == len(one.victims) for one in rounds)
-    assert {one.trigger.moment for one in rounds} == set(get_args(Moment))
-    pairs = {one.victims[:2] for one in rounds if len(one.victims) > 1}
+    assert len({str(played) for played in rounds[:200]}) > 190
+    assert [played.victims[0] for played in rounds[:4]] == list(VICTIMS)
+    assert all(len(set(played.victims)) == len(played.victims) for played in rounds)
+    assert {played.trigger.moment for played in rounds} == set(get_args(Moment))
+    pairs = {played.victims[:2] for played in rounds if len(played.victims) > 1}
     assert len(pairs) == len(VICTIMS) * (len(VICTIMS) - 1)
 
 
 def round_in_which(victim: Victim) -> int:
     """The first round that kills it alone, half way through a repetition."""
     for number in range(10_000):
-        one = round_of(number)
-        trigger = one.trigger
+        played = round_of(number)
+        trigger = played.trigger
         half_way = trigger.count in (3, 4) and 0.25 < trigger.way < 0.45
-        if one.victims == (victim,) and trigger.moment == "motion" and half_way and not one.loops:
+        if (
+            played.victims == (victim,)
+            and trigger.moment == "motion"
+            and half_way
+            and not played.loops
+        ):
             return number
     raise AssertionError("no round is like that")
 
 
 @pytest.mark.parametrize(
-    ("victim", "how", "status", "words"),
+    ("victim", "how", "status", "message"),
     [
         ("supervisor", "SIGINT", 4, "was stopped: a stop was requested"),
         pytest.param("supervisor", "SIGHUP", 4, "was stopped", marks=pytest.mark.slow),
@@ -184,7 +189,7 @@ def round_in_which(victim: Victim) -> int:
     ],
 )
 def test_what_is_no_kill_brings_the_arm_to_rest_too(
-    victim: Victim, how: Strike, status: int, words: str, tmp_path: Path
+    victim: Victim, how: Strike, status: int, message: str, tmp_path: Path
 ) -> None:
     """Ctrl-C, a terminal that is closed, an archive process that hangs, a full disk."""
     cell = fast_cell(tmp_path, **SHORT).with_values({"simulation.current_noise": NOISE})
@@ -193,7 +198,7 @@ def test_what_is_no_kill_brings_the_arm_to_rest_too(
     seen = run(campaign, played, (victim,), tmp_path / "report.json", how=how)
     assert broken_by(seen, campaign)[0] == []
     assert seen.status == status
-    assert words in seen.report["text"]
+    assert message in seen.report["text"]
     assert finished(campaign, played, seen, tmp_path) == []
 
 

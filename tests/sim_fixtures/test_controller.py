@@ -421,9 +421,9 @@ class TestArms:
         np.testing.assert_array_equal(init.gear_ratio[arm - 1, :2], (-100.0, 80.0))
         assert np.all(init.gear_ratio[init.open_axes_map != 0xFF] != 0.0)
         axes = self.axes_at(controller, Phase.CLOSED, 2 + foreign)
-        own = list(slots or (0, 1))
+        arm_slots = list(slots or (0, 1))
         there = small_cell.drive().motor_revolutions(small_cell.HOME)
-        np.testing.assert_allclose(axes["d"][own, 2], there, atol=1.0 / 65536)
+        np.testing.assert_allclose(axes["d"][arm_slots, 2], there, atol=1.0 / 65536)
 
     def test_each_arm_has_a_status_byte(self) -> None:
         """Also in replies: only the one of this arm ends its open mode."""
@@ -523,20 +523,20 @@ class TestFields:
 
     def test_mode_7_adds_d1_to_the_controllers_own_target(self) -> None:
         controller = opened(open_mode=7)
-        own = np.array(controller.servo.target)
+        target = np.array(controller.servo.target)
         for k in range(200):
             step(controller, {1: 0.2 * min(1.0, k / 150)})
-        np.testing.assert_allclose(controller.servo.target, own + 0.2, atol=1e-7)
-        np.testing.assert_allclose(controller.servo.measured, own + 0.2, atol=0.01)
+        np.testing.assert_allclose(controller.servo.target, target + 0.2, atol=1e-7)
+        np.testing.assert_allclose(controller.servo.measured, target + 0.2, atol=0.01)
 
     @pytest.mark.parametrize("mode", [2, 8])
     def test_modes_2_and_8_add_d4_to_the_speed_demanded(self, mode: int) -> None:
         controller = opened(open_mode=mode)
-        own = np.array(controller.servo.measured)
+        start = np.array(controller.servo.measured)
         speed = np.array([0.004, -0.004])
         for k in range(600):
             step(controller, {4: speed * min(1.0, k / 100)})
-        moved = np.array(controller.servo.measured) - own
+        moved = np.array(controller.servo.measured) - start
         # the position loop pulls back until its demand cancels what is added
         gain = controller.settings.servo.position_gain * controller.period
         np.testing.assert_allclose(moved, speed / gain, rtol=0.1)

@@ -75,16 +75,16 @@ def _one(options: argparse.Namespace) -> int:
         broken, runs = judged(seen), runs_of(seen)
         lines = [f"seed {options.seed}: {stage.twin(options.seed).scene.words}"]
     if options.json:
-        found = {
+        document = {
             "ran": 1,
             "failed": int(bool(broken)),
             "seeds_failed": [options.seed] if broken else [],
             "script": list(seen.schedule),
             "struck": list(seen.struck),
             "runs": list(runs),
-            "broken": [list(one) for one in broken],
+            "broken": [list(violation) for violation in broken],
         }
-        sys.stdout.write(json.dumps(found) + "\n")
+        sys.stdout.write(json.dumps(document) + "\n")
         return int(bool(broken))
     lines += [
         f"  {line}{'' if line in seen.struck else '   (did not occur)'}" for line in seen.schedule
@@ -114,11 +114,11 @@ def _many(options: argparse.Namespace) -> int:
                 task.advance(1, f"{failed} failed")
                 if verdict.broken:
                     progress.say(_failure(verdict))
-    found = summary(verdicts)
+    figures = summary(verdicts)
     if options.json:
-        sys.stdout.write(json.dumps(found) + "\n")
+        sys.stdout.write(json.dumps(figures) + "\n")
     else:
-        sys.stdout.writelines(f"{name}: {value}\n" for name, value in found.items())
+        sys.stdout.writelines(f"{name}: {value}\n" for name, value in figures.items())
     return int(bool(failed))
 
 

@@ -43,17 +43,17 @@ def stage_folder() -> Iterator[Path]:
 
 def recorded(journal: Path | None) -> dict[int, Verdict]:
     """Return the verdicts of a journal by seed."""
-    found = () if journal is None else entries(journal, Verdict.from_dict, "verdict on a seed")
-    return {verdict.seed: verdict for verdict in found}
+    verdicts = () if journal is None else entries(journal, Verdict.from_dict, "verdict on a seed")
+    return {verdict.seed: verdict for verdict in verdicts}
 
 
 def played(
     seeds: Sequence[int], journal: Path | None, jobs: int, *, shrink: bool = True
 ) -> Iterator[Verdict]:
     """Yield the verdicts on seeds in the order of completion, those of the journal first."""
-    known = recorded(journal)
-    yield from (known[seed] for seed in seeds if seed in known)
-    missing = [seed for seed in seeds if seed not in known]
+    verdict_of = recorded(journal)
+    yield from (verdict_of[seed] for seed in seeds if seed in verdict_of)
+    missing = [seed for seed in seeds if seed not in verdict_of]
     groups = [list(group) for _, group in groupby(missing, lambda seed: seed // NEIGHBOURS)]
     batch = jobs * GROUPS_PER_CHILD
     with stage_folder() as root, Journal(journal, sync_every=60.0) as lines:
@@ -71,20 +71,20 @@ def _in_children(
             stack.enter_context(WorkerProcess(timeout=LONGEST))
             for _ in range(min(jobs, len(groups)))
         ]
-        for seed, found in stream_in_children(
+        for seed, outcome in stream_in_children(
             children, play_all, groups, lambda group: (group, root, shrink)
         ):
-            if isinstance(found, Verdict):
-                yield found
+            if isinstance(outcome, Verdict):
+                yield outcome
             else:
-                yield Verdict(seed, broken=((DIED, str(found)),))
+                yield Verdict(seed, broken=((DIED, str(outcome)),))
 
 
 @cache
 def _stage(root: str) -> Stage:
-    own = Path(root) / str(os.getpid())
-    own.mkdir()
-    return Stage(own)
+    process_folder = Path(root) / str(os.getpid())
+    process_folder.mkdir()
+    return Stage(process_folder)
 
 
 def play_all(seeds: Sequence[int], root: str, shrink: bool) -> list[Verdict]:

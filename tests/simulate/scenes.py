@@ -56,8 +56,8 @@ def draw_arm(chance: random.Random) -> Arm:
     arm = chance.choice((1, 1, 1, 1, 2, 4))
     where = _controller_text(chance, cycle, arm, foreign)
     text = "\n".join((*_cell_text(chance, n, mass, reach, cycle=cycle, coupled=coupled), *where))
-    words = f"{n} joints, {shape}, {cycle} ms" + (", coupled wrist" if coupled else "")
-    return Arm(_urdf(chance, shape, mass, reach), text, n, foreign, words)
+    description = f"{n} joints, {shape}, {cycle} ms" + (", coupled wrist" if coupled else "")
+    return Arm(_urdf(chance, shape, mass, reach), text, n, foreign, description)
 
 
 def _urdf(chance: random.Random, shape: str, mass: Sequence[float], reach: Sequence[float]) -> str:
@@ -182,8 +182,8 @@ def scene_of(group: int, variant: int = 0) -> Scene:
         cell = Cell.from_texts(arm.cell, arm.urdf, Path("cell.toml"))
         plan = _draw_plan(chance, cell)
         if plan is not None:
-            words = f"{arm.words}; {_words_of(plan)}; {cell.campaign.repetitions} repetitions"
-            return Scene(group, arm, cell, plan, _controller(chance, arm, cell), words)
+            description = f"{arm.words}; {_words_of(plan)}; {cell.campaign.repetitions} repetitions"
+            return Scene(group, arm, cell, plan, _controller(chance, arm, cell), description)
     raise RuntimeError(f"no usable scene for group {group} in {_ARMS} arms")
 
 
@@ -196,17 +196,19 @@ def _draw_plan(chance: random.Random, cell: Cell) -> CampaignPlan | None:
     """Return an excitation and a validation motion within all limits, or None."""
     checks = MotionChecks.of(cell)
     sines = chance.random() < 0.25
-    found: list[Excitation] = []
+    excitations: list[Excitation] = []
     for size in np.linspace(1.0, 0.25, _MOTIONS):
-        motion = _sines(chance, cell, size) if sines and not found else _vias(chance, cell, size)
+        motion = (
+            _sines(chance, cell, size) if sines and not excitations else _vias(chance, cell, size)
+        )
         if motion is None or checks.refusal(motion.trajectory) is not None:
             continue
-        found.append(motion)
-        if len(found) == 2:
+        excitations.append(motion)
+        if len(excitations) == 2:
             break
-    if len(found) < 2:
+    if len(excitations) < 2:
         return None
-    plan = CampaignPlan(found[0], (PlannedMotion(found[1].trajectory),))
+    plan = CampaignPlan(excitations[0], (PlannedMotion(excitations[1].trajectory),))
     try:
         require_runnable(cell, plan, checks)
     except HilError:

@@ -75,10 +75,10 @@ class Script:
 
     def of(self, counts: str) -> tuple[ScriptedEvent, ...]:
         """Return the events whose `AT` counts this quantity, in order."""
-        return tuple(one for one in self.events if KINDS[one.kind] == counts)
+        return tuple(event for event in self.events if KINDS[event.kind] == counts)
 
     def has(self, kind: str) -> bool:
-        return any(one.kind == kind for one in self.events)
+        return any(event.kind == kind for event in self.events)
 
 
 DISTURBS_THE_ARM: Final = frozenset({"push", "saturate", "following-error"})

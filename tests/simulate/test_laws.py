@@ -99,7 +99,7 @@ def with_answer(observed: Observed, index: int, offset: int, mask: int = 1) -> O
 def of_kind(observed: Observed, kind: str, number: int = 0) -> int:
     """Index of a packet of the first life with this kind of required answer."""
     kinds = heard(observed)[0].kinds
-    return [index for index, one in enumerate(kinds) if one == kind][number]
+    return [index for index, packet_kind in enumerate(kinds) if packet_kind == kind][number]
 
 
 def talk_of(observed: Observed) -> Talk:
@@ -117,7 +117,9 @@ def moving(observed: Observed) -> np.ndarray:
 
 def index_of(observed: Observed, row: int) -> int:
     """Index of the packet of a record of the first life."""
-    return next(k for k, one in enumerate(observed.runs[0].exchanged) if one.record == row)
+    return next(
+        k for k, exchanged in enumerate(observed.runs[0].exchanged) if exchanged.record == row
+    )
 
 
 def axis_of(observed: Observed) -> int:
@@ -149,10 +151,10 @@ def reply_at(observed: Observed) -> tuple[bytes, ...]:
 
 def refused_instead(observed: Observed, index: int, *modes: int) -> Observed:
     """A packet answered with these modes and the targets received."""
-    one = observed.runs[0].exchanged[index]
+    exchanged = observed.runs[0].exchanged[index]
     talk = talk_of(observed)
     assert talk.init.arms is not None
-    safe = oracle.safe_answer(oracle.parse(one.packet, talk.init.n_axes), talk.init.arms)
+    safe = oracle.safe_answer(oracle.parse(exchanged.packet, talk.init.n_axes), talk.init.arms)
     axes = tuple(
         axis._replace(mode=modes[k % len(modes)] or axis.mode) for k, axis in enumerate(safe.axes)
     )
@@ -190,12 +192,12 @@ def with_set_points(
     first = first or int(moving(observed)[len(moving(observed)) // 2])
     slots, drives = list(talk_of(observed).init.slots or ()), observed.cell.drive_train
     exchanged, before = list(life.exchanged), 0.0
-    for index, one in enumerate(exchanged):
-        row = one.record
+    for index, exchange in enumerate(exchanged):
+        row = exchange.record
         q = rows["commanded_position"][row]
         if row < first or rows["interval"][row] != rows["interval"][first] or np.isnan(q).any():
             continue
-        now, reply = change(row - first), bytearray(one.replies[0])
+        now, reply = change(row - first), bytearray(exchange.replies[0])
         origin = drives.joint_position(np.zeros(len(q)))
         q = q + drives.joint_position(np.full(len(q), now)) - origin
         position = np.asarray(drives.motor_revolutions(q), np.float32)
@@ -203,7 +205,7 @@ def with_set_points(
             at = 16 + 36 * slot
             step = float(np.frombuffer(reply[at + 4 : at + 8], np.float32)[0]) + now - before
             reply[at : at + 8] = np.array([position[joint], step], np.float32).tobytes()
-        exchanged[index], before = one._replace(replies=(bytes(reply),)), now
+        exchanged[index], before = exchange._replace(replies=(bytes(reply),)), now
         if records:
             rows["commanded_position"][row] = q
     return with_life(observed, 0, exchanged=tuple(exchanged), records=rows)
@@ -234,8 +236,8 @@ def unrequested(observed: Observed) -> Observed:
 
 def ended_early(observed: Observed) -> Observed:
     events = tuple(
-        (at, replace(one, cycle=one.cycle - 150) if isinstance(one, MotionEnded) else one)
-        for at, one in observed.runs[0].events
+        (at, replace(event, cycle=event.cycle - 150) if isinstance(event, MotionEnded) else event)
+        for at, event in observed.runs[0].events
     )
     return with_life(observed, 0, events=events)
 
@@ -259,7 +261,7 @@ def unarchived(observed: Observed) -> Observed:
     life = observed.runs[0]
     rows = life.records.copy()
     index = len(life.exchanged) // 2
-    later = [one.record for one in life.exchanged[index + 1 :] if one.record >= 0]
+    later = [exchanged.record for exchanged in life.exchanged[index + 1 :] if exchanged.record >= 0]
     rows["cycle"][later] += 1
     rows["gap"][later[0]] += 1
     return with_life(observed, 0, records=rows)
@@ -272,7 +274,11 @@ def too_many_missed(observed: Observed) -> Observed:
         done = [event.interval for event in ends if event.outcome == "completed"]
         speed = np.nan_to_num(np.abs(life.records["commanded_velocity"])).max(axis=1)
         moving = (speed > 0.1) & np.isin(life.records["interval"], done)
-        at = [k for k, one in enumerate(life.exchanged) if one.record >= 0 and moving[one.record]]
+        at = [
+            k
+            for k, exchanged in enumerate(life.exchanged)
+            if exchanged.record >= 0 and moving[exchanged.record]
+        ]
         if at:
             middle, most = at[len(at) // 2], observed.cell.controller.max_gap
             left = life.exchanged[:middle] + life.exchanged[middle + most + 1 :]
@@ -284,8 +290,8 @@ def piled_up(observed: Observed) -> Observed:
     exchanged, mode = list(observed.runs[0].exchanged), observed.cell.controller.mode
     at = next(
         index
-        for index, one in enumerate(exchanged)
-        if one.record >= 0 and one.packet[12] == mode and one.replies
+        for index, exchange in enumerate(exchanged)
+        if exchange.record >= 0 and exchange.packet[12] == mode and exchange.replies
     )
     exchanged[at + 1] = exchanged[at + 1]._replace(cycle=exchanged[at].cycle)
     return with_life(observed, 0, exchanged=tuple(exchanged))
@@ -463,12 +469,12 @@ SPOILT: dict[str, tuple[Callable[[Path], object], dict[str, str]]] = {
     "an archive": (Path.unlink,
      {"archives": "cycles are in 0 archives",
       "folder": "{name} is in the manifest and not in the folder"}),
-    "a digest": (lambda path: entered(path, lambda one: [one | {"sha256": "0" * 64}]),
+    "a digest": (lambda path: entered(path, lambda entry: [entry | {"sha256": "0" * 64}]),
      {"folder": "differs from its checksum"}),
-    "an entry twice": (lambda path: entered(path, lambda one: [one, one]),
+    "an entry twice": (lambda path: entered(path, lambda entry: [entry, entry]),
      {"folder": "an archive is entered twice"}),
-    "no entry": (lambda path: entered(path, lambda one: []), {"resume": "are missing"}),
-    "a rejection": (lambda path: entered(path, lambda one: [one | {"outcome": "rejected"}]),
+    "no entry": (lambda path: entered(path, lambda entry: []), {"resume": "are missing"}),
+    "a rejection": (lambda path: entered(path, lambda entry: [entry | {"outcome": "rejected"}]),
      {"estimate": "{name} was pooled although"}),
     "the cell": (cell_edited, {"folder": "cell.toml is not the one in the manifest"}),
 }  # fmt: skip

@@ -105,7 +105,7 @@ def test_it_is_found(name: str, stage: Stage, monkeypatch: pytest.MonkeyPatch) -
     wanted = script(stage, lines)
     assert judged(stage.observed(SEED, wanted)) == []
     plant(monkeypatch)
-    assert law in {one.law for one in judged(stage.observed(SEED, wanted))}
+    assert law in {violation.law for violation in judged(stage.observed(SEED, wanted))}
 
 
 def test_a_defect_without_faults_is_reported(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:

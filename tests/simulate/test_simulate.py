@@ -58,15 +58,15 @@ def verdict(seed: int, *broken: tuple[str, str]) -> Verdict:
 
 class TestJournal:
     def test_a_summary_counts_kinds_ends_and_failures(self) -> None:
-        found = summary([verdict(1), verdict(2, ("guard", "a"), ("guard", "b"), ("rest", "c"))])
-        assert (found["ran"], found["failed"], found["seeds_failed"]) == (2, 1, [2])
-        assert found["laws_broken"] == {"guard": 1, "rest": 1}
-        assert found["struck"] == {"kill": 2}
-        assert "push" in found["never_struck"]
-        assert "kill" not in found["never_struck"]
-        assert found["met"] == {"the process died": 2}
-        assert "motion lost" in found["never_met"]
-        assert found["campaigns_ended"] == {"complete": 2}
+        figures = summary([verdict(1), verdict(2, ("guard", "a"), ("guard", "b"), ("rest", "c"))])
+        assert (figures["ran"], figures["failed"], figures["seeds_failed"]) == (2, 1, [2])
+        assert figures["laws_broken"] == {"guard": 1, "rest": 1}
+        assert figures["struck"] == {"kill": 2}
+        assert "push" in figures["never_struck"]
+        assert "kill" not in figures["never_struck"]
+        assert figures["met"] == {"the process died": 2}
+        assert "motion lost" in figures["never_met"]
+        assert figures["campaigns_ended"] == {"complete": 2}
 
 
 def test_a_seed_is_reproducible_to_the_last_byte() -> None:
@@ -78,9 +78,9 @@ def test_a_seed_is_reproducible_to_the_last_byte() -> None:
     first, second = played
     assert first.schedule == second.schedule
     assert first.arm.sent == second.arm.sent
-    for one, other in zip(first.runs, second.runs, strict=True):
-        assert one.exchanged == other.exchanged
-        assert one.after == other.after
+    for life, other in zip(first.runs, second.runs, strict=True):
+        assert life.exchanged == other.exchanged
+        assert life.after == other.after
     assert np.ptp(first.arm.position) > 0.0
 
 
@@ -145,7 +145,7 @@ def test_a_campaign_that_does_not_end_is_a_finding(
     assert judged(stage.observed(4, [])) == []
     monkeypatch.setattr(world, "MOST_CYCLES", 500)
     broken = judged(stage.observed(4, ["drive-drop@300"]))
-    assert any("EndlessError" in one.text for one in broken)
+    assert any("EndlessError" in violation.text for violation in broken)
 
 
 def test_a_scene_with_a_trembling_arm_is_replaced(tmp_path: Path) -> None:

@@ -34,7 +34,9 @@ def gaps(seen: Observed) -> Iterator[str]:
     for number, life in enumerate(seen.runs, start=1):
         ends = [event for _, event in life.events if isinstance(event, MotionEnded)]
         completed = {end.interval: end.cycle for end in ends if end.outcome == "completed"}
-        rows = life.records[[one.record for one in life.exchanged if one.record >= 0]]
+        rows = life.records[
+            [exchanged.record for exchanged in life.exchanged if exchanged.record >= 0]
+        ]
         speed = rows["commanded_velocity"]
         moves = np.append(np.nan_to_num(speed).any(axis=1), [True, True])
         missed = np.diff(rows["number"]) % _NUMBERS - 1
@@ -87,13 +89,13 @@ LAWS: Final[dict[str, Law]] = {"completion": completion, "gaps": gaps, "piles": 
 
 def judged(seen: Observed) -> list[Broken]:
     """Return the violations of all laws; an exception of a law is a violation of its name."""
-    found: list[Broken] = []
+    violations: list[Broken] = []
     for name, law in LAWS.items():
         try:
-            found.extend(Broken(name, text) for text in law(seen))
+            violations.extend(Broken(name, text) for text in law(seen))
         except Exception as error:
-            found.append(Broken(f"{name} (exception)", f"{type(error).__name__}: {error}"))
-    return found
+            violations.append(Broken(f"{name} (exception)", f"{type(error).__name__}: {error}"))
+    return violations
 
 
 MOST_TRIES: Final = 40  # largest number of campaigns simulated for the reduction
@@ -127,7 +129,9 @@ def _events(life: Life, kind: type[Event]) -> list[Any]:
 
 
 def _ended(outcome: str) -> Callable[[Life, Observed], bool]:
-    return lambda life, _: any(one.outcome == outcome for one in _events(life, MotionEnded))
+    return lambda life, _: any(
+        motion_end.outcome == outcome for motion_end in _events(life, MotionEnded)
+    )
 
 
 MET: Final[dict[str, Callable[[Life, Observed], Any]]] = {
@@ -200,7 +204,9 @@ class Stage:
             shutil.rmtree(old)
         twin = twin_of(group, self._root)
         if broken := judged(twin.seen):
-            raise UndisturbedError("; ".join(f"{one.law}: {one.text}" for one in broken))
+            raise UndisturbedError(
+                "; ".join(f"{violation.law}: {violation.text}" for violation in broken)
+            )
         return twin
 
     def twin(self, seed: int) -> Twin:
@@ -232,7 +238,9 @@ class Stage:
         broken = judged(seen)
 
         def fails(lines: tuple[str, ...]) -> bool:
-            return any(one.law == broken[0].law for one in judged(self.observed(seed, lines)))
+            return any(
+                violation.law == broken[0].law for violation in judged(self.observed(seed, lines))
+            )
 
         smallest = shrunk(seen.schedule, fails) if broken and shrink else ()
         self.clear()
@@ -244,7 +252,7 @@ class Stage:
             met=situations(seen),
             runs=runs_of(seen),
             cycles=len(seen.arm.sent),
-            broken=tuple((one.law, one.text) for one in broken),
+            broken=tuple((violation.law, violation.text) for violation in broken),
             shrunk=smallest,
             redrawn=self.twin(seed).redrawn,
             seconds=time.process_time() - begun,
@@ -268,10 +276,10 @@ def summary(verdicts: Sequence[Verdict]) -> dict[str, Any]:
     def counts(values: Iterable[str]) -> dict[str, int]:
         return dict(sorted(Counter(values).items()))
 
-    failed = sorted(one.seed for one in verdicts if one.broken)
-    struck = counts(kind for one in verdicts for kind in one.struck)
-    met = counts(name for one in verdicts for name in one.met)
-    scenes = {one.seed // NEIGHBOURS: one.redrawn for one in verdicts}
+    failed = sorted(verdict.seed for verdict in verdicts if verdict.broken)
+    struck = counts(kind for verdict in verdicts for kind in verdict.struck)
+    met = counts(name for verdict in verdicts for name in verdict.met)
+    scenes = {verdict.seed // NEIGHBOURS: verdict.redrawn for verdict in verdicts}
     return {
         "ran": len(verdicts),
         "failed": len(failed),
@@ -281,11 +289,15 @@ def summary(verdicts: Sequence[Verdict]) -> dict[str, Any]:
         "met": met,
         "never_met": sorted(set(MET) - set(met)),
         "laws": sorted(LAWS),
-        "laws_broken": counts(law for one in verdicts for law in {law for law, _ in one.broken}),
-        "runs_ended": counts(how for one in verdicts for how in one.runs),
-        "campaigns_ended": counts(one.runs[-1] if one.runs else "nothing" for one in verdicts),
+        "laws_broken": counts(
+            law for verdict in verdicts for law in {law for law, _ in verdict.broken}
+        ),
+        "runs_ended": counts(how for verdict in verdicts for how in verdict.runs),
+        "campaigns_ended": counts(
+            verdict.runs[-1] if verdict.runs else "nothing" for verdict in verdicts
+        ),
         "scenes": len(scenes),
         "scenes_redrawn": sum(scenes.values()),
-        "cycles": sum(one.cycles for one in verdicts),
-        "processor_seconds": round(sum(one.seconds for one in verdicts), 1),
+        "cycles": sum(verdict.cycles for verdict in verdicts),
+        "processor_seconds": round(sum(verdict.seconds for verdict in verdicts), 1),
     }

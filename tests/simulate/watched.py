@@ -96,7 +96,9 @@ class Clock:
 
     def __init__(self, script: Script) -> None:
         jumps = sorted(
-            (one.at, one.value, one.line) for one in script.of("cycle") if one.kind == "clock"
+            (event.at, event.value, event.line)
+            for event in script.of("cycle")
+            if event.kind == "clock"
         )
         self._at = [at for at, _, _ in jumps]
         self._offset: list[float] = [0.0, *accumulate(value for _, value, _ in jumps)]
@@ -127,8 +129,12 @@ class WatchedTransport(SimulatedTransport):
         self._inner.cycle = peer.cycle
         self._clock, self._on_cycle = clock, on_cycle
         self._period = peer.period
-        stalls = (one for one in script.of("cycle") if one.kind == "stall" and one.at >= peer.cycle)
-        self._stalls = deque(sorted(stalls, key=lambda one: one.at))
+        stalls = (
+            event
+            for event in script.of("cycle")
+            if event.kind == "stall" and event.at >= peer.cycle
+        )
+        self._stalls = deque(sorted(stalls, key=lambda stall: stall.at))
         self._held: deque[tuple[float, bytes]] = deque()
         self._arrival = -math.inf
         self.struck: list[str] = []
@@ -149,10 +155,10 @@ class WatchedTransport(SimulatedTransport):
         if self._held:
             self._arrival, packet = self._held.popleft()
         else:
-            found = self._inner.receive(timeout)
-            if found is None:
+            received = self._inner.receive(timeout)
+            if received is None:
                 return None
-            self._arrival, packet = self._inner.now, found
+            self._arrival, packet = self._inner.now, received
         self.seen.append((self.now, self._inner.cycle - 1, packet, []))
         return packet
 

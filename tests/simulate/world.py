@@ -64,7 +64,11 @@ class Disk:
 
     def __init__(self, script: Script) -> None:
         self._events_at = {
-            what: {at: one for one in script.of(what) for at in range(one.at, one.at + one.count)}
+            what: {
+                at: event
+                for event in script.of(what)
+                for at in range(event.at, event.at + event.count)
+            }
             for what in ("write", "save", "create")
         }
         self._count = dict.fromkeys(self._events_at, 0)
@@ -102,11 +106,11 @@ class Disk:
 
     def _due(self, what: str) -> ScriptedEvent | None:
         self._count[what] += 1
-        found = self._events_at[what].get(self._count[what])
-        if found is not None:
-            self.struck.append(found.line)
-            self.failures.append(found.kind)
-        return found
+        event = self._events_at[what].get(self._count[what])
+        if event is not None:
+            self.struck.append(event.line)
+            self.failures.append(event.kind)
+        return event
 
     def open(self, path: Any, flags: int, mode: int = 0o777) -> int:
         if flags & os.O_CREAT and self._due("create") is not None:
@@ -175,12 +179,12 @@ class ScriptedOperator:
     can_answer = True
 
     def __init__(self, script: Script, cycle: Callable[[], int]) -> None:
-        acts = sorted(script.of("cycle"), key=lambda one: one.at)
-        self._overrides = [one for one in acts if one.kind == "override"]
-        self._holds = [one for one in acts if one.kind == "hold"]
+        acts = sorted(script.of("cycle"), key=lambda event: event.at)
+        self._overrides = [event for event in acts if event.kind == "override"]
+        self._holds = [event for event in acts if event.kind == "hold"]
         self._asked = 0
-        declines = [one for one in script.of("always") if one.kind == "declines"]
-        self._declines = [one.line for one in declines for _ in range(one.count)]
+        declines = [event for event in script.of("always") if event.kind == "declines"]
+        self._declines = [event.line for event in declines for _ in range(event.count)]
         self._cycle = cycle
         self._speed = 1.0
         self.struck: list[str] = []
@@ -205,8 +209,8 @@ class ScriptedOperator:
                 self._asked = 0
         return OperatorRequest(self._speed, held)
 
-    def accept_dry_run(self, found: DryRunRecord) -> bool:
-        del found
+    def accept_dry_run(self, record: DryRunRecord) -> bool:
+        del record
         if self._declines:
             self.struck.append(self._declines.pop())
             return False
@@ -216,11 +220,13 @@ class ScriptedOperator:
 @contextmanager
 def lurching(script: Script, cycle: Callable[[], int], struck: list[str]) -> Iterator[None]:
     """Shift set-points as scripted; add the lines that occurred to `struck`."""
-    due = [one for one in script.of("cycle") if one.kind == "lurch" and one.line not in struck]
+    due = [
+        event for event in script.of("cycle") if event.kind == "lurch" and event.line not in struck
+    ]
     if not due:
         yield
         return
-    due.sort(key=lambda one: one.at)
+    due.sort(key=lambda event: event.at)
     left = due[0].count
     advance = TrajectoryPlayer.advance
 
@@ -294,7 +300,8 @@ class World:
         self._clock = Clock(script)
         self._operator = ScriptedOperator(script, lambda: self.controller.cycle)
         self._due = sorted(
-            (one for one in script.of("cycle") if one.kind in _BY_CYCLE), key=lambda one: one.at
+            (event for event in script.of("cycle") if event.kind in _BY_CYCLE),
+            key=lambda event: event.at,
         )
         self._stop = Stop()
         self._last = _when(script)
@@ -408,7 +415,9 @@ class World:
         if not hurried:
             self.controller.alone(_AFTERWARDS)
         else:
-            self._struck += [one.line for one in self.script.of("always") if one.kind == "hurry"]
+            self._struck += [
+                event.line for event in self.script.of("always") if event.kind == "hurry"
+            ]
         if jog:
             home = self._scene.cell.home
             self.controller.controller.plant.set_state(home, np.zeros(len(home)))
@@ -422,12 +431,16 @@ class World:
 
     def struck(self) -> tuple[str, ...]:
         """Return the lines that occurred; those of the link by their cycles."""
-        found = [*self._struck, *self.controller.struck, *self.disk.struck]
-        found += [*self._clock.struck, *self._operator.struck]
-        found += [one.line for one in self.script.of("always") if one.kind == "with-dry-run"]
-        past = [one for one in self.script.faults if one[1].cycle < self.controller.cycle]
-        found += [line for line, fault in past if line not in found and _of_link(fault)]
-        return tuple(dict.fromkeys(found))
+        lines = [*self._struck, *self.controller.struck, *self.disk.struck]
+        lines += [*self._clock.struck, *self._operator.struck]
+        lines += [event.line for event in self.script.of("always") if event.kind == "with-dry-run"]
+        past = [
+            line_and_fault
+            for line_and_fault in self.script.faults
+            if line_and_fault[1].cycle < self.controller.cycle
+        ]
+        lines += [line for line, fault in past if line not in lines and _of_link(fault)]
+        return tuple(dict.fromkeys(lines))
 
 
 _BY_CYCLE: Final = frozenset({"kill", "interrupt", "power-cut", "stop"})
@@ -440,7 +453,7 @@ def _of_link(fault: object) -> bool:
 def _when(script: Script) -> int:
     """Return the last cycle in a script."""
     cycles = [fault.cycle + getattr(fault, "count", 1) for _, fault in script.faults]
-    cycles += [one.at for one in script.of("cycle")]
+    cycles += [event.at for event in script.of("cycle")]
     return max(cycles, default=0)
 
 
@@ -523,10 +536,10 @@ def _twin(scene: Scene, folder: Path) -> Twin:
     world = World(scene, scene.controller, _EMPTY, random.Random(0), folder)
     life = world.live()
     _check_usable(scene, life)
-    found, why = estimated(folder)
-    if found is None:
+    estimate, why = estimated(folder)
+    if estimate is None:
         raise UndisturbedError(f"{scene.words}: complete, and not identified: {why}")
-    if found.result.pooled.undetermined:
+    if estimate.result.pooled.undetermined:
         raise SceneError(f"{scene.words}: its motion does not determine all parameters")
     history = world.history()
     if (ratio := standstill_ratio(scene, history)) > 1.0:
@@ -539,8 +552,8 @@ def _twin(scene: Scene, folder: Path) -> Twin:
         bytes=12 + 36 * (scene.arm.n_joints + scene.arm.foreign_axes),
         **world.disk.done,
     )
-    seen = _observed(scene, world, [life], found, why)
-    return Twin(scene, folder, found, story, replace(seen, seed=scene.group * NEIGHBOURS))
+    seen = _observed(scene, world, [life], estimate, why)
+    return Twin(scene, folder, estimate, story, replace(seen, seed=scene.group * NEIGHBOURS))
 
 
 def play(seed: int, twin: Twin, root: Path, script: Script | None = None) -> Observed:
@@ -551,19 +564,19 @@ def play(seed: int, twin: Twin, root: Path, script: Script | None = None) -> Obs
         while_silent=chance.choice(WHILE_SILENT),
         missed_replies=chance.choice((1, 3, 5, 9)),
     )
-    own = draw_script(chance, twin.story)  # drawn in any case: `chance` is used further
-    script = parse_script(own) if script is None else script
+    drawn_lines = draw_script(chance, twin.story)  # drawn in any case: `chance` is used further
+    script = parse_script(drawn_lines) if script is None else script
     world = World(twin.scene, settings, script, chance, root / f"seed_{seed}")
     lives = world.all_lives()
-    found, why = None, ""
+    estimate, why = None, ""
     if lives[-1].result is not None and lives[-1].result.complete:
-        found, why = estimated(world.folder)
-    seen = _observed(twin.scene, world, lives, found, why)
+        estimate, why = estimated(world.folder)
+    seen = _observed(twin.scene, world, lives, estimate, why)
     return replace(seen, seed=seed, twin_found=twin.found)
 
 
 def _observed(
-    scene: Scene, world: World, lives: Sequence[Life], found: Estimated | None, why: str
+    scene: Scene, world: World, lives: Sequence[Life], estimate: Estimated | None, why: str
 ) -> Observed:
     return Observed(
         seed=-1,
@@ -575,7 +588,7 @@ def _observed(
         runs=tuple(lives),
         arm=world.history(),
         folder=world.folder,
-        found=found,
+        found=estimate,
         twin_found=None,
         unidentified=why,
     )

@@ -91,8 +91,8 @@ def run_with(meddle: Meddle) -> tuple[Run, SharedBus]:
 
 def test_frames_of_another_node_are_ignored() -> None:
     rng = np.random.default_rng(1)
-    own = {frame.arbitration_id for frames in frames_of() for frame in frames}
-    others = [number for number in range(0x800) if number not in own | REPLY_IDS | PACKED]
+    session_ids = {frame.arbitration_id for frames in frames_of() for frame in frames}
+    others = [number for number in range(0x800) if number not in session_ids | REPLY_IDS | PACKED]
 
     def chat(bus: SharedBus, _: int) -> None:
         for number in rng.choice(others, 3):
@@ -103,7 +103,9 @@ def test_frames_of_another_node_are_ignored() -> None:
     run, bus = run_with(chat)
     (ended,) = run.seen(MotionEnded)
     assert ended.outcome == "completed"
-    foreign = [one.count for one in run.seen(PacketRejected) if one.kind == "foreign"]
+    foreign = [
+        rejection.count for rejection in run.seen(PacketRejected) if rejection.kind == "foreign"
+    ]
     assert sum(foreign) == 3 * (len(bus.frames) - 1), "frames behind the last packet are not read"
 
 
@@ -120,7 +122,9 @@ def test_repeated_frames_get_no_reply() -> None:
     run, _ = run_with(again)
     (ended,) = run.seen(MotionEnded)
     assert ended.outcome == "completed", ended.reason
-    assert {(one.kind, one.count) for one in run.seen(PacketRejected)} == {("stale", 1)}
+    assert {(rejection.kind, rejection.count) for rejection in run.seen(PacketRejected)} == {
+        ("stale", 1)
+    }
     assert run.session.counters.stale == len(repeated)
 
 

@@ -191,28 +191,28 @@ def test_writing_follows_no_link_and_waits_for_no_pipe(
     suffix: str, thing: str, folder: Path
 ) -> None:
     """Neither at the file nor at its temporary file."""
-    own, target = folder.parent / "profile", folder / "manifest.json"
-    own.write_text("mine")
+    other_file, target = folder.parent / "profile", folder / "manifest.json"
+    other_file.write_text("mine")
     in_the_way = folder / f"{target.name}{suffix}"
     in_the_way.unlink(missing_ok=True)
-    in_the_way.symlink_to(own) if thing == "a link" else os.mkfifo(in_the_way)
+    in_the_way.symlink_to(other_file) if thing == "a link" else os.mkfifo(in_the_way)
     with within(20.0):
         write_atomically(target, "new")
         write_files(folder, {"results.json": "new"})
-    assert own.read_text() == "mine"
+    assert other_file.read_text() == "mine"
     assert target.is_file() and not target.is_symlink()
     assert target.read_text() == "new"
 
 
 def test_link_is_no_lock(folder: Path) -> None:
     campaign = Campaign.open(folder)
-    own = folder.parent / "not_made"
+    missing_target = folder.parent / "not_made"
     (folder / LOCK).unlink(missing_ok=True)
-    (folder / LOCK).symlink_to(own)
+    (folder / LOCK).symlink_to(missing_target)
     with pytest.raises(CampaignFolderError, match=f"{LOCK} cannot be written"), \
             campaign.folder.locked():  # fmt: skip
         pass
-    assert not own.exists()
+    assert not missing_target.exists()
 
 
 RECORDINGS: dict[str, Callable[[Path], object]] = {

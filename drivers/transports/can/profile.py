@@ -114,9 +114,13 @@ DUPLICATE_TIME: Final = 0.1
 
 def payload_sizes(n_bytes: int) -> list[int]:
     """Return the bytes of each frame of a packet with this length."""
-    rest = max(0, n_bytes - _FIRST)
-    full, last = divmod(rest, _OTHER)
-    sizes = [_HEAD.size + n_bytes - rest, *[SIZE] * full, *([_PREFIX.size + last] if last else [])]
+    remaining_bytes = max(0, n_bytes - _FIRST)
+    full, last = divmod(remaining_bytes, _OTHER)
+    sizes = [
+        _HEAD.size + n_bytes - remaining_bytes,
+        *[SIZE] * full,
+        *([_PREFIX.size + last] if last else []),
+    ]
     return [_padded(size) for size in sizes]
 
 

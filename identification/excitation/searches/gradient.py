@@ -91,14 +91,14 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
         bundle = [here, *near[-_BUNDLE_SIZE:]]
         change, gain = _step(bundle, centre, value, box)
         tried = np.clip(centre + _FRACTIONS[:, None] * change, 0.0, 1.0)
-        found = ascent.score(tried.copy())
-        values = np.where(found.usable, ascent.fitness(found), -np.inf)
+        trial_scores = ascent.score(tried.copy())
+        values = np.where(trial_scores.usable, ascent.fitness(trial_scores), -np.inf)
         index = int(np.argmax(values))
         least = 0.0 if failures >= _PATIENCE else _SHARE * max(gain, 0.0)
         if values[index] > value + least:
             if values[index] - value > 0.5 * gain:
                 box = min(1.5 * box, _WIDEST)
-            best = (tried[index].copy(), found.take(index))
+            best = (tried[index].copy(), trial_scores.take(index))
             value = values[index]
             failures = 0
             slopes = ascent.linearise(best[0], best[1])
@@ -107,7 +107,7 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
             bundle.append(_Cut(best[0], float(value), slopes))
             continue
         failures += 1
-        refused = _refused(ascent, tried[0].copy(), found.take(0))
+        refused = _refused(ascent, tried[0].copy(), trial_scores.take(0))
         if refused is not None:
             bundle.append(refused)
         if refused is None or failures >= _PATIENCE:
@@ -163,7 +163,7 @@ def _step(bundle: list[_Cut], genes: Array, fitness: float, box: float) -> tuple
         cones,
         settings,
     ).solve()
-    found = np.array(solution.x)
-    if not np.all(np.isfinite(found)):
+    optimum = np.array(solution.x)
+    if not np.all(np.isfinite(optimum)):
         return np.zeros(n), 0.0
-    return found[:n], float(found[n])
+    return optimum[:n], float(optimum[n])

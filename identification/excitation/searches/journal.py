@@ -33,11 +33,11 @@ _FRAME: Final = struct.Struct("<QI")
 
 def versions() -> dict[str, str]:
     """Return the installed releases of the packages that determine a search's numbers."""
-    found = dict.fromkeys(_DISTRIBUTIONS, "not installed")
+    releases = dict.fromkeys(_DISTRIBUTIONS, "not installed")
     for name in _DISTRIBUTIONS:
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            releases[name] = version(name)
+    return releases
 
 
 class Journal:
@@ -133,8 +133,12 @@ def _difference(stored: bytes | None, identity: bytes) -> str:
     if stored is None:
         return "its identity is damaged"
     old, new = (
-        {(part, name): value for part, table in found.items() for name, value in table.items()}
-        for found in (json.loads(stored), json.loads(identity))
+        {
+            (part, name): value
+            for part, table in identity_tables.items()
+            for name, value in table.items()
+        }
+        for identity_tables in (json.loads(stored), json.loads(identity))
     )
     first = min(key for key in old.keys() | new.keys() if old.get(key) != new.get(key))
     return f"{' '.join(first)} was {old.get(first)!r:.80}, is {new.get(first)!r:.80}"

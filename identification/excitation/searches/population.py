@@ -183,9 +183,9 @@ class Front:
 
     def scores(self, index: int) -> Scores:
         """Return the scores of one motion, m = 1."""
-        one = slice(index, index + 1)
+        row = slice(index, index + 1)
         met = np.zeros((1, len(KINDS)))
-        return Scores(self.measures[one], self.precision[one], self.duration[one], met)
+        return Scores(self.measures[row], self.precision[row], self.duration[row], met)
 
     def merge(self, other: Self) -> Self:
         """Return the front of the motions of both."""
@@ -230,11 +230,11 @@ class Front:
     def _nondominated(self) -> Self:
         cost = np.column_stack((columns(-SENSE * self.measures, self.criteria), self.precision))
         left = np.lexsort((*self.genes.T[::-1], self.duration, *cost.T))
-        found = []
+        nondominated = []
         while len(left):  # no other one dominates the first in this order
-            found.append(left[0])
+            nondominated.append(left[0])
             left = left[np.any(cost[left] < cost[left[0]], axis=1)]
-        return self._part(np.array(found, dtype=np.intp))
+        return self._part(np.array(nondominated, dtype=np.intp))
 
 
 @dataclass(frozen=True)
@@ -368,10 +368,10 @@ class Population:
     def violations(self, genes: Array) -> tuple[Violation, ...]:
         """Return the violations of the motion of genes (n_genes,)."""
         try:
-            found: tuple[Violation, ...] = self._call("violations", genes)
+            violations: tuple[Violation, ...] = self._call("violations", genes)
         except (PlannerCrashed, PlanningTimedOut) as error:
             return (_unplannable(error),)
-        return found
+        return violations
 
     def evaluate(self, genes: Array, period: float) -> tuple[Motion, Criteria]:
         """Return the motion of genes (n_genes,) and its criteria, sampled every `period` [s].
@@ -379,8 +379,8 @@ class Population:
         Raises:
             PlannerError: the motion cannot be planned.
         """
-        found: tuple[Motion, Criteria] = self._call("evaluate", genes, period)
-        return found
+        evaluation: tuple[Motion, Criteria] = self._call("evaluate", genes, period)
+        return evaluation
 
     def linearise(self, genes: Array, weights: Array | None) -> Linearisation | None:
         """Return `weights` (d,) times the criteria, and the margins, to first order in the genes.

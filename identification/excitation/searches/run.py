@@ -110,14 +110,14 @@ def polish(
     evaluated = 0
     while evaluated + size <= evaluations and not stop():
         asked = np.array(strategy.ask())
-        found = score(asked.copy())
-        excess, values = _merits(found, fitness)
+        asked_scores = score(asked.copy())
+        excess, values = _merits(asked_scores, fitness)
         strategy.tell(list(asked), _ranks(excess, values).tolist())
         index = int(np.lexsort((-values, excess))[0])  # the first of equal ones
         if (excess[index], -values[index]) < (least, -most):
             least = float(excess[index])
             most = float(values[index])
-            best = asked[index].copy(), found.take(index)
+            best = asked[index].copy(), asked_scores.take(index)
         evaluated += size
         if not _SMALLEST_STEP < float(np.max(strategy.stds)) < np.inf:
             break
@@ -308,9 +308,9 @@ class Goal:
             return front.knee(self.scale)
         return int(np.argmin(self.objectives(front.measures)[:, 0]))
 
-    def is_worse(self, one: Criteria, other: Criteria) -> bool:
+    def is_worse(self, criteria: Criteria, other: Criteria) -> bool:
         """Return whether a motion is worse than another, without a fitness in any criterion."""
-        first, second = self.objectives(np.array((one.measures, other.measures)))
+        first, second = self.objectives(np.array((criteria.measures, other.measures)))
         return not bool(np.all(first <= second))
 
     def polish_fitness(self, start: Scores) -> Fitness:
@@ -471,9 +471,9 @@ class _Search:
         if settings.starts > 1:
             each = steps // (2 * settings.starts)
             others = self._first_best(fitness, settings.starts - 1, genes)
-            found = [improve(ascent, *start, each) for start in (best, *others)]
-            best = max(found, key=lambda motion: float(fitness(motion[1])[0]))
-            steps -= each * len(found)
+            climbed = [improve(ascent, *start, each) for start in (best, *others)]
+            best = max(climbed, key=lambda motion: float(fitness(motion[1])[0]))
+            steps -= each * len(climbed)
         return improve(ascent, *best, steps)
 
     def _first_best(self, fitness: Fitness, count: int, but: Array) -> list[tuple[Array, Scores]]:

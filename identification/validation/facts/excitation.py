@@ -59,8 +59,8 @@ class ExcitationFacts:
         poor = self.condition > self.limit
         if self.undetermined:
             labels = ", ".join(self.undetermined)
-            words = f"the motion does not determine {labels}"
-            yield Finding("excitation", "wrong", words, _RICHER)
+            message = f"the motion does not determine {labels}"
+            yield Finding("excitation", "wrong", message, _RICHER)
         if self.only_sum.any():
             joints = naming.of(self.only_sum)
             pairs = naming.each(self.only_sum, lambda joint: " and ".join(_friction_pair(joint)))
@@ -90,5 +90,5 @@ class ExcitationFacts:
                 f"record a motion in which {joints} moves in both directions",
             )
         if self.determined and not poor:
-            words = f"the motion determines every parameter: {condition}"
-            yield Finding("excitation", "good", words)
+            message = f"the motion determines every parameter: {condition}"
+            yield Finding("excitation", "good", message)

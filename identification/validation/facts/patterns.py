@@ -64,8 +64,8 @@ class WhitenessFacts:
                 "record a longer motion, or the same one several times",
             )
         else:
-            words = f"{text}; the standard deviations include this"
-            yield Finding("whiteness", "good", words)
+            message = f"{text}; the standard deviations include this"
+            yield Finding("whiteness", "good", message)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,22 +117,22 @@ class ProfileFacts:
         """Yield the joints of such a residual, or that there are none."""
         check = f"residual over {self.quantity}"
         if not self.joints.any():
-            words = f"the residual does not depend noticeably on {self.quantity}"
-            yield Finding(check, "good", words)
+            message = f"the residual does not depend noticeably on {self.quantity}"
+            yield Finding(check, "good", message)
             return
         worst = naming.each(self.joints, lambda joint: self.worst[joint])
-        words = f"the residual depends on {self.quantity}: {worst}"
+        message = f"the residual depends on {self.quantity}: {worst}"
         step = (
             "check the URDF's geometry and gravity direction, and for a hose, spring or payload"
             " that the model lacks"
         )
         if self.quantity == "speed":
-            words += "; the friction law may have another form"
+            message += "; the friction law may have another form"
             step = (
                 f"try further friction terms for {naming.of(self.joints)} (Stribeck, asymmetric,"
                 " third)"
             )
-        yield Finding(check, "doubtful", words, step, "symptom")
+        yield Finding(check, "doubtful", message, step, "symptom")
 
 
 @dataclass(frozen=True, eq=False)

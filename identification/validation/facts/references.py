@@ -117,7 +117,7 @@ class InertiaFacts:
         def ratio(joint: int) -> str:
             return f"{self.ratio[joint]:.2f}"
 
-        known = np.isfinite(self.ratio)
+        comparable = np.isfinite(self.ratio)
         if self.off.any():
             yield Finding(
                 "against the controller's inertia",
@@ -126,10 +126,10 @@ class InertiaFacts:
                 f" one: {naming.each(self.off, ratio)}",
                 f"check torque constant and gear ratio of {naming.of(self.off)}, and the payload",
             )
-        elif known.any():
+        elif comparable.any():
             yield Finding(
                 "against the controller's inertia",
                 "good",
                 "the controller's inertia agrees with the identified one: ratio"
-                f" {naming.each(known, ratio)}",
+                f" {naming.each(comparable, ratio)}",
             )

@@ -174,12 +174,12 @@ class PhysicalSignFacts:
 
     def findings(self, _: Naming) -> Iterator[Finding]:
         """Yield each message."""
-        for words in self.impossible:
-            step = _BALANCED if ELEMENTS in words else _SIGNS
-            yield Finding("physical signs", "wrong", words, step, "symptom")
+        for message in self.impossible:
+            step = _BALANCED if ELEMENTS in message else _SIGNS
+            yield Finding("physical signs", "wrong", message, step, "symptom")
         step = "use the consistent estimate where the model must be physical (simulation, URDF)"
-        for words in self.doubtful:
-            yield Finding("physical signs", "doubtful", words, step)
+        for message in self.doubtful:
+            yield Finding("physical signs", "doubtful", message, step)
         step = "compare with `hil identify --friction coulomb,viscous,offset`"
-        for words in self.added_friction:
-            yield Finding("friction law", "doubtful", words, step)
+        for message in self.added_friction:
+            yield Finding("friction law", "doubtful", message, step)

@@ -108,12 +108,12 @@ def repair_and_compare(path: Path, archive: Archive) -> None:
 def new_cell(path: Path, archive: Archive) -> None:
     """`hil new --from-archive`."""
     try:
-        known = from_archive(path, archive.joint_names)
+        values = from_archive(path, archive.joint_names)
     except InputError as error:
         assert error.remedy
         return
     if archive.joint_names == JOINTS:
-        cell = replace(cell_of_urdf(_urdf(), {}), known=known)
+        cell = replace(cell_of_urdf(_urdf(), {}), known=values)
         cell.text(path.with_name("cell.toml"))
 
 

@@ -133,8 +133,8 @@ def changed(cell: Cell) -> None:
 
 def seeds() -> list[bytes]:
     """A simulated cell, one on each link, one with all optional tables."""
-    begin, rest = CELL.split("[controller]")
-    campaign = rest[rest.index("[campaign]") :]
+    begin, end = CELL.split("[controller]")
+    campaign = end[end.index("[campaign]") :]
     texts = [CELL, begin + LINKS + campaign, begin + CAN + campaign, CELL + OTHERS, begin]
     return [text.encode() for text in texts]
 

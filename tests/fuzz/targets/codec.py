@@ -68,7 +68,7 @@ class Talk:
         received, touched = harmed(frames, self._draw)
         self._untouched &= not touched
         made = [receiver.receive(frame, self._time) for frame in received]
-        got = [one for one in made if one is not None]
+        got = [assembled for assembled in made if assembled is not None]
         assert self._sent.issuperset(got), "a packet that nobody sent"
         if self._untouched:
             assert got == [packet]

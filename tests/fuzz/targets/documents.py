@@ -56,20 +56,20 @@ def explained(error: InputError) -> None:
 
 def plan(path: Path) -> None:
     """A plan that is read is written as what it was read from."""
-    found = CampaignPlan.load(path)
-    assert found.is_of(found.to_text())
+    stored = CampaignPlan.load(path)
+    assert stored.is_of(stored.to_text())
     again = path.with_name("again.json")
-    again.write_text(found.to_text())
-    assert CampaignPlan.load(again).to_text() == found.to_text()
+    again.write_text(stored.to_text())
+    assert CampaignPlan.load(again).to_text() == stored.to_text()
 
 
 def manifest(path: Path) -> None:
     """Everything a run asks of the manifest."""
-    found = CampaignFolder(path.parent)
+    folder = CampaignFolder(path.parent)
     for ask in (
-        found.damaged, lambda: found.completed("excitation"),
-        lambda: found.whole("excitation", 0), lambda: found.next_name("excitation", 0),
-        found.require_unchanged, lambda: found.plan_hash,
+        folder.damaged, lambda: folder.completed("excitation"),
+        lambda: folder.whole("excitation", 0), lambda: folder.next_name("excitation", 0),
+        folder.require_unchanged, lambda: folder.plan_hash,
     ):  # fmt: skip
         try:
             ask()
@@ -77,15 +77,15 @@ def manifest(path: Path) -> None:
             explained(error)
         except NotRehearsedError as error:
             assert str(path.parent) in str(error), error
-    found.manifest()
+    folder.manifest()
 
 
 def results(path: Path) -> None:
     """A result that is read is written as what it was read from."""
-    found = Results.load(path)
+    stored = Results.load(path)
     again = path.with_name("again.json")
-    again.write_text(found.to_json())
-    assert Results.load(again).to_json() == found.to_json()
+    again.write_text(stored.to_json())
+    assert Results.load(again).to_json() == stored.to_json()
 
 
 READERS: dict[str, Callable[[Path], object]] = {

@@ -127,10 +127,10 @@ def _map() -> ColumnMap:
 def seeds() -> list[bytes]:
     """Return one valid input of each kind."""
     q, t = np.arange(16.0).reshape(8, 2), np.arange(8) * 0.002
-    arrays, packed, one, typed = (io.BytesIO() for _ in range(4))
+    arrays, packed, array, typed = (io.BytesIO() for _ in range(4))
     np.savez(arrays, q=q, t=t)
     np.savez_compressed(packed, q=q, t=t)
-    np.save(one, q)
+    np.save(array, q)
     rows = np.zeros(8, [("q1", "<f8"), ("q2", "<f4"), ("at", "<M8[ns]"), ("t", "<f8")])
     rows["t"] = t
     np.save(typed, rows)
@@ -150,7 +150,7 @@ def seeds() -> list[bytes]:
     made = {
         TEXT: (LINES.encode(), LINES.replace(",", "\t").encode()),
         MAP: (COLUMNS.encode(), FULL_MAP.encode()), NPZ: (arrays.getvalue(), packed.getvalue()),
-        NPY: (one.getvalue(),), FIELDS: (typed.getvalue(),),
+        NPY: (array.getvalue(),), FIELDS: (typed.getvalue(),),
         MATLAB: (matlab.encode(),), SQLITE: (sqlite,),
         BAG: (foreign,), MESSAGES: (foreign,), PACKED: (zstandard.compress(sqlite),),
     }  # fmt: skip

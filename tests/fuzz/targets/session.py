@@ -132,10 +132,10 @@ class Arm:
 @lru_cache(maxsize=64)
 def arm_of(n: int, number: int, order: int, foreign: int) -> Arm:
     """An arm of `n` joints among `foreign` axes that are not its own, in a drawn order."""
-    own = [(number, joint) for joint in range(n)]
+    arm_axes = [(number, joint) for joint in range(n)]
     others = [(number, 9), (number % 4 + 1, 0), (number % 4 + 1, 3)][:foreign]
     mixed = np.random.default_rng(order).permutation(n + foreign) if order else range(n + foreign)
-    axes = tuple((own + others)[k] for k in mixed)
+    axes = tuple((arm_axes + others)[k] for k in mixed)
     train = train_of(n)
     made = [init_of(axes, number, train, n, ratio) for ratio in (1.0, 1.5)]
     return Arm(n, number, axes, CYCLE_MS / 1000, train, limits(n), *made)
@@ -426,13 +426,13 @@ def run(data: bytes) -> bool:
 
 def seeds() -> list[bytes]:
     """Conversations that begin with a motion in each mode, and continue at random."""
-    found = []
+    conversations = []
     # The controller of seed 13 ends the conversation before the arm is open.
     for seed in (*range(13), *range(14, 25)):
         rng = random.Random(seed)
         head = bytes((seed % 6, seed % 3, seed % 4, seed % 4, seed % 8, 0, 0, 0, 0, 0, 0))
-        found.append(head + bytes((1,)) + rng.randbytes(rng.choice((20, 60, 150))))
-    return found
+        conversations.append(head + bytes((1,)) + rng.randbytes(rng.choice((20, 60, 150))))
+    return conversations
 
 
 TARGET = Target(run, seeds, mutate_bytes, most=400, replayed=60)

@@ -58,8 +58,8 @@ def flipped(data: bytes, at: int, mask: int = 0xFF) -> bytes:
 def repaired_twice(path: Path, data: bytes) -> tuple[Repair, bytes]:
     """Repair bytes, and repair the result."""
     output, again = path.with_name("once.mcap"), path.with_name("twice.mcap")
-    for one in (output, again):
-        one.unlink(missing_ok=True)
+    for earlier in (output, again):
+        earlier.unlink(missing_ok=True)
     path.write_bytes(data)
     done = repair(path, output)
     assert path.read_bytes() == data, "the original is unchanged"
@@ -92,14 +92,14 @@ def assert_others_read(path: Path, archive: Archive) -> None:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()], validate_crcs=True)
         topics = ["/hil/cycle"]
         messages = reader.iter_decoded_messages(topics=topics, log_time_order=False)
-        found = [message for *_, message in messages]
+        decoded = [message for *_, message in messages]
         statistics = reader.get_summary().statistics
     for name in archive.columns.keys() - {"stamp"}:
         column = archive.columns[name]
-        values = np.array([getattr(message, name) for message in found], column.dtype)
+        values = np.array([getattr(message, name) for message in decoded], column.dtype)
         assert values.tobytes() == column.tobytes(), name
     shown = statistics.channel_message_counts.get(5, 0)  # of the description
-    assert statistics.message_count == 3 * len(found) + len(archive.events) + shown
+    assert statistics.message_count == 3 * len(decoded) + len(archive.events) + shown
 
 
 @dataclass(frozen=True)
@@ -201,8 +201,8 @@ class TestLosses:
         assert case.reason in " ".join(check.faults)
         part = open_archive(path, start=50.1, stop=50.3)
         assert part.n_samples == 20 or not part.complete
-        for one in (archive, part):
-            written.assert_true(one)
+        for opened in (archive, part):
+            written.assert_true(opened)
         assert archive.columns["stamp"].tolist() == [10**7 * k for k in case.cycles]
         assert check.samples == archive.n_samples
         done, output = repaired_twice(path, data)
@@ -303,8 +303,8 @@ class TestAnyDamage:
         part = open_archive(path, start=50.1, stop=50.3)
         written.assert_true(part)
         assert part.n_samples == 20 or not part.complete
-        same = [data[one.offset : one.end] == written.data[one.offset : one.end]
-                for one in written.chunks]  # fmt: skip
+        same = [data[chunk.offset : chunk.end] == written.data[chunk.offset : chunk.end]
+                for chunk in written.chunks]  # fmt: skip
         if same[0] or data.endswith(written.data[written.records[-1].end :]):  # definitions
             whole = {10**7 * (FIRST + k) for k in range(43) if same[k // 10]}
             assert whole <= {*archive.columns["stamp"].tolist()}
@@ -412,7 +412,7 @@ def longer(content: Content) -> None:
 
 
 def no_events(content: Content) -> None:
-    content.messages = [one for one in content.messages if one.topic != schema.EVENTS]
+    content.messages = [message for message in content.messages if message.topic != schema.EVENTS]
 
 
 FAULTS: dict[str, tuple[Callable[[Content], object], str]] = {
@@ -448,7 +448,9 @@ class TestRefused:
     def truncated(self, path: Path, written) -> Iterator[None]:
         path.write_bytes(written.data[:-100])
         yield
-        assert [one.name for one in path.parent.iterdir() if one.name != "x.mcap"] == [path.name]
+        assert [entry.name for entry in path.parent.iterdir() if entry.name != "x.mcap"] == [
+            path.name
+        ]
 
     def test_an_existing_file_is_never_overwritten(self, path):
         (path.parent / "x.mcap").write_bytes(b"precious")
@@ -523,7 +525,7 @@ class TestFiles:
         assert link.is_symlink()
         assert path.read_bytes() == written.data
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
-        assert {one.name for one in path.parent.iterdir()} == {path.name, link.name}
+        assert {entry.name for entry in path.parent.iterdir()} == {path.name, link.name}
 
 
 def run(*arguments: str | Path):
@@ -580,15 +582,15 @@ class TestCommands:
     def test_info(self, written, truncated, text_file):
         done = run("info", written.path)
         assert done.exit_code == 0
-        for words in ("validation 4, attempt 1", "completed", "samples      43", "tick  text"):
-            assert words in done.stdout
+        for line in ("validation 4, attempt 1", "completed", "samples      43", "tick  text"):
+            assert line in done.stdout
         done = run("info", truncated)
         assert done.exit_code == 0
         assert "samples      30" in done.stdout
         assert "hil archive repair" in done.stdout
         assert run("info", text_file).exit_code == 2
-        found = json.loads(run("info", "--json", written.path).stdout)
-        assert (found["samples"], found["joint_names"]) == (43, ["a", "b"])
-        assert ["/hil/cycle", "hil_msgs/msg/Cycle2", 43] in found["channels"]
+        printed = json.loads(run("info", "--json", written.path).stdout)
+        assert (printed["samples"], printed["joint_names"]) == (43, ["a", "b"])
+        assert ["/hil/cycle", "hil_msgs/msg/Cycle2", 43] in printed["channels"]
         sizes = {name: len(data) for name, data in written.attachments.items()}
-        assert found["attachments"] == sizes
+        assert printed["attachments"] == sizes

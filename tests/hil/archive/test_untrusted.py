@@ -58,16 +58,16 @@ def forged(
     given = {"hil": metadata or {}, "hil.outcome": outcome or {}}
     records = split_file(data)
     assert records is not None
-    for one in records:
-        if one.opcode == container.METADATA:
-            name, entries = entries_of(one)
-            one.body = body_of(Metadata(name, {**entries, **given[name]}))
-        elif one.opcode == container.CHUNK:
-            one.inside = [FileRecord(*part) for part in split_records(chunk(one.content))]
-        elif one.opcode == container.ATTACHMENT:
-            found = container.parse(Attachment, Record(0, one.opcode, one.body))
-            found.data = (attachments or {}).get(found.name, found.data)
-            one.body = body_of(found)
+    for record in records:
+        if record.opcode == container.METADATA:
+            name, entries = entries_of(record)
+            record.body = body_of(Metadata(name, {**entries, **given[name]}))
+        elif record.opcode == container.CHUNK:
+            record.inside = [FileRecord(*part) for part in split_records(chunk(record.content))]
+        elif record.opcode == container.ATTACHMENT:
+            attachment = container.parse(Attachment, Record(0, record.opcode, record.body))
+            attachment.data = (attachments or {}).get(attachment.name, attachment.data)
+            record.body = body_of(attachment)
     path.write_bytes(join_file(records, index=True))
     return path
 
@@ -360,8 +360,8 @@ class TestSizes:
         self.with_entries(written.data, path, change)
         assert peak(lambda: outcomes(path)) < MEMORY
         assert set(outcomes(path).values()) == {""}
-        found = open_archive(path, start=50.0, stop=50.2)
-        assert found.columns["cycle"].tolist() == [*range(5000, 5020)]
+        opened = open_archive(path, start=50.0, stop=50.2)
+        assert opened.columns["cycle"].tolist() == [*range(5000, 5020)]
 
     @staticmethod
     def with_entries(data: bytes, path: Path, change: Callable[[bytes], bytes]) -> None:
@@ -369,10 +369,10 @@ class TestSizes:
         start = struct.unpack_from("<Q", data, len(data) - len(container.MAGIC) - 20)[0]
         body = data[start : -container.FOOTER_SIZE - len(container.MAGIC)]
         summary = b""
-        for one in container.split_records(body, 0):
-            record = mcap_bytes.record(one.opcode, one.body)
-            if one.opcode != container.SUMMARY_OFFSET:
-                summary += change(record) if one.opcode == container.CHUNK_INDEX else record
+        for item_record in container.split_records(body, 0):
+            record = mcap_bytes.record(item_record.opcode, item_record.body)
+            if item_record.opcode != container.SUMMARY_OFFSET:
+                summary += change(record) if item_record.opcode == container.CHUNK_INDEX else record
         summary += struct.pack("<BQQQ", container.FOOTER, 20, start, 0)
         crc = struct.pack("<I", zlib.crc32(summary))
         path.write_bytes(data[:start] + summary + crc + container.MAGIC)

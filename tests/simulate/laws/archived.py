@@ -106,22 +106,22 @@ def read(path: Path) -> Archived:
 
 @lru_cache(maxsize=24)
 def _read(path: Path, _changed: int, _size: int) -> Archived:
-    found = Archived(path)
-    reading = _Reading(found)
+    archived = Archived(path)
+    reading = _Reading(archived)
     try:
         with path.open("rb") as stream:
             for record in StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
                 reading.read(record)
-        found.whole = True
+        archived.whole = True
     except (McapError, struct.error, ValueError, zstandard.ZstdError) as error:
-        found.problem = f"{type(error).__name__}: {error}"
+        archived.problem = f"{type(error).__name__}: {error}"
     reading.finish()
-    return found
+    return archived
 
 
 class _Reading:
-    def __init__(self, found: Archived) -> None:
-        self._found = found
+    def __init__(self, archived: Archived) -> None:
+        self._found = archived
         self._topics: dict[int, str] = {}
         self._parts: dict[str, list[bytes]] = {}
         self._stamps: list[int] = []
@@ -141,8 +141,8 @@ class _Reading:
             self._topics[record.id] = record.topic
 
     def _metadata(self, name: str, entries: dict[str, str]) -> None:
-        rest = {key: value for key, value in entries.items() if key != "checksum"}
-        text = json.dumps(rest, sort_keys=True, separators=(",", ":"))
+        sealed = {key: value for key, value in entries.items() if key != "checksum"}
+        text = json.dumps(sealed, sort_keys=True, separators=(",", ":"))
         if entries.get("checksum") != f"{zlib.crc32(text.encode()):08x}":
             raise ValueError(f"metadata {name} fail their checksum")
         if name == "hil":
@@ -168,17 +168,17 @@ class _Reading:
 
     def finish(self) -> None:
         """Convert the collected messages to columns."""
-        found, parts = self._found, self._parts
-        found.events = [_event(one) for one in parts.get("/hil/events", ())]
-        names = json.loads((found.metadata or {}).get("joint_names", "[]"))
+        archived, parts = self._found, self._parts
+        archived.events = [_event(message) for message in parts.get("/hil/events", ())]
+        names = json.loads((archived.metadata or {}).get("joint_names", "[]"))
         cycles = parts.get("/hil/cycle", ())
         if not (cycles and names):
             return
-        found.cycles = np.frombuffer(b"".join(cycles), cycle_layout(len(names)))
-        found.stamps = np.array(self._stamps, np.int64)
-        found.sequences = np.array(self._sequences, np.int64)
-        found.states = _joint_states(parts.get("/joint_states", ()), names, 3)
-        found.commanded = _joint_states(parts.get("/joint_states_commanded", ()), names, 2)
+        archived.cycles = np.frombuffer(b"".join(cycles), cycle_layout(len(names)))
+        archived.stamps = np.array(self._stamps, np.int64)
+        archived.sequences = np.array(self._sequences, np.int64)
+        archived.states = _joint_states(parts.get("/joint_states", ()), names, 3)
+        archived.commanded = _joint_states(parts.get("/joint_states_commanded", ()), names, 2)
 
 
 def _event(message: bytes) -> LoggedEvent:

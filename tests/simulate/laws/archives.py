@@ -49,14 +49,16 @@ class Placed:
 @lru_cache(maxsize=2)
 def placed(observed: Observed) -> tuple[Placed, ...]:
     """Return the archives of all lives that are in the folder."""
-    found = []
-    for life, one in zip(observed.runs, heard(observed), strict=True):
+    archives_placed = []
+    for life, conversation in zip(observed.runs, heard(observed), strict=True):
         for name in life.archives:
             path = observed.folder / "archives" / name
             if path.exists():
                 archived = read(path)
-                found.append(Placed(archived, life, *_place(archived, one.talks)))
-    return tuple(found)
+                archives_placed.append(
+                    Placed(archived, life, *_place(archived, conversation.talks))
+                )
+    return tuple(archives_placed)
 
 
 def _place(archived: Archived, talks: tuple[Talk, ...]) -> tuple[Talk | None, NDArray[np.intp]]:
@@ -80,15 +82,15 @@ def archives(observed: Observed) -> Iterator[str]:
     gears = Gears.of(observed.cell.drive_table)
     constants = np.array(observed.cell.drive_table.torque_constant, float)
     all_placed = placed(observed)
-    for number, one in enumerate(all_placed):
-        name = one.archived.path.name
+    for number, placed_archive in enumerate(all_placed):
+        name = placed_archive.archived.path.name
         intact_too = number == observed.seed % len(all_placed)
-        newest = any(one is p for p in _newest(all_placed, one.life))
+        newest = any(placed_archive is p for p in _newest(all_placed, placed_archive.life))
         texts = [
-            *_readable(one, intact_too=intact_too, newest=newest),
-            *_columns(one.archived, observed.cell.period),
-            *_stated(one),
-            *_made_of(one, gears, constants),
+            *_readable(placed_archive, intact_too=intact_too, newest=newest),
+            *_columns(placed_archive.archived, observed.cell.period),
+            *_stated(placed_archive),
+            *_made_of(placed_archive, gears, constants),
         ]
         for text in texts:
             yield f"{name}: {text}"
@@ -102,13 +104,17 @@ def _newest(all_placed: tuple[Placed, ...], life: Life) -> list[Placed]:
     return [p for p in mine if _last_of(p) in (-1, last)]
 
 
-def _last_of(one: Placed) -> int:
+def _last_of(placed_archive: Placed) -> int:
     """Return the index of the packet of the last cycle in an archive; -1 for none."""
-    return int(one.talk.index[one.rows[-1]]) if one.talk is not None and len(one.rows) else -1
+    return (
+        int(placed_archive.talk.index[placed_archive.rows[-1]])
+        if placed_archive.talk is not None and len(placed_archive.rows)
+        else -1
+    )
 
 
-def _readable(one: Placed, *, intact_too: bool, newest: bool) -> Iterator[str]:
-    archived, life = one.archived, one.life
+def _readable(placed_archive: Placed, *, intact_too: bool, newest: bool) -> Iterator[str]:
+    archived, life = placed_archive.archived, placed_archive.life
     name = archived.path.name
     being_written = newest and (life.died or bool(life.disk))  # at the fault
     if not archived.whole and not being_written and name not in life.torn:
@@ -162,9 +168,9 @@ def _columns(archived: Archived, period: float) -> Iterator[str]:
         yield "more packets are missing than cycles between two records"
 
 
-def _stated(one: Placed) -> Iterator[str]:
+def _stated(placed_archive: Placed) -> Iterator[str]:
     """The numbers of the outcome agree with the records."""
-    archived, outcome = one.archived, one.archived.outcome
+    archived, outcome = placed_archive.archived, placed_archive.archived.outcome
     if outcome is None or not archived.whole:
         return
     rows = archived.cycles
@@ -180,9 +186,9 @@ def _stated(one: Placed) -> Iterator[str]:
             yield f"{key} is stated as {outcome.get(key)}, and is {value}"
 
 
-def _made_of(one: Placed, gears: Gears, constants: Array) -> Iterator[str]:
+def _made_of(placed_archive: Placed, gears: Gears, constants: Array) -> Iterator[str]:
     """Each record agrees with its packet and answer."""
-    archived, talk, rows = one.archived, one.talk, one.rows
+    archived, talk, rows = placed_archive.archived, placed_archive.talk, placed_archive.rows
     cycles = archived.cycles
     if not len(cycles):
         return
@@ -258,9 +264,11 @@ def _decoded(
 
 def _each_interval(observed: Observed, all_placed: tuple[Placed, ...]) -> Iterator[str]:
     """Each motion is completely in one archive of its life, with its outcome."""
-    for number, (life, one) in enumerate(zip(observed.runs, heard(observed), strict=True), 1):
+    for number, (life, conversation) in enumerate(
+        zip(observed.runs, heard(observed), strict=True), 1
+    ):
         mine = [p for p in all_placed if p.life is life and p.talk is not None]
-        begun = [(talk, interval) for talk in one.talks for interval in _motions(talk)]
+        begun = [(talk, interval) for talk in conversation.talks for interval in _motions(talk)]
         at_risk = begun[len(begun) - _at_risk(life, mine) :]
         for talk, interval in begun:
             rows = np.flatnonzero(talk.records["interval"] == interval)

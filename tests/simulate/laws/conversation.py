@@ -120,41 +120,41 @@ class _Classifier:
             self._missed,
         )
 
-    def _classify(self, index: int, one: Exchanged) -> None:
+    def _classify(self, index: int, exchanged: Exchanged) -> None:
         reception = self._reception
-        if self._fell_silent(index, one.now) and not reception.ended:
+        if self._fell_silent(index, exchanged.now) and not reception.ended:
             reception.silent = reception.n_axes is not None
-        if not one.given:
+        if not exchanged.given:
             recent = self._life.exchanged[max(0, index - _RECENT) : index]
-            self._repeated += any(one.packet == other.packet for other in recent)
+            self._repeated += any(exchanged.packet == other.packet for other in recent)
             self._kinds.append("nothing")
             self._left_out.append(index)
             return
-        if one.now >= self._deadline and not reception.ended:
+        if exchanged.now >= self._deadline and not reception.ended:
             self._wrong.append((index, "came after a silence that was not detected"))
         last, silent = reception.last, reception.silent
-        kind = reception.expect(one.packet)
-        self._kinds.append(kind if one.replies else "nothing")
-        if not one.replies:
+        kind = reception.expect(exchanged.packet)
+        self._kinds.append(kind if exchanged.replies else "nothing")
+        if not exchanged.replies:
             # The last packet of a life may have no answer.
             if kind != "nothing" and index < len(self._life.exchanged) - 1:
                 self._wrong.append((index, f"got no answer although required ({kind})"))
             return
-        if len(one.replies) > 1:
-            self._wrong.append((index, f"{len(one.replies)} answers"))
-        self._judge(index, one, kind)
+        if len(exchanged.replies) > 1:
+            self._wrong.append((index, f"{len(exchanged.replies)} answers"))
+        self._judge(index, exchanged, kind)
         if kind in ("echo", "init", "cyclic"):
-            self._reply = one.replies[0]
+            self._reply = exchanged.replies[0]
         if kind == "init":
-            self._begin(index, one)
+            self._begin(index, exchanged)
         if kind == "cyclic" and self._parts:
-            ahead = (number_of(one.packet) - last) % LAST
+            ahead = (number_of(exchanged.packet) - last) % LAST
             if 1 <= ahead <= reception.window:
                 self._missed += ahead - 1
             self._parts[-1].index.append(index)
             self._parts[-1].silent.append(silent)
         if kind in ("echo", "init", "cyclic"):
-            self._deadline = one.now + self._patience(one.packet, kind)
+            self._deadline = exchanged.now + self._patience(exchanged.packet, kind)
 
     def _fell_silent(self, index: int, now: float) -> bool:
         """Whether the session detected a silence before this packet or with it."""
@@ -164,30 +164,30 @@ class _Classifier:
             self._deadline, fell = np.inf, True
         return fell
 
-    def _judge(self, index: int, one: Exchanged, kind: Kind) -> None:
+    def _judge(self, index: int, exchanged: Exchanged, kind: Kind) -> None:
         """Check an answer as far as it depends on the packet and the previous answer."""
-        reply = one.replies[0]
+        reply = exchanged.replies[0]
         if kind == "nothing":
             self._wrong.append((index, "was answered although it must not be"))
         elif kind == "again" and reply != self._reply:
             self._wrong.append((index, "came twice, and the second answer differs"))
-        elif kind in ("echo", "init") and reply != oracle.echo(one.packet):
+        elif kind in ("echo", "init") and reply != oracle.echo(exchanged.packet):
             self._wrong.append((index, "was not echoed byte for byte with its number plus one"))
         elif kind == "cyclic":
             n_axes = self._reception.n_axes
             assert n_axes is not None
             if len(reply) != oracle.length(n_axes):
                 self._wrong.append((index, f"was answered by {len(reply)} bytes"))
-            if _END in one.packet and {*_modes(one.packet, range(n_axes))} == {504}:
+            if _END in exchanged.packet and {*_modes(exchanged.packet, range(n_axes))} == {504}:
                 self._reception.ended = True
-        if kind != "cyclic" and one.record >= 0:
+        if kind != "cyclic" and exchanged.record >= 0:
             self._wrong.append((index, f"has a record though it is not a cyclic packet ({kind})"))
-        if kind == "cyclic" and one.record < 0:
+        if kind == "cyclic" and exchanged.record < 0:
             self._wrong.append((index, "is a new cyclic packet and has no record"))
 
-    def _begin(self, index: int, one: Exchanged) -> None:
-        init = Init.of(one.packet, self._arm, self._n_joints)
-        self._parts.append(_Part(one.packet, index))
+    def _begin(self, index: int, exchanged: Exchanged) -> None:
+        init = Init.of(exchanged.packet, self._arm, self._n_joints)
+        self._parts.append(_Part(exchanged.packet, index))
         self._slots = init.slots or ()
 
     def _patience(self, packet: bytes, kind: Kind) -> float:
@@ -210,7 +210,11 @@ class _Classifier:
         usable = isinstance(first, InitReceived) and first.unusable is None
         rows = [life.exchanged[i] for i in part.index]
         # Answers that are too short were reported above and cannot be decoded.
-        fit = [k for k, one in enumerate(rows) if len(one.replies[0]) >= oracle.length(init.n_axes)]
+        fit = [
+            k
+            for k, exchanged in enumerate(rows)
+            if len(exchanged.replies[0]) >= oracle.length(init.n_axes)
+        ]
         received = Packets.of([rows[k].packet for k in fit], init.n_axes)
         answer = Packets.of([rows[k].replies[0] for k in fit], init.n_axes)
         index = np.array([part.index[k] for k in fit], np.intp)

@@ -39,14 +39,14 @@ ALLOWED: Final = 5.0
 
 def estimate(observed: Observed) -> Iterator[str]:
     """Check the law of this module."""
-    found, twin = observed.found, observed.twin_found
-    if found is not None:
+    estimated, twin = observed.found, observed.twin_found
+    if estimated is not None:
         yield from _pooled(observed)
-    if found is not None and twin is not None:
+    if estimated is not None and twin is not None:
         disturbed = any(kind_of(line) in DISTURBS_THE_ARM for line in observed.struck)
-        yield from alike(found.result.pooled, twin.result.pooled)
+        yield from alike(estimated.result.pooled, twin.result.pooled)
         if not disturbed:
-            yield from _predicted_alike(found, twin)
+            yield from _predicted_alike(estimated, twin)
 
 
 def _pooled(observed: Observed) -> Iterator[str]:
@@ -84,20 +84,22 @@ def alike(ours: Estimate, theirs: Estimate) -> Iterator[str]:
             )
 
 
-def _predicted_alike(found: Estimated, twin: Estimated) -> Iterator[str]:
-    ours, theirs = found.result.pooled, twin.result.pooled
+def _predicted_alike(estimated: Estimated, twin: Estimated) -> Iterator[str]:
+    ours, theirs = estimated.result.pooled, twin.result.pooled
     if ours.names != theirs.names:
         return
-    known = ~np.isin(ours.names, [*ours.undetermined, *theirs.undetermined])
-    change = np.where(known, ours.values - theirs.values, 0.0)
-    scatter = np.where(np.outer(known, known), ours.covariance + theirs.covariance, 0.0)
+    determined = ~np.isin(ours.names, [*ours.undetermined, *theirs.undetermined])
+    change = np.where(determined, ours.values - theirs.values, 0.0)
+    scatter = np.where(np.outer(determined, determined), ours.covariance + theirs.covariance, 0.0)
     variances, directions = np.linalg.eigh(scatter)
     deviations = (directions * np.sqrt(np.maximum(variances, 0.0))).T
     noise = np.minimum(ours.noise_std, theirs.noise_std)
     white = noise * np.sqrt(2.0 * len(change) / np.minimum(ours.samples, theirs.samples))
-    for number, samples in enumerate(found.fitted):
-        apart = _rms(samples, found.model, change)
-        stated = np.linalg.norm([_rms(samples, found.model, one) for one in deviations], axis=0)
+    for number, samples in enumerate(estimated.fitted):
+        apart = _rms(samples, estimated.model, change)
+        stated = np.linalg.norm(
+            [_rms(samples, estimated.model, deviation) for deviation in deviations], axis=0
+        )
         allowed = ALLOWED * np.hypot(white, stated)
         for joint in np.flatnonzero(apart > allowed):
             yield (

@@ -54,11 +54,17 @@ def manifest_of(observed: Observed) -> tuple[dict[str, Any], list[Entry]]:
     """Return the checksums of the inputs, and the entries."""
     content = json.loads((observed.folder / "manifest.json").read_text("utf-8"))
     entries = []
-    for one in content["archives"]:
-        path = observed.folder / "archives" / one["name"]
-        same = path.exists() and hashlib.sha256(path.read_bytes()).hexdigest() == one["sha256"]
+    for archive in content["archives"]:
+        path = observed.folder / "archives" / archive["name"]
+        same = path.exists() and hashlib.sha256(path.read_bytes()).hexdigest() == archive["sha256"]
         entries.append(
-            Entry(one["name"], one["outcome"], one["sha256"], one.get("reason", ""), same)
+            Entry(
+                archive["name"],
+                archive["outcome"],
+                archive["sha256"],
+                archive.get("reason", ""),
+                same,
+            )
         )
     return content["inputs"], entries
 
@@ -71,8 +77,8 @@ def folder(observed: Observed) -> Iterator[str]:
         yield f"manifest.json cannot be read: {type(error).__name__}: {error}"
         return
     for name in ("cell.toml", "robot.urdf", "plan.json"):
-        found = hashlib.sha256((observed.folder / name).read_bytes()).hexdigest()
-        if inputs.get(name) != found:
+        digest = hashlib.sha256((observed.folder / name).read_bytes()).hexdigest()
+        if inputs.get(name) != digest:
             yield f"{name} is not the one in the manifest"
     torn = {name for life in observed.runs for name in life.torn}
     names = [entry.name for entry in entries]

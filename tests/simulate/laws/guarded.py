@@ -21,9 +21,9 @@ from .conversation import Talk, heard
 
 def guard(observed: Observed) -> Iterator[str]:
     """Check the law of this module; it names the first violation of each session."""
-    for number, one in enumerate(heard(observed), 1):
+    for number, conversation in enumerate(heard(observed), 1):
         entitled = False
-        for talk in one.talks:
+        for talk in conversation.talks:
             if talk.init.arms is None or not talk.init.slots:
                 continue
             conduct = _conduct(observed, talk, entitled)
@@ -63,7 +63,7 @@ def _judged(talk: Talk, conduct: Conduct) -> Iterator[int]:
     # The end of a motion with a packet precedes requests after it.
     news = [(talk.at_cycle(cycle) + 1, 0, "ended") for cycle in ended]
     news += [(act.before, 1, act.name) for act in talk.life.acts if act.before > talk.at]
-    news.sort(key=lambda one: one[:2])
+    news.sort(key=lambda entry: entry[:2])
     last = talk.at
     for row, index in enumerate(talk.index.tolist()):
         yield last
@@ -71,7 +71,7 @@ def _judged(talk: Talk, conduct: Conduct) -> Iterator[int]:
             _note(conduct, news.pop(0)[2])
         if talk.silent[row]:
             conduct.interrupted()
-        record, one = talk.records[row], talk.life.exchanged[index]
+        record, exchanged = talk.records[row], talk.life.exchanged[index]
         # Superseded packets count as missing. The session counts those with a corrupted number
         # twice, as stale and as missing, unless they are no packets at all.
         newest, *between = talk.life.exchanged[last:index]
@@ -82,7 +82,7 @@ def _judged(talk: Talk, conduct: Conduct) -> Iterator[int]:
         given = [other.packet for other in between if other.given]
         stale = [packet for packet in given if 1 <= number_of(packet) <= LAST_NUMBER]
         at_most = gap + len(stale)
-        conduct.judge(one.packet, one.replies[0], record, missed, at_most)
+        conduct.judge(exchanged.packet, exchanged.replies[0], record, missed, at_most)
 
 
 def _note(conduct: Conduct, what: str) -> None:

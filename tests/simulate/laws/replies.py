@@ -21,60 +21,62 @@ _MOST_NAMED: Final = 3
 
 def replies(observed: Observed) -> Iterator[str]:
     """Check the law of this module."""
-    for number, (life, one) in enumerate(zip(observed.runs, heard(observed), strict=True), 1):
-        for text in _of_life(life, one):
+    for number, (life, conversation) in enumerate(
+        zip(observed.runs, heard(observed), strict=True), 1
+    ):
+        for text in _of_life(life, conversation):
             yield f"life {number}: {text}"
 
 
-def _of_life(life: Life, one: Heard) -> Iterator[str]:
-    for index, what in one.wrong[:_MOST_NAMED]:
+def _of_life(life: Life, conversation: Heard) -> Iterator[str]:
+    for index, what in conversation.wrong[:_MOST_NAMED]:
         yield f"packet {index} {what}"
-    if len(one.wrong) > _MOST_NAMED:
-        yield f"and {len(one.wrong) - _MOST_NAMED} more of these"
-    yield from _counters(life, one)
-    for talk in one.talks:
+    if len(conversation.wrong) > _MOST_NAMED:
+        yield f"and {len(conversation.wrong) - _MOST_NAMED} more of these"
+    yield from _counters(life, conversation)
+    for talk in conversation.talks:
         if (talk.answer.number != next_number(talk.received.number)).any():
             yield "an answer of another number"
         if talk.answer.function.any():
             yield "function bytes in an answer"
 
 
-def _counters(life: Life, one: Heard) -> Iterator[str]:
+def _counters(life: Life, conversation: Heard) -> Iterator[str]:
     """The counters of the session agree with the packets."""
-    found, fates = life.counters, one.fates
+    counters, fates = life.counters, conversation.fates
     answered = fates["echo"] + fates["init"] + fates["cyclic"]
     # The last packet may be counted without an answer, if the process is killed or the link closed.
     last = life.exchanged[-1:]
-    slack = int(any(one.given and not one.replies for one in last))
+    slack = int(any(exchanged.given and not exchanged.replies for exchanged in last))
     # Waiting packets that were being read at the end are not counted.
     given = [index for index, other in enumerate(life.exchanged) if other.given]
-    pile = [index for index in one.left_out if given and index < given[-1]]
-    late, left_out = found.discarded.get("late", 0), len(one.left_out)
-    refused = found.stale + found.malformed + found.ended
+    pile = [index for index in conversation.left_out if given and index < given[-1]]
+    late, left_out = counters.discarded.get("late", 0), len(conversation.left_out)
+    refused = counters.stale + counters.malformed + counters.ended
     for name, number, least, most in (
-        ("replied", found.replied, answered, answered + slack),
-        ("duplicates", found.duplicates, fates["again"], fates["again"] + slack),
-        ("missed", found.missed, one.missed, one.missed + slack * LAST),
+        ("replied", counters.replied, answered, answered + slack),
+        ("duplicates", counters.duplicates, fates["again"], fates["again"] + slack),
+        ("missed", counters.missed, conversation.missed, conversation.missed + slack * LAST),
         # Duplicates among waiting packets are not counted.
-        ("late", late, len(pile) - one.repeated, left_out),
+        ("late", late, len(pile) - conversation.repeated, left_out),
         ("refused", refused, fates["nothing"] - left_out - slack, fates["nothing"] - left_out),
     ):
         if not least <= number <= most:
             yield f"{name} is {number}, and {least} were observed"
     for index in pile:
-        if not _newer_answered(life, one, index):
+        if not _newer_answered(life, conversation, index):
             yield f"packet {index} was superseded, and no newer one was answered"
 
 
-def _newer_answered(life: Life, one: Heard, index: int) -> bool:
+def _newer_answered(life: Life, conversation: Heard, index: int) -> bool:
     """Whether the next answered packet, or the previous one, is newer than this one."""
     number = number_of(life.exchanged[index].packet)
     for step in (1, -1):
         at = index + step
-        while 0 <= at < len(one.kinds):
-            if one.kinds[at] in ("init", "echo", "cyclic"):
+        while 0 <= at < len(conversation.kinds):
+            if conversation.kinds[at] in ("init", "echo", "cyclic"):
                 ahead = (number_of(life.exchanged[at].packet) - number) % LAST
-                if one.kinds[at] != "cyclic" or 1 <= ahead <= LAST // 2:
+                if conversation.kinds[at] != "cyclic" or 1 <= ahead <= LAST // 2:
                     return True
                 break
             at += step

@@ -90,7 +90,7 @@ def _ends_at_rest(life: Life) -> bool:
     Not after a kill, a refused or lost motion, or without a session: there the controller acts.
     """
     error = life.error
-    if any(isinstance(one, KeyboardInterrupt) for one in _behind(error)):
+    if any(isinstance(cause, KeyboardInterrupt) for cause in _behind(error)):
         return False  # the disk failed during the abort
     if isinstance(error, MotionFailedError):
         return error.outcome == "stopped"

@@ -73,11 +73,11 @@ def _ended(number: int, life: Life) -> Iterator[str]:
 
 def _whole(observed: Observed) -> dict[tuple[str, int], Archived]:
     """Return the completed archives by kind and index."""
-    found = {}
+    completed = {}
     for entry in manifest_of(observed)[1]:
         if entry.outcome == "completed" and entry.unchanged and entry.motion[0] in WANTED:
-            found[entry.motion] = read(observed.folder / "archives" / entry.name)
-    return found
+            completed[entry.motion] = read(observed.folder / "archives" / entry.name)
+    return completed
 
 
 def _motion(observed: Observed, kind: str, index: int) -> PiecewiseCubic | FourierSeries | None:

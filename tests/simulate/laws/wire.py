@@ -91,9 +91,9 @@ class Init:
         arms = slots = None
         if sorted(place) == list(range(n_axes)) and count == n_axes:
             arms = tuple(place[slot][0] for slot in range(n_axes))
-            found = {axis: slot for slot, (row, axis) in place.items() if row == arm}
-            if all(joint in found for joint in range(n_joints)):
-                slots = tuple(found[joint] for joint in range(n_joints))
+            slot_of = {axis: slot for slot, (row, axis) in place.items() if row == arm}
+            if all(joint in slot_of for joint in range(n_joints)):
+                slots = tuple(slot_of[joint] for joint in range(n_joints))
         row = slice(PER_ARM * (arm - 1), PER_ARM * (arm - 1) + n_joints)
         floats = np.frombuffer(packet, "<f4").astype(np.float64)
         return cls(
