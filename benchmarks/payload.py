@@ -161,18 +161,18 @@ def coverage(seeds: range, most_pairs: int = 1, duration: float = _DURATION) -> 
         order = tuple(load if k % 4 in (1, 2) else None for k in range(2 * most_pairs))
         for pair in range(1, most_pairs + 1):
             runs = runs_of(seed, model, loads=order[: 2 * pair], duration=duration)
-            found = identify_payload(model, runs)
-            low, high = found.intervals[0]
-            if (high - low) / 2.0 <= ENOUGH * found.parameters[9]:
+            payload = identify_payload(model, runs)
+            low, high = payload.intervals[0]
+            if (high - low) / 2.0 <= ENOUGH * payload.parameters[9]:
                 break
         pairs.append(pair)
-        truth, intervals = figures_of(load), found.intervals
+        truth, intervals = figures_of(load), payload.intervals
         inside.append((intervals[:, 0] <= truth) & (truth <= intervals[:, 1]))
         halves.append((intervals[:, 1] - intervals[:, 0]) / 2.0)
         moment = load.mass * float(np.linalg.norm(load.centre))
-        moments.append(found.moment[1] <= moment <= found.moment[2])
-        assert found.body is not None
-        errors.append(found.body.mass / load.mass - 1.0)
+        moments.append(payload.moment[1] <= moment <= payload.moment[2])
+        assert payload.body is not None
+        errors.append(payload.body.mass / load.mass - 1.0)
     error = np.array(errors)
     return Coverage(
         seeds=len(seeds),
@@ -218,8 +218,8 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=1, help="at most, bare and loaded")
     parser.add_argument("--duration", type=float, default=_DURATION, help="of a motion [s]")
     options = parser.parse_args()
-    found = coverage(range(options.seeds), options.pairs, options.duration)
-    show(asdict(found), only_json=options.json)
+    summary = coverage(range(options.seeds), options.pairs, options.duration)
+    show(asdict(summary), only_json=options.json)
 
 
 if __name__ == "__main__":

@@ -99,16 +99,16 @@ def campaigns(count: int, required: str) -> dict[str, Any]:
         show(done[-1].summary() | {"seed": seed}, only_json=True)
     repetitions = [campaign.repetitions for campaign in done]
     forecasts = [promise.forecasts(excitation, number) for number in repetitions]
-    promised = np.array([[one.half for one in forecast] for forecast in forecasts])
+    promised = np.array([[expected.half for expected in forecast] for forecast in forecasts])
     reached = np.array([campaign.reached for campaign in done])
     return {
         "campaigns": count,
         "outcomes": dict(Counter(campaign.outcome for campaign in done)),
         "repetitions": float(np.mean(repetitions)),
         "robot_time_of_thirty": float(np.mean(repetitions)) / _THIRTY,
-        "required": [one.value for one in requirements],
+        "required": [requirement.value for requirement in requirements],
         "promised": np.median(promised, axis=0).tolist(),
-        "promised_repetitions": [one.repetitions for one in forecasts[0]],
+        "promised_repetitions": [expected.repetitions for expected in forecasts[0]],
         "reached": np.median(reached, axis=0).tolist(),
         "reached_over_promised": np.quantile(
             reached / promised, (0.05, 0.5, 0.95), axis=0
@@ -196,7 +196,7 @@ def _ended(cell: Cell, plan: CampaignPlan, requirements: Sequence[Requirement]) 
     return _Ended(
         outcome=record.outcome,
         repetitions=number,
-        reached=[one.half for one in record.looks[-1].reached],
+        reached=[quantity.half for quantity in record.looks[-1].reached],
         inside=[
             float(np.mean((error <= measured.half)[measured.wanted.owners == k]))
             for k in range(len(requirements))

@@ -244,7 +244,7 @@ class PayloadCampaign:
         if not choices.get("unrehearsed", False):  # reported before anything is mounted
             for side in (self.bare, self.loaded):
                 require_rehearsed(side.folder)
-        found = None
+        result = None
         pairs = 0
         while True:
             for loaded in _order(pairs):
@@ -252,17 +252,17 @@ class PayloadCampaign:
                 self._record_side(loaded, wanted, execute, mounting, choices, links or _own_link)
             pairs += 1
             if record is not None and len(record.looks) < pairs:
-                found = self._found(pairs, reporter)
-                record = record.with_look(_look(found, pairs, requirements[0]), self.limit)
+                result = self._found(pairs, reporter)
+                record = record.with_look(_look(result, pairs, requirements[0]), self.limit)
                 record.save(self._precision)
                 reporter.say(record.message)
             if pairs >= FEWEST and (
                 record is None or (record.ended and len(record.looks) == pairs)
             ):
                 break
-        found = found or self._found(pairs, reporter)
+        result = result or self._found(pairs, reporter)
         sides = ((self.bare.folder.root,), (self.loaded.folder.root,))
-        weighed = Weighed(replace(found, typed=sides), pairs, record)
+        weighed = Weighed(replace(result, typed=sides), pairs, record)
         text = json.dumps(weighed.as_json(), indent=1, ensure_ascii=False)
         write_output(self.root / "payload.json", text + "\n")
         write_output(self.root / "payload.txt", "\n".join(weighed.lines) + "\n")
@@ -322,8 +322,8 @@ class PayloadCampaign:
         (requirement,) = requirements
         plan_hash = self.loaded.folder.plan_hash
         new = PrecisionRecord(plan_hash, (str(requirement),), unit="pair")
-        found = PrecisionRecord.load(self._precision, plan_hash)
-        return new if found is None or found.requirements != new.requirements else found
+        record = PrecisionRecord.load(self._precision, plan_hash)
+        return new if record is None or record.requirements != new.requirements else record
 
     def _found(self, pairs: int, reporter: Reporter) -> PayloadFound:
         """Weigh the payload by the first pairs of recordings."""
@@ -362,11 +362,11 @@ def loaded_cell(cell: Cell, name: str, assumed: Payload) -> Cell:
     joint, inertial = assumed.carried_by(chain)
     tool = cell.model.payload
     if tool is not None:
-        where, own = tool.carried_by(chain)
+        where, tool_body = tool.carried_by(chain)
         if where != joint:
             remedy = "describe it as a part of the URDF"
             raise cell.error(_ASSUMED, None, "is not on the last joint", remedy)
-        inertial = inertial + own
+        inertial = inertial + tool_body
     mass, centre, tensor = body(inertial)
     return cell.with_values(
         {
@@ -417,9 +417,9 @@ def _order(pair: int) -> tuple[bool, bool]:
     return (False, True) if pair % 2 == 0 else (True, False)
 
 
-def _look(found: PayloadFound, pairs: int, requirement: Requirement) -> Look:
+def _look(result: PayloadFound, pairs: int, requirement: Requirement) -> Look:
     """Return the precision of the mass after some pairs."""
-    low, high = found.estimate.intervals[0].tolist()
-    half = (high - low) / 2.0 / (found.body.mass if requirement.relative else 1.0)
-    more = further(pairs, half / requirement.value, 1.0 - found.estimate.scale_share)
+    low, high = result.estimate.intervals[0].tolist()
+    half = (high - low) / 2.0 / (result.body.mass if requirement.relative else 1.0)
+    more = further(pairs, half / requirement.value, 1.0 - result.estimate.scale_share)
     return Look(pairs, (Reached(str(requirement), "mass", half, more),))

@@ -170,5 +170,5 @@ class RecordedCampaign:
             ) from error
 
     def _manifest(self) -> Manifest:
-        found = load_record(Manifest, self._path, "restore it or start a new folder")
-        return found or Manifest({}, [])
+        manifest = load_record(Manifest, self._path, "restore it or start a new folder")
+        return manifest or Manifest({}, [])

@@ -143,16 +143,16 @@ def _rehearsal(folder: CampaignFolder) -> Step:
 
 def _dry_run(campaign: CampaignState) -> Step:
     folder = campaign.folder
-    found = DryRunRecord.load_valid(
+    record = DryRunRecord.load_valid(
         folder,
         plan_hash=folder.plan_hash,
         motions=1 + len(campaign.plan.validation),
         simulated=campaign.cell.only_simulated,
     )
-    if found is None and folder.dry_run.exists():
+    if record is None and folder.dry_run.exists():
         problem = "of another plan or kind of arm, or its archives are missing"
         return Step("next", f"the recorded one is not valid: {problem}", "run {} --dry-run")
-    return _accepted(found)
+    return _accepted(record)
 
 
 def _accepted(record: DryRunRecord | None) -> Step:

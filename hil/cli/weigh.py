@@ -128,11 +128,11 @@ def weigh(
     )
     if choices["dry_run_only"]:
         return weighed.dry_run(execute, mounting, choices)
-    found = weighed.run(execute, mounting, reporter, requirements=requirements, choices=choices)
+    result = weighed.run(execute, mounting, reporter, requirements=requirements, choices=choices)
     if json:
-        print_json(found.as_json())
+        print_json(result.as_json())
     else:
-        typer.echo("\n".join(found.lines))
-    if found.found.mounting is not None:
+        typer.echo("\n".join(result.lines))
+    if result.found.mounting is not None:
         raise typer.Exit(NOT_GOOD)
     return None

@@ -48,13 +48,13 @@ def concluded(
         return imported
     if not _is_suspect(imported.archive):
         return imported
-    found = look_at_joints(source, imported)
-    if found.error is not None and found.error > _OTHER_ARM:
-        raise _other_arm(source, found.error)
-    if found.questions:
-        raise _undecided(source, found.questions[0])
-    if found.map_text != imported.map_text or found.options:
-        return _again(imported, source, robot_of, found, use)
+    look = look_at_joints(source, imported)
+    if look.error is not None and look.error > _OTHER_ARM:
+        raise _other_arm(source, look.error)
+    if look.questions:
+        raise _undecided(source, look.questions[0])
+    if look.map_text != imported.map_text or look.options:
+        return _again(imported, source, robot_of, look, use)
     return imported
 
 

@@ -127,7 +127,9 @@ def every_torque_factor(model: RobotModel, samples: Samples) -> Factor:
         )
         for part, tables in augmented_rows(model, samples)
     )
-    columns = tuple(np.append(own, np.arange(p, p + n - 1)) for own in model.plan.columns)
+    columns = tuple(
+        np.append(joint_columns, np.arange(p, p + n - 1)) for joint_columns in model.plan.columns
+    )
     names = (*model.parameter_names, *(f"torque {joint}" for joint in range(1, n)))
     counts = np.count_nonzero(samples.usable, axis=0)[None]
     return Factor.of_rows(chunks, counts, columns, names)
@@ -150,7 +152,9 @@ def of_torques(factor: Factor, order: NDArray[np.intp], sign: Array) -> Factor:
     return replace(
         factor,
         matrices=tuple(matrices),
-        columns=tuple(own[: 1 - n] if n > 1 else own for own in factor.columns),
+        columns=tuple(
+            joint_columns[: 1 - n] if n > 1 else joint_columns for joint_columns in factor.columns
+        ),
         parameter_names=factor.parameter_names[: len(factor.parameter_names) + 1 - n],
     )
 

@@ -251,8 +251,8 @@ class Factor:
         augmented = np.column_stack([-values, np.ones(len(values))])
         squares = np.zeros((len(self), self.n_joints))
         for joint, grams in enumerate(self.matrices):
-            own = augmented[:, self._places(joint)]
-            squares[:, joint] = (own[:, None] @ grams @ own[:, :, None])[:, 0, 0]
+            joint_gram = augmented[:, self._places(joint)]
+            squares[:, joint] = (joint_gram[:, None] @ grams @ joint_gram[:, :, None])[:, 0, 0]
         return np.maximum(squares, 0.0)
 
     def residual_rms(self, values: Array) -> Array:

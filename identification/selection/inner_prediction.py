@@ -442,14 +442,14 @@ class _Trial:
         self,
         model: RobotModel,
         ready: Ready,
-        known: Known | None = None,
+        stated: Known | None = None,
         ripples: Sequence[Sequence[TorqueRipple]] = (),
     ) -> None:
         self.ripples = {ripple[0].orders: ripple for ripple in ripples if ripple}
         self._model = model
         self._models: dict[Columns, RobotModel] = {}
         self._ready = ready
-        self._known = known
+        self._known = stated
         self._samples: dict[Preprocessing, list[Samples]] = {}
         self._directed: dict[tuple[Preprocessing, tuple[float, ...]], list[Samples]] = {}
         self._tables: dict[tuple[Columns, Preprocessing], _Reduced] = {}

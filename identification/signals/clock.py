@@ -302,9 +302,9 @@ def _fitted_lines(values: Array, width: int) -> Array:
         (slice(0, width), slice(0, half)),
         (slice(len(values) - width, len(values)), slice(half + 1, width)),
     ):
-        own = values[window]
-        slope = float(place @ own) / max(1.0, float(place @ place))
-        fitted[window][beside] = own.mean() + slope * place[beside]
+        section = values[window]
+        slope = float(place @ section) / max(1.0, float(place @ place))
+        fitted[window][beside] = section.mean() + slope * place[beside]
     return np.asarray(fitted)
 
 

@@ -208,8 +208,8 @@ def _drift_sums(
     sums = np.empty((2, len(edges), model.n_joints))
     for joint, usable in enumerate(samples.usable.T):  # one by one, as recordings can be long
         friction = np.where(usable, torque[:, joint], 0.0)
-        for own, factor in zip(sums, (residual[:, joint], friction), strict=True):
-            own[:, joint] = np.add.reduceat(friction * factor, edges)
+        for joint_sums, factor in zip(sums, (residual[:, joint], friction), strict=True):
+            joint_sums[:, joint] = np.add.reduceat(friction * factor, edges)
     return sums
 
 

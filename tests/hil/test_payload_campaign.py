@@ -110,7 +110,7 @@ def done(designed: Campaign) -> tuple[PayloadCampaign, Weighed, list[str]]:
     def noting(side: Campaign, choices: Mapping[str, Any]) -> RunResult:
         before = recorded(weighed)
         result = execute(side, choices)
-        order.extend(one for one in recorded(weighed) if one not in before)
+        order.extend(path for path in recorded(weighed) if path not in before)
         return result
 
     return weighed, run(weighed, noting), order
@@ -118,13 +118,13 @@ def done(designed: Campaign) -> tuple[PayloadCampaign, Weighed, list[str]]:
 
 class TestRecording:
     def test_the_motion_runs_bare_loaded_loaded_bare(self, done) -> None:
-        _, found, order = done
+        _, payload, order = done
         assert order == ORDER
-        assert found.pairs == 2
+        assert payload.pairs == 2
 
     def test_the_carried_mass_is_found_and_not_the_assumed_one(self, done) -> None:
-        _, found, _ = done
-        low, high = found.found.estimate.intervals[0]
+        _, payload, _ = done
+        low, high = payload.found.estimate.intervals[0]
         assert low < MASS < high < ASSUMED
         assert high - low < 0.05 * MASS
 
@@ -135,11 +135,11 @@ class TestRecording:
             assert {open_archive(path).header.payload for path in paths} == {name}
 
     def test_the_result_is_stored_as_hil_payload_prints_it(self, done) -> None:
-        weighed, found, _ = done
+        weighed, payload, _ = done
         stored = json.loads((weighed.root / "payload.json").read_text())
-        assert stored["figures"]["mass"]["value"] == pytest.approx(found.found.body.mass)
+        assert stored["figures"]["mass"]["value"] == pytest.approx(payload.found.body.mass)
         text = (weighed.root / "payload.txt").read_text()
-        assert text == "\n".join(found.lines) + "\n"
+        assert text == "\n".join(payload.lines) + "\n"
         assert "$TOOL_MASS := 1." in text or "$TOOL_MASS := 2." in text
         printed = CliRunner().invoke(
             app,
@@ -148,19 +148,19 @@ class TestRecording:
         assert printed.stdout == text
 
     def test_nothing_is_recorded_again(self, designed, done) -> None:
-        _, found, _ = done
+        _, payload, _ = done
 
         def never(*_: object) -> RunResult:
             pytest.fail("nothing was missing")
 
         again = PayloadCampaign.of(designed, "weight", None)
-        assert run(again, never).found.body.mass == found.found.body.mass
+        assert run(again, never).found.body.mass == payload.found.body.mass
 
     def test_an_identification_of_the_loaded_side_warns(self, done) -> None:
         """What the assumed payload is wrong by is in the last link."""
         weighed, _, _ = done
         warnings = weighed.loaded.identify().results.verdict.warnings
-        assert any("payload of assumed figures" in one for one in warnings)
+        assert any("payload of assumed figures" in warning for warning in warnings)
 
 
 class TestInterrupted:
@@ -192,9 +192,9 @@ class TestInterrupted:
             run(weighed, stopping)
         kept = recorded(weighed)
         assert kept == sorted(ORDER[:stage])
-        found = run(PayloadCampaign.of(Campaign.open(campaign.folder.root), "weight", None))
+        payload = run(PayloadCampaign.of(Campaign.open(campaign.folder.root), "weight", None))
         assert recorded(weighed) == sorted(ORDER)
-        assert found.found.body.mass == pytest.approx(MASS, rel=0.03)
+        assert payload.found.body.mass == pytest.approx(MASS, rel=0.03)
         attempts = [path.name for path in weighed.root.glob("*/archives/excitation*")]
         assert sum("_a2" in name for name in attempts) == 1
 
