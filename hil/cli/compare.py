@@ -54,8 +54,7 @@ def compare(
                 line = (
                     f"{change.parameter} in {change.campaign}:"
                     f" {change.after:.4g} instead of {change.before:.4g} {unit_text(change.unit)}, "
-                    f"change"
-                    f" {change.change:+.3g} ± {change.half:.2g} (95 %), p {change.p_value:.1g}"
+                    f"change {change.change:+.3g} ± {change.half:.2g} (95 %), p {change.p_value:.1g}"
                 )
                 typer.echo(printable(line), err=True)
             for warning in comparison.warnings:

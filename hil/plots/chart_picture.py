@@ -70,7 +70,7 @@ def _entries(charts: Sequence[Chart], legends: Sequence[Legend]) -> tuple[list[A
     ]
     texts = [legend.text for legend in shown]
     if any(plot.shaded for plot in plots):
-        lines.append(Patch(color=style.colour("--band")))
+        lines.append(Patch(color=style.colour("band")))
         texts.append("not in motion")
     return lines, texts
 
@@ -89,7 +89,7 @@ def _draw(chart: Chart, rows: Sequence[Axes], *, is_last: bool) -> None:
 
 def _draw_plot(axes: Axes, plot: Plot, chart: Chart) -> None:
     for start, stop in plot.shaded:
-        axes.axvspan(start, stop, color=style.colour("--band"), linewidth=0.0)
+        axes.axvspan(start, stop, color=style.colour("band"), linewidth=0.0)
     for trace in plot.traces:
         x = chart.x if trace.x is None else trace.x
         size = trace.width * _POINTS

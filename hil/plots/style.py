@@ -48,7 +48,7 @@ def _palette() -> dict[str, str]:
 
 
 def colour(variable: str) -> str:
-    """Return the colour of a variable of the style sheet, such as ``--ink`` or ``var(--ink)``."""
+    """Return the colour of a variable of the style sheet: ``ink``, ``--ink`` or ``var(--ink)``."""
     return _palette()[variable.removeprefix("var(").removesuffix(")").removeprefix("--")]
 
 

@@ -35,7 +35,7 @@ from planner.corners import (
 )
 from planner.errors import UnsupportedSolver
 from planner.fourier import FourierSeries, harmonic_bounds
-from planner.interpolator import corner
+from planner.motion_queue import corner
 from planner.piecewise_cubic import Block, check_rest
 from planner.time_law import RateBounds, TimeLaw, admits, ramp, slowing_bounds
 from tests.planner.six_axes import SIX_AXES, join, legs_between, random_points, rows_of
