@@ -54,7 +54,8 @@ def compare(
                 line = (
                     f"{change.parameter} in {change.campaign}:"
                     f" {change.after:.4g} instead of {change.before:.4g} {unit_text(change.unit)}, "
-                    f"change {change.change:+.3g} ± {change.half:.2g} (95 %), p {change.p_value:.1g}"
+                    f"change {change.change:+.3g} ± {change.half:.2g} (95 %),"
+                    f" p {change.p_value:.1g}"
                 )
                 typer.echo(printable(line), err=True)
             for warning in comparison.warnings:
