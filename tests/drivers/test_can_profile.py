@@ -116,6 +116,7 @@ class TestDisturbances:
             frames += [(wire.time, frame) for frame in wire.far.frames(each)]
         return wire, packets, frames
 
+    @pytest.mark.safety
     @settings(max_examples=60, deadline=None)
     @given(seed=seeds, first=firsts, fates=fates)
     def test_packets_are_not_mixed(self, seed, first, fates):

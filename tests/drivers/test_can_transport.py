@@ -364,6 +364,7 @@ def run():
     return Run()
 
 
+@pytest.mark.safety
 class TestSession:
     def test_complete_motion(self, run):
         (ended,) = run.seen(MotionEnded)

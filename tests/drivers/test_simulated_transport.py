@@ -151,6 +151,7 @@ class TestFaults:
         st.builds(Corrupt, cycles, directions, offset=st.just(1), mask=st.just(1)),
     )
 
+    @pytest.mark.safety
     @given(st.lists(any_fault, max_size=12), st.floats(1e-4, 0.02))
     def test_time_increases_and_each_cycle_has_one_reply(self, faults, timeout):
         peer = Script(packets(30))

@@ -12,6 +12,7 @@ from tests.golden.cases import CASES, HERE, PUBLISHED, RECORDINGS
 
 # Rounding, through the condition of the estimates.
 SAME = 1e-9
+LONG = ("batch",)  # cases that take many seconds
 
 
 def assert_same(result: Any, golden: Any, place: str) -> None:
@@ -30,7 +31,10 @@ def assert_same(result: Any, golden: Any, place: str) -> None:
 
 
 class TestGoldenResults:
-    @pytest.mark.parametrize("name", CASES)
+    @pytest.mark.parametrize(
+        "name",
+        [pytest.param(name, marks=pytest.mark.long if name in LONG else ()) for name in CASES],
+    )
     def test_they_stay(self, name: str, tmp_path: Path) -> None:
         golden = json.loads((HERE / f"{name}.json").read_text(encoding="utf-8"))
         assert_same(CASES[name](tmp_path), golden, name)

@@ -155,6 +155,7 @@ class TestRoundTrip:
 
 
 class TestChunks:
+    @pytest.mark.safety
     @given(st.lists(st.integers(1, 260), min_size=1, max_size=12))
     def test_bytes_do_not_depend_on_the_batches(self, tmp_path_factory, batches):
         folder = tmp_path_factory.mktemp("bytes")

@@ -243,6 +243,7 @@ class TestFiles:
         robot = Robot.from_urdf(urdf)
         return open_archive(import_rosbag2(source, output, robot=robot, force=True))
 
+    @pytest.mark.long
     def test_a_split_bag_at_a_path_with_any_characters(self, urdf) -> None:
         assert_right(self.read(self.folder(urdf), urdf))
 

@@ -64,6 +64,7 @@ class TestCache:
     CONTENT: Final = {"a": [1.5, "x"], "b": None}
     ARRAYS: Final = {"values": np.eye(7), "none": np.zeros((0, 3)), "counts": np.arange(3)}
 
+    @pytest.mark.long
     @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(st.data())
     def test_entries_with_one_wrong_bit_are_ignored(self, tmp_path, data):

@@ -222,6 +222,7 @@ def cell_text(**controller: object) -> str:
     return text.replace('"ns16.urdf"', json.dumps(str(urdf)))
 
 
+@pytest.mark.safety
 def test_the_command_sends_the_controller_nothing(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as controller:
         controller.bind(("127.0.0.2", 0))

@@ -88,6 +88,7 @@ def test_time_is_read_in_any_zone(at: datetime, minutes: int) -> None:
     assert parse_time(at.isoformat()) == at.replace(tzinfo=UTC)
 
 
+@pytest.mark.long
 @given(st.one_of(st.text(), st.datetimes().map(datetime.isoformat)))
 def test_any_text_is_a_time_in_range_or_none(text: str) -> None:
     time = parse_time(text)

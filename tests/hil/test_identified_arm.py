@@ -106,6 +106,7 @@ class TestResult:
             assert opened.page.locator("td").count() == 12
             assert opened.errors == []
 
+    @pytest.mark.long
     def test_names_of_channels_are_no_markup(self, folder: Path, tmp_path: Path) -> None:
         text = (folder / "a.csv").read_text().replace("tau", "<b>tau", 3)
         (tmp_path / "x.csv").write_text(text)

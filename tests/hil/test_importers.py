@@ -584,6 +584,7 @@ class TestTextMatrices:
         arrays = read(tmp_path / "a.txt", robot, time=time, format=form)
         assert np.array_equal(arrays["position"], Q)
 
+    @pytest.mark.long
     @given(
         values=arrays(np.float64, (7, 3), elements=st.floats(-1e6, 1e6, width=32)),
         delimiter=st.sampled_from([",", ";", "\t", " ", "|", "  ", "; "]),
@@ -1019,6 +1020,7 @@ class TestReplacing:
             ".toml",
         ]
 
+    @pytest.mark.long
     def test_never_by_one_without_a_row_within_the_limits(
         self, command: list[str], tmp_path: Path
     ) -> None:

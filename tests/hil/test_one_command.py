@@ -267,6 +267,7 @@ def test_a_bag_leaves_how_it_was_read(tmp_path: Path, urdf: Path) -> None:
     assert all(np.array_equal(columns[0][name], columns[1][name]) for name in columns[1])
 
 
+@pytest.mark.long
 def test_a_bag_is_identified_again_with_its_map(tmp_path: Path, urdf: Path) -> None:
     source, folder = tmp_path / "x.db3", tmp_path / "out"
     rows = np.loadtxt(moving(tmp_path / "a.csv"), delimiter=",", skiprows=1)

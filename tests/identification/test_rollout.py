@@ -90,6 +90,7 @@ def test_an_unstable_arm_is_counted_and_silent(capfd) -> None:
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.long
 def test_a_polish_finds_friction_rotor_and_delay() -> None:
     true, motion = an_arm(coulomb=3.0), a_recording(an_arm(coulomb=3.0), 0.005)
     values = true.values.copy()

@@ -106,6 +106,7 @@ def rounding_of(limits: JointLimits, duration: float) -> tuple[np.ndarray, ...]:
 class TestMotion:
     """Laws of every motion through moves."""
 
+    @pytest.mark.safety
     @given(problems())
     @settings(max_examples=150)
     def test_it_satisfies_limits_and_is_smooth(self, problem):
@@ -380,6 +381,7 @@ def populations(draw):
 class TestPopulation:
     """Motions planned together, as a search does."""
 
+    @pytest.mark.safety
     @given(populations(), st.data())
     @settings(max_examples=100)
     def test_others_change_no_bit(self, problem, data):

@@ -30,6 +30,7 @@ def files(draw):
     return PlanFile(names, points[0], tuple(moves), overrides, limits)
 
 
+@pytest.mark.safety
 @given(files())
 @settings(max_examples=150, deadline=None)
 def test_json_restores_every_bit(file):

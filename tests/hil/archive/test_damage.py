@@ -270,6 +270,7 @@ def cuts(_: random.Random, data: bytes, share: float) -> bytes:
     return data[: int(len(data) * share)]
 
 
+@pytest.mark.safety
 class TestAnyDamage:
     """No wrong sample is read or repaired, no whole chunk is lost, and losses are reported."""
 
@@ -347,6 +348,7 @@ class TestAnyDamage:
                 read(path)
 
 
+@pytest.mark.safety
 class TestNothingLost:
     def test_damaged_index_is_restored_to_the_byte(self, path, written):
         data = written.data

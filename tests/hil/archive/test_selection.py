@@ -30,6 +30,7 @@ instants = st.none() | st.floats(49.5, 51.0) | st.integers(4999, 5050).map(lambd
 
 
 class TestTimes:
+    @pytest.mark.long
     @given(instants, instants, st.booleans(), st.sampled_from([0, 1 << 20]))
     def test_range_selects_samples_and_events(self, written, start, stop, truncated, batch):
         """Of a truncated file what is left."""

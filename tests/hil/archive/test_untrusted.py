@@ -344,6 +344,7 @@ class TestSizes:
         assert open_archive(path).n_samples == 43
         assert not open_archive(path).complete
 
+    @pytest.mark.safety
     @pytest.mark.parametrize("what", ["over and over", "behind the file", "truncated", "farthest"])
     def test_an_index_of_chunks_that_does_not_fit(self, what, written, path):
         """The first chunk is always read."""
