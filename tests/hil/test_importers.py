@@ -1001,6 +1001,7 @@ class TestReplacing:
         arguments = ["import", "log", str(tmp_path / "log.npz"), "-o", str(tmp_path / "a.mcap")]
         return [*arguments, "--urdf", str(panda.urdf), "--lock-others", "--map"]
 
+    @pytest.mark.long
     def test_only_with_force(self, command: list[str], tmp_path: Path) -> None:
         right = [*command, str(tmp_path / "q.toml")]
         assert typed(right)[0] == 0

@@ -111,6 +111,7 @@ def test_all_channels_and_events_are_sent() -> None:
         pytest.fail("no event arrived")
 
 
+@pytest.mark.safety
 def test_a_viewer_that_reads_nothing_delays_nothing() -> None:
     """Its oldest messages are dropped; another client receives the newest."""
     with served(rate=1000.0) as publisher, Viewer(publisher.port) as dead:

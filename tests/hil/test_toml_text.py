@@ -85,6 +85,7 @@ class TestWritten:
 
 
 class TestDegrees:
+    @pytest.mark.long
     @given(st.floats(allow_nan=False, allow_infinity=False, min_value=-1e6, max_value=1e6))
     @settings(max_examples=1000)
     def test_they_restore_every_bit(self, angle: float) -> None:

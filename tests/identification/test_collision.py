@@ -216,6 +216,7 @@ class TestMotions:
 
 
 class TestDistances:
+    @pytest.mark.long
     def test_shapes_are_freed(self, arm):
         def living():
             gc.collect()

@@ -1155,6 +1155,7 @@ class TestDelay:
         assert not right.significant
         assert right.applied == 0.004
 
+    @pytest.mark.long
     def test_encoder_noise_in_a_servo_loop_biases_it_little(self):
         """Simulated cell in closed loop: within 0.05 ms of the true 0.2 ms."""
         t = np.arange(6001) * STEP

@@ -756,6 +756,7 @@ class TestRefusal:
             motions_of(count=1, **options)
         return caught.value
 
+    @pytest.mark.long
     def test_it_names_the_violated_constraints(self, monkeypatch):
         error = self.refusal(seed=3, currents=currents(0.01))
         assert error.rejected == {"current": 100}

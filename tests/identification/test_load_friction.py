@@ -155,6 +155,7 @@ class TestFixedPoint:
         rms = np.sqrt(np.mean((samples.torque - _predicted(load_fit, samples)) ** 2, axis=0))
         np.testing.assert_allclose(rms, NOISE, rtol=0.05)
 
+    @pytest.mark.long
     def test_intervals_cover_the_shares(self):
         inside = []
         for seed in range(40):

@@ -346,6 +346,7 @@ class TestCorrelation:
 
 
 class TestResidualChecks:
+    @pytest.mark.long
     def test_coloured_noise_is_not_reported(self):
         alarms = np.zeros(4)
         campaigns = 25

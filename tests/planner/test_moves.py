@@ -152,6 +152,7 @@ class TestMotion:
                 assert (passage.how == "flown") == (passage.fly == asked)
         assert motion.targets[-1].how == "stopped"
 
+    @pytest.mark.safety
     @given(problems(), st.floats(0.02, 1.0))
     @settings(max_examples=60)
     def test_stops_take_longer_than_fly_by_and_less_with_more_speed(self, problem, share):

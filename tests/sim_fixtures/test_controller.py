@@ -258,6 +258,7 @@ class TestOpenMode:
         assert np.all(d[:, :, 4].std(axis=0) < 0.01 * np.array([16.5, 22.0, 9.5, 3.5, 7.0, 10.0]))
 
 
+@pytest.mark.safety
 def test_one_seed_is_one_run_bit_for_bit() -> None:
     settings, effects = ControllerSettings(**NOISY), UnmodelledEffects.default_sizes(6)
     logs = [play(DRIVE, settings, seed=seed, effects=effects)[1] for seed in (3, 3, 4)]
