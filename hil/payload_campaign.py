@@ -29,6 +29,7 @@ from hil.campaign.precision import further
 from hil.campaign.precision_record import Look, PrecisionRecord, Reached
 from hil.campaign.run import RunResult
 from hil.cell import Cell
+from hil.cell.schema import CellFile
 from hil.design.requirements import Requirement
 from hil.errors import CampaignFolderError, InputError, OperatorStopError, UnsafeError
 from hil.files import write_output
@@ -78,7 +79,10 @@ class Mounting:
     ) -> None:
         self._name = campaign.name
         self._command = campaign.bare.folder.run_command
-        self._virtual = campaign.bare.cell.controller.transport == "simulated"
+        self._virtual = all(
+            side.cell.controller.transport == "simulated"
+            for side in (campaign.bare, campaign.loaded)
+        )
         self._reporter = reporter
         self._ask = ask
         self._mounted = mounted
@@ -163,7 +167,9 @@ class PayloadCampaign:
             InputError: the name is no name of a folder, or nothing was assumed yet.
             MotionRefusedError: the motion breaks a limit with the payload; nothing was created.
             CampaignFolderError: a side has recordings of another cell, motion or payload.
+            NotRehearsedError: a file of the campaign was edited.
         """
+        campaign.folder.require_unchanged()
         if not _NAME.fullmatch(name):
             problem = f"{name!r} is not a valid name of a payload"
             remedy = "use letters, digits, dots, dashes and underscores"
@@ -186,8 +192,11 @@ class PayloadCampaign:
             )
         bare = _side(places[0], cell, plan)
         loaded = Campaign.open(places[1])
-        if loaded.plan.to_text() != bare.plan.to_text():
-            problem = "was begun with another motion"
+        same_motion = loaded.plan.to_text() == bare.plan.to_text()
+        if not same_motion or _bare_file(loaded.cell) != _bare_file(cell):
+            problem = (
+                "was begun with another cell" if same_motion else "was begun with another motion"
+            )
             remedy = "state --payload-mass again, or use another name for the payload"
             raise CampaignFolderError(places[1], problem, remedy)
         return cls(root, name, bare, loaded)
@@ -415,6 +424,14 @@ def _own_link(side: Campaign, session: int) -> MotionLink | None:
 def _order(pair: int) -> tuple[bool, bool]:
     """Return whether the first and second motion of a pair (from 0) are loaded."""
     return (False, True) if pair % 2 == 0 else (True, False)
+
+
+def _bare_file(cell: Cell) -> CellFile:
+    """Return a cell's file without its payload, assumed or stated."""
+    robot = cell.file.robot.model_copy(update={"payload": None})
+    assumed = [entry for entry in cell.file.cell.assumed if entry != _ASSUMED]
+    described = cell.file.cell.model_copy(update={"assumed": assumed})
+    return cell.file.model_copy(update={"robot": robot, "cell": described})
 
 
 def _look(result: PayloadFound, pairs: int, requirement: Requirement) -> Look:

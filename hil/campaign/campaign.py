@@ -17,7 +17,7 @@ from hil.identify.options import Options
 from hil.progress import Reporter, Silent
 from identification.excitation import Excitation
 
-from .folder import LOCK, CampaignFolder
+from .folder import LOCK, PAYLOADS, CampaignFolder
 from .link import MotionLink
 from .operator import Operator, RunWatch, Stop, Unattended
 from .plan import CampaignPlan
@@ -186,6 +186,8 @@ def require_replaceable(root: Path) -> None:
         raise CampaignFolderError(
             root, "holds a campaign with recordings", "name another folder (-o)"
         )
+    if any((root / PAYLOADS).glob("*")):
+        raise CampaignFolderError(root, "holds payload campaigns", "name another folder (-o)")
 
 
 def campaign_of_design(root: Path, cell: Cell, excitation: Excitation | CampaignPlan) -> Campaign:

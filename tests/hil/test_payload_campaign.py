@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import open_archive
 from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError, NotRehearsedError
+from hil.campaign.campaign import require_replaceable
 from hil.campaign.errors import MotionFailedError
 from hil.campaign.folder import SIDES, CampaignFolder
 from hil.campaign.operator import OperatorRequest, Stop
@@ -305,6 +307,38 @@ class TestLimits:
         other = assumed_payload(designed.cell, 1.0, CENTRE)
         with pytest.raises(CampaignFolderError, match="another name"):
             PayloadCampaign.of(designed, "weight", other)
+
+
+class TestChanged:
+    def test_an_edited_cell_of_the_campaign_is_refused(self, tmp_path) -> None:
+        campaign = campaign_in(tmp_path)
+        begun(campaign)
+        path = campaign.folder.cell
+        path.write_text(path.read_text() + "\n# edited\n")
+        with pytest.raises(NotRehearsedError, match="was edited"):
+            PayloadCampaign.of(campaign, "weight", None)
+
+    def test_a_loaded_side_with_another_cell_is_refused(self, tmp_path) -> None:
+        """Its motion would run within the limits of the cell of then."""
+        weighed = begun(campaign_in(tmp_path))
+        cell = fast_cell(tmp_path, repetitions=6).with_values({"campaign.settle_s": 0.6})
+        other = fast_campaign(tmp_path / "other", cell)
+        shutil.copytree(weighed.root, other.folder.root / "payload" / "weight")
+        with pytest.raises(CampaignFolderError, match="begun with another cell"):
+            PayloadCampaign.of(other, "weight", None)
+
+    def test_a_design_does_not_replace_a_campaign_with_payloads(self, tmp_path) -> None:
+        weighed = begun(campaign_in(tmp_path))
+        with pytest.raises(CampaignFolderError, match="payload campaigns"):
+            require_replaceable(weighed.root.parent.parent)
+
+    def test_a_loaded_side_on_a_link_is_never_mounted_by_itself(self, tmp_path) -> None:
+        weighed = begun(campaign_in(tmp_path))
+        link = {"controller.transport": "udp", "controller.host": "192.0.2.1"}
+        real = weighed.loaded.cell.with_values(link)
+        mixed = replace(weighed, loaded=replace(weighed.loaded, cell=real))
+        with pytest.raises(MountingError, match="Mount weight"):
+            Mounting(mixed, Silent()).require(True)
 
 
 def invoke(root: Path, *words: str):
