@@ -106,7 +106,8 @@ class Mounting:
             word = "yes" if loaded else "no"
             raise MountingError(
                 f"{demand} and change nothing else; then confirm it with `{self._command} "
-                f"--mounted {word}` (there is no terminal to ask)."
+                f"--mounted {word}`, and --dry-run or --accept-dry-run where that is the next step "
+                "(there is no terminal to ask)."
             )
         elif not self._ask(f"{demand} and change nothing else."):
             raise OperatorStopError(
