@@ -17,7 +17,7 @@ _LONGEST_TEXT: Final = 1 << 20  # bytes of output that are read
 
 
 class _Text:
-    """What a child writes to a descriptor, kept in memory."""
+    """Memory that a child writes its output to."""
 
     def __init__(self, name: str) -> None:
         self.descriptor = create_memory(name, 0)

@@ -3,7 +3,7 @@
 In this order a steady drift of friction has the same mean in both. Each side is a campaign; that of
 the loaded arm has the payload, with assumed figures, as `[robot.payload]` in its cell, so that
 checks, rehearsal and dry run include it. Torques are linear in the inertial parameters of a
-payload: a bound that a motion keeps without it and with it is kept with every part of it.
+payload: limits that hold without it and with it hold for every share of it.
 """
 
 from __future__ import annotations

@@ -168,7 +168,7 @@ class TestRecording:
 class TestInterrupted:
     @pytest.mark.parametrize("stage", range(4), ids=ORDER)
     def test_a_stop_in_each_stage_is_resumed(self, tmp_path, stage: int) -> None:
-        """Ctrl-C brings the arm to rest on its path; complete recordings are kept."""
+        """Ctrl-C brings the arm to rest on its path; complete recordings stay."""
         campaign = campaign_in(tmp_path, repetitions=2)
         weighed = begun(campaign)
         stop = Stop()
@@ -192,8 +192,8 @@ class TestInterrupted:
 
         with pytest.raises(MotionFailedError, match="stopped"):
             run(weighed, stopping)
-        kept = recorded(weighed)
-        assert kept == sorted(ORDER[:stage])
+        complete = recorded(weighed)
+        assert complete == sorted(ORDER[:stage])
         payload = run(PayloadCampaign.of(Campaign.open(campaign.folder.root), "weight", None))
         assert recorded(weighed) == sorted(ORDER)
         assert payload.found.body.mass == pytest.approx(MASS, rel=0.03)
