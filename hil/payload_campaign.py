@@ -87,8 +87,10 @@ class Mounting:
         self._ask = ask
         self._mounted = mounted
 
-    def require(self, loaded: bool) -> None:
+    def require(self, loaded: bool, option: str = "") -> None:
         """Return when the payload is mounted (`loaded`) or removed.
+
+        `option` is that of the command with which the run goes on.
 
         Raises:
             NotRehearsedError: a side has not passed its rehearsal.
@@ -106,8 +108,7 @@ class Mounting:
             word = "yes" if loaded else "no"
             raise MountingError(
                 f"{demand} and change nothing else; then confirm it with `{self._command} "
-                f"--mounted {word}`, and --dry-run or --accept-dry-run where that is the next step "
-                "(there is no terminal to ask)."
+                f"{' '.join(['--mounted', word, *option.split()])}` (there is no terminal to ask)."
             )
         elif not self._ask(f"{demand} and change nothing else."):
             raise OperatorStopError(
@@ -218,7 +219,7 @@ class PayloadCampaign:
             if self.side(loaded).folder.whole("excitation", pair) is None
         )
         loaded = next(missing, False)
-        mounting.require(loaded)
+        mounting.require(loaded, "--dry-run")
         return execute(self.side(loaded), choices)
 
     def run(
@@ -292,9 +293,9 @@ class PayloadCampaign:
         missing = [k for k in range(wanted) if side.folder.whole("excitation", k) is None]
         if not missing:
             return
-        mounting.require(loaded)
         # Only a dry run that was seen can be accepted, and each side has its own.
         seen = side.cell.only_simulated or path_exists(side.folder.dry_run)
+        mounting.require(loaded, "--accept-dry-run" if seen else "--dry-run")
         execute(
             side,
             {
@@ -425,6 +426,11 @@ def _own_link(side: Campaign, session: int) -> MotionLink | None:
 def _order(pair: int) -> tuple[bool, bool]:
     """Return whether the first and second motion of a pair (from 0) are loaded."""
     return (False, True) if pair % 2 == 0 else (True, False)
+
+
+def assumes_payload(cell: Cell) -> bool:
+    """Whether a cell is that of a loaded side, which runs only when the payload is mounted."""
+    return _ASSUMED in cell.file.cell.assumed
 
 
 def _bare_file(cell: Cell) -> CellFile:

@@ -28,6 +28,7 @@ from hil.cli.verdict import NOT_GOOD, as_json, finish
 from hil.cli.weigh import Weighing, weigh
 from hil.design.requirements import Requirement
 from hil.errors import ExecutionError, InputError, OperatorStopError
+from hil.payload_campaign import assumes_payload
 from hil.progress import reporter as make_reporter
 from hil.progress import say
 from hil.screen import Screen
@@ -119,6 +120,10 @@ def _opened(root: Path) -> Campaign:
     if opened.folder.weighs is not None:
         problem = "is one side of a payload campaign"
         raise InputError(root, problem, remedy=f"run `{opened.folder.run_command}`")
+    if assumes_payload(opened.cell):
+        problem = "is a copy of the loaded side of a payload campaign"
+        remedy = "run the campaign that it was copied from, with --payload"
+        raise InputError(root, problem, remedy=remedy)
     return opened
 
 

@@ -110,6 +110,10 @@ def weigh(
     `choices` are those of `Campaign.run` for both sides.
     """
     silent = quiet or json
+    asks = can_read(sys.stdin) and not silent
+    if asks and weighing.mounted is not None:
+        problem = "is for runs without a terminal; here the operator is asked"
+        raise InputError(None, problem, field="--mounted", remedy="leave it out")
     reporter = make_reporter(quiet=silent)
     weighed = PayloadCampaign.of(campaign, weighing.payload or "", weighing.assumed(campaign))
     if rehearse:
@@ -123,7 +127,7 @@ def weigh(
     mounting = Mounting(
         weighed,
         reporter,
-        ask=ask if can_read(sys.stdin) and not silent else None,
+        ask=ask if asks else None,
         mounted={"yes": True, "no": False, None: None}[weighing.mounted],
     )
     if choices["dry_run_only"]:

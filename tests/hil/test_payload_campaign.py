@@ -258,8 +258,9 @@ class TestMounting:
     def test_without_a_terminal_it_names_the_next_command(self, real) -> None:
         mounting = Mounting(real, Silent(), mounted=False)
         mounting.require(False)
-        with pytest.raises(MountingError, match=r"Mount weight.*--payload weight --mounted yes`"):
-            mounting.require(True)
+        command = r"Mount weight.*--payload weight --mounted yes --dry-run`"
+        with pytest.raises(MountingError, match=command):
+            mounting.require(True, "--dry-run")
         assert MountingError.exit_code == 3
 
     def test_the_operator_is_asked_only_where_it_changes(self, real) -> None:
@@ -382,6 +383,18 @@ class TestCommand:
         campaign = campaign_in(tmp_path)
         with pytest.raises(InputError, match=sentence):
             invoke(campaign.folder.root, *words)
+
+    def test_a_copy_of_the_loaded_side_is_not_run(self, tmp_path) -> None:
+        weighed = begun(campaign_in(tmp_path))
+        shutil.copytree(weighed.loaded.folder.root, tmp_path / "copy")
+        with pytest.raises(InputError, match="copy of the loaded side"):
+            invoke(tmp_path / "copy", "--dry-run")
+
+    def test_a_terminal_is_asked_whatever_was_stated(self, tmp_path, monkeypatch) -> None:
+        monkeypatch.setattr("hil.cli.weigh.can_read", lambda _: True)
+        campaign = campaign_in(tmp_path)
+        with pytest.raises(InputError, match="--mounted"):
+            invoke(campaign.folder.root, *STATED, "--mounted", "yes")
 
     def test_a_side_is_not_run_alone(self, designed, done) -> None:
         weighed, _, _ = done
