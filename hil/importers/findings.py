@@ -6,7 +6,7 @@ Where another order fits better, its error is given with that of the map.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -20,7 +20,7 @@ from hil.errors import SourceError
 from hil.importers.stamps import FASTEST, SLOWEST
 from identification.model.urdf_text import urdf_tree
 from identification.signals.clock import time_base
-from identification.signals.recording import unwrap
+from identification.signals.recording import STUCK_MOVEMENT, unwrap
 
 Array = NDArray[np.float64]
 
@@ -46,11 +46,12 @@ def examine(
     *,
     locked: Mapping[str, float] | None = None,
     nominal: NominalTorque | None = None,
+    held_joints: Collection[str] = (),
 ) -> Findings:
     """Return the findings on samples of the joint side, in SI units.
 
     `locked` are positions [rad or m] of joints that are not in the model, by name; `nominal` is the
-    torque of the nominal inertias, None if the URDF has none.
+    torque of the nominal inertias, None if the URDF has none; `held_joints` were clamped.
     """
     time = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9)
     position = unwrap(samples.position)
@@ -73,7 +74,22 @@ def examine(
     warnings += _torques(samples, joint_names, limits.effort)
     if is_plausible:
         warnings += _torque_size(samples, joint_names, limits.effort, nominal)
+    warnings += _constant(position, joint_names, held_joints)
     return Findings(lines=tuple(lines), warnings=tuple(warnings))
+
+
+def _constant(position: Array, names: Sequence[str], held: Collection[str]) -> Iterator[str]:
+    """Yield a warning if joints have one reading throughout while others move."""
+    ranges = np.ptp(position, axis=0)
+    if np.all(ranges <= STUCK_MOVEMENT):
+        return
+    constant = [name for name, size in zip(names, ranges, strict=True) if size == 0.0]
+    constant = [name for name in constant if name not in held]
+    if constant:
+        yield (
+            f"the position of {', '.join(constant)} is the same in all {len(position)} samples: "
+            "taken as standing still; if it moved, its encoder or its column is wrong"
+        )
 
 
 def _turning(urdf: str, names: Sequence[str]) -> NDArray[np.bool_]:

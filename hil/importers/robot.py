@@ -256,7 +256,14 @@ def write_imported(
         check_positions(samples.position, robot.joint_names, robot.urdf, source[0])
     _require_joints(held_joints, robot, source[0])
     nominal = robot.nominal_torque()
-    findings = examine(samples, robot.joint_names, robot.urdf, locked=robot.locked, nominal=nominal)
+    findings = examine(
+        samples,
+        robot.joint_names,
+        robot.urdf,
+        locked=robot.locked,
+        nominal=nominal,
+        held_joints=held_joints,
+    )
     findings = Findings(lines=(*notes, *findings.lines), warnings=findings.warnings)
     entries = {
         **metadata,

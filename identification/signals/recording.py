@@ -188,24 +188,18 @@ class Recording:
             )
 
     def _check_stuck(self) -> None:
-        """Raise RecordingError for a constant position of a commanded joint."""
-        ranges = np.ptp(self.position, axis=0)
+        """Raise RecordingError for a constant position of a joint that is commanded to move."""
+        if self.commanded_position is None:
+            return
         for j, name in enumerate(self.joint_names):
             if name in self.held_joints:
                 continue
-            if self.commanded_position is not None:
-                standstill = stuck(self.position[:, j], self.commanded_position[:, j])
-                if standstill is not None:
-                    raise RecordingError(
-                        f"joint {name} is stuck: its position stays"
-                        f" {self.position[standstill[0], j]:.6g} from sample {standstill[0]} on "
-                        f"while its command moves by {standstill[1]:.3g}"
-                    )
-            elif ranges[j] == 0.0 and np.any(ranges > STUCK_MOVEMENT):
+            standstill = stuck(self.position[:, j], self.commanded_position[:, j])
+            if standstill is not None:
                 raise RecordingError(
-                    f"joint {name} is stuck: its position is {self.position[0, j]:.6g} in all"
-                    f" {self.n_samples} samples while other joints move; declare it as held if"
-                    " it was meant to stand still"
+                    f"joint {name} is stuck: its position stays"
+                    f" {self.position[standstill[0], j]:.6g} from sample {standstill[0]} on "
+                    f"while its command moves by {standstill[1]:.3g}"
                 )
 
 

@@ -240,7 +240,6 @@ class TestSources:
         ("spoilt", "sentence"),
         [
             ({"nan": (700, 2)}, r"position of joint joint_3 is nan at sample 700"),
-            ({"stuck": 4}, r"joint joint_5 is stuck"),
             ({"fall": 300}, r"clock falls back at sample 300"),
             ({"torque": False}, "neither joint torques"),
             (
@@ -252,6 +251,13 @@ class TestSources:
     def test_that_are_invalid_are_refused_by_name(self, tmp_path, spoilt, sentence):
         with pytest.raises(ArchiveError, match=r"bad\.mcap.*" + sentence):
             identified(imported(tmp_path / "bad.mcap", **spoilt))
+
+    def test_with_a_joint_that_never_moves_are_identified(self, tmp_path):
+        """Its torque holds its load; a model that knows nothing of its motion is not good."""
+        identification = identified(imported(tmp_path / "standing.mcap", stuck=4))
+        assert not identification.verdict.good
+        errors = identification.results.fitted.all_rows_joint_errors
+        assert np.isfinite(np.delete(errors, 4)).all()
 
     def test_alone_are_split_and_repeated_stamps_averaged(self, tmp_path):
         identification = identified(imported(tmp_path / "one.mcap", repeat=300))

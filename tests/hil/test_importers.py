@@ -923,6 +923,20 @@ class TestWarnings:
         sentences = warnings(arm, **error)
         assert any(sentence in warning for warning in sentences), sentences
 
+    def test_a_joint_with_one_reading_is_named_unless_it_was_held(self, arm: Simulated) -> None:
+        stamp = np.rint(arm.time * 1e9).astype(np.int64)
+        standing = np.where(np.arange(6) == 2, 0.4, arm.position)
+        samples = Samples(stamp, standing, torque=arm.torque)
+        robot = Robot.from_urdf(arm.urdf, recorded=arm.joint_names)
+
+        def findings(held_joints: Sequence[str] = ()) -> list[str]:
+            result = examine(samples, arm.joint_names, robot.urdf, held_joints=held_joints)
+            return list(result.warnings)
+
+        (sentence,) = findings()
+        assert sentence.startswith("the position of elbow_joint is the same in all")
+        assert findings([arm.joint_names[2]]) == []
+
     def test_velocities_have_factors_by_joint(self, arm: Simulated, panda: Simulated) -> None:
         for factor in (DEGREES, -1.0):
             (sentence,) = warnings(panda, velocity=factor)
