@@ -88,7 +88,7 @@ def _constant(position: Array, names: Sequence[str], held: Collection[str]) -> I
     if constant:
         yield (
             f"the position of {', '.join(constant)} is the same in all {len(position)} samples: "
-            "taken as standing still; if it moved, its encoder or its column is wrong"
+            "it is assumed to stand still; if it moved, its encoder or its column is wrong"
         )
 
 

@@ -68,6 +68,11 @@ _SETTLED: Final = 1e-3  # relative change of the noise
 # Of the scatter of its torque, that a term of friction alone makes. Coulomb and viscous friction
 # together are the torque of a light wrist, and a fifth of that of a heavy arm.
 _FRICTION_SHARE: Final = 0.5
+# RMS of motions that excite an arm: 0.2 to 4.5 rad/s in the recordings of six arms of the board,
+# half of the joints above 0.45; at a base frequency of 0.1 to 0.2 Hz the acceleration is as large.
+_USUAL_SPEED: Final = 0.5  # rad/s or m/s
+_USUAL_ACCELERATION: Final = 0.5  # rad/s² or m/s²
+_SPEEDS: Final = 20  # up to the usual one
 LOAD_SHARE: Final = 0.1
 """Deviation of the share of the transmitted torque that becomes friction: strain-wave gears lose
 some 2 to 15 % (Bittencourt and Gunnarsson 2012)."""
@@ -453,16 +458,33 @@ def _outboard_inertia(model: RobotModel, masses: Array, length: Array) -> Array:
 def _torque_over_columns(model: RobotModel, factor: Factor) -> Array:
     """Return the coefficient (p,) with which a column alone makes its joints' torque vary so.
 
-    A joint without an offset is taken to vary about zero.
+    A motion slower than usual does not allow more: what it hardly shows would be huge in a faster
+    one. A joint without an offset is taken to vary about zero.
     """
     power = (_FRICTION_SHARE * torque_scatter(model, factor)) ** 2 * factor.samples
     columns = np.diagonal(factor.gram, axis1=1, axis2=2)[:, :-1]
     acting = columns > 0.0
     whole = np.where(acting, power[:, None], 0.0).sum(axis=0)
-    size = np.sqrt(whole / np.where(acting.any(axis=0), columns.sum(axis=0), 1.0))
+    rows = np.where(acting, factor.samples[:, None], 0).sum(axis=0)
+    squares = np.maximum(columns.sum(axis=0), rows * _usual_columns(model) ** 2)
+    size = np.sqrt(whole / np.where(squares > 0.0, squares, 1.0))
     # Without a row that shows it, a coefficient of the size of the torque.
     rms = np.sqrt(power.sum() / max(1, int(factor.samples.sum()))) or 1.0
     return np.asarray(np.where(size > 0.0, size, rms))
+
+
+def _usual_columns(model: RobotModel) -> Array:
+    """Return columns (p,) of friction, offsets and rotors at the usual speed and acceleration.
+
+    Zero for other parameters.
+    """
+    usual = np.zeros(model.n_parameters)
+    speeds = np.linspace(0.0, _USUAL_SPEED, _SPEEDS)
+    for k, term in enumerate(model.friction.terms, model.base.rank):
+        usual[k] = np.abs(term.term.column(speeds, np.ones(_SPEEDS))).max()
+    rotors = np.isin(model.base.pivots, model.layout.rotors)
+    usual[: model.base.rank][rotors] = _USUAL_ACCELERATION
+    return usual
 
 
 def torque_scatter(model: RobotModel, factor: Factor) -> Array:

@@ -85,8 +85,11 @@ PRESLIDING: Final = (1e-4, 1e-6, 1e-5, 3e-5, 3e-4, 1e-3)  # rad or m
 # rest by brake or static friction, can mislead.
 LEFT_OUT: Final[tuple[LeftOut, ...]] = ("rests", "halts", "slow")
 NEARBY: Final = (1.0, 0.9, 0.95, 1.05, 1.1)  # factors of the bandwidth of a low-pass
-STRENGTHS: Final = (1.0, 4.0, 0.25)
-"""Weights of the prior: factors of the rows that count as one by the correlation of residuals."""
+STRENGTHS: Final = (1.0, 4.0)
+"""Weights of the prior: factors of the rows that count as one by the correlation of residuals.
+
+None below one: folds of one motion would favour a weaker prior, which another motion pays for.
+"""
 # Terms beside Coulomb and viscous friction; they correlate, so one at most. The stated law comes
 # first.
 FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (

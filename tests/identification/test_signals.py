@@ -118,7 +118,7 @@ class TestChecks:
     def test_valid_recordings_pass(self, recording):
         assert recording.checked() is recording
 
-    def test_a_constant_reading_without_commands_is_a_joint_that_stands(self):
+    def test_without_commands_a_constant_joint_stands(self):
         recording = replace(changed("position", slice(None), 0, 0.3), commanded_position=None)
         assert recording.checked() is recording
 
