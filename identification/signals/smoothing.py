@@ -232,22 +232,24 @@ class _Problem:
         gram = _gram_band(rows)
         penalty = _penalty_band(intervals)
         lightest = _LIGHTEST * density
-        factor = (scipy.linalg.cholesky_banded(gram + lightest * penalty, lower=True), True)
-        closest = scipy.linalg.cho_solve_banded(factor, rows.T @ values)
+        factor = _banded_factor(gram + lightest * penalty)
+        closest = _banded_solution(factor, rows.T @ values)
         residual = rows @ closest
         np.subtract(values, residual, out=residual)
         refined = rows.T @ residual - lightest * _roughness(closest)
-        closest += scipy.linalg.cho_solve_banded(factor, refined)
+        closest += _banded_solution(factor, refined)
         np.subtract(values, rows @ closest, out=residual)
         return cls(spacing, density, rows, gram, penalty, closest, residual, _roughness(closest))
 
     def correction(self, channel: int | slice, penalty: float) -> Array:
         """Return the change of coefficients from the least smoothed ones."""
-        factor = scipy.linalg.cholesky_banded(self.gram + penalty * self.penalty, lower=True)
-        excess = penalty - _LIGHTEST * self.density
-        return np.asarray(
-            scipy.linalg.cho_solve_banded((factor, True), -excess * self.roughness[:, channel])
-        )
+        return self._corrected(penalty, self.roughness[:, channel])[1]
+
+    def _corrected(self, penalty: float, roughness: Array) -> tuple[Array, Array]:
+        """Return the factor (6, k) of the normal equations, and the change of coefficients."""
+        factor = _banded_factor(self.gram + penalty * self.penalty)
+        change = penalty - _LIGHTEST * self.density
+        return factor, _banded_solution(factor, -change * roughness)
 
     def penalty_at(self, bandwidth: float) -> float:
         """Return the penalty of a bandwidth [Hz], within the limits of the knots."""
@@ -261,10 +263,14 @@ class _Problem:
         By Newton's method in logarithms, or bisection where a step would leave the bracket.
         """
         low, high = (float(np.log(self.penalty_at(width))) for width in (widest, 0.0))
+        closest = np.ascontiguousarray(self.closest_residual[:, channel])
+        roughness = np.ascontiguousarray(self.roughness[:, channel])
         point = low
         high_tried = False
         while high - low > _PENALTY:
-            excess, slope = self._excess(channel, float(np.exp(point)), tolerance)
+            penalty = float(np.exp(point))
+            variance, slope = self._residual_variance(penalty, closest, roughness)
+            excess = float(np.log(variance / tolerance))
             if excess > 0.0:
                 high = point
                 high_tried = True
@@ -281,22 +287,36 @@ class _Problem:
             point = target
         return float(np.exp(low))
 
-    def _excess(self, channel: int, penalty: float, tolerance: float) -> tuple[float, float]:
-        """Return the logarithm of mean squared residual over tolerance, and its slope.
+    def _residual_variance(
+        self, penalty: float, closest: Array, roughness: Array
+    ) -> tuple[float, float]:
+        """Return the mean squared residual of a channel, and the slope of its logarithm.
 
-        The slope is that over the logarithm of the penalty.
+        The slope is that over the logarithm of the penalty; `closest` (m,) is the closest residual,
+        `roughness` (k,) that of its coefficients.
         """
-        factor = scipy.linalg.cholesky_banded(self.gram + penalty * self.penalty, lower=True)
-        change = penalty - _LIGHTEST * self.density
-        correction = scipy.linalg.cho_solve_banded(
-            (factor, True), -change * self.roughness[:, channel]
-        )
-        residual = self.closest_residual[:, channel] - self.rows @ correction
+        factor, correction = self._corrected(penalty, roughness)
+        residual = closest - self.rows @ correction
         variance = max(float(np.mean(residual**2)), np.finfo(np.float64).tiny)
-        bending = self.roughness[:, channel] + _roughness(correction[:, None])[:, 0]
-        sensitivity = float(bending @ scipy.linalg.cho_solve_banded((factor, True), bending))
-        slope = 2.0 * penalty**2 * sensitivity / (len(residual) * variance)
-        return float(np.log(variance / tolerance)), slope
+        bending = roughness + _roughness(correction)
+        sensitivity = float(bending @ _banded_solution(factor, bending))
+        return variance, 2.0 * penalty**2 * sensitivity / (len(residual) * variance)
+
+
+def _banded_factor(band: Array) -> Array:
+    """Return the lower Cholesky factor (6, k) of a positive definite matrix by its lower band.
+
+    Without the checks of scipy's function, which take as long as the factorisation.
+    """
+    factor, failed = scipy.linalg.lapack.dpbtrf(band, lower=1, overwrite_ab=1)
+    if failed:
+        raise np.linalg.LinAlgError("the normal equations of the spline are singular")
+    return np.asarray(factor)
+
+
+def _banded_solution(factor: Array, right: Array) -> Array:
+    """Solve for right-hand sides (k,) or (k, c) with a factor of `_banded_factor`."""
+    return np.asarray(scipy.linalg.lapack.dpbtrs(factor, right, lower=1)[0])
 
 
 @cache
@@ -336,10 +356,10 @@ def _rows(
 
 
 def _gram_band(rows: scipy.sparse.csr_array) -> Array:
-    """Return the lower band (6, k) of rows' rows."""
+    """Return the lower band (6, k) of rows' rows, in the order of LAPACK."""
     columns = rows.indices.reshape(-1, ORDER)
     weights = rows.data.reshape(-1, ORDER)
-    band = np.zeros((ORDER, rows.shape[1]))
+    band = np.zeros((ORDER, rows.shape[1]), order="F")
     for k in range(ORDER):
         for offset in range(ORDER - k):
             band[offset] += np.bincount(
@@ -361,7 +381,7 @@ _QUADRATICS: Final = _products(_pieces(2))
 
 def _penalty_band(intervals: int) -> Array:
     """Return the lower band (6, k) of integrals of third derivatives, in knot units."""
-    band = np.zeros((ORDER, intervals + DEGREE))
+    band = np.zeros((ORDER, intervals + DEGREE), order="F")
     for k in range(ORDER):
         for offset in range(ORDER - k):
             band[offset, k : k + intervals] += _THIRD_DERIVATIVES[k, k + offset]
@@ -369,14 +389,25 @@ def _penalty_band(intervals: int) -> Array:
 
 
 def _roughness(coefficients: Array) -> Array:
-    """Return the penalty matrix times coefficients (k, c), accurate also with a heavy penalty."""
-    third = np.diff(coefficients, 3, axis=0)
+    """Return the penalty matrix times coefficients (k,) or (k, c).
+
+    Accurate also with a heavy penalty.
+    """
+    third = _third_differences(coefficients)
     intervals = len(third) - 2
-    product = np.zeros_like(third)
+    padded = np.zeros((len(third) + 6, *third.shape[1:]))
+    product = padded[3:-3]
     for k in range(3):
         for other in range(3):
             product[k : k + intervals] += _QUADRATICS[k, other] * third[other : other + intervals]
-    return -np.diff(np.pad(product, ((3, 3), (0, 0))), 3, axis=0)
+    return -_third_differences(padded)
+
+
+def _third_differences(values: Array) -> Array:
+    """Return ``np.diff(values, 3, axis=0)``, which takes longer."""
+    for _ in range(3):
+        values = values[1:] - values[:-1]
+    return values
 
 
 _HIGHEST: Final = 0.45  # largest cut-off as a share of the sampling rate
