@@ -275,11 +275,7 @@ def _unpacked(
     units = tuple(map(intern, content["units"]))
     n_joints = arrays["counts"].shape[1]
     columns = tuple(arrays[f"columns_{j}"] for j in range(n_joints))
-
-    def factor(kind: str, counts: NDArray[np.intp], rows: slice) -> Factor:
-        matrices = (_symmetric(arrays[f"{kind}_{j}"][rows]) for j in range(n_joints))
-        return Factor(tuple(matrices), columns, counts, names)
-
+    totals = [_symmetric(arrays[f"total_{j}"]) for j in range(n_joints)]
     summaries = []
     k, begin, measured = 0, 0, 0  # fits, rows of scatter and products so far
     for number, (ref, entry) in enumerate(zip(refs, content["archives"], strict=True)):
@@ -311,7 +307,9 @@ def _unpacked(
         summaries.append(
             Summary(
                 ref=ref,
-                total=factor("total", arrays["counts"][rows], rows),
+                total=Factor(
+                    tuple(grams[rows] for grams in totals), columns, arrays["counts"][rows], names
+                ),
                 fit=fit,
                 scatter=scatter,
                 warnings=tuple(map(intern, entry["warnings"])),
@@ -320,15 +318,15 @@ def _unpacked(
         )
     total = None
     if "sum_counts" in arrays:
-        total = factor("sum", arrays["sum_counts"], slice(None))
+        grams = tuple(_symmetric(arrays[f"sum_{j}"]) for j in range(n_joints))
+        total = Factor(grams, columns, arrays["sum_counts"], names)
     return Reduction(tuple(summaries), total, cached=len(refs))
 
 
 def _symmetric(triangles: Array) -> Array:
     """Return the matrices (B, c, c) of upper triangles (B, c (c + 1) / 2)."""
     width = (int(np.sqrt(8 * triangles.shape[1] + 1)) - 1) // 2
-    matrices = np.zeros((len(triangles), width, width))
+    place = np.zeros((width, width), dtype=np.intp)
     row, column = np.triu_indices(width)
-    matrices[:, row, column] = triangles
-    matrices[:, column, row] = triangles
-    return matrices
+    place[row, column] = place[column, row] = np.arange(triangles.shape[1])
+    return np.take(triangles, place, axis=1)

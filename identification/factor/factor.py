@@ -357,7 +357,12 @@ class Factor:
     def occupied(self) -> Self:
         """Return the blocks with rows."""
         rows = np.asarray(self.counts.any(axis=1))
-        return self if rows.all() else self.blocks(rows)
+        if rows.all():
+            return self
+        used = np.flatnonzero(rows)
+        if len(used) and used[-1] - used[0] < len(used):  # without a gap, so that none is copied
+            return self.blocks(slice(int(used[0]), int(used[-1]) + 1))
+        return self.blocks(rows)
 
     def merged(self, length: int) -> Self:
         """Merge runs of `length` blocks; the last one may be shorter."""

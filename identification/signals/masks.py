@@ -146,13 +146,16 @@ def flat_topped(values: Array, moving: Rows) -> Rows:
     At least `SHORTEST_TOP` equal values, left faster than the peak of a smooth signal would be.
     """
     clipped = np.zeros(values.shape, dtype=np.bool_)
-    for j, channel in enumerate(values.T):
+    for j, channel in enumerate(np.ascontiguousarray(values.T)):
+        tops = [channel == extreme for extreme in (channel.max(), channel.min())]
+        if max(map(np.count_nonzero, tops)) < SHORTEST_TOP:
+            continue
         steps = np.abs(np.diff(channel))
         if not steps.any():
             continue
         resolution = float(steps[steps > 0.0].min())
-        for extreme in (channel.max(), channel.min()):
-            for start, stop in _runs(channel == extreme):
+        for top in tops:
+            for start, stop in _runs(top):
                 if stop - start >= SHORTEST_TOP and _leaves_peak(channel, start, stop, resolution):
                     clipped[start:stop, j] = True
     return clipped & moving

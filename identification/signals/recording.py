@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, Final
 
@@ -79,10 +80,20 @@ class Recording:
                 f"the recorded joints are {', '.join(self.joint_names)}; the model's are"
                 f" {', '.join(joint_names)}, in this order"
             )
-        self.check_finite()
-        self._check_clock()
-        self._check_stuck()
+        if self._defect is not None:
+            raise RecordingError(self._defect)
         return self
+
+    @cached_property
+    def _defect(self) -> str | None:
+        """What makes the arrays useless, examined once; None if nothing does."""
+        try:
+            self.check_finite()
+            self._check_clock()
+            self._check_stuck()
+        except RecordingError as error:
+            return str(error)
+        return None
 
     def between(self, start: int, stop: int) -> Recording:
         """Return samples start to stop (exclusive)."""
