@@ -21,7 +21,8 @@ from hil.errors import HilError, InputError
 from hil.files import file_digest
 from hil.identify import Identification, Options, identify_paths
 from hil.identify.cell_context import torque_limits
-from hil.identify.estimating import OF_PRIOR, Posterior
+from hil.identify.estimating import Posterior
+from hil.identify.estimators import OF_PRIOR
 from hil.identify.prepared import Prepared, prepared_with
 from hil.identify.sources import gather_sources
 from hil.outcome import PARAMETERS_JSON, RESULTS, archive_digests, provenance_of, single_line

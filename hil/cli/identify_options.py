@@ -11,7 +11,8 @@ import typer
 
 from hil.cli.arguments import ESTIMATION
 from hil.errors import InputError
-from hil.identify.options import ESTIMATORS, Estimator, Options, friction_from
+from hil.identify.estimators import ESTIMATORS, Estimator
+from hil.identify.options import Options, friction_from
 from identification.rollout.servo import Servo
 
 LONGEST_DELAY: Final = 0.5

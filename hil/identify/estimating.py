@@ -16,7 +16,6 @@ from hil.progress import Reporter
 from identification import IdentificationError, RobotModel
 from identification.estimators.consistent import (
     SolverError,
-    consistent_estimate,
     consistent_values,
 )
 from identification.estimators.delay import rate_products, with_uncertain_delay
@@ -26,11 +25,8 @@ from identification.estimators.instrumental import (
     same_plan,
 )
 from identification.estimators.least_squares import (
-    Fit,
     RepeatedEstimate,
-    Weighting,
     estimate_repetitions,
-    fit_least_squares,
 )
 from identification.estimators.load_friction import LoadFit, fit_with_load
 from identification.estimators.losses import Huber, Loss, Tukey
@@ -52,7 +48,6 @@ from identification.factor.factor import (
     Estimate,
     Factor,
     inverse_variance,
-    joint_weights,
     no_rows_message,
     solve,
     total_factor,
@@ -64,7 +59,8 @@ from identification.validation.calibration import Refit
 from identification.validation.finding import joined
 
 from .cell_context import TorqueScale, torque_scale
-from .options import Estimator, Options
+from .estimators import OF_PRIOR, Estimator, fit_of, values_of
+from .options import Options
 from .prepared import Prepared, known_parameters, samples_of
 from .sources import Sources
 
@@ -319,34 +315,9 @@ class Posterior:
 # Estimators
 
 
-def fit_of(model: RobotModel, name: str) -> Fit:
-    """Return the fit function of an estimator that works on factors, without prior."""
-
-    def fit(some: Sequence[Samples], factor: Factor) -> Estimate:
-        weighting: Weighting = "ordinary" if name == "ols" else "weighted"
-        result = fit_least_squares(model, some, weighting, factor=factor)
-        if name == "consistent":
-            result = consistent_estimate(model, factor, result).estimate
-        return result
-
-    return fit
-
-
 def refit_of(model: RobotModel, name: Estimator, posterior: Posterior) -> Refit:
-    """Return the parameters (p,) by an estimator as a function of a factor.
-
-    Robust losses and instruments need samples; weighted least squares represents them.
-    """
-    if name in OF_PRIOR:
-        return posterior.values
-    if name == "ols":
-        return lambda factor: factor.solve(np.ones(model.n_joints)).values
-    if name == "consistent":
-        return lambda factor: consistent_estimate(model, factor).estimate.values
-    return lambda factor: factor.solve(joint_weights(factor)).values
-
-
-OF_PRIOR: Final = ("auto", "prior")
+    """Return the parameters (p,) by an estimator as a function of a factor."""
+    return posterior.values if name in OF_PRIOR else values_of(model, name)
 
 
 def _posterior(

@@ -12,20 +12,9 @@ from identification.model.friction import ABSENT, TERMS
 from identification.signals.masks import LeftOut
 from identification.signals.samples import RIGID_BANDWIDTH, VelocitySource
 
-Method = Literal["default", "paper"]
-Estimator = Literal["auto", "wls", "ols", "huber", "tukey", "prior", "consistent", "iv"]
+from .estimators import ESTIMATORS, Estimator
 
-ESTIMATORS: Final[dict[Estimator, str]] = {
-    "auto": "posterior of a prior on bodies, drives and friction, as strong as the residuals and "
-    "inner prediction say",
-    "wls": "weighted least squares (eq. 4), residuals weighted by the noise of their joint",
-    "ols": "ordinary least squares, equal weights of all joints",
-    "huber": "iteratively reweighted least squares, Huber loss",
-    "tukey": "iteratively reweighted least squares, Tukey's bisquare loss",
-    "prior": "posterior of the bodies of the URDF to the uncertainty of [nominal]",
-    "consistent": "weighted least squares over physically consistent parameters",
-    "iv": "instrumental variables, with the commanded motion as instruments",
-}
+Method = Literal["default", "paper"]
 
 
 @dataclass(frozen=True)
@@ -47,7 +36,7 @@ class Options:
     #: bandwidth [Hz] of a low-pass filter in the recorded torque; None for none; "auto" detects one
     #: in imported torques (a controller's currents are unfiltered)
     torque_bandwidth: float | Literal["auto"] | None = "auto"
-    estimator: Estimator = "auto"  #: see `ESTIMATORS`
+    estimator: Estimator = "auto"  #: see :mod:`hil.identify.estimators`
     bandwidth: float | Literal["auto"] = "auto"  #: maximum bandwidth of the smoothed positions [Hz]
     #: derivative of the smoothed positions, or measured velocity
     velocity: VelocitySource | Literal["auto"] = "auto"

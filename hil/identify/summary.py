@@ -34,7 +34,7 @@ from planner import FourierSeries
 from sim_fixtures.ns16 import TABLE2, URDF_PATH
 
 from .estimating import Estimation
-from .options import ESTIMATORS
+from .estimators import ESTIMATORS
 from .prepared import Prepared, executed_rows
 from .sources import Sources
 from .validation import Validation

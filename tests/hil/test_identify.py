@@ -20,7 +20,8 @@ from hil.cli.verdict import NOT_GOOD, as_json, finish, sentences, table
 from hil.errors import ArchiveError, InputError, OutputError
 from hil.identify import Options, identify_archives, identify_campaign
 from hil.identify.estimating import estimate_with
-from hil.identify.options import ESTIMATORS, FIXED, friction_from
+from hil.identify.estimators import ESTIMATORS
+from hil.identify.options import FIXED, friction_from
 from hil.identify.prepared import prepare_sources
 from hil.identify.sources import gather_sources
 from hil.identify.summary import _delays
