@@ -6,9 +6,10 @@ stamp error e moves the sample of every joint off its smooth motion by v e.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import scipy
@@ -168,12 +169,64 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     if recording.velocity is not None:
         signals = np.hstack([signals, recording.velocity])
     base = time_base(time, recording.gap_before)
-    even, repeated, idle = time.copy(), *np.zeros((2, len(time)), np.bool_)
+    clock = _even_clock(time, signals, recording.segments(), base)
+    share = np.nan
+    deviation = np.nan
+    residuals = (1.0, 1.0)
+    if np.abs(clock.late).max() > UNIFORM:
+        parts = [_residuals(*part, base.step) for part in clock.evidence]
+        share, deviation, residuals = _stamp_share(*map(np.concatenate, zip(*parts, strict=True)))
+    # Not between the hypotheses.
+    certain = bool(abs(share - 0.5) > max(_MARGIN * deviation, 0.25))
+    rows = ~(clock.repeated | clock.idle)
+    is_even = certain and share < 0.5 and bool(np.all(np.diff(clock.time[rows]) > 0.0))
+    out = ~rows if is_even else clock.repeated
+    sentences = []
+    if out.any():
+        sentences.append(
+            f"{np.count_nonzero(out)} rows repeat the sample before them while the arm moves and"
+            " were removed"
+        )
+    if is_even or (base.largest_deviation > UNIFORM and not np.isnan(share)):
+        used = f"even times, {clock.missing} missing samples counted" if is_even else "the stamps"
+        if not certain or (share < 0.5 and not is_even):
+            used += " (positions are inconclusive)"
+        scatter = percentage(0.0 if base.uniform else clock.late.std(), 1)
+        sentences.append(
+            f"the time stamps scatter by {scatter} of a step;"
+            f" share confirmed by the positions: {share:.2f} ± {deviation:.1g}; high-frequency"
+            f" residual in multiples of noise: {residuals[0]:.3g} with the stamps,"
+            f" {residuals[1]:.3g} with even times; used: {used}"
+        )
+    if not out.any() and not is_even:
+        return recording, tuple(sentences)
+    return replace(recording, time=clock.time if is_even else time).rows(~out), tuple(sentences)
+
+
+class _EvenClock(NamedTuple):
+    """Even times that follow the slow drift of the stamps."""
+
+    time: Array  # (m,)
+    repeated: Rows  # rows (m,) that repeat the sample before them
+    idle: Rows  # other rows (m,) of the number of the one before
+    #: of each segment: numbers (k,), even times (k,), signals (k, c), lateness of the stamps (k,)
+    evidence: list[tuple[Array, Array, Array, Array]]
+    late: Array  # lateness of all stamps in steps, after a zero
+    missing: int  # samples
+
+
+def _even_clock(
+    time: Array, signals: Array, segments: Sequence[slice], base: TimeBase
+) -> _EvenClock:
+    """Number the samples of each segment, and place them at even times."""
+    even = time.copy()
+    repeated = np.zeros(len(time), dtype=np.bool_)
+    idle = np.zeros(len(time), dtype=np.bool_)
     evidence = []
     scatter = []
     missing = 0
     longer = 0.0
-    for part in recording.segments():
+    for part in segments:
         even[part] += longer
         repeated[part] = _repeated(time[part], signals[part])
         rows = part.start + np.flatnonzero(~repeated[part])
@@ -197,37 +250,9 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
         missing += lost
         scatter.append(late / base.step)
         evidence.append((number, times, signals[rows], late))
-    scattered = np.concatenate([np.zeros(1), *scatter])
-    share = np.nan
-    deviation = np.nan
-    residuals = (1.0, 1.0)
-    if np.abs(scattered).max() > UNIFORM:
-        parts = [_residuals(*part, base.step) for part in evidence]
-        share, deviation, residuals = _stamp_share(*map(np.concatenate, zip(*parts, strict=True)))
-    # Not between the hypotheses.
-    certain = bool(abs(share - 0.5) > max(_MARGIN * deviation, 0.25))
-    is_even = certain and share < 0.5 and bool(np.all(np.diff(even[~(repeated | idle)]) > 0.0))
-    out = repeated | idle if is_even else repeated
-    sentences = []
-    if out.any():
-        sentences.append(
-            f"{np.count_nonzero(out)} rows repeat the sample before them while the arm moves and"
-            " were removed"
-        )
-    if is_even or (base.largest_deviation > UNIFORM and not np.isnan(share)):
-        used = f"even times, {missing} missing samples counted" if is_even else "the stamps"
-        if not certain or (share < 0.5 and not is_even):
-            used += " (positions are inconclusive)"
-        sentences.append(
-            f"the time stamps scatter by {percentage(0.0 if base.uniform else scattered.std(), 1)} "
-            "of a step;"
-            f" share confirmed by the positions: {share:.2f} ± {deviation:.1g}; high-frequency"
-            f" residual in multiples of noise: {residuals[0]:.3g} with the stamps,"
-            f" {residuals[1]:.3g} with even times; used: {used}"
-        )
-    if not out.any() and not is_even:
-        return recording, tuple(sentences)
-    return replace(recording, time=even if is_even else time).rows(~out), tuple(sentences)
+    return _EvenClock(
+        even, repeated, idle, evidence, np.concatenate([np.zeros(1), *scatter]), missing
+    )
 
 
 def _numbers(time: Array, signals: Array, step: float) -> Array:
