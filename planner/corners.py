@@ -396,7 +396,7 @@ class Solutions(NamedTuple):
     """Unchecked solutions of ruckig for many joins.
 
     `starts` and `ends` are position, velocity and acceleration of the joints (c, n, 3); `times` the
-    unit of time of each (c,) [s]; `durations` (c,) [s] are infinite, and `found` (trajectories in
+    unit of time of each (c,) [s]; `durations` (c,) [s] are infinite, and `trajectories` (in
     normalised units) None, where there is no join.
     """
 
@@ -404,7 +404,7 @@ class Solutions(NamedTuple):
     ends: Array
     times: Array
     durations: Array
-    found: NDArray[np.object_]
+    trajectories: NDArray[np.object_]
 
     def take(self, rows: Rows) -> Solutions:
         """Return solutions by index."""
@@ -503,7 +503,7 @@ def _tables(solutions: Solutions, bounds: Allowance) -> Block:
     profiles = np.array(
         [
             [[*p.brake.t, *p.t, *p.brake.j, *p.j] for p in result.profiles[0]]
-            for result in solutions.found
+            for result in solutions.trajectories
         ]
     )
     lengths = profiles[..., :_PIECES] * solutions.times[:, None, None]

@@ -47,4 +47,4 @@ def join(start, end, limits: JointLimits, time: float) -> PiecewiseCubic | None:
     """Join two states (n, 3) within limits in about a time [s], as a corner does."""
     bounds = rows_of(limits)
     solutions = solve_many(start[None], end[None], np.array([time]), bounds)
-    return finish_many(solutions, bounds)[0] if solutions.found[0] is not None else None
+    return finish_many(solutions, bounds)[0] if solutions.trajectories[0] is not None else None
