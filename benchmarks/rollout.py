@@ -2,6 +2,7 @@
 
     python -m benchmarks.rollout
     python -m benchmarks.rollout --arms [--data DIR] [--only NAME]
+    python -m benchmarks.rollout --sysid [--iterations N] [--data DIR] [--only NAME]
 
 The arm is the nominal NS 16 (simulated), its torque along sines is exact. Prints time and processor
 time; wanted are 30 s on two idle cores.
@@ -10,6 +11,12 @@ With `--arms` held-out motions of the real arms of the board are simulated inste
 errors at 0.5 s and their ratio to those of the nominal arm (at most 0.5 is wanted, where the URDF
 has masses), and the share of measured positions in the 95 % band at 0.2 s (88 to 99 % is wanted);
 and what misses that.
+
+With `--sysid` an arm by `hil identify` is compared with one by the minimiser of `mujoco.sysid`
+(`benchmarks.sysid_rival`) that is fitted to windows of one second which cover the same recording.
+Both are then simulated in the same held-out windows, under the recorded torque and a feedback of
+1 Hz. Prints errors and processor time; wanted are no larger error and a tenth of the time. The
+recording is that of a simulated NS 16, or those of `--only`.
 """
 
 from __future__ import annotations
@@ -22,19 +29,23 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import parser_of
-from benchmarks.board import DATA, import_all
+from benchmarks.board import DATA, import_all, simulated_logs
 from benchmarks.published import Published, known
 from hil.cell import Cell
-from hil.identified_model import model_of
+from hil.identified_model import IdentifiedModel, model_of
 from hil.identify import identify_paths
 from hil.progress import Silent
-from hil.rollout import RolloutOptions, roll_out
+from hil.rollout import RolloutOptions, nominal_arm, roll_out
 from hil.rollout_result import JUDGED, RolloutResult
 from identification import Samples
 from identification.export.arm import Arm, Ranges
 from identification.model.motion import Motion
 from identification.rollout.comparison import (
+    HORIZONS,
     RecordedMotion,
+    ToolFrame,
+    errors_of,
+    horizon_rows,
     light_feedback,
     recorded_stretches,
     simulate,
@@ -85,6 +96,71 @@ def time_of_windows() -> None:
     )
 
 
+def compare_with_sysid(names: Sequence[str], data: Path, iterations: int) -> None:
+    """Print errors and processor times of `hil identify` and of `mujoco.sysid`."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        if not names:
+            archives = {
+                n: log.imported(folder / f"{n}.mcap") for n, log in simulated_logs()[1].items()
+            }
+            _print_comparison("NS 16 (simulated)", [*archives.values()], iterations)
+        for name in names:
+            published = Published.named(name)
+            archives = import_all(published, data / (published.folder or name), folder)
+            split = published.splits[0]
+            predict = [archives[split.predicted]] if split.predicted else []
+            _print_comparison(f"{name}, {split}", [archives[split.fitted], *predict], iterations)
+
+
+def _print_comparison(name: str, archives: Sequence[Path], iterations: int) -> None:
+    """Print the comparison for a recording that is fitted, and those that are predicted."""
+    from benchmarks.sysid_rival import fit_by_sysid, positions_of
+
+    begin = time.process_time()
+    model = model_of(identify_paths(archives[:1], Silent(), predict=archives[1:]))
+    seconds = time.process_time() - begin
+    arm = model.arm
+    nominal = nominal_arm(model.cell, arm)
+    if nominal is None:
+        raise SystemExit(f"{name}: the URDF has no masses to start from")
+    feedback = light_feedback(arm, STEP, 1.0)
+    fitted = _windows_of(model, model.prepared.fitted, HORIZONS[-1])
+    held_out = _windows_of(model, model.prepared.held_out, 0.1)
+    begin = time.process_time()
+    rival = fit_by_sysid(nominal, fitted, feedback, iterations)
+    rival_seconds = time.process_time() - begin
+    print(
+        f"{name}: {len(fitted.windows)} fitted and {len(held_out.windows)} held-out windows;"
+        f" mujoco.sysid: {rival.parameters} parameters, at most {iterations} iterations,"
+        f" all windows simulated {rival.simulations} times"
+    )
+    rows = {
+        "hil identify": (simulate(arm, held_out, feedback), seconds),
+        "mujoco.sysid": (positions_of(rival, nominal, held_out, feedback), rival_seconds),
+        "nominal": (simulate(nominal, held_out, feedback), None),
+    }
+    print(f"{'position error (rms) [mrad]':30}" + "".join(f"{f'{h:g} s':>10}" for h in HORIZONS))
+    measured = held_out.windows.reached[:, horizon_rows(held_out.windows)]
+    for label, (positions, spent) in rows.items():
+        joints = errors_of(positions, measured, ToolFrame(arm)).joints
+        overall = 1e3 * np.sqrt(np.mean(joints**2, axis=1))
+        figures = "".join(f"{error:10.3g}" for error in overall)
+        print(
+            f"{label:30}{figures}" + ("" if spent is None else f"   in {spent:.1f} s"), flush=True
+        )
+
+
+def _windows_of(
+    model: IdentifiedModel, samples: Sequence[Samples], stride: float
+) -> RecordedMotion:
+    """Return windows of one second of samples, which start every `stride` seconds."""
+    stretches, owners = recorded_stretches(
+        model.arm.model, [(recording, None) for recording in samples], STEP
+    )
+    return RecordedMotion(windows_of(stretches, STEP, HORIZONS[-1], stride), tuple(owners))
+
+
 def arms(names: Sequence[str], data: Path) -> None:
     """Print errors and bands of real arms, and what misses the bounds."""
     missed = []
@@ -121,13 +197,17 @@ def _print_arm(name: str, result: RolloutResult) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print times, or the errors of real arms."""
+    """Print times, errors of real arms, or a comparison with `mujoco.sysid`."""
     parser = parser_of(__doc__)
     parser.add_argument("--arms", action="store_true", help="real arms in place of the time")
+    parser.add_argument("--sysid", action="store_true", help="compare with mujoco.sysid")
+    parser.add_argument("--iterations", type=int, default=30, help="of mujoco.sysid, at most")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of recordings")
     parser.add_argument("--only", action="append", choices=known(), help="may be repeated")
     options = parser.parse_args(arguments)
-    if options.arms:
+    if options.sysid:
+        compare_with_sysid(options.only or (), options.data, options.iterations)
+    elif options.arms:
         arms(options.only or known(), options.data)
     else:
         time_of_windows()

@@ -206,31 +206,42 @@ def _nominal(
     tool: ToolFrame,
 ) -> tuple[ArmErrors | None, str, list[str]]:
     """Return the errors of the nominal arm, why there is none, and notes."""
-    nominal = nominal_of(cell)
-    model = cell.model
-    if nominal is None:
+    described = nominal_arm(cell, arm)
+    if described is None:
         return None, "the URDF has no masses", []
-    standard = model.nominal
-    if cell.file.nominal is not None and model.layout.rotor_inertia:
-        standard[model.layout.rotors] = cell.nominal.rotor_inertia
     notes = []
-    links = standard[model.layout.links]
-    impossible = [
-        name for name, least in zip(model.joint_names, margin(links), strict=True) if least <= 0.0
-    ]
-    if impossible:
+    if described.balanced:
+        names = ", ".join(_impossible_bodies(described))
         notes.append(
-            f"the nominal bodies of {', '.join(impossible)} are not physically consistent; MuJoCo"
-            " balances their inertias"
+            f"the nominal bodies of {names} are not physically consistent; MuJoCo balances their"
+            " inertias"
         )
-    described = replace(
-        arm, standard=standard, values=nominal.values, load=None, balanced=bool(impossible)
-    )
     try:
         positions = simulate(described, motion, feedback)
     except IdentificationError as error:
         return None, str(error), []
     return ArmErrors.of(errors_of(positions, measured, tool)), "", notes
+
+
+def nominal_arm(cell: Cell, arm: Arm) -> Arm | None:
+    """Return an arm with the URDF's bodies and what the cell states; None without masses."""
+    nominal = nominal_of(cell)
+    if nominal is None:
+        return None
+    model = cell.model
+    standard = model.nominal
+    if cell.file.nominal is not None and model.layout.rotor_inertia:
+        standard[model.layout.rotors] = cell.nominal.rotor_inertia
+    described = replace(arm, standard=standard, values=nominal.values, load=None)
+    return replace(described, balanced=bool(_impossible_bodies(described)))
+
+
+def _impossible_bodies(arm: Arm) -> list[str]:
+    """Return the joints whose bodies are not physically consistent."""
+    margins = margin(arm.standard[arm.model.layout.links])
+    return [
+        name for name, least in zip(arm.model.joint_names, margins, strict=True) if least <= 0.0
+    ]
 
 
 def _simulated_ensemble(
