@@ -39,7 +39,7 @@ from hil.archive.schema import ArchivedEvent
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import open_file, parse_json, remedy_for_missing
 
-NUMBERS = (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.MOTOR_CURRENT)
+NUMBERS = (schema.CYCLE, schema.MEASURED, schema.COMMANDED, *schema.OTHERS.values())
 """Channels with one message per sample."""
 ALWAYS: Final = -(1 << 63), 1 << 63  # ns, before and after every stamp
 
@@ -131,7 +131,7 @@ class Scan:
     def topics(self) -> Collection[str]:
         """The channels of the samples and the events."""
         recorded = schema.CYCLE in self.parser.topics
-        samples = (schema.CYCLE,) if recorded else (schema.MEASURED, schema.MOTOR_CURRENT)
+        samples = (schema.CYCLE,) if recorded else (schema.MEASURED, *schema.OTHERS.values())
         return (*samples, schema.EVENTS)
 
     @property

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import lru_cache
 from itertools import product
-from typing import Any, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from mcap.records import Schema
@@ -39,6 +39,7 @@ LIBRARY = "hil"  # without version: the same recording gives the same bytes
 CYCLE = "/hil/cycle"
 MEASURED = "/joint_states"
 COMMANDED = "/joint_states_commanded"
+COMMANDED_POSITION = "/hil/commanded_position"
 MOTOR_CURRENT = "/motor_currents"
 EVENTS = "/hil/events"
 DESCRIPTION = "/robot_description"
@@ -100,6 +101,12 @@ std_msgs/Header header
 float64[{n}] motor_current        # A
 """
 
+_COMMANDED_POSITION = """\
+# Commanded positions of a foreign recording.
+std_msgs/Header header
+float64[{n}] commanded_position   # rad
+"""
+
 _LOG = """\
 byte DEBUG=10
 byte INFO=20
@@ -143,18 +150,27 @@ DESCRIPTION_CHANNEL = Channel(DESCRIPTION, "std_msgs/msg/String", _DESCRIPTION)
 def profile(n_joints: int) -> Mapping[str, Channel]:
     """Return the channels of the profile by topic, for a number of joints."""
     state = "sensor_msgs/msg/JointState", _text(_JOINT_STATE, _HEADER, _TIME)
-    cycle, current = (
-        _text(text.format(n=n_joints), _HEADER, _TIME) for text in (_CYCLE, _MOTOR_CURRENT)
+    cycle, current, commanded = (
+        _text(text.format(n=n_joints), _HEADER, _TIME)
+        for text in (_CYCLE, _MOTOR_CURRENT, _COMMANDED_POSITION)
     )
     channels = (
         Channel(CYCLE, f"hil_msgs/msg/Cycle{n_joints}", cycle),
         Channel(MEASURED, *state),
         Channel(COMMANDED, *state),
         Channel(MOTOR_CURRENT, f"hil_msgs/msg/MotorCurrent{n_joints}", current),
+        Channel(COMMANDED_POSITION, f"hil_msgs/msg/CommandedPosition{n_joints}", commanded),
         EVENT_CHANNEL,
         DESCRIPTION_CHANNEL,
     )
     return {channel.topic: channel for channel in channels}
+
+
+OTHERS: Final[Mapping[str, str]] = {
+    "motor_current": MOTOR_CURRENT,
+    "commanded_position": COMMANDED_POSITION,
+}
+"""Topics of what an imported recording has beside joint states."""
 
 
 class Batch(NamedTuple):
@@ -187,17 +203,17 @@ def sample_messages(
     names: Sequence[str],
     stamp: NDArray[np.int64],
     states: Mapping[str, Array],
-    motor_current: Array | None,
+    others: Mapping[str, Array],
 ) -> Batch:
     """Return samples of an imported recording as messages.
 
     `stamp` (k,) [ns]; `states` are ``position``, ``velocity`` and ``effort`` (k, n), where known;
-    `motor_current` (k, n) [A], None where not recorded.
+    `others` are what was recorded of ``motor_current`` [A] and ``commanded_position``.
     """
     messages = {MEASURED: joint_states(names, stamp, states)}
-    if motor_current is not None:
-        channel = profile(len(names))[MOTOR_CURRENT]
-        messages[MOTOR_CURRENT] = _numbers(channel, stamp, {"motor_current": motor_current})
+    for name, values in others.items():
+        channel = profile(len(names))[OTHERS[name]]
+        messages[channel.topic] = _numbers(channel, stamp, {name: values})
     return Batch(stamp, messages)
 
 

@@ -35,7 +35,7 @@ from hil.archive.schema import (
     EVENTS,
     LIBRARY,
     MEASURED,
-    MOTOR_CURRENT,
+    OTHERS,
     PROFILE,
     ArchivedEvent,
     Batch,
@@ -424,6 +424,7 @@ class Samples:
         velocity: (m, n) [rad/s], None where not recorded.
         torque: (m, n) [N·m], None where not recorded.
         motor_current: (m, n) [A], motor side, None where not recorded.
+        commanded_position: (m, n) [rad], None where not recorded.
     """
 
     stamp: NDArray[np.int64]
@@ -431,6 +432,7 @@ class Samples:
     velocity: Array | None = None
     torque: Array | None = None
     motor_current: Array | None = None
+    commanded_position: Array | None = None
 
 
 def write_samples(
@@ -452,7 +454,6 @@ def write_samples(
     """
     path = Path(path)
     stamp = samples.stamp
-    current = samples.motor_current
     if stamp.size and not 0 <= stamp.min() <= stamp.max() < 2**31 * 10**9:
         raise ArchiveWriteError(
             path, "a stamp is outside 0 .. 2^31 s", remedy="shift the recording's clock"
@@ -461,10 +462,12 @@ def write_samples(
         "position": samples.position, "velocity": samples.velocity, "effort": samples.torque
     }  # fmt: skip
     states = {name: values for name, values in recorded.items() if values is not None}
+    channels = {name: getattr(samples, name) for name in OTHERS}
+    others = {name: values for name, values in channels.items() if values is not None}
     file = ArchiveFile(
         path,
         joint_names=joint_names,
-        topics=(MEASURED, *([] if current is None else [MOTOR_CURRENT]), EVENTS),
+        topics=(MEASURED, *(OTHERS[name] for name in others), EVENTS),
         metadata={**metadata, "kind": "imported"},
         period=period,
         attachments=attachments or {},
@@ -473,8 +476,8 @@ def write_samples(
     for start in range(0, len(stamp), _SAMPLES_PER_CHUNK):
         part = slice(start, start + _SAMPLES_PER_CHUNK)
         values = {name: column[part] for name, column in states.items()}
-        currents = None if current is None else current[part]
-        file.add(sample_messages(joint_names, stamp[part], values, currents))
+        rows = {name: column[part] for name, column in others.items()}
+        file.add(sample_messages(joint_names, stamp[part], values, rows))
         file.flush()
     file.finish({"outcome": "completed", "samples": str(len(stamp)), "events": "0"})
     return path

@@ -165,6 +165,7 @@ class ColumnMap(_Table):
     velocity: Quantity | None = None
     torque: Quantity | None = None
     motor_current: Quantity | None = None
+    commanded_position: Quantity | None = None
     time: TimeColumn | None = None
     sample_rate: Annotated[FiniteFloat, Field(gt=0.0)] | None = Field(
         default=None, description="a number above 0, in Hz"

@@ -263,7 +263,12 @@ class _Log:
         names = robot.joint_names
         degree = UNITS["position"]["deg"]
         if "position" in self._unstated:
-            degrees = {**values, "position": values["position"] * degree}
+            degrees = {
+                name: array * degree
+                if name in ("position", "commanded_position") and name in self._unstated
+                else array
+                for name, array in values.items()
+            }
             converted = _joint_side(degrees, self._map, self)
             if are_degrees(joint["position"], converted["position"], names, robot.urdf):
                 joint = converted
@@ -478,14 +483,16 @@ def _joint_side(values: dict[str, Array], columns: ColumnMap, log: _Log) -> dict
     matrix = log.matrix
     sides = {name: quantity.side for name, quantity in columns.quantities().items()}
     joint = dict(values)
-    for name in ("position", "velocity"):
+    for name in ("position", "velocity", "commanded_position"):
         if sides.get(name) == "motor":
             joint[name] = np.asarray(np.linalg.solve(matrix, values[name].T).T, np.float64)
     if sides.get("torque") == "motor":
         joint["torque"] = values["torque"] @ matrix
     drive = columns.drive
     if drive.joint_offset is not None:
-        joint["position"] = joint["position"] + drive.joint_offset
+        for name in ("position", "commanded_position"):
+            if name in joint:
+                joint[name] = joint[name] + drive.joint_offset
     if "torque" not in joint and "motor_current" in joint and drive.torque_constant is not None:
         joint["torque"] = (joint["motor_current"] * drive.torque_constant) @ matrix
     return {name: array[:, log.order] for name, array in joint.items()}

@@ -22,7 +22,9 @@ from hil.reading import parse_toml
 from hil.toml_text import to_text
 
 _NUMBER: Final = re.compile(r"\d{1,2}(?=\D*$)")
-_JOINT_KINDS: Final[tuple[Kind, ...]] = ("position", "velocity", "torque", "motor_current")
+_JOINT_KINDS: Final[tuple[Kind, ...]] = (
+    "position", "velocity", "torque", "motor_current", "commanded_position",
+)  # fmt: skip
 _MOST_NAMED: Final = 30
 _Columns = str | Sequence[str | int]
 """A name, with ``{}`` for the joint, or a list of names or of indices."""
@@ -224,7 +226,7 @@ class _Search:
         missing = [kind for kind in ("time", "position") if kind not in columns]
         if self._rate is not None:
             missing.remove("time")
-        if "torque" not in columns and "motor_current" not in columns:
+        if not columns.keys() & {"torque", "motor_current", "commanded_position"}:
             missing.append("torque")
         if missing:
             self._refuse_missing(missing)
@@ -312,7 +314,7 @@ class _Search:
     def _refuse_unit(self, kind: Kind, group: _Group) -> NoReturn:
         assert group.unit is not None
         problem = f"{group.label} is named as {kind}, and {group.unit} is not a unit of it"
-        kinds = [kind, *(other for other in _JOINT_KINDS if unit_of(group.unit, other))]
+        kinds = [kind, *(other for other in _JOINT_KINDS[:4] if unit_of(group.unit, other))]
         options = " or ".join(f"--columns '{name}={group.pattern}'" for name in kinds)
         raise SourceError(self._log, problem, field=kind, remedy=f"choose one: {options}")
 
@@ -363,7 +365,10 @@ class _Search:
                 steps.append(f"--columns '{kind}={pattern}'")
             remedy = f"state {'; '.join(steps)}; or write a map (--map map.toml)"
             if missing == ["torque"] and not unnamed:
-                remedy = f"record it, since nothing can be identified without, or {remedy}"
+                remedy = (
+                    f"record it, or {remedy}; without it, commanded positions (--columns"
+                    " 'commanded_position=NAME{}') are enough for `hil rollout --polish`"
+                )
         raise SourceError(self._log, problem, field=", ".join(missing), remedy=remedy)
 
     def _files(self) -> dict[Kind, str]:

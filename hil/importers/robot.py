@@ -310,6 +310,7 @@ def _check(samples: Samples, source: Path, joints: Sequence[str]) -> None:
         "velocity": samples.velocity,
         "torque": samples.torque,
         "motor current": samples.motor_current,
+        "commanded position": samples.commanded_position,
     }
     for name, values in quantities.items():
         if values is None:

@@ -7,20 +7,20 @@ import re
 from collections.abc import Mapping
 from typing import Final, Literal
 
-Kind = Literal["time", "position", "velocity", "torque", "motor_current"]
+Kind = Literal["time", "position", "velocity", "torque", "motor_current", "commanded_position"]
 
 _TURN: Final = 2.0 * math.pi
 _DEGREE: Final = math.pi / 180.0
+_ANGLES: Final = {"rad": 1.0, "mrad": 1e-3, "deg": _DEGREE, "rev": _TURN, "m": 1.0, "mm": 1e-3}
 _SI: Final[Mapping[str, Mapping[str, float]]] = {
-    "position": {
-        "rad": 1.0, "mrad": 1e-3, "deg": _DEGREE, "rev": _TURN, "m": 1.0, "mm": 1e-3,
-    },
+    "position": _ANGLES,
     "velocity": {
         "rad/s": 1.0, "deg/s": _DEGREE, "rev/s": _TURN, "rpm": _TURN / 60.0, "m/s": 1.0,
         "mm/s": 1e-3,
     },
     "torque": {"N.m": 1.0, "mN.m": 1e-3, "kN.m": 1e3, "N": 1.0, "%": 0.01},
     "motor_current": {"A": 1.0, "mA": 1e-3, "%": 0.01},
+    "commanded_position": _ANGLES,
 }  # fmt: skip
 _SPELLED: Final[Mapping[str, tuple[str, ...]]] = {
     "rad": ("radian", "radians"),
