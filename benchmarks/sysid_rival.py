@@ -11,12 +11,10 @@ import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from typing import Any, Final, NamedTuple
 
-import mujoco
 import numpy as np
-from mujoco import sysid
-from mujoco.sysid._src.model_modifier import pi_from_theta
 from numpy.typing import NDArray
 
 from identification.export.arm import Arm
@@ -25,6 +23,11 @@ from identification.rollout.comparison import RecordedMotion, horizon_rows
 from identification.rollout.simulation import Feedback, SimulatedArm
 
 Array = NDArray[np.float64]
+
+# Extensions in C++, without types.
+mujoco: Any = import_module("mujoco")
+sysid: Any = import_module("mujoco.sysid")
+pi_from_theta: Any = import_module("mujoco.sysid._src.model_modifier").pi_from_theta
 
 _SHARE: Final = 0.05
 """Start of friction as a share of a joint's torque, of armature as a share of its inertia."""

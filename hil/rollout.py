@@ -59,8 +59,8 @@ POLISHED = "polished.xml"
 MOST_WINDOWS: Final = 1000
 """Windows that are simulated at most."""
 _FEW_WINDOWS: Final = 200  # of which the error of each sample is computed
-_STRIDE: Final = 0.1  # s between the starts of windows
-_POLISHED_WINDOWS: Final = 60  # of the fitted motion
+STRIDE: Final = 0.1  # s between the starts of windows
+POLISHED_WINDOWS: Final = 60  # of the fitted motion
 _LEADS: Final = 0.1  # share of the mean square error that mending an effect has to remove
 
 
@@ -131,7 +131,7 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
         widened=ensemble.widened,
         inside=coverage(simulated[1], measured).tolist(),
         leading_joint=arm.model.joint_names[joint],
-        leading_effect=_leading_effect(arm, motion, feedback, positions, measured, joint),
+        leading_effect=leading_effect(arm, motion, feedback, positions, measured, joint),
         polish=None if polished is None else polished[0],
         notes=[*notes, *_about(motion, prepared)],
     )
@@ -148,13 +148,13 @@ def _motion_of(
     arm = model.arm
     prepared = model.prepared
     sources = model.prepared.sources
-    recordings = _with_commands(sources.held_out, prepared.held_out)
+    recordings = with_commands(sources.held_out, prepared.held_out)
     stretches, owners = recorded_stretches(arm.model, recordings, STEP)
     try:
         servo, drive = _servo_of(model, options)
         if servo is not None and any(stretch.commanded is None for stretch in stretches):
             raise NoServoError("the held-out recordings have no commanded positions")
-        windows = windows_of(stretches, STEP, HORIZONS[-1], _STRIDE).some(MOST_WINDOWS)
+        windows = windows_of(stretches, STEP, HORIZONS[-1], STRIDE).some(MOST_WINDOWS)
     except NoServoError as error:
         remedy = "omit --servo: the recorded torque drives the arm then"
         raise InputError(model.paths[0], str(error), field="--servo", remedy=remedy) from error
@@ -179,7 +179,7 @@ def _servo_of(model: IdentifiedModel, options: RolloutOptions) -> tuple[Servo | 
         stated = options.servo
         servo = Servo(np.broadcast_to(stated.kp, n), np.broadcast_to(stated.kd, n), stated.delay)
         return servo, f"a servo as stated, delay {1e3 * servo.delay:.3g} ms"
-    fitted = _with_commands(prepared.sources.training, prepared.fitted)
+    fitted = with_commands(prepared.sources.training, prepared.fitted)
     stretches, _ = recorded_stretches(arm.model, fitted, STEP)
     servo = identify_servo(stretches, STEP)
     gains = ", ".join(f"{kp:.3g}" for kp in servo.kp)
@@ -188,9 +188,10 @@ def _servo_of(model: IdentifiedModel, options: RolloutOptions) -> tuple[Servo | 
     )
 
 
-def _with_commands(
+def with_commands(
     sources: Sequence[Source], samples: Sequence[Samples]
 ) -> list[tuple[Samples, Array | None]]:
+    """Return samples with the commanded positions of their recordings."""
     return [
         (recording_samples, source.recording.commanded_position)
         for source, recording_samples in zip(sources, samples, strict=True)
@@ -274,16 +275,16 @@ def _polish(
 ) -> tuple[PolishResult, Arm]:
     """Fit to windows of the fitted motion, and judge on the held-out ones."""
     sources = model.prepared.sources
-    recordings = _with_commands(sources.training, model.prepared.fitted)
+    recordings = with_commands(sources.training, model.prepared.fitted)
     stretches, owners = recorded_stretches(model.arm.model, recordings, STEP)
-    windows = windows_of(stretches, STEP, HORIZONS[-1], _STRIDE).some(_POLISHED_WINDOWS)
+    windows = windows_of(stretches, STEP, HORIZONS[-1], STRIDE).some(POLISHED_WINDOWS)
     fitted = replace(driven.motion, windows=windows, samples=tuple(owners))
     return polish(
         replace(driven, motion=fitted), driven, identified, reporter, in_sample=sources.in_sample
     )
 
 
-def _leading_effect(
+def leading_effect(
     arm: Arm,
     motion: RecordedMotion,
     feedback: Feedback,

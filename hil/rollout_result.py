@@ -53,6 +53,56 @@ class PolishResult(Frozen):
     parameters: list[PolishedParameter]
 
 
+class ServoParameter(Frozen):
+    """A parameter of a joint's servo or drive."""
+
+    name: str
+    unit: str
+    value: float
+    deviation: Known  #: standard deviation; null where nothing is determined
+    determined: bool  #: whether it differs from zero by more than its interval
+
+
+class ServoResult(Frozen):
+    """Servo, friction and rotor inertias from positions alone, with the masses of the URDF."""
+
+    parameters: list[ServoParameter]
+    delay: float  #: of the command, s
+    delay_deviation: Known  #: standard deviation, s
+
+    @property
+    def message(self) -> str:
+        """What is determined, in two sentences."""
+        unknown = [parameter.name for parameter in self.parameters if not parameter.determined]
+        text = (
+            "Positions determine gains, friction and rotor inertias in proportion to the masses of"
+            " the URDF only."
+        )
+        return f"{text} Not determined: {', '.join(unknown)}." if unknown else text
+
+    def lines(self) -> list[str]:
+        """Return a row for each joint."""
+        by_joint: dict[str, dict[str, ServoParameter]] = {}
+        for parameter in self.parameters:
+            name, _, joint = parameter.name.partition("_")
+            by_joint.setdefault(joint, {})[name] = parameter
+        names = list(next(iter(by_joint.values())))
+        first = next(iter(by_joint.values()))
+        heads = [f"{name} [{first[name].unit}]" for name in names]
+        rows = ["joint" + "".join(f"{head:>20}" for head in heads)]
+        for joint, row in by_joint.items():
+            figures = "".join(f"{_with_deviation(row[name]):>20}" for name in names)
+            rows.append(f"{joint:5}{figures}")
+        spread = "" if self.delay_deviation is None else f" ± {_milli(self.delay_deviation)}"
+        return [*rows, f"delay of the command: {_milli(self.delay)}{spread} ms", self.message]
+
+
+def _with_deviation(parameter: ServoParameter) -> str:
+    if not parameter.determined:
+        return "not determined"
+    return f"{parameter.value:.4g} ± {parameter.deviation:.2g}"
+
+
 class RolloutResult(Frozen):
     """Result of a rollout, `rollout.json`."""
 
@@ -79,6 +129,7 @@ class RolloutResult(Frozen):
     leading_effect: str  #: empty if no single one
     polish: PolishResult | None
     notes: list[str]
+    servo: ServoResult | None = None  #: of recordings without torque
 
     @property
     def ratio(self) -> list[float] | None:
@@ -134,7 +185,7 @@ class RolloutResult(Frozen):
     @property
     def band_message(self) -> str:
         """A warning about the band; empty if it holds."""
-        if self.band_holds or not self.sample_errors:
+        if not self.sample_errors or self.band_holds:
             return ""
         return (
             f"{percentage(self.band, 1)} at {self.horizons[_BAND]:g} s is not"
@@ -165,6 +216,7 @@ class RolloutResult(Frozen):
         lines = [
             f"{self.windows} windows of {self.cell}, driven by {self.drive}",
             *self.notes,
+            *([] if self.servo is None else self.servo.lines()),
             f"{'position error (rms)':42}{columns}",
         ]
         arms = {"identified": self.identified, "nominal": self.nominal}

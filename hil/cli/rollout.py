@@ -27,6 +27,7 @@ from hil.progress import reporter as make_reporter
 from hil.report.rollout import overview_charts, overview_legends
 from hil.rollout import PICTURE, POLISHED, Rollout, RolloutOptions, roll_out, write_rollout
 from hil.rollout_result import ROLLOUT
+from hil.servo_rollout import roll_out_servo, without_torque
 
 
 @with_options(Identifying, "how")
@@ -69,7 +70,9 @@ def rollout(
         servo: A servo in place of the recorded torque: gains in N·m/rad and N·m·s/rad and delay
             in s, or identified from commanded and measured positions.
         polish: Fit friction, rotors, servo and delay to windows of the fitted motion, and write
-            polished.xml if the held-out windows are predicted better.
+            polished.xml if the held-out windows are predicted better. Of archives without torque,
+            servo, friction and rotors are identified from commanded and measured positions, with
+            the masses of the URDF.
         split: Fraction of the recording that is fitted if there is no validation run; the rest is
             simulated.
         again: Identify again even if results.json and parameters.json are there.
@@ -79,8 +82,13 @@ def rollout(
     options = how.options(split=split, estimator=estimator)
     output = _folder(output, archives)
     as_usual = options == Options() and not again
-    arm = read_or_identify(archives, options, reporter, reuse=as_usual, predict=predict or ())
-    simulated = roll_out(arm, asked, reporter)
+    if polish and without_torque(archives):
+        good = True
+        simulated = roll_out_servo(archives, predict or (), split, reporter)
+    else:
+        arm = read_or_identify(archives, options, reporter, reuse=as_usual, predict=predict or ())
+        good = arm.good
+        simulated = roll_out(arm, asked, reporter)
     if output is not None:
         _write(output, simulated, reporter)
     if json:
@@ -88,7 +96,7 @@ def rollout(
     else:
         for line in simulated.result.lines()[-1 if quiet else 0 :]:
             say(line)
-    if not arm.good:
+    if not good:
         raise typer.Exit(NOT_GOOD)
 
 

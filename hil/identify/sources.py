@@ -109,13 +109,19 @@ def arm_differences(cell: Cell, other: Cell) -> list[str]:
 
 
 def gather_sources(
-    paths: Sequence[Path], split: float, predict: Sequence[Path] = (), *, in_sample: bool = False
+    paths: Sequence[Path],
+    split: float,
+    predict: Sequence[Path] = (),
+    *,
+    in_sample: bool = False,
+    with_torque: bool = True,
 ) -> Sources:
     """Open archives and sort them into fitted and held-out recordings.
 
     Excitations are fitted, validation runs and `predict` are held out; imported recordings state
     their use. Without held-out archives, the last part of a single recording (see `Options.split`)
-    or the last of several is held out, unless `in_sample`.
+    or the last of several is held out, unless `in_sample`. Without `with_torque` recordings may
+    lack it.
 
     Raises:
         InputError: there is nothing to fit, an archive is given twice, or `predict` is given with
@@ -146,9 +152,9 @@ def gather_sources(
     standstills = [
         source_of(archive, cell, to_fit=False).recording for archive in by_use["standstill"]
     ]
-    sources = [(archive, source_of(archive, cell)) for archive in fitted]
+    sources = [(archive, source_of(archive, cell, to_fit=with_torque)) for archive in fitted]
     every = all_fitted(cell, sources, standstills[0] if standstills else None)
-    held_out = tuple(source_of(archive, cell) for archive in predicted)
+    held_out = tuple(source_of(archive, cell, to_fit=with_torque) for archive in predicted)
     warnings = (
         *known_warnings(cell, fitted[0]),
         *filter(None, map(_incomplete, archives)),
@@ -355,6 +361,8 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
     if to_fit and recording.torque is None and recording.motor_current is None:
         problem = "contains neither joint torques nor motor currents"
         remedy = "import torques, or motor currents with gear ratios and torque constants"
+        if recording.commanded_position is not None:
+            remedy += "; `hil rollout --polish` identifies servo and friction from positions alone"
         raise ArchiveError(archive.path, problem, remedy=remedy)
     return _usable(archive, cell, recording)
 

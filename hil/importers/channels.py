@@ -50,6 +50,7 @@ CHANNEL_NAMES: Final[Mapping[Kind, tuple[str, ...]]] = {
         "i", "iq", "cur", "curr", "current", "currents", "actual_current", "motor_current",
         "motor_currents", "motorcurrent", "joint_current", "strom", "amp", "observation.current",
     ),
+    "commanded_position": (),  # stated by the user: names of commands differ too much
 }  # fmt: skip
 """Names of channels in the logs of the field, lower case, without number and unit."""
 _BY_NAME: Final = {name: kind for kind, names in CHANNEL_NAMES.items() for name in names}

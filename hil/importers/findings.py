@@ -310,7 +310,10 @@ def against_position(time: Array, position: Array, velocity: Array) -> tuple[Arr
 
 def _torques(samples: Samples, names: Sequence[str], limits: Array) -> Iterator[str]:
     if samples.torque is None and samples.motor_current is None:
-        yield ("the log has neither torque nor motor current: nothing can be identified from it")
+        use = "nothing can be identified from it"
+        if samples.commanded_position is not None:
+            use = "bodies cannot be identified, servo and friction can (`hil rollout --polish`)"
+        yield f"the log has neither torque nor motor current: {use}"
     if samples.torque is None:
         return
     for name, largest, limit in zip(names, np.abs(samples.torque).max(axis=0), limits, strict=True):

@@ -364,11 +364,13 @@ class _Search:
                     pattern = ",".join(map(str, range(first, first + count)))
                 steps.append(f"--columns '{kind}={pattern}'")
             remedy = f"state {'; '.join(steps)}; or write a map (--map map.toml)"
-            if missing == ["torque"] and not unnamed:
-                remedy = (
-                    f"record it, or {remedy}; without it, commanded positions (--columns"
+            if missing == ["torque"]:
+                remedy += (
+                    "; without torque, commanded positions (--columns"
                     " 'commanded_position=NAME{}') are enough for `hil rollout --polish`"
                 )
+                if not unnamed:
+                    remedy = f"record it, or {remedy}"
         raise SourceError(self._log, problem, field=", ".join(missing), remedy=remedy)
 
     def _files(self) -> dict[Kind, str]:

@@ -100,6 +100,8 @@ def overview_charts(result: RolloutResult) -> list[Chart]:
     errors = _chart(result, of_all, 0, "", "position error, rms of all joints [mrad or mm]")
     note = f"{label(result.cell)}: {result.windows} windows"
     errors = replace(errors, caption=errors.caption._replace(note=note))
+    if not result.inside:
+        return [errors]
     horizons = np.array(result.horizons)
     traces = [EXPECTED.trace(np.full(len(horizons), 100.0 * end)) for end in WANTED]
     for legend, shares in zip(_band_legends(result), zip(*result.inside, strict=True), strict=True):

@@ -287,10 +287,14 @@ def variants(joint: int) -> list[Variant]:
         return change
 
     def delayed(instants: int) -> Callable[..., tuple[Arm, RecordedMotion]]:
-        return lambda arm, motion: (
-            arm,
-            replace(motion, delay=motion.delay + instants * motion.windows.step),
-        )
+        def change(arm: Arm, motion: RecordedMotion) -> tuple[Arm, RecordedMotion]:
+            later = instants * motion.windows.step
+            if motion.servo is None:
+                return arm, replace(motion, delay=motion.delay + later)
+            delay = max(0.0, motion.servo.delay + later)
+            return arm, replace(motion, servo=motion.servo._replace(delay=delay))
+
+        return change
 
     return [
         *(("dry friction", scaled(("f0", "fl"), factor)) for factor in (0.7, 1.3)),

@@ -83,9 +83,9 @@ def _gains_at(stretches: Sequence[Stretch], delay: float, step: float) -> tuple[
         rate = np.gradient(position, step, axis=0)
         # The same rows for every delay: those whose command is known.
         with_command = slice(round(LONGEST_DELAY / step) + 1, -1)
-        errors += _without_means((position - stretch.motion.position)[with_command], rows)
-        rates += _without_means((rate - stretch.motion.velocity)[with_command], rows)
-        torques += _without_means(stretch.torque[with_command], rows)
+        errors += without_means((position - stretch.motion.position)[with_command], rows)
+        rates += without_means((rate - stretch.motion.velocity)[with_command], rows)
+        torques += without_means(stretch.torque[with_command], rows)
     if not errors:
         raise NoServoError(f"no stretch lasts {BLOCK:g} s")
     error, rate, torque = (np.concatenate(part) for part in (errors, rates, torques))
@@ -104,7 +104,7 @@ def _gains_at(stretches: Sequence[Stretch], delay: float, step: float) -> tuple[
     return left, Servo(kp, kd, delay)
 
 
-def _without_means(values: Array, rows: int) -> list[Array]:
+def without_means(values: Array, rows: int) -> list[Array]:
     """Return the blocks of some rows of values (g, n), each without its mean."""
     whole = len(values) // rows
     blocks = values[: whole * rows].reshape(whole, rows, -1)

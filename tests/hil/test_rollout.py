@@ -168,7 +168,7 @@ def test_a_log_without_torque_and_command_is_named(tmp_path: Path) -> None:
     refused = run("identify", log, "--urdf", urdf)
     assert isinstance(refused.exception, HilError)
     assert "log.csv: torque: no channel is named as torque" in str(refused.exception)
-    assert "record it, since nothing can be identified without" in str(refused.exception)
+    assert "commanded positions (--columns 'commanded_position=NAME{}')" in str(refused.exception)
     refused = run("rollout", log)
     assert isinstance(refused.exception, HilError)
     assert "log.csv: is not an MCAP file" in str(refused.exception)

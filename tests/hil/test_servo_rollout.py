@@ -1,0 +1,103 @@
+"""A log with commanded and measured positions and no torque, from the command line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hil.cli import app
+from hil.errors import HilError, InputError
+from hil.recordings import open_recording
+from hil.rollout_result import ROLLOUT, RolloutResult
+from tests.identification.test_encoders import DELAY, KP, TRUE, URDF, an_arm, on_its_servo
+
+pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
+
+COMMAND = "commanded_position=command{}"
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory) -> Path:
+    """The positions of a simulated arm at 250 Hz, with the noise of an encoder."""
+    folder = tmp_path_factory.mktemp("servo")
+    time, position, _, command = on_its_servo(an_arm(), disturbance=0.3, duration=24.0)
+    noise = 1e-5 * np.random.default_rng(1).standard_normal(position.shape)
+    columns = np.column_stack([time, position + noise, command])[::4]
+    header = "t,q1,q2,command1,command2"
+    np.savetxt(folder / "log.csv", columns, delimiter=",", header=header, comments="")
+    (folder / "robot.urdf").write_text(URDF)
+    return folder / "log.csv"
+
+
+@pytest.fixture(scope="module")
+def archive(log: Path) -> Path:
+    path = log.with_suffix(".mcap")
+    done = run("import", "log", log, "--urdf", log.with_name("robot.urdf"), "--columns", COMMAND,
+               "-o", path)  # fmt: skip
+    assert done.exit_code == 0, done.output
+    return path
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(app, [*map(str, arguments)])
+
+
+def test_commanded_positions_are_imported(log: Path, archive: Path) -> None:
+    recording = open_recording(archive)
+    columns = np.loadtxt(log, delimiter=",", skiprows=1)
+    assert recording.torque is None
+    assert recording.position == pytest.approx(columns[:, 1:3])
+    assert recording.commanded_position == pytest.approx(columns[:, 3:])
+
+
+def test_the_servo_is_identified_and_what_is_not_determined_is_named(
+    archive: Path, tmp_path: Path
+) -> None:
+    done = run("rollout", archive, "--polish", "-o", tmp_path)
+    assert done.exit_code == 0, done.exception
+    result = RolloutResult.load(tmp_path / ROLLOUT)
+    assert result.servo is not None
+    rows = {parameter.name: parameter for parameter in result.servo.parameters}
+    for joint in range(2):
+        gain = rows[f"kp_{joint + 1}"]
+        assert gain.determined
+        assert gain.value == pytest.approx(KP[joint], rel=0.05)
+        assert rows[f"f0_{joint + 1}"].value == pytest.approx(TRUE[joint, 3], rel=0.15)
+    assert result.servo.delay == pytest.approx(DELAY, abs=0.003)
+    assert not rows["f1_1"].determined
+    assert "in proportion to the masses of the URDF only" in done.output
+    assert "Not determined: f1_1, f1_2." in done.output
+    assert result.identified.overall(2) < result.nominal.overall(2)  # at 0.5 s
+    assert result.identified.unstable == 0
+    assert "nan" not in (tmp_path / ROLLOUT).read_text().lower()
+
+
+def test_an_identification_names_the_way_without_torque(log: Path, archive: Path) -> None:
+    refused = run("identify", archive)
+    assert isinstance(refused.exception, HilError)
+    assert "contains neither joint torques nor motor currents" in str(refused.exception)
+    assert "`hil rollout --polish` identifies servo and friction" in str(refused.exception)
+    refused = run("identify", log, "--urdf", log.with_name("robot.urdf"))
+    assert "commanded positions (--columns 'commanded_position=NAME{}')" in str(refused.exception)
+
+
+def test_without_masses_there_is_no_torque_to_compare_with(log: Path, tmp_path: Path) -> None:
+    urdf = tmp_path / "massless.urdf"
+    parts = URDF.split("<inertial>")
+    urdf.write_text("".join([parts[0], *(part.split("</inertial>")[1] for part in parts[1:])]))
+    archive = tmp_path / "massless.mcap"
+    run("import", "log", log, "--urdf", urdf, "--columns", COMMAND, "-o", archive)
+    refused = run("rollout", archive, "--polish")
+    assert isinstance(refused.exception, InputError)
+    assert "has no torque, and the URDF no masses" in str(refused.exception)
+
+
+def test_without_commands_neither(log: Path, tmp_path: Path) -> None:
+    text = tmp_path / "map.toml"
+    text.write_text('[time]\ncolumn = "t"\n[position]\ncolumns = "q{}"\n')
+    archive = tmp_path / "positions.mcap"
+    run("import", "log", log, "--urdf", log.with_name("robot.urdf"), "--map", text, "-o", archive)
+    refused = run("rollout", archive, "--polish")
+    assert isinstance(refused.exception, InputError)
+    assert "the recordings have no commanded positions" in str(refused.exception)
