@@ -91,10 +91,11 @@ class IdentifiedModel:
         strength = self.prepared.settings.strength
         return Posterior.of(self.cell, self.factor, self.estimator, strength)
 
-    def predicted_residuals(self) -> list[Array]:
+    def predicted_residuals(self, shortest: float) -> list[Array]:
         """Return measured minus predicted torque (m, n) of each fitted recording.
 
-        Each tenth of the rows is predicted from the others: what was fitted leaves too little.
+        Each tenth of the rows is predicted from the others: what was fitted leaves too little. Of a
+        short recording the parts are fewer, so that none is shorter than `shortest` [s].
 
         Raises:
             InputError: the estimator has no posterior.
@@ -104,16 +105,23 @@ class IdentifiedModel:
         fitted = self.prepared.fitted
         rows = total.counts.sum(axis=1)
         before = np.cumsum(rows) - 0.5 * rows
-        fold = np.minimum(np.floor(FOLDS * before / rows.sum()).astype(np.intp), FOLDS - 1)
+        duration = sum(float(np.ptp(samples.motion.time)) for samples in fitted)
+        parts = predicted_parts(duration, shortest)
+        fold = np.minimum(np.floor(parts * before / rows.sum()).astype(np.intp), parts - 1)
         length = round(total.block / FINE_BLOCK)
         folds = [fold[fine_blocks(samples) // length] for samples in fitted]
         residuals = [np.empty(samples.torque.shape) for samples in fitted]
-        for k in range(FOLDS):
+        for k in range(parts):
             values = self.posterior.values(total.without(fold == k))
             for samples, fold_of_row, residual in zip(fitted, folds, residuals, strict=True):
                 error = samples.torque - samples.predicted_torque(model, values)
                 residual[fold_of_row == k] = error[fold_of_row == k]
         return residuals
+
+
+def predicted_parts(duration: float, shortest: float) -> int:
+    """Return in how many parts, two or more, a motion [s] is predicted from its rest."""
+    return int(np.clip(duration / shortest, 2, FOLDS))
 
 
 def consistent_of(identification: Identification) -> ConsistentEstimate:

@@ -257,7 +257,8 @@ def _simulated_ensemble(
     random = np.random.default_rng(options.seed)
     few = replace(motion, windows=motion.windows.some(_FEW_WINDOWS))
     fitted = model.prepared.fitted
-    residual = ResidualTorque.of(model.predicted_residuals(), fitted, motion.windows)
+    residuals = model.predicted_residuals(HORIZONS[-1])
+    residual = ResidualTorque.of(residuals, fitted, motion.windows)
     alone = []
     disturbed = []
     with reporter.task("simulating", len(ensemble)) as task:

@@ -18,6 +18,7 @@ from hil.archive.schema import MEASURED
 from hil.campaign import Campaign
 from hil.cli import app
 from hil.errors import HilError, InputError
+from hil.identified_model import predicted_parts
 from hil.outcome import PARAMETERS_JSON, REPORT
 from hil.plots.chart_picture import draw_charts
 from hil.report.rollout import overview_charts, overview_legends
@@ -138,6 +139,11 @@ class TestSectionOfTheReport:
         done = run("rollout", folder, "--samples", "3", "--again")
         assert "not in report.html: the arm was identified for this rollout" in done.output
         assert "Simulated motion" not in (folder / REPORT).read_text()
+
+
+def test_no_predicted_part_is_shorter_than_a_window() -> None:
+    """Of a short motion a tenth would continue what was fitted: the band was too narrow."""
+    assert [predicted_parts(duration, 1.0) for duration in (1.5, 4.7, 7.0, 60.0)] == [2, 4, 7, 10]
 
 
 def test_to_identify_imports_nothing_of_mujoco() -> None:
