@@ -171,7 +171,9 @@ def _result(
         leading_joint=names[joint],
         leading_effect=leading_effect(arm, motion, driven.feedback, positions, measured, joint),
         polish=None,
-        notes=["the recordings have no torque: the nominal arm has the same servo"],
+        notes=[
+            "the recordings have no torque: no arms are drawn, and the nominal arm has this servo"
+        ],
         servo=_servo_result(fit),
     )
 

@@ -16,6 +16,7 @@ from hil.cli.arguments import (
 )
 from hil.cli.identify_options import EstimatorOption, Identifying, servo_from
 from hil.cli.verdict import NOT_GOOD
+from hil.errors import InputError
 from hil.files import make_folder
 from hil.identified_model import read_or_identify
 from hil.identify import Options
@@ -83,6 +84,9 @@ def rollout(
     output = _folder(output, archives)
     as_usual = options == Options() and not again
     if polish and without_torque(archives):
+        if servo is not None:
+            problem = "cannot be given for recordings without torque, from which it is identified"
+            raise InputError(archives[0], problem, field="--servo", remedy="omit it")
         good = True
         simulated = roll_out_servo(archives, predict or (), split, reporter)
     else:

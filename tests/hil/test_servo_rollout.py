@@ -82,6 +82,12 @@ def test_an_identification_names_the_way_without_torque(log: Path, archive: Path
     assert "commanded positions (--columns 'commanded_position=NAME{}')" in str(refused.exception)
 
 
+def test_its_servo_cannot_be_stated(archive: Path) -> None:
+    refused = run("rollout", archive, "--polish", "--servo", "1000,10,0")
+    assert isinstance(refused.exception, InputError)
+    assert "from which it is identified" in str(refused.exception)
+
+
 def test_without_masses_there_is_no_torque_to_compare_with(log: Path, tmp_path: Path) -> None:
     urdf = tmp_path / "massless.urdf"
     parts = URDF.split("<inertial>")
