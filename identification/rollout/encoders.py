@@ -101,7 +101,10 @@ def fit_servo(arm: Arm, stretches: Sequence[Stretch], step: float) -> ServoFit:
     stiffness = values[:, 0] - _DETERMINED * deviations[:, 0]
     if not (stiffness > 0.0).all():
         name = model.joint_names[int(np.argmin(stiffness))]
-        raise NoServoError(f"{name} does not follow its commanded position")
+        raise NoServoError(
+            f"the gain of {name} is not determined: it hardly moves, or does not follow its"
+            " commanded position"
+        )
     return ServoFit(
         _with_drives(bare, values),
         Servo(values[:, 0], values[:, 1], delay),
