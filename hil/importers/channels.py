@@ -112,7 +112,9 @@ def kind_of(name: str, unit: str | None = None) -> tuple[Kind | None, int | None
     for candidate in (base, base.strip(" _.-"), base.replace(" ", "_").strip("_")):
         if candidate in _BY_NAME:
             return _BY_NAME[candidate], number
-    kinds: list[Kind] = [kind for kind in CHANNEL_NAMES if unit is not None and unit_of(unit, kind)]
+    kinds: list[Kind] = [
+        kind for kind, names in CHANNEL_NAMES.items() if names and unit and unit_of(unit, kind)
+    ]
     return (kinds[0] if len(kinds) == 1 else None), number
 
 
