@@ -55,7 +55,8 @@ def rollout(
     the measured ones, for the identified arm, the nominal one, and arms drawn from the posterior.
     The arm is driven by the recorded torque and a light feedback, or by a servo. Parameters and
     settings are those of results.json and parameters.json in a folder, as for `hil export`; its
-    report receives a section. Writes rollout.json and rollout.png. Exit status 5 if the model is
+    report receives a section. Of archives without torque, --polish identifies servo, friction and
+    rotors from commanded and measured positions, with the masses of the URDF. Writes rollout.json and rollout.png. Exit status 5 if the model is
     not good.
 
     **Example:** `hil rollout runs/demo`
@@ -71,9 +72,7 @@ def rollout(
         servo: A servo in place of the recorded torque: gains in N·m/rad and N·m·s/rad and delay
             in s, or identified from commanded and measured positions.
         polish: Fit friction, rotors, servo and delay to windows of the fitted motion, and write
-            polished.xml if the held-out windows are predicted better. Of archives without torque,
-            servo, friction and rotors are identified from commanded and measured positions, with
-            the masses of the URDF.
+            polished.xml if the held-out windows are predicted better.
         split: Fraction of the recording that is fitted if there is no validation run; the rest is
             simulated.
         again: Identify again even if results.json and parameters.json are there.
