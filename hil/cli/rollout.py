@@ -56,8 +56,8 @@ def rollout(
     The arm is driven by the recorded torque and a light feedback, or by a servo. Parameters and
     settings are those of results.json and parameters.json in a folder, as for `hil export`; its
     report receives a section. Of archives without torque, --polish identifies servo, friction and
-    rotors from commanded and measured positions, with the masses of the URDF. Writes rollout.json and rollout.png. Exit status 5 if the model is
-    not good.
+    rotors from commanded and measured positions, with the masses of the URDF. Writes rollout.json
+    and rollout.png. Exit status 5 if the model is not good.
 
     **Example:** `hil rollout runs/demo`
 

@@ -64,7 +64,7 @@ class SimulatedArm:
         model.opt.disableflags |= (
             off.mjDSBL_LIMIT | off.mjDSBL_CONTACT | off.mjDSBL_ACTUATION | off.mjDSBL_AUTORESET
         )
-        # What an arm without them has no use for costs a third of the time of a step.
+        # Parts without effect on this arm: a step takes a quarter less time without them.
         model.opt.disableflags |= off.mjDSBL_SENSOR | off.mjDSBL_EQUALITY | off.mjDSBL_ISLAND
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         order = [int(model.joint(name).dofadr[0]) for name in arm.model.joint_names]

@@ -51,6 +51,7 @@ def test_commanded_positions_are_imported(log: Path, archive: Path) -> None:
     assert recording.commanded_position == pytest.approx(columns[:, 3:])
 
 
+@pytest.mark.long
 def test_the_servo_is_identified_and_what_is_not_determined_is_named(
     archive: Path, tmp_path: Path
 ) -> None:

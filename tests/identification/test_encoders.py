@@ -124,7 +124,7 @@ def test_a_joint_that_ignores_its_command_is_named(disturbed: list[Stretch]) -> 
         replace(stretch, commanded=2.0 * stretch.motion.position - stretch.commanded)
         for stretch in disturbed
     ]
-    with pytest.raises(NoServoError, match="gain of .* does not follow its commanded position"):
+    with pytest.raises(NoServoError, match=r"gain of .* does not follow its commanded position"):
         fit_servo(an_arm(), parts, STEP)
 
 
