@@ -52,9 +52,7 @@ def test_commanded_positions_are_imported(log: Path, archive: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_servo_is_identified_and_what_is_not_determined_is_named(
-    archive: Path, tmp_path: Path
-) -> None:
+def test_the_servo_is_identified_as_far_as_determined(archive: Path, tmp_path: Path) -> None:
     done = run("rollout", archive, "--polish", "-o", tmp_path)
     assert done.exit_code == 0, done.exception
     result = RolloutResult.load(tmp_path / ROLLOUT)
