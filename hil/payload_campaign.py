@@ -33,11 +33,13 @@ from hil.cell.schema import CellFile
 from hil.design.requirements import Requirement
 from hil.errors import CampaignFolderError, InputError, OperatorStopError, UnsafeError
 from hil.files import write_output
-from hil.identify.payload_run import PayloadFound, find_payload, flange_of
+from hil.identify.payload_run import NoPayloadError, PayloadFound, find_payload, flange_of
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter
 from hil.reading import path_exists
 from hil.simulation import simulated_link
+from hil.terminal_text import plural
+from identification import IdentificationError
 from identification.estimators.payload import ball_radius
 from identification.model.payload import Payload
 from identification.model.pseudo_inertia import body
@@ -262,14 +264,13 @@ class PayloadCampaign:
                 wanted = max(pairs + 1, FEWEST) if loaded else pairs + 1
                 self._record_side(loaded, wanted, execute, mounting, choices, links or _own_link)
             pairs += 1
-            if record is not None and len(record.looks) < pairs:
-                result = self._found(pairs, reporter)
+            if record is not None and record.measured < pairs:
+                result = self._weighed_so_far(pairs, reporter)
+            if record is not None and result is not None and record.measured < pairs:
                 record = record.with_look(_look(result, pairs, requirements[0]), self.limit)
                 record.save(self._precision)
                 reporter.say(record.message)
-            if pairs >= FEWEST and (
-                record is None or (record.ended and len(record.looks) == pairs)
-            ):
+            if pairs >= FEWEST and (record is None or (record.ended and record.measured == pairs)):
                 break
         result = result or self._found(pairs, reporter)
         sides = ((self.bare.folder.root,), (self.loaded.folder.root,))
@@ -335,6 +336,17 @@ class PayloadCampaign:
         new = PrecisionRecord(plan_hash, (str(requirement),), unit="pair")
         record = PrecisionRecord.load(self._precision, plan_hash)
         return new if record is None or record.requirements != new.requirements else record
+
+    def _weighed_so_far(self, pairs: int, reporter: Reporter) -> PayloadFound | None:
+        """Weigh the payload as `_found`; None if too few pairs leave it undetermined."""
+        try:
+            return self._found(pairs, reporter)
+        except (NoPayloadError, IdentificationError) as error:
+            if pairs >= FEWEST:
+                raise
+            pair = plural(pairs, "pair")
+            reporter.say(f"precision after {pair}: the mass is not determined yet: {error}")
+            return None
 
     def _found(self, pairs: int, reporter: Reporter) -> PayloadFound:
         """Weigh the payload by the first pairs of recordings."""

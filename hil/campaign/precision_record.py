@@ -128,6 +128,11 @@ class PrecisionRecord:
         return replace(longer, outcome="going on")
 
     @property
+    def measured(self) -> int:
+        """Repetitions at the last look, 0 without one."""
+        return self.looks[-1].repetitions if self.looks else 0
+
+    @property
     def ended(self) -> bool:
         """Whether no more repetitions are run."""
         return self.outcome != "going on"

@@ -118,8 +118,13 @@ def _opened(root: Path) -> Campaign:
     """Return a campaign that is run by itself (InputError for a side of a payload campaign)."""
     opened = Campaign.open(root)
     if opened.folder.weighs is not None:
+        whole, _ = opened.folder.weighs
         problem = "is one side of a payload campaign"
-        raise InputError(root, problem, remedy=f"run `{opened.folder.run_command}`")
+        remedy = f"run `{opened.folder.run_command}`"
+        if not CampaignFolder(whole).sealed:
+            problem = f"lies where a payload campaign has a side; {whole.resolve()} is no campaign"
+            remedy = "move the folder to a path without payload/NAME and run it there"
+        raise InputError(root, problem, remedy=remedy)
     if assumes_payload(opened.cell):
         problem = "is a copy of the loaded side of a payload campaign"
         remedy = "run the campaign that it was copied from, with --payload"

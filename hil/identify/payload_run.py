@@ -279,7 +279,8 @@ def find_payload(
     default that of `flange_of`.
 
     Raises:
-        InputError: archives cannot be used, are of two arms, or have no payload.
+        NoPayloadError: the loaded recordings show no payload.
+        InputError: archives cannot be used, or are of two arms.
         IdentificationError: the recordings do not determine the mass.
     """
     sides = _sides(bare, loaded)
@@ -319,9 +320,13 @@ def find_payload(
     )
 
 
-def _no_payload(estimate: PayloadEstimate, mounting: str | None) -> InputError:
+class NoPayloadError(InputError):
+    """The recordings show no payload; more of them may."""
+
+
+def _no_payload(estimate: PayloadEstimate, mounting: str | None) -> NoPayloadError:
     low, high = estimate.intervals[0]
-    return InputError(
+    return NoPayloadError(
         None,
         f"the loaded archives show no payload: its mass is between {low:.3g} and {high:.3g} kg",
         field="--loaded",

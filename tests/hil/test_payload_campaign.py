@@ -24,6 +24,7 @@ from hil.campaign.virtual_link import VirtualLink
 from hil.cli import app
 from hil.design.requirements import requirements_from
 from hil.errors import InputError, OperatorStopError
+from hil.identify.payload_run import find_payload
 from hil.payload_campaign import (
     Mounting,
     MountingError,
@@ -34,6 +35,7 @@ from hil.payload_campaign import (
 )
 from hil.progress import Silent
 from hil.simulation import carried, planted_truth, simulated_controller
+from identification.estimators.payload import PayloadError
 from identification.model.payload import Payload
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
@@ -243,6 +245,36 @@ class TestPrecision:
         assert found.pairs == 3
         assert recorded(weighed) == sorted([*ORDER, "bare 3", "loaded 3"])
 
+    def test_a_first_pair_that_determines_nothing_is_not_the_last(
+        self, designed, monkeypatch
+    ) -> None:
+        """One pair can be too few; the next one is run, and the mass is estimated from both."""
+
+        def of_two_pairs(bare, loaded, reporter):
+            if sum("excitation" in path.name for path in loaded) < 2:
+                raise PayloadError("the motion does not separate the mass from other parameters")
+            return find_payload(bare, loaded, reporter)
+
+        monkeypatch.setattr("hil.payload_campaign.find_payload", of_two_pairs)
+        heard = Heard()
+        weighed = begun(designed, "early")
+        found = run(
+            weighed, reporter=heard, requirements=requirements_from(["mass of payload 10 %"])
+        )
+        assert any("after 1 pair: the mass is not determined yet" in line for line in heard.lines)
+        assert [look.repetitions for look in found.precision.looks] == [2, 3]
+        assert found.precision.outcome == "met"
+
+    def test_pairs_that_determine_nothing_end_with_the_reason(self, designed, monkeypatch) -> None:
+        def none(bare, loaded, reporter):
+            raise PayloadError("the motion does not separate the mass from other parameters")
+
+        monkeypatch.setattr("hil.payload_campaign.find_payload", none)
+        weighed = begun(designed, "never")
+        with pytest.raises(PayloadError, match="does not separate"):
+            run(weighed, requirements=requirements_from(["mass of payload 10 %"]))
+        assert recorded(weighed) == sorted(ORDER)
+
     def test_other_requirements_are_refused(self, designed) -> None:
         with pytest.raises(InputError, match="not about the payload"):
             run(begun(designed, "other"), requirements=requirements_from(["torque 2"]))
@@ -389,6 +421,13 @@ class TestCommand:
         shutil.copytree(weighed.loaded.folder.root, tmp_path / "copy")
         with pytest.raises(InputError, match="copy of the loaded side"):
             invoke(tmp_path / "copy", "--dry-run")
+
+    def test_a_campaign_in_the_place_of_a_side_is_to_be_moved(self, tmp_path) -> None:
+        campaign = campaign_in(tmp_path)
+        place = tmp_path / "mine" / "payload" / "gripper" / "bare"
+        shutil.copytree(campaign.folder.root, place)
+        with pytest.raises(InputError, match=r"mine is no campaign; move the folder"):
+            invoke(place, "--dry-run")
 
     def test_a_terminal_is_asked_whatever_was_stated(self, tmp_path, monkeypatch) -> None:
         monkeypatch.setattr("hil.cli.weigh.can_read", lambda _: True)
