@@ -14,7 +14,7 @@ from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from planner.arrays import Array, read_only
 from planner.corners import STOP, Corner, How, StraightMoves, passing, round_corners
@@ -129,6 +129,10 @@ class Legs(NamedTuple):
         )
         slowing = SEGMENT_ACCELERATION * deceleration
         return cls(StraightMoves.between(starts, ends, cautious, slowing), bounds, deceleration)
+
+    def take(self, rows: Rows) -> Legs:
+        """Return legs by index."""
+        return Legs(self.moves.take(rows), self.bounds.take(rows), self.deceleration[rows])
 
     def followed_by(self, other: Legs) -> Legs:
         """Return these legs and others."""
@@ -470,15 +474,40 @@ def plan_chunk(
             np.broadcast_to(bound, velocity.shape)
             for bound in (limits.lower, limits.upper, limits.acceleration, limits.jerk)
         )
-        legs = Legs.between(
+        legs, corners = _shared(
             through[:, :-1].reshape(-1, n),
             through[:, 1:].reshape(-1, n),
             Allowance(lower, upper, velocity, acceleration, jerk),
-            acceleration,
+            fly,
+            count,
         )
-        each = np.arange(len(velocity)).reshape(count, -1)
-        before = each[:, :-1].ravel()
-        after = each[:, 1:].ravel()
-        corners = legs.corners(before, after, np.full(len(before), 100.0 * fly / 100.0))
         planned |= dict(zip(rows, legs.checked_motions(corners, count), strict=True))
     return [planned[index] for index in range(len(individuals))]
+
+
+def _shared(
+    starts: Array, ends: Array, bounds: Allowance, fly: float, count: int
+) -> tuple[Legs, list[Corner]]:
+    """Plan the legs (s, n) of `count` motions and their corners, equal ones once.
+
+    Neighbours of one motion in a search have most of them in common.
+    """
+    rows = np.concatenate((starts, ends, bounds.velocity), axis=1)
+    first, leg = _distinct(rows)
+    few = bounds.take(first)
+    distinct = Legs.between(starts[first], ends[first], few, few.acceleration)
+    each = leg.reshape(count, -1)
+    pairs = np.stack((each[:, :-1].ravel(), each[:, 1:].ravel()), axis=1)
+    first, corner = _distinct(pairs)
+    before, after = pairs[first].T
+    # in per cent and back, as a move has it
+    shares = np.full(len(first), 100.0 * fly / 100.0)
+    corners = distinct.corners(before, after, shares)
+    return distinct.take(leg), [corners[index] for index in corner.tolist()]
+
+
+def _distinct(rows: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the first of each group of equal rows (s, k), and for each row its group (s,)."""
+    numbers = np.ascontiguousarray(rows).view(np.int64)  # bit by bit: 0 is not -0
+    _, first, group = np.unique(numbers, axis=0, return_index=True, return_inverse=True)
+    return first, group.ravel()

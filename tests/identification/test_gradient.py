@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from identification.excitation.constraints import CurrentModel, midpoints
-from identification.excitation.criteria import SENSE, Given, measures
+from identification.excitation.criteria import (
+    CRITERIA,
+    SENSE,
+    SMALL_CORRELATION,
+    Given,
+    correlation,
+    log10_det,
+)
 from identification.excitation.searches import run
 from identification.excitation.searches.gradient import Ascent, improve
 from identification.excitation.searches.population import Population, Scores, SearchSettings
@@ -75,12 +82,16 @@ def test_slopes_are_derivatives_by_the_information():
     gram, change = root.T @ root, random.standard_normal((13, 13))
     change = 1e-6 * (change + change.T)
     objective = problem().objective
-    for weights in np.eye(len(SENSE)):
-        above, below = (
-            weights @ [*measures(gram + sign * change, 40).values()] for sign in (1.0, -1.0)
-        )
+    values = {"log10_det": lambda gram: log10_det(gram, 40), "coupling_index": smoothed_coupling}
+    for weights, name in zip(np.eye(len(SENSE)), CRITERIA, strict=True):
+        above, below = (values[name](gram + sign * change) for sign in (1.0, -1.0))
         expected = np.sum(objective.slope(gram, weights) * change)
         np.testing.assert_allclose((above - below) / 2.0, expected, rtol=1e-5)
+
+
+def smoothed_coupling(gram):
+    """I_c without the kinks at correlations of zero."""
+    return np.hypot(correlation(gram)[np.tril_indices(len(gram), -1)], SMALL_CORRELATION).sum()
 
 
 @pytest.mark.parametrize("with_given", [False, True], ids=["alone", "beside-earlier-recordings"])

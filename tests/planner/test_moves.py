@@ -22,7 +22,7 @@ from planner import (
     plan,
     plan_chunk,
 )
-from planner.corners import StraightMoves
+from planner.corners import StraightMoves, round_corners
 from planner.moves import Move, Overrides, plan_moves
 from planner.piecewise_cubic import Block, check_smooth
 from tests.planner.six_axes import SIX_AXES, random_points, rows_of
@@ -396,6 +396,24 @@ class TestPopulation:
             for point in points[index][1:]
         ]
         assert bits(plan_moves(points[index][0], moves, limits).trajectory) == bits(alone)
+
+    def test_what_neighbours_have_in_common_is_planned_once(self, monkeypatch):
+        """Each differs from the first motion in its point 3: in two legs and three corners."""
+        points = random_points(4)
+        neighbours = [points.copy() for _ in range(5)]
+        for k, neighbour in enumerate(neighbours):
+            neighbour[3, 0] += 1e-3 * k
+        corners = []
+
+        def counted(moves, before, after, bounds, fly):
+            corners.append(len(before))
+            return round_corners(moves, before, after, bounds, fly)
+
+        monkeypatch.setattr("planner.moves.round_corners", counted)
+        together = plan_chunk(neighbours, np.ones((5, 6)), SIX_AXES, 0.5)
+        assert corners == [len(points) - 2 + 4 * 3]
+        for neighbour, motion in zip(neighbours, together, strict=True):
+            assert bits(plan(neighbour, SIX_AXES, fly=0.5)) == bits(motion)
 
     def test_motions_that_cannot_be_planned_are_errors(self):
         good, outside, unknown = random_points(0), random_points(1), random_points(2)

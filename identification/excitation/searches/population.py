@@ -322,10 +322,6 @@ CHUNK: Final = 8
 """Motions per call to a child process; few, so that all children finish a generation together."""
 
 
-_GENES: Final = 16
-"""Genes per call to a child process for a gradient."""
-
-
 class Population:
     """Scores motions of one problem in child processes.
 
@@ -391,7 +387,8 @@ class Population:
             tangent: Tangent = self._call("tangent", genes, weights)
         except PlannerError:
             return None
-        chunks = chunks_of(len(genes), _GENES)
+        # As many together as possible: legs and corners that they share are planned once.
+        chunks = chunks_of(len(genes), -(-len(genes) // len(self._children)))
         packed = pack(tangent)
         rows = map_in_children(
             self._children,
