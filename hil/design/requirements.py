@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Final, Literal
 
 from hil.errors import InputError
@@ -27,8 +28,9 @@ _FIGURE: Final = re.compile(
     r"(?P<name>\D.*?)\s+(?P<value>[-+]?[0-9.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>%|N·m|Nm|N m|N|kg)?"
 )
 _ABSOLUTE: Final = {"torque": ("N·m", "Nm", "N m", "N"), "mass": ("kg",)}
-_OF_JOINT: Final = re.compile(r"(friction|torque)(?:\s+of\s+(\S+))?")
+_OF_JOINT: Final = re.compile(r"(friction|torque)(?:\s+of\s+(.+))?")
 _FIELD: Final = "--precision"
+_SIMILAR: Final = 0.7  # of difflib; 1 are equal names
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,16 @@ def _known() -> str:
     return f"write one or several of: {', '.join(FORMS)}"
 
 
+def _names(name: str, known: Sequence[str], what: str) -> str:
+    """Return which joints or parameters there are, only similar ones if there are such."""
+    spelling = {each.lower(): each for each in known}
+    similar = get_close_matches(name.lower(), spelling, n=4, cutoff=_SIMILAR)
+    if similar:
+        return f"similar are {', '.join(spelling[each] for each in similar)}"
+    forms = f"{_known()}; " if what == "parameter" else ""
+    return f"{forms}its {what}s are {', '.join(known)}"
+
+
 def require_known(requirements: Sequence[Requirement], model: RobotModel) -> None:
     """Require the joints and parameters of requirements (InputError)."""
     for requirement in requirements:
@@ -130,12 +142,11 @@ def require_known(requirements: Sequence[Requirement], model: RobotModel) -> Non
         names = model.joint_names if joints else model.parameter_names
         if requirement.name and requirement.name not in names:
             what = "joint" if joints else "parameter"
-            hint = "" if joints else f"; or write one of: {', '.join(FORMS)}"
             raise InputError(
                 None,
                 f"{str(requirement)!r} names no {what} of this arm",
                 field=_FIELD,
-                remedy=f"known are {', '.join(names)}{hint}",
+                remedy=_names(requirement.name, names, what),
             )
         if requirement.kind == "friction" and not model.friction_columns.any():
             problem = f"{str(requirement)!r}: the cell has no friction terms"

@@ -87,9 +87,11 @@ class TestRequirements:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("torque of wrist 2", "names no joint of this arm; known are shoulder, elbow"),
-            ("friction of wrist 5%", "names no joint of this arm; known are shoulder, elbow"),
-            ("I9zz 5%", "names no parameter of this arm; known are .*I2m"),
+            ("torque of wrist 2", "names no joint of this arm; its joints are shoulder, elbow"),
+            ("friction of wrist 5%", "names no joint of this arm; its joints are shoulder, elbow"),
+            ("friction of the elbow 5%", "names no joint of this arm; similar are elbow"),
+            ("I2M 5%", "names no parameter of this arm; similar are I2m"),
+            ("gripper 5%", "no parameter .*; write one .*; its parameters are .*I2m"),
         ],
     )
     def test_joints_and_parameters_must_exist(self, cell, text: str, message: str) -> None:
