@@ -30,7 +30,7 @@ from hil.importers import Convention, urdf_of_dh
 from hil.reading import read_input, read_text
 from hil.toml_text import comment_lines, inline
 from identification.errors import ModelError
-from identification.model.kinematics import Chain, chain_from_urdf
+from identification.model.kinematics import MOST_JOINTS, Chain, chain_from_urdf, pinocchio_model
 from identification.model.urdf_text import urdf_tree
 
 from .known import ASSUMED, Known, assumed_for_design, clear_home, from_urdf
@@ -312,25 +312,29 @@ def cell_of_urdf(
     With links `base` and `tip`, all joints that do not lie between them are fixed as well.
     """
     text = read_input(path, "name a URDF")
+    names = _moving_joints(path, text)
     if base is None and tip is None:
+        if len(names) > MOST_JOINTS:
+            problem = f"has {len(names)} moving joints; at most {MOST_JOINTS} can be identified"
+            remedy = "choose one arm with --base LINK --tip LINK"
+            raise InputError(path, problem, remedy=remedy)
         return _cell_of(path, text, fixed, moved=moved)
     between = set(_joints_between(path, text, base, tip))
-    names = _chain(path, text).joint_names
     others = [name for name in names if name not in between and name not in fixed]
     if len(others) == len(names):
         problem = f"no joint moves between {base or 'the root'} and {tip or 'the tip'}"
         raise InputError(path, problem, field="--base, --tip", remedy=_LINKS_REMEDY)
+    if not others:
+        return _cell_of(path, text, fixed, moved=moved)
     limits = urdf_limits(text, others)
     nearest = np.clip(0.0, limits.lower, limits.upper).tolist()
-    every = {**dict(zip(others, nearest, strict=True)), **fixed}
-    made = _cell_of(path, text, every, moved=moved)
-    if not others:
-        return made
+    arm = with_fixed(text, dict(zip(others, nearest, strict=True)))
+    made = _cell_of(path, arm, fixed, moved=moved)
     note = (
         f"fixed, as they do not lie between {base or 'the root'} and {tip or 'the tip'}: "
         f"{', '.join(others)}"
     )
-    return replace(made, known=made.known | Known(notes=(note,)))
+    return replace(made, urdf=made.urdf or arm, known=made.known | Known(notes=(note,)))
 
 
 _LINKS_REMEDY: Final = "name links of the URDF, the tip farther from the root than the base"
@@ -347,8 +351,9 @@ def _joints_between(path: Path, text: str, base: str | None, tip: str | None) ->
     links = sorted({*to_link, *(parent for _, parent in to_link.values())})
     for option, link in (("--base", base), ("--tip", tip)):
         if link is not None and link not in links:
-            similar = get_close_matches(link, links, n=3) or links
-            remedy = f"its links are {', '.join(similar[:_MOST_NAMES])}"
+            matches = get_close_matches(link, links, n=3)
+            listed = "the nearest are" if matches else "its links are"
+            remedy = f"{listed} {', '.join((matches or links)[:_MOST_NAMES])}"
             raise InputError(path, f"has no link {link!r}", field=option, remedy=remedy)
     ends = [tip] if tip is not None else list(to_link)
     joints: dict[str, None] = {}
@@ -367,53 +372,68 @@ def _joints_between(path: Path, text: str, base: str | None, tip: str | None) ->
 
 
 _GRIPPER: Final = re.compile(
-    r"finger|gripper|hand_|_hand|thumb|knuckle|claw|jaw|pinky|palm", re.IGNORECASE
+    r"finger|gripper|hand_|_hand|thumb|knuckle|claw|jaw|pinky|palm"
+    r"|(?:^|_)(?:index|middle|ring|little)(?:_|$)",
+    re.IGNORECASE,
 )
 _MOST_NAMES: Final = 12
 
 
-def _branches(chain: Chain) -> list[str]:
-    """Return the last joint of each branch of a tree of joints."""
-    parents = set(chain.parents.tolist())
-    return [name for k, name in enumerate(chain.joint_names) if k not in parents]
-
-
-def _links_of(text: str) -> dict[str, str]:
-    """Return the link that each joint moves."""
+def _links_of(text: str) -> dict[str, tuple[str, str]]:
+    """Return the links that each joint connects, parent and child."""
     return {
-        joint.get("name", ""): child.get("link", "")
+        joint.get("name", ""): (parent.get("link", ""), child.get("link", ""))
         for joint in urdf_tree(text).findall("joint")
+        for parent in joint.findall("parent")
         for child in joint.findall("child")
     }
 
 
 def _of_gripper(text: str, chain: Chain) -> list[str]:
-    """Return the joints that are of a gripper or hand by their names or those of their links."""
+    """Return the joints that are of a gripper or hand by their names or those of both links."""
     links = _links_of(text)
     return [
         name
         for name in chain.joint_names
-        if _GRIPPER.search(name) or _GRIPPER.search(links.get(name, ""))
+        if _GRIPPER.search(name) or all(_GRIPPER.search(link) for link in links[name])
     ]
 
 
-def _note_on_branches(text: str, chain: Chain) -> list[str]:
-    """Return a note on a gripper or further arms among the joints that move."""
-    notes = []
+def _note_on_gripper(fingers: Sequence[str], chain: Chain, text: str) -> str:
+    """Return a note on joints that look like those of a gripper."""
     links = _links_of(text)
+    parents = dict(zip(chain.joint_names, chain.parents.tolist(), strict=True))
+    wrists = {
+        links[chain.joint_names[parents[name]]][1]
+        for name in fingers
+        if parents[name] >= 0 and chain.joint_names[parents[name]] not in fingers
+    }
+    tip = wrists.pop() if len(wrists) == 1 else "LINK"
+    names = ", ".join(fingers[:_MOST_NAMES])
+    if len(fingers) > _MOST_NAMES:
+        names += f" and {len(fingers) - _MOST_NAMES} others"
+    looks = "looks like a joint" if len(fingers) == 1 else "look like joints"
+    note = f"{names} {looks} of a gripper or hand by name: "
+    if len(fingers) <= _MOST_NAMES:
+        fixing = " ".join(f"--fix {name}" for name in fingers)
+        note += f"fix what is not identified ({fixing}), or "
+    return f"{note}name the last link of the arm (--tip {tip})"
+
+
+def _note_on_branches(text: str, chain: Chain) -> list[str]:
+    """Return notes on a gripper and on further arms among the joints that move."""
+    notes = []
     fingers = _of_gripper(text, chain)
     if fingers:
-        fixing = " ".join(f"--fix {name}" for name in fingers[:_MOST_NAMES])
-        notes.append(
-            f"{', '.join(fingers)} look like joints of a gripper or hand by their names: fix those "
-            f"that are not identified ({fixing}), or name the last link of the arm (--tip LINK)"
-        )
-    ends = [name for name in _branches(chain) if name not in fingers]
+        notes.append(_note_on_gripper(fingers, chain, text))
+    arm = [k for k, name in enumerate(chain.joint_names) if name not in fingers]
+    inner = {int(chain.parents[k]) for k in arm}
+    links = _links_of(text)
+    ends = [links[chain.joint_names[k]][1] for k in arm if k not in inner]
     if len(ends) > 1:
-        tips = ", ".join(links.get(name, name) for name in ends[:_MOST_NAMES])
         notes.append(
-            f"the joints form {len(ends)} branches, with the last moving links {tips}: choose one "
-            "arm with --base LINK --tip LINK"
+            f"the joints form {len(ends)} branches, with the last moving links "
+            f"{', '.join(ends[:_MOST_NAMES])}: choose one arm with --base LINK --tip LINK"
         )
     return notes
 
@@ -497,6 +517,15 @@ def _cell_of(path: Path, text: str, fixed: Mapping[str, float], *, moved: bool) 
         known=from_urdf(used, moving) | Known(notes=tuple(notes)),
         lifting=() if moved else tuple(lifting),
     )
+
+
+def _moving_joints(path: Path, urdf: str) -> list[str]:
+    """Return the names of all joints that move, also of a robot with more than an arm may have."""
+    try:
+        with quiet_libraries():
+            return [*pinocchio_model(urdf).names][1:]
+    except ModelError as error:
+        raise InputError(path, str(error), remedy="correct the URDF") from error
 
 
 def _chain(path: Path, urdf: str) -> Chain:

@@ -410,15 +410,34 @@ class TestOneArmOfARobot:
         path = tmp_path / "hand.urdf"
         path.write_text(HAND)
         made = cell_of_urdf(path, {})
-        assert any("left_finger look like joints of a gripper" in note for note in made.known.notes)
+        assert any(
+            "left_finger looks like a joint of a gripper" in note and "--tip arm" in note
+            for note in made.known.notes
+        )
         made = cell_of_urdf(path, {}, tip="tool")
         assert made.joint_names == ("shoulder",)
         assert not any("gripper" in note for note in made.known.notes)
 
+    def test_a_wrist_that_carries_a_gripper_is_of_the_arm(self) -> None:
+        notes = cell_of_urdf(urdf_path("so101.urdf"), {}).known.notes
+        assert any(note.startswith("gripper looks like a joint of a gripper") for note in notes)
+
+    def test_arms_with_hands_are_branches_too(self) -> None:
+        notes = cell_of_urdf(urdf_path("talos_reduced.urdf"), {}).known.notes
+        assert any("5 branches" in note and "arm_left_7_link" in note for note in notes)
+
+    def test_one_arm_of_a_robot_with_too_many_joints(self) -> None:
+        tiago = urdf_path("tiago_dual.urdf")
+        with pytest.raises(InputError, match=r"101 moving joints.*--base LINK --tip LINK"):
+            cell_of_urdf(tiago, {})
+        made = cell_of_urdf(tiago, {}, base="torso_lift_link", tip="arm_left_7_link")
+        assert made.joint_names == tuple(f"arm_left_{k}_joint" for k in range(1, 8))
+        assert made.urdf is not None
+
     @pytest.mark.parametrize(
         ("links", "sentence"),
         [
-            ({"tip": "tol"}, "--tip: has no link 'tol'; its links are tool"),
+            ({"tip": "tol"}, "--tip: has no link 'tol'; the nearest are tool"),
             ({"base": "arm", "tip": "base"}, "link 'base' does not hang on link 'arm'"),
             ({"base": "arm", "tip": "tool"}, "no joint moves between arm and tool"),
         ],
