@@ -300,13 +300,13 @@ def _over_repetitions(folder: CampaignFolder, record: PrecisionRecord) -> list[P
 def _recorded(folder: CampaignFolder, kind: str) -> Step:
     """Return how many motions of a kind are complete, with the reasons of the others."""
     entries = [entry for entry in folder.manifest() if entry.kind == kind]
-    bad = tuple(f"{e.name} {e.outcome}: {e.reason}" for e in entries if e.outcome != "completed")
+    bad = [f"{e.name} {e.outcome}: {e.reason}" for e in entries if e.outcome != "completed"]
     good = len(entries) - len(bad)
     entered = {entry.name for entry in entries}
     names = sorted(path.name for path in folder.archives.glob("*.mcap") if path.name not in entered)
     for name in names:
         parsed = ArchiveName.parse(name)
         if parsed is not None and parsed.kind == kind:
-            bad += (f"{name} killed: it was never closed, for the program or the computer ended",)
+            bad.append(f"{name} killed: it was never closed, for the program or the computer ended")
     rejected = f"; {len(bad)} rejected or ended early" if bad else ""
-    return Step("done" if good else "next", f"{good} complete{rejected}", details=bad)
+    return Step("done" if good else "next", f"{good} complete{rejected}", details=(*sorted(bad),))

@@ -209,6 +209,18 @@ def test_the_conduct_has_killed_attempts_and_no_wanted_warm_up(
     assert steps["warm-up"].words == status_of(Campaign.open(folder.root)).steps[3].sentence
 
 
+def test_ended_attempts_are_in_the_order_of_their_names(folder: CampaignFolder) -> None:
+    whole = (folder.archives / "excitation_001_a1.mcap").read_bytes()
+    for name in ("excitation_001_a8.mcap", "excitation_001_a9.mcap"):
+        (folder.archives / name).write_bytes(whole)
+    folder.add("excitation_001_a9.mcap", "rejected", "it was held")
+    steps = {step.step: step for step in conduct_of(folder).steps}
+    assert [detail.split(":")[0] for detail in steps["repetitions"].details] == [
+        "excitation_001_a8.mcap killed",
+        "excitation_001_a9.mcap rejected",
+    ]
+
+
 def test_steps_of_another_plan_or_unreadable_are_not_done(folder: CampaignFolder) -> None:
     pass_rehearsal(folder)
     folder.cell.write_text(folder.cell.read_text() + "\n# another\n")
