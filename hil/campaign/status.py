@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from hil.archive import ArchiveName
+from hil.archive import ArchiveName, open_archive
 from hil.cell import Cell
 from hil.design.result import RESULT, DesignResult
 from hil.errors import HilError
@@ -297,6 +297,17 @@ def _over_repetitions(folder: CampaignFolder, record: PrecisionRecord) -> list[P
     ]
 
 
+def _end_of_killed(path: Path) -> str:
+    """Return how an archive ended that no program entered into the manifest."""
+    try:
+        outcome = open_archive(path).outcome
+    except HilError:
+        outcome = None
+    if outcome is None:
+        return "it was never closed, for the program or the computer ended"
+    return f"the program ended before it checked the motion ({outcome.outcome}: {outcome.reason})"
+
+
 def _recorded(folder: CampaignFolder, kind: str) -> Step:
     """Return how many motions of a kind are complete, with the reasons of the others."""
     entries = [entry for entry in folder.manifest() if entry.kind == kind]
@@ -307,6 +318,6 @@ def _recorded(folder: CampaignFolder, kind: str) -> Step:
     for name in names:
         parsed = ArchiveName.parse(name)
         if parsed is not None and parsed.kind == kind:
-            bad.append(f"{name} killed: it was never closed, for the program or the computer ended")
+            bad.append(f"{name} killed: {_end_of_killed(folder.archives / name)}")
     rejected = f"; {len(bad)} rejected or ended early" if bad else ""
     return Step("done" if good else "next", f"{good} complete{rejected}", details=(*sorted(bad),))

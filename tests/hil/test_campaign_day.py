@@ -215,9 +215,10 @@ def test_ended_attempts_are_in_the_order_of_their_names(folder: CampaignFolder) 
         (folder.archives / name).write_bytes(whole)
     folder.add("excitation_001_a9.mcap", "rejected", "it was held")
     steps = {step.step: step for step in conduct_of(folder).steps}
-    assert [detail.split(":")[0] for detail in steps["repetitions"].details] == [
-        "excitation_001_a8.mcap killed",
-        "excitation_001_a9.mcap rejected",
+    assert steps["repetitions"].details == [
+        "excitation_001_a8.mcap killed: the program ended before it checked the motion "
+        "(completed: the motion is complete)",
+        "excitation_001_a9.mcap rejected: it was held",
     ]
 
 
