@@ -52,7 +52,8 @@ class Exported:
         unit = " or ".join(sorted(set(self.units)))
 
         def row(torque: Array) -> str:
-            return f"{', '.join(f'{component:.3g}' for component in torque)} {unit}"
+            pairs = zip(self.joint_names, torque, strict=True)
+            return f"{', '.join(f'{name} {component:.3g}' for name, component in pairs)} {unit}"
 
         lines = [*([f"parameters: {self.origin}"] if self.origin else [])]
         lines.append(f"written: {self.path}")
@@ -129,7 +130,8 @@ class ExportedEnsemble:
     def lines(self) -> list[str]:
         """Return the summary as lines of text."""
         arms = self.ensemble
-        spread = ", ".join(f"{share:.2f}" for share in arms.spread)
+        pairs = zip(self.joint_names, arms.spread, strict=True)
+        spread = ", ".join(f"{name} {share:.2f}" for name, share in pairs)
         pooled = float(np.sqrt(np.nanmean(arms.spread**2)))
         lines = [
             f"written: {len(arms)} arms drawn with seed {self.seed} in {self.path}",

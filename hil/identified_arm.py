@@ -7,7 +7,7 @@ import weakref
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from html import escape
 from io import BytesIO
 from os import PathLike
@@ -30,6 +30,7 @@ from hil.output_folder import SOURCES, folder_beside, sources_text
 from hil.progress import Reporter, Silent
 from hil.report.figures import MEASURED, NOMINAL, PREDICTED, RESIDUAL, joints_of, torque_charts
 from hil.results import Results
+from identification.text import percentage
 from identification.validation.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -176,7 +177,9 @@ class IdentifiedArm:
             columns=["joint", "RMS error", "relative error", "error of the nominal model"],
         )
         shown = joints.dropna(axis="columns", how="all")
-        table = shown.to_html(index=False, border=0, float_format="{:.1%}".format, na_rep="-")
+        table = shown.to_html(
+            index=False, border=0, float_format=partial(percentage, decimals=1), na_rep="-"
+        )
         picture = BytesIO()
         self.plot().savefig(picture, format="png", dpi=_DOTS)
         source = base64.b64encode(picture.getvalue()).decode("ascii")

@@ -44,7 +44,7 @@ class SimulatedDrive:
     calibration: tuple[float, ...]  # motor revolutions at controller angle zero
     joint_sign: tuple[float, ...]  # +1 or -1; controller angle = joint_sign * q + joint_offset
     joint_offset: tuple[float, ...]  # rad
-    torque_constant: tuple[float, ...]  # N m/A on the motor side
+    torque_constant: tuple[float, ...]  # N·m/A on the motor side
     current_limit: tuple[float, ...]  # A
     following_error: tuple[float, ...]  # threshold in motor revolutions
     encoder_counts: int  # per motor revolution

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 NOT_DETERMINED: Final = "not determined: enter the maker's, or record faster motion"
 KGF_CM_S2: Final = 0.0980665
-"""1 kgf cm s² in kg m²: 9.80665 N times 0.01 m s²."""
+"""1 kgf·cm·s² in kg·m²: 9.80665 N times 0.01 m·s²."""
 
 
 class Load(NamedTuple):
@@ -156,7 +156,7 @@ def _figures(moments: Array) -> list[str]:
 
 
 def _six(load: Load) -> list[str]:
-    """Return Ixx, Iyy, Izz, Ixy, Ixz, Iyz as text [kg m²]."""
+    """Return Ixx, Iyy, Izz, Ixy, Ixz, Iyz as text [kg·m²]."""
     tensor = load.body.inertia
     return [f"{part:.5f}" for part in (*np.diag(tensor), tensor[0, 1], tensor[0, 2], tensor[1, 2])]
 

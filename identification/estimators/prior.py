@@ -445,7 +445,7 @@ def body_lengths(model: RobotModel) -> Array:
 
 
 def _outboard_inertia(model: RobotModel, masses: Array, length: Array) -> Array:
-    """Return the inertia of the stretched links outboard of each joint (n,) [kg m² or kg]."""
+    """Return the inertia of the stretched links outboard of each joint (n,) [kg·m² or kg]."""
     if not model.layout.rotor_inertia:
         return np.zeros(0)
     inertia = np.zeros(model.n_joints)

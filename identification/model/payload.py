@@ -15,7 +15,7 @@ from identification.model.regressor import RegressorPlan, joint_arrays
 Array = NDArray[np.float64]
 
 _ROUNDING = 1e-9  # relative to the largest principal moment
-_MOST = 1e9  # kg, m, kg m²; products of larger numbers could overflow
+_MOST = 1e9  # kg, m, kg·m²; products of larger numbers could overflow
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Payload:
 
     mass: float  #: [kg]
     centre: tuple[float, float, float]  #: centre of mass in the frame (3,) [m]
-    #: tensor about the centre of mass in the axes of the frame: xx, xy, xz, yy, yz, zz [kg m²]
+    #: tensor about the centre of mass in the axes of the frame: xx, xy, xz, yy, yz, zz [kg·m²]
     inertia: tuple[float, float, float, float, float, float] = (0.0,) * 6
     #: link of the robot description, such as "tool0"; None: frame of the last joint
     frame: str | None = None
@@ -44,7 +44,7 @@ class Payload:
 
     @property
     def tensor(self) -> Array:
-        """Inertia tensor about the centre of mass, in the axes of the frame (3, 3) [kg m²]."""
+        """Inertia tensor about the centre of mass, in the axes of the frame (3, 3) [kg·m²]."""
         return tensors(np.array(self.inertia))
 
     @property

@@ -35,7 +35,7 @@ class Body(NamedTuple):
 
     mass: float  # [kg]
     centre: Array  # centre of mass in the frame of the parameters [m], shape (3,)
-    inertia: Array  # tensor about the centre of mass, axes of that frame [kg m²], shape (3, 3)
+    inertia: Array  # tensor about the centre of mass, axes of that frame [kg·m²], shape (3, 3)
 
 
 def pseudo_inertia(inertial: Array) -> Array:

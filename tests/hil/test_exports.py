@@ -230,6 +230,14 @@ class TestCommand:
         assert "verdict: " in text
         assert "log.mcap sha256" in text
 
+    def test_torques_left_out_have_the_names_of_their_joints(
+        self, log: Path, tmp_path: Path
+    ) -> None:
+        lines = command("export", log, "--to", "urdf", "-o", tmp_path / "arm.urdf").stdout
+        torques = r"shoulder [-+.e\d]+, elbow [-+.e\d]+ N·m rms\n"
+        assert re.search(f"left out: rotor inertias: {torques}", lines)
+        assert re.search(f"whole torque of the recorded motion: {torques}", lines)
+
     def test_without_mujoco_the_file_is_not_read_back(
         self, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
