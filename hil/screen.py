@@ -319,7 +319,8 @@ class Screen:
         title: of the run.
         controller: `SIMULATED`, or the controller's address.
         quiet: show nothing and read no keys.
-        console: written to; standard output if left out.
+        console: written to; standard output if left out. Without a terminal the status lines
+            go to standard error, so that piped output is quiet.
     """
 
     def __init__(
@@ -333,6 +334,7 @@ class Screen:
         console: Console | None = None,
     ) -> None:
         self._console = console or Console()
+        self._log = console or Console(stderr=True)
         self._full = not quiet and self._console.is_terminal and not self._console.is_dumb_terminal
         self._quiet = quiet
         self._stop = stop
@@ -539,7 +541,7 @@ class Screen:
         at = (status.phase, status.number)
         if at != self._line_of or time.monotonic() >= self._line_due:
             self._line_of, self._line_due = at, time.monotonic() + LINE_EVERY
-            put(self._console, status_line(status))
+            put(self._log, status_line(status))
 
     def _print_messages(self) -> None:
         while self._messages:

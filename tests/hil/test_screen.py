@@ -429,6 +429,16 @@ def test_without_a_terminal_there_are_lines_or_none() -> None:
     assert out.getvalue() == ""
 
 
+def test_piped_output_has_messages_and_no_progress(capsys: pytest.CaptureFixture[str]) -> None:
+    with Screen(NAMES, Stop()) as screen:
+        screen.say("the cell is open")
+        screen.show(status())
+        time.sleep(0.3)
+    printed = capsys.readouterr()
+    assert printed.out == "the cell is open\n"
+    assert "repetition 7 of 30" in printed.err.replace("\n", " ")
+
+
 def test_a_full_pipe_blocks_nothing() -> None:
     reads, writes = os.pipe()
     fcntl.fcntl(writes, fcntl.F_SETPIPE_SZ, 4096)
