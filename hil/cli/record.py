@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Mapping
 from functools import partial
@@ -125,7 +126,10 @@ def _line(figures: Mapping[str, object]) -> str:
 
 
 class View:
-    """Progress of a recording: a line every 5 s, and one when it is over."""
+    """Progress of a recording: a line every 5 s, and one when it is over.
+
+    Progress goes to standard error unless standard output is a terminal.
+    """
 
     def __init__(self, cell: Cell, *, quiet: bool) -> None:
         self._cell = cell
@@ -147,7 +151,8 @@ class View:
             say(f"{progress.over}; {how}", err=self._quiet)
         if time.monotonic() >= self._next:
             self._next = time.monotonic() + LINE_PERIOD
-            self.say(self._line(progress))
+            if not self._quiet:
+                say(self._line(progress), err=not sys.stdout.isatty())
 
     def _line(self, progress: Progress) -> str:
         if progress.waiting:
