@@ -80,7 +80,7 @@ def advice_on_branches(chain: Chain) -> str | None:
     last = ", ".join(chain.joint_names[end] for end in ends)
     return (
         f"the {chain.n_joints} joints form {len(ends)} arms, with the last joints {last}: move one "
-        f"at a time, with a cell whose other joints are fixed (`hil new ARM.urdf {fixing}`)"
+        f"at a time, with a cell whose other joints are fixed (`hil new --urdf ARM.urdf {fixing}`)"
     )
 
 

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import re
+import shlex
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from hil.cell import AngleFrame, Cell
+from hil.cli import app
 from hil.design import METHODS, load_settings, preset, problem_of, search_settings
 from hil.design.advice import NoExcitationError, advice_on_branches, no_excitation
 from hil.design.settings import SettingsError, preset_text, settings_of
+from hil.new import cell_of_urdf
 from hil.toml_text import to_text
 from identification.excitation import NoFeasibleMotionError, Violation
+from identification.model.kinematics import chain_from_urdf
 from sim_fixtures.ns16 import CELL_PATH
+from tests.hil.simulated_logs import urdf_path
 
 
 @pytest.fixture(scope="module")
@@ -213,4 +220,16 @@ def test_a_tree_of_two_arms_is_advised_to_move_one(cell: Cell) -> None:
     advice = advice_on_branches(tree)
     assert advice is not None
     assert "the 4 joints form 2 arms, with the last joints left_2, right_1" in advice
-    assert "`hil new ARM.urdf --fix right_1`" in advice
+    assert "`hil new --urdf ARM.urdf --fix right_1`" in advice
+
+
+def test_the_advice_to_move_one_arm_works_when_typed(tmp_path: Path) -> None:
+    baxter = urdf_path("baxter.urdf")
+    fixed = cell_of_urdf(baxter, {}, moved=True)
+    assert fixed.urdf is not None
+    advice = advice_on_branches(chain_from_urdf(fixed.urdf)) or ""
+    (command,) = re.findall(r"`hil (.*)`", advice)
+    arguments = shlex.split(command.replace("ARM.urdf", str(baxter)))
+    result = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "cell.toml")])
+    assert result.exit_code == 0, result.output
+    assert "cell.toml: 7 joints (left_s0, " in result.output.replace("\n", " ")
