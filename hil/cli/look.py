@@ -58,6 +58,8 @@ def look(
             is_open = True
         elif text is not None and chosen.entries:
             text = with_entries(text, dict(chosen.entries))
+    if output is not None and text is None:
+        say(f"note: {output} is not written: a bag has no columns to map", err=True)
     if output is not None and text is not None and not is_open:
         write_output(output, text)
         if not json:

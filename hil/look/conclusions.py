@@ -9,17 +9,19 @@ from typing import Final
 import numpy as np
 
 from hil.archive import open_archive
+from hil.cell import Cell
 from hil.errors import SourceError
 from hil.identify.sources import cell_of, source_of
 from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, import_recording
 from hil.importers.robot import Robot, Use
-from hil.look.result import Choice, Look
+from hil.look.other_arm import Contradictions
+from hil.look.result import Choice, Look, Row
 from hil.look.run import SETTINGS, look_at_joints
 from hil.terminal_text import typed
 from identification.errors import IdentificationError
-from identification.signals.samples import prepare
+from identification.signals.samples import Samples, prepare
 from identification.text import percentage
-from identification.validation.readings import score_of
+from identification.validation.readings import Score, score_of
 
 _SUSPECT: Final = 0.15
 """Error of the torque, predicted from other parts, above which a log is looked at closely. Right
@@ -28,6 +30,10 @@ _OTHER_ARM: Final = 0.5
 """The same, above which no masses of this arm explain the torque."""
 _DRIVES: Final = -4.0  # standard errors of a friction that drives a joint
 _ROWS: Final = 700
+_REMEDY: Final = (
+    "give the URDF of this arm; to identify in spite of that, give the column map "
+    "(`hil look LOG --urdf ARM.urdf -o map.toml`, --map map.toml)"
+)
 
 
 def concluded(
@@ -46,30 +52,65 @@ def concluded(
     """
     if options.columns is not None or imported.map_text is None:
         return imported
-    if not _is_suspect(imported.archive):
+    few = _few_rows(imported.archive)
+    if few is None:
+        return imported
+    cell, samples, score = few
+    if score.overall <= _SUSPECT and not np.any(score.friction < _DRIVES):
+        _require_this_arm(source, Contradictions.of(cell, cell.model, samples, score.overall))
         return imported
     look = look_at_joints(source, imported)
-    if look.error is not None and look.error > _OTHER_ARM:
-        raise _other_arm(source, look.error)
+    error = score.overall if look.error is None else look.error
+    if error > _OTHER_ARM:
+        raise _other_arm(source, error)
+    changed = _changed(look)
+    if not changed:
+        _require_this_arm(source, Contradictions.of(cell, cell.model, samples, error))
     if look.questions:
         raise _undecided(source, look.questions[0])
     if look.map_text != imported.map_text or look.options:
-        return _again(imported, source, robot_of, look, use)
+        again = _again(imported, source, robot_of, look, use)
+        if (few := _few_rows(again.archive)) is not None:
+            cell, samples, _ = few
+            axes = [row.aspect for row in changed if row.aspect in ("order", "signs", "zero")]
+            found = Contradictions.of(cell, cell.model, samples, error, axes)
+            _require_this_arm(source, found)
+        return again
     return imported
 
 
-def _is_suspect(archive: Path) -> bool:
-    """Return whether the torque does not follow the arm, or friction would drive a joint."""
+def _few_rows(archive: Path) -> tuple[Cell, Samples, Score] | None:
+    """Return the arm, some rows of an archive and their score; None if they cannot be used."""
     opened = open_archive(archive)
     cell = cell_of(opened)
     try:
         recording = source_of(opened, cell).recording
         samples = prepare(recording, cell.model, options=SETTINGS)
         few = samples.thinned(max(1, len(samples.torque) // _ROWS))
-        score = score_of(cell.model, few)
+        return cell, few, score_of(cell.model, few)
     except (IdentificationError, ValueError):
-        return False  # the identification says what is wrong
-    return score.overall > _SUSPECT or bool(np.any(score.friction < _DRIVES))
+        return None  # the identification says what is wrong
+
+
+def _require_this_arm(source: Path, contradictions: Contradictions) -> None:
+    """Raise SourceError if two independent findings contradict the arm of the URDF."""
+    sentences = contradictions.sentences
+    if len(sentences) > 1:
+        problem = f"is not of the arm of the URDF: {'; '.join(sentences)}"
+        raise SourceError(source, problem, field="--urdf", remedy=_REMEDY)
+
+
+def _changed(look: Look) -> list[Row]:
+    """Return the rows of what is sure to be other than recorded."""
+    aspects = ("order", "signs", "angle unit", "zero", "gravity", "mounting")
+    return [
+        row
+        for row in look.rows
+        if row.aspect in aspects
+        and row.certainty == "sure"
+        and not row.reason.startswith("next")
+        and "friction takes energy" not in row.reason
+    ]
 
 
 def _again(
@@ -89,13 +130,7 @@ def _again(
         source, imported.archive, robot, ImportOptions(column_map), use=use, force=True
     )
     column_map.unlink()
-    aspects = ("order", "signs", "angle unit", "zero", "gravity", "mounting")
-    lines = [
-        f"{row.aspect}: {row.reading}, concluded; {row.reason}"
-        for row in look.rows
-        if row.aspect in aspects and row.certainty == "sure" and not row.reason.startswith("next")
-    ]
-    lines = [line for line in lines if "friction takes energy" not in line]
+    lines = [f"{row.aspect}: {row.reading}, concluded; {row.reason}" for row in _changed(look)]
     return replace(again, lines=(*imported.lines, *lines))
 
 
@@ -130,8 +165,4 @@ def _other_arm(source: Path, error: float) -> SourceError:
         f"{percentage(error)} of it stays unexplained, and no other unit, sign or order of the "
         "joints helps"
     )
-    remedy = (
-        "give the URDF of this arm; to identify in spite of that, give the column map "
-        "(`hil look LOG --urdf ARM.urdf -o map.toml`, --map map.toml)"
-    )
-    return SourceError(source, problem, field="--urdf", remedy=remedy)
+    return SourceError(source, problem, field="--urdf", remedy=_REMEDY)

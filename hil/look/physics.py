@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,10 +19,11 @@ from identification.estimators.delay import DelayEstimate
 from identification.estimators.prior import LEARNED, body_prior, fit_posterior
 from identification.factor.factor import Factor
 from identification.model.regressor import LINK_SYMBOLS
+from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
-from identification.signals.samples import Preprocessing
+from identification.signals.samples import Preprocessing, Samples
 from identification.text import percentage
-from identification.validation.plausibility import NominalScale, nominal_scale
+from identification.validation.plausibility import nominal_scale
 from identification.validation.readings import (
     EXPLAINED,
     SEPARATE,
@@ -70,6 +71,68 @@ _DENSITY_SPREAD: Final = 3.0  # factor of one standard deviation
 _GRAVITY: Final = 9.81
 
 
+@dataclass(frozen=True)
+class Size:
+    """Measured torque over that which the arm needs.
+
+    Attributes:
+        factor: of the whole arm; None where neither masses nor weight say.
+        by_masses: whether it is by the URDF's masses, else by those of arms of its reach.
+    """
+
+    factor: float | None
+    by_masses: bool
+
+    @classmethod
+    def of(cls, cell: Cell, model: RobotModel, samples: Samples) -> Size:
+        """Compare samples with the nominal arm, or with the weight of arms of its reach."""
+        nominal = nominal_of(cell)
+        if nominal is None:
+            return cls(_by_reach(model, samples), by_masses=False)
+        scale = nominal_scale(model, nominal.values, [samples]).scale
+        if not np.isfinite(scale).any():
+            return cls(_by_reach(model, samples), by_masses=True)
+        scales = np.abs(scale[np.isfinite(scale)])
+        positive = scales[scales > 0.0]
+        return cls(float(np.median(positive)) if len(positive) else None, by_masses=True)
+
+    @property
+    def basis(self) -> str:
+        """What is expected by."""
+        return "the URDF's masses" if self.by_masses else "the masses of arms of its reach"
+
+    @property
+    def is_off(self) -> bool:
+        """Whether the torque has another order of magnitude than the arm needs."""
+        if self.factor is None:
+            return False
+        limit = _OTHER_UNIT if self.by_masses else _DENSITY_SPREAD**3
+        return not 1.0 / limit < self.factor < limit
+
+    @property
+    def is_thousand(self) -> bool:
+        """Whether it is about 1000 or 1/1000, the factor of units."""
+        if self.factor is None:
+            return False
+        return bool(abs(abs(np.log(self.factor)) - np.log(_THOUSAND)) < np.log(2.0))
+
+
+def _by_reach(model: RobotModel, samples: Samples) -> float | None:
+    """Return the weight that the torque shows over that of an arm of this reach; None if none."""
+    if not np.any(model.gravity):
+        return None
+    factor = Factor.by_time(model, samples)
+    values = fit_posterior(model, factor, body_prior(model, factor).gaussian, 5.0).estimate.values
+    still = np.zeros_like(samples.torque)
+    rigid = np.where(model.friction_columns, 0.0, values)
+    weight = np.ptp(model.torque(rigid, samples.motion.position, still, still), axis=0).max()
+    reach = float(np.linalg.norm(model.chain.translation[1:], axis=1).sum())
+    if not weight > 0.0 or not reach > 0.0:
+        return None
+    mass = _DENSITY * reach**3
+    return float(weight / (0.3 * mass * _GRAVITY * reach))
+
+
 @dataclass(frozen=True, eq=False)
 class Finding:
     """What the torque says of a recording.
@@ -86,31 +149,12 @@ class Finding:
     source: Path
 
     @cached_property
-    def scale(self) -> NominalScale | None:
-        """Measured over nominal torque; None without masses."""
-        nominal = nominal_of(self.cell)
-        if nominal is None:
-            return None
-        return nominal_scale(self.readings.model, nominal.values, [self.readings.samples])
+    def size(self) -> Size:
+        """Measured torque over that which the arm needs."""
+        return Size.of(self.cell, self.readings.model, self.readings.samples)
 
-    @cached_property
-    def common(self) -> float | None:
-        """Factor between measured and expected torque of the whole arm; None if unknown."""
-        if self.scale is not None and np.isfinite(self.scale.scale).any():
-            scales = np.abs(self.scale.scale[np.isfinite(self.scale.scale)])
-            return float(np.median(scales[scales > 0.0])) if (scales > 0.0).any() else None
-        return _by_size(self.readings)
-
-    @property
-    def size_is_off(self) -> bool:
-        """Whether the torque has another order of magnitude than the arm needs."""
-        if self.common is None:
-            return False
-        limit = _OTHER_UNIT if self.scale is not None else _DENSITY_SPREAD**3
-        return not 1.0 / limit < self.common < limit
-
-    def rows(self) -> list[Row]:
-        """Return the rows of the table."""
+    def rows(self, groups: Sequence[Group] = ()) -> list[Row]:
+        """Return the rows of the table; `groups` are the parameters that are determined."""
         rows = [
             self._order(),
             self._signs(),
@@ -119,7 +163,7 @@ class Finding:
             self._gravity(),
             self._mounting(),
             self._size(),
-            self._payload(),
+            self._payload(groups),
         ]
         error = self.readings.score.overall
         if error > EXPLAINED:
@@ -265,35 +309,38 @@ class Finding:
                           decide="state --gravity X Y Z")  # fmt: skip
 
     def _size(self) -> Row:
-        if self.common is None:
+        factor = self.size.factor
+        if factor is None:
             reason = "no masses in the URDF and little weight: size not tested"
             decide = "state gear ratios or torque constants ([drive] of a map) if not"
             return Row("side", "joint side", "likely", reason, decide)
-        basis = "the URDF's masses" if self.scale is not None else "the masses of arms of its reach"
-        reason = f"measured over expected by {basis}: {self.common:.2g}"
-        if not self.size_is_off:
-            certainty: Certainty = "sure" if self.scale is not None else "likely"
+        reason = f"measured over expected by {self.size.basis}: {factor:.2g}"
+        if not self.size.is_off:
+            certainty: Certainty = "sure" if self.size.by_masses else "likely"
             return Row("side", "joint side, a torque", certainty, reason)
-        if self._is_thousand:
-            unit = "mN.m" if self.common > 1.0 else "kN.m"
+        if self.size.is_thousand:
+            unit = "mN.m" if factor > 1.0 else "kN.m"
             return Row("side", f"torque in {unit}", "likely", reason, f'[torque] unit = "{unit}"')
-        if self.common > 1.0:
+        if factor > 1.0:
             return Row("side", "larger than the arm needs", "open", reason, "check the unit")
         return Row("side", "motor side (before the gears), or a current", "open", reason,
                    "ask for the unit of the channel")  # fmt: skip
 
-    @property
-    def _is_thousand(self) -> bool:
-        assert self.common is not None
-        return bool(abs(abs(np.log(self.common)) - np.log(_THOUSAND)) < np.log(2.0))
-
-    def _payload(self) -> Row:
+    def _payload(self, groups: Sequence[Group]) -> Row:
         payload = self.cell.file.robot.payload
         if payload is not None:
             return Row("payload", f"{payload.mass:g} kg as stated", "sure", "by the cell")
-        return Row("payload", "none stated; part of the last body", "open",
-                   "one recording does not separate it from the wrist",
-                   "record with and without it (`hil payload`)")  # fmt: skip
+        decide = "record with and without it (`hil payload`)"
+        last = next((group for group in reversed(groups) if group.quantity == "body"), None)
+        if last is None or not last.identifiable:
+            reason = "the motion determines no parameter of the last body"
+            return Row("payload", "none stated; not determined", "open", reason, decide)
+        total = last.identifiable + last.weak + last.missing
+        reason = (
+            f"the motion determines {last.identifiable} of the {total} parameters of the body of"
+            f" {last.body}, with all that it carried"
+        )
+        return Row("payload", "none stated; part of the last body", "likely", reason, decide)
 
     def questions(self) -> tuple[tuple[Choice, ...], ...]:
         """Return the readings that fit alike."""
@@ -303,8 +350,8 @@ class Finding:
                 continue
             pairs = [(step.change, step.error), *step.alike]
             choices.append(tuple(self._choice(step, change, error) for change, error in pairs[:2]))
-        small = self.common is not None and self.common < 1.0
-        if self.size_is_off and not self._is_thousand and small:
+        size = self.size
+        if size.is_off and not size.is_thousand and (size.factor or 1.0) < 1.0:
             choices.append(self._sides())
         return tuple(choices)
 
@@ -327,7 +374,7 @@ class Finding:
         return Choice(aspect, self.described(change), error, line, tuple(entries.items()))
 
     def _sides(self) -> tuple[Choice, ...]:
-        ratio = 1.0 / (self.common or 1.0)
+        ratio = 1.0 / (self.size.factor or 1.0)
         count = self.cell.model.n_joints
         each = ", ".join([f"{ratio:.0f}"] * count)
         return (
@@ -345,8 +392,8 @@ class Finding:
         sure = [step.change for step in self.readings.steps if step.sure]
         axes = Axes.of(sure, self.cell.model.n_joints)
         entries = entries_of(axes, self.map_text, self.source, self.cell.joint_names)
-        if self.size_is_off and self._is_thousand and self.common is not None:
-            entries["torque.unit"] = "mN.m" if self.common > 1.0 else "kN.m"
+        if self.size.is_off and self.size.is_thousand:
+            entries["torque.unit"] = "mN.m" if (self.size.factor or 1.0) > 1.0 else "kN.m"
         return entries
 
     def options(self) -> tuple[str, ...]:
@@ -380,24 +427,6 @@ def _toml(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_toml, value))}]"
     return f"{value:g}"
-
-
-def _by_size(readings: Readings) -> float | None:
-    """Return the weight that the torque shows over that of an arm of this reach; None if none."""
-    model = readings.model
-    samples = readings.samples
-    if not np.any(model.gravity):
-        return None
-    factor = Factor.by_time(model, samples)
-    values = fit_posterior(model, factor, body_prior(model, factor).gaussian, 5.0).estimate.values
-    still = np.zeros_like(samples.torque)
-    rigid = np.where(model.friction_columns, 0.0, values)
-    weight = np.ptp(model.torque(rigid, samples.motion.position, still, still), axis=0).max()
-    reach = float(np.linalg.norm(model.chain.translation[1:], axis=1).sum())
-    if not weight > 0.0 or not reach > 0.0:
-        return None
-    mass = _DENSITY * reach**3
-    return float(weight / (0.3 * mass * _GRAVITY * reach))
 
 
 def current_only() -> Row:

@@ -82,7 +82,7 @@ def _with_torque(
     delay, low_pass = _channel(finding.axes.read(recording), finding.readings.model)
     channel = physics.channel_rows(delay, low_pass)
     groups = physics.determined(finding.readings)
-    return _look_of(finding, (*rows, *finding.rows(), *channel), groups)
+    return _look_of(finding, (*rows, *finding.rows(groups), *channel), groups)
 
 
 def look_at_joints(source: Path, imported: ImportedRecording) -> Look:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -28,6 +29,7 @@ from hil.look.physics import channel_rows
 from identification.estimators.delay import DelayEstimate
 from identification.validation.readings import Axes, Change
 from tests.hil.simulated_logs import write_log, write_moving_log
+from tests.hil.test_importers_rosbag2 import STATE, bag, states
 from tests.hil.test_log_kinds import JOINTS, URDF
 
 Floats = NDArray[np.float64]
@@ -190,6 +192,61 @@ class TestConclusions:
         result = hil("identify", path, "--urdf", urdf)
         assert isinstance(result.exception, SourceError)
         assert [*tmp_path.iterdir()] == [path]
+
+
+class TestOtherArm:
+    """Two independent findings against the URDF: it is that of another arm."""
+
+    @staticmethod
+    def described(path: Path, text: str) -> Path:
+        path.write_text(text)
+        return path
+
+    def narrow(self, text: str) -> str:
+        return text.replace("lower='-3' upper='3'", "lower='-0.05' upper='0.05'")
+
+    def weak(self, text: str) -> str:
+        return text.replace("effort='99'", "effort='0.5'")
+
+    def test_range_and_torque_contradict_it(
+        self, tmp_path: Path, table: Mapping[str, Floats]
+    ) -> None:
+        path = tmp_path / "a.csv"
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *table.values())
+        other = self.described(tmp_path / "other.urdf", self.weak(self.narrow(URDF)))
+        result = hil("identify", path, "--urdf", other)
+        assert isinstance(result.exception, SourceError)
+        message = str(result.exception)
+        assert "is not of the arm of the URDF: " in message
+        assert re.search(r"moves \d+° beyond its range; the torque of \w+ reaches", message)
+        assert sorted(tmp_path.iterdir()) == [path, other]
+
+    @pytest.mark.parametrize("change", ["narrow", "weak"])
+    def test_one_of_them_alone_may_be_a_limit_that_is_wrong(
+        self, tmp_path: Path, table: Mapping[str, Floats], change: str
+    ) -> None:
+        path = tmp_path / "a.csv"
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *table.values())
+        other = self.described(tmp_path / "other.urdf", getattr(self, change)(URDF))
+        result = hil("identify", path, "--urdf", other)
+        assert not isinstance(result.exception, SourceError)
+        assert (tmp_path / "a" / "results.json").exists()
+
+
+def test_the_payload_is_part_of_what_is_determined_of_the_last_body(
+    tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
+) -> None:
+    row = next(row for row in look(urdf, tmp_path / "a.csv", table).rows if row.aspect == "payload")
+    assert row.certainty == "likely"
+    assert re.search(r"determines \d+ of the \d+ parameters of the body of", row.reason)
+
+
+def test_a_bag_has_no_columns_to_map(tmp_path: Path) -> None:
+    path = bag(tmp_path / "a.db3", {"/joint_states": (STATE, states(300))})
+    output = tmp_path / "map.toml"
+    result = hil("look", path, "-o", output)
+    assert "a bag has no columns to map" in result.output
+    assert not output.exists()
 
 
 def test_axes_of_changes_become_entries_of_a_map(tmp_path: Path) -> None:
