@@ -18,15 +18,20 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
+from hil.archive import open_archive
 from hil.cli import app
 from hil.errors import SourceError
+from hil.identify.sources import cell_of, source_of
 from hil.importers import ColumnMap, Robot
 from hil.importers.recording import ImportOptions
 from hil.look import Look, look_at
 from hil.look.conclusions import concluded
 from hil.look.maps import entries_of
+from hil.look.other_arm import Contradictions
 from hil.look.physics import channel_rows
+from hil.look.run import SETTINGS
 from identification.estimators.delay import DelayEstimate
+from identification.signals.samples import prepare
 from identification.validation.readings import Axes, Change
 from tests.hil.simulated_logs import write_log, write_moving_log
 from tests.hil.test_importers_rosbag2 import STATE, bag, states
@@ -206,7 +211,7 @@ class TestOtherArm:
         return text.replace("lower='-3' upper='3'", "lower='-0.05' upper='0.05'")
 
     def weak(self, text: str) -> str:
-        return text.replace("effort='99'", "effort='0.5'")
+        return text.replace("effort='99'", "effort='0.1'")
 
     def test_range_and_torque_contradict_it(
         self, tmp_path: Path, table: Mapping[str, Floats]
@@ -220,6 +225,22 @@ class TestOtherArm:
         assert "is not of the arm of the URDF: " in message
         assert re.search(r"moves \d+° beyond its range; the torque of \w+ reaches", message)
         assert sorted(tmp_path.iterdir()) == [path, other]
+
+    def test_positions_and_torques_of_the_motor_side_do_not(
+        self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
+    ) -> None:
+        """Behind gears of 100: angles 100 times larger, torques 100 times smaller."""
+        path = tmp_path / "a.csv"
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *table.values())
+        assert hil("import", "log", path, "--urdf", urdf).exit_code == 0
+        archive = open_archive(tmp_path / "a.mcap")
+        cell = cell_of(archive)
+        samples = prepare(source_of(archive, cell).recording, cell.model, options=SETTINGS)
+        motor = samples.motion._replace(position=100.0 * samples.motion.position)
+        before_gears = replace(samples, motion=motor, torque=samples.torque / 100.0)
+        assert not Contradictions.of(cell, cell.model, samples, 0.0).sentences
+        (sentence,) = Contradictions.of(cell, cell.model, before_gears, 0.0).sentences
+        assert "beyond its range" in sentence
 
     @pytest.mark.parametrize("change", ["narrow", "weak"])
     def test_one_of_them_alone_may_be_a_limit_that_is_wrong(
