@@ -73,8 +73,8 @@ def concluded(
         if (few := _few_rows(again.archive)) is not None:
             cell, samples, _ = few
             axes = [row.aspect for row in changed if row.aspect in ("order", "signs", "zero")]
-            found = Contradictions.of(cell, cell.model, samples, error, axes)
-            _require_this_arm(source, found)
+            contradictions = Contradictions.of(cell, cell.model, samples, error, axes)
+            _require_this_arm(source, contradictions)
         return again
     return imported
 

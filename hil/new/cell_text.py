@@ -352,8 +352,8 @@ def _joints_between(path: Path, text: str, base: str | None, tip: str | None) ->
     for option, link in (("--base", base), ("--tip", tip)):
         if link is not None and link not in links:
             matches = get_close_matches(link, links, n=3)
-            listed = "the nearest are" if matches else "its links are"
-            remedy = f"{listed} {', '.join((matches or links)[:_MOST_NAMES])}"
+            heading = "the nearest are" if matches else "its links are"
+            remedy = f"{heading} {', '.join((matches or links)[:_MOST_NAMES])}"
             raise InputError(path, f"has no link {link!r}", field=option, remedy=remedy)
     ends = [tip] if tip is not None else list(to_link)
     joints: dict[str, None] = {}

@@ -254,7 +254,7 @@ class TestOtherArm:
         assert (tmp_path / "a" / "results.json").exists()
 
 
-def test_the_payload_is_part_of_what_is_determined_of_the_last_body(
+def test_payload_is_part_of_what_the_motion_determines(
     tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
 ) -> None:
     row = next(row for row in look(urdf, tmp_path / "a.csv", table).rows if row.aspect == "payload")
