@@ -30,6 +30,7 @@ _OTHER_ARM: Final = 0.5
 """The same, above which no masses of this arm explain the torque."""
 _DRIVES: Final = -4.0  # standard errors of a friction that drives a joint
 _ROWS: Final = 700
+_WARNED: Final = 2  # contradictions: a wrong limit of a right URDF explains one, more are refused
 _REMEDY: Final = (
     "give the URDF of this arm; to identify in spite of that, give the column map "
     "(`hil look LOG --urdf ARM.urdf -o map.toml`, --map map.toml)"
@@ -45,7 +46,8 @@ def concluded(
 ) -> ImportedRecording:
     """Return a log imported again with what its motion and torque say, if that is sure.
 
-    A log that a map describes, or whose torque follows its arm, is returned as it is.
+    A log that a map describes, or whose torque follows its arm, is returned as it is. A warning is
+    among its lines if the URDF may be that of another arm.
 
     Raises:
         SourceError: two readings fit alike, or the URDF is that of another arm.
@@ -57,15 +59,16 @@ def concluded(
         return imported
     cell, samples, score = few
     if score.overall <= _SUSPECT and not np.any(score.friction < _DRIVES):
-        _require_this_arm(source, Contradictions.of(cell, cell.model, samples, score.overall))
-        return imported
+        contradictions = Contradictions.of(cell, cell.model, samples, score.overall)
+        return _of_this_arm(imported, source, contradictions)
     look = look_at_joints(source, imported)
     error = score.overall if look.error is None else look.error
     if error > _OTHER_ARM:
         raise _other_arm(source, error)
     changed = _changed(look)
     if not changed:
-        _require_this_arm(source, Contradictions.of(cell, cell.model, samples, error))
+        contradictions = Contradictions.of(cell, cell.model, samples, error)
+        imported = _of_this_arm(imported, source, contradictions)
     if look.questions:
         raise _undecided(source, look.questions[0])
     if look.map_text != imported.map_text or look.options:
@@ -74,7 +77,7 @@ def concluded(
             cell, samples, _ = few
             axes = [row.aspect for row in changed if row.aspect in ("order", "signs", "zero")]
             contradictions = Contradictions.of(cell, cell.model, samples, error, axes)
-            _require_this_arm(source, contradictions)
+            return _of_this_arm(again, source, contradictions)
         return again
     return imported
 
@@ -92,12 +95,22 @@ def _few_rows(archive: Path) -> tuple[Cell, Samples, Score] | None:
         return None  # the identification says what is wrong
 
 
-def _require_this_arm(source: Path, contradictions: Contradictions) -> None:
-    """Raise SourceError if two independent findings contradict the arm of the URDF."""
+def _of_this_arm(
+    imported: ImportedRecording, source: Path, contradictions: Contradictions
+) -> ImportedRecording:
+    """Return a recording, with a warning if two independent findings contradict the URDF.
+
+    Raises:
+        SourceError: more of them do.
+    """
     sentences = contradictions.sentences
-    if len(sentences) > 1:
+    if len(sentences) < _WARNED:
+        return imported
+    if len(sentences) > _WARNED:
         problem = f"is not of the arm of the URDF: {'; '.join(sentences)}"
         raise SourceError(source, problem, field="--urdf", remedy=_REMEDY)
+    warning = f"warning: the URDF may be that of another arm: {'; '.join(sentences)}"
+    return replace(imported, lines=(*imported.lines, warning))
 
 
 def _changed(look: Look) -> list[Row]:
