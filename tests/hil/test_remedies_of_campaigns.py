@@ -1,0 +1,284 @@
+"""What messages of design, campaign and batch tell a user to type, typed.
+
+A small simulated arm is designed for, rehearsed, run and identified by nothing but the commands
+that the messages name; its folder has a blank in its name. `TYPED` says which test types which
+message, and a test that every message is in it, in `ELSEWHERE` or in `UNTYPED`.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hil.campaign.folder import CampaignFolder
+from hil.design import DesignResult
+from hil.errors import InputError
+from tests.docs.test_messages import COMMAND, FIELD, MESSAGES, OPTION
+from tests.hil.fast_cell import fast_campaign, fast_cell, mirrored, pass_rehearsal
+from tests.hil.test_campaign_day import QUICK
+from tests.hil.test_remedies_of_commands import message, typed
+
+pytestmark = pytest.mark.long
+
+PACKAGES = re.compile(
+    r"hil/(campaign|design|batch)/|hil/cli/(run|rehearse|status|design|batch)\.py"
+)
+TYPED = {
+    "resume it (--resume), name another folder (-o), or add --force": "test_a_folder_with_a_design",
+    "start one without --resume, or name its folder (-o)": "test_nothing_to_resume",
+    "see `hil design --show-settings gradient`": "test_settings_that_are_none",
+    "design it again (`hil design`)": "test_a_design_that_was_edited",
+    "run `hil rehearse FIELD`": "test_each_refusal_names_the_next_command",
+    "run `FIELD --dry-run`": "test_each_refusal_names_the_next_command",
+    "if the motions looked right, run `FIELD --accept-dry-run`":
+        "test_each_refusal_names_the_next_command",
+    "`FIELD --accept-dry-runFIELD`": "test_each_refusal_names_the_next_command",
+    "run {} --accept-dry-runFIELD": "test_status_names_each_command",
+    "run FIELD --dry-run": "test_status_names_each_command",
+    "rehearse FIELD --again": "test_a_damaged_rehearsal",
+    "rehearse again (`hil rehearse FIELD --again`)": "test_a_damaged_rehearsal",
+    "restore it, or rehearse again (`hil rehearse FIELD`)": "test_a_cell_edited_after_it",
+    "run --dry-run first, watch the arm, then --accept-dry-run": "test_both_at_once",
+    "if you know that the arm is right": "test_a_torque_against_gravity",
+    "--accept-torque FIELD": "test_a_torque_against_gravity",
+    'state it, for example --precision "parameters 5 %, torque 10"': "test_no_precision",
+    "add --until-precise": "test_a_precision_without_an_end",
+    "omit --workers, or --scheduler": "test_workers_of_a_cluster",
+    "make room, or name another folder with --cache, or none": "test_a_cache_that_is_no_folder",
+}  # fmt: skip
+ELSEWHERE = {
+    "find the torque constants with `hil torque-constants`": "tests/hil/test_importers.py",
+    "hil run FIELD --payload FIELD": "tests/hil/test_payload_campaign.py",
+    "check this PC with `hil doctor`": "a computer that was suspended; tests/hil/test_doctor.py",
+    "stopped before the end of the search": "tests/hil/test_design_command.py, interrupted",
+    "repeat with --resume to draw it": "a picture on a full disk",
+    "free disk space": "tests/disk",
+}
+
+UNTYPED = (
+    "resume with the same cell and settings, or start again (--force)",
+    "name a file that `hil design` wrote",
+    "for a payload add --for payload",
+    "FIELD; no motion of this arm can meet it",
+    "FIELD % of each joint's torque; recordings measure it (--given)",
+    "run it with --payload NAME",
+    "FIELD more: see --output and --json",
+    "the FIELD joints form FIELD arms",
+    "FIELD workers of Dask did not start",
+    "the scaled condition number is FIELD",
+    "run the campaign that it was copied from",
+    "begin a new campaign folder (`hil design`)",
+    "no more repetitions; another motion adds",
+    "design a better excitation (`hil design`)",
+)
+"""Messages whose remedy no test types yet."""
+
+
+def commands(text: str) -> list[list[str]]:
+    """Words behind `hil` of the commands in backticks, and of that behind "next:"."""
+    lines = re.findall(r"`hil ([^`]+)`", text) + re.findall(r"next: hil (.+)", text)
+    return [shlex.split(line) for line in lines]
+
+
+def type_printed(text: str) -> str:
+    """Type the last command that a message names; it has to succeed. Return what it prints."""
+    *_, words = commands(text)
+    result = typed(*words)
+    assert result.exit_code == 0, (words, message(result))
+    return result.output
+
+
+def refusal(*words: object) -> str:
+    """Type what is refused, and return its message."""
+    result = typed(*words)
+    assert result.exit_code != 0, message(result)
+    return message(result)
+
+
+def accepted(*words: object) -> str:
+    result = typed(*words)
+    assert result.exit_code == 0, message(result)
+    return message(result)
+
+
+DESIGN = ("design", "cell.toml", "--settings", "quick.toml")
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a cell, settings of a short search, and a design of it."""
+    folder = tmp_path_factory.mktemp("template")
+    fast_cell(folder, repetitions=2)
+    (folder / "quick.toml").write_text(QUICK)
+    with pytest.MonkeyPatch.context() as inside:
+        inside.chdir(folder)
+        accepted(*DESIGN, "-o", "my runs/a")
+    return folder
+
+
+@pytest.fixture
+def here(template: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    shutil.copytree(template, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def designed(here: Path) -> Path:
+    return here / "my runs" / "a"
+
+
+@pytest.fixture
+def rehearsed(designed: Path) -> Path:
+    pass_rehearsal(CampaignFolder(designed))
+    return designed
+
+
+class TestDesign:
+    def test_a_folder_with_a_design(self, designed: Path) -> None:
+        assert "(--resume)" in refusal(*DESIGN, "-o", designed)
+        for options in (["-o", designed, "--resume"], ["-o", "b"], ["-o", designed, "--force"]):
+            accepted(*DESIGN, *options)
+
+    def test_nothing_to_resume(self, designed: Path) -> None:
+        assert "without --resume" in refusal(*DESIGN, "-o", "b", "--resume")
+        accepted(*DESIGN, "-o", designed, "--resume")
+        accepted(*DESIGN, "-o", "b")
+
+    def test_settings_that_are_none(self, here: Path) -> None:
+        (here / "none.toml").write_text("population =")
+        text = refusal("design", "cell.toml", "--settings", "none.toml", "-o", "b")
+        assert "population" in tomllib.loads(type_printed(text))["search"]
+
+    def test_a_design_that_was_edited(self, designed: Path, here: Path) -> None:
+        file = designed / "excitation.toml"
+        file.write_text(file.read_text().replace("generations = 3", "generations = 4"))
+        with pytest.raises(InputError, match="design it again"):
+            DesignResult.load(file)
+        accepted(*DESIGN, "-o", designed, "--force")
+        DesignResult.load(file)
+
+
+class TestCampaign:
+    def test_status_names_each_command(self, designed: Path) -> None:
+        """From a design to its report."""
+        text = accepted("status", designed)
+        names = []
+        while "next: hil" in text:
+            *_, words = commands(text)
+            names.append([word for word in words if word != str(designed)])
+            assert len(names) < 9, names
+            accepted(*words)
+            text = accepted("status", designed)
+        run = [["run", "--dry-run"], ["run", "--accept-dry-run"]]
+        assert names[0] == ["rehearse"] and names[1:3] == run, names
+        assert (designed / "report.html").exists()
+
+    def test_each_refusal_names_the_next_command(self, designed: Path) -> None:
+        type_printed(refusal("run", designed))
+        type_printed(refusal("run", designed))
+        type_printed(refusal("run", designed))
+        assert (designed / "results.json").exists()
+
+    def test_a_cell_edited_after_it(self, designed: Path) -> None:
+        accepted("rehearse", designed)
+        cell = designed / "cell.toml"
+        before = cell.read_text()
+        cell.write_text(before.replace("repetitions = 2", "repetitions = 3"))
+        text = refusal("run", designed, "--dry-run")
+        type_printed(text)
+        cell.write_text(before)
+        accepted("rehearse", designed)
+        accepted("run", designed, "--dry-run")
+
+    def test_a_damaged_rehearsal(self, designed: Path) -> None:
+        accepted("rehearse", designed)
+        for ask in (lambda: accepted("status", designed), lambda: refusal("run", designed)):
+            (designed / "rehearsal.json").write_text("{")
+            type_printed(ask())
+
+    def test_both_at_once(self, rehearsed: Path) -> None:
+        text = refusal("run", rehearsed, "--dry-run", "--accept-dry-run")
+        assert "run --dry-run first, watch the arm, then --accept-dry-run" in text
+        accepted("run", rehearsed, "--dry-run")
+        accepted("run", rehearsed, "--accept-dry-run")
+
+    def test_a_torque_against_gravity(self, here: Path) -> None:
+        fast_campaign(here / "m", mirrored(fast_cell(here), "[-1, 1]"))
+        text = refusal("run", "m", "--accept-dry-run")
+        assert "--accept-torque" in text
+        accepts = [words for words in commands(text) if "--accept-torque" in words]
+        typed(*accepts[-1])
+        assert (here / "m" / "results.json").exists()
+
+    def test_no_precision(self, rehearsed: Path) -> None:
+        text = refusal("run", rehearsed, "--until-precise")
+        (example,) = re.findall(r"for example (--precision \".*\")", text)
+        accepted("run", rehearsed, "--dry-run")
+        accepted("run", rehearsed, "--accept-dry-run", "--until-precise", *shlex.split(example))
+
+    def test_a_precision_without_an_end(self, rehearsed: Path) -> None:
+        precise = ("run", rehearsed, "--precision", "parameters 50 %")
+        assert "add --until-precise" in refusal(*precise)
+        accepted("run", rehearsed, "--dry-run")
+        accepted(*precise, "--until-precise", "--accept-dry-run")
+
+
+class TestBatch:
+    @pytest.fixture
+    def folder(self, here: Path) -> Path:
+        fast_campaign(here / "all runs" / "a", fast_cell(here, repetitions=1))
+        accepted("run", here / "all runs" / "a", "--accept-dry-run")
+        return here / "all runs"
+
+    def test_workers_of_a_cluster(self, folder: Path) -> None:
+        text = refusal("batch", folder, "--workers", 1, "--scheduler", "tcp://127.0.0.1:9")
+        assert "omit --workers, or --scheduler" in text
+        accepted("batch", folder, "--workers", 1)
+
+    def test_a_cache_that_is_no_folder(self, folder: Path, here: Path) -> None:
+        (here / "cache").write_text("")
+        text = refusal("batch", folder, "--cache", here / "cache")
+        assert "name another folder with --cache, or none" in text
+        accepted("batch", folder, "--cache", here / "other")
+        accepted("batch", folder, "--cache", "none")
+
+
+def remedies() -> Iterator[tuple[str, str]]:
+    """Messages of these packages that name a command or an option to type."""
+    for place, text in MESSAGES:
+        names_command = COMMAND.search(text) or "`hil " in text
+        is_label = re.fullmatch(r" ?--[a-z-]+", text) or text.startswith(
+            ("#", FIELD + ", for `hil")
+        )
+        is_comment = "can read them from" in text or "names of parameters as" in text
+        is_problem = text.startswith("--")
+        if is_label or is_comment or is_problem or not PACKAGES.match(place):
+            continue
+        if names_command or OPTION.search(text):
+            yield place, text
+
+
+def test_every_remedy_is_typed() -> None:
+    missing = [
+        f"{place}: {text}"
+        for place, text in remedies()
+        if not any(part in text for part in (*TYPED, *ELSEWHERE, *UNTYPED))
+    ]
+    assert not missing, "\n".join(missing)
+
+
+def test_every_test_and_message_of_the_table_exists() -> None:
+    tests = {name for group in (TestDesign, TestCampaign, TestBatch) for name in vars(group)}
+    texts = [text for _, text in remedies()]
+    assert {*TYPED.values()} <= tests
+    stale = [
+        part for part in (*TYPED, *ELSEWHERE, *UNTYPED) if not any(part in text for text in texts)
+    ]
+    assert not stale, stale
