@@ -47,6 +47,7 @@ CAPACITY: Final = 40_000
 _HEADER: Final = 128
 WAIT: Final = 60.0  # s that a living PC is waited for
 REST: Final = 10  # Cycles without motion after which an arm is at rest
+STILL: Final = 0.01  # rad/s below which no joint moves
 _PDEATHSIG: Final = 1
 
 
@@ -219,4 +220,4 @@ def at_rest(rows: Rows) -> bool:
     """Whether the arm has stood, with axes closed, for the last cycles."""
     last = rows[-REST:]
     closed = ~np.isin(last["phase"], (Phase.OPENING, Phase.OPEN, Phase.CLOSING, Phase.TRIPPED))
-    return bool(len(last) == REST and closed.all() and np.abs(last["velocity"]).max() < 0.01)
+    return bool(len(last) == REST and closed.all() and np.abs(last["velocity"]).max() < STILL)

@@ -1,8 +1,10 @@
-"""Laws after the death of a process, checked by the controller's account and the files left."""
+"""Laws after the death of a process, checked by the controller's account and the files left.
+
+Those of `tests.laws` for archives, manifest, motions and errors; the others are of processes.
+"""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +18,22 @@ from drivers.states import State
 from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
 from hil.campaign import Campaign
 from hil.errors import ArchiveError
-from hil.recorded_campaign import Entry
 from sim_fixtures import Phase
-from tests.process_death.controller import REST, at_rest
+from tests.laws.archives import (
+    as_exchanged,
+    gap_free,
+    in_one_archive,
+    not_truncated,
+    nothing_lost,
+    readable,
+)
+from tests.laws.arm import IN_OPEN_MODE, closed, stands
+from tests.laws.errors import names_one
+from tests.laws.manifests import entries_kept, manifest_of
+from tests.laws.motions import on_path
+from tests.laws.second_reader import read
+from tests.process_death.controller import REST, STILL, at_rest
 from tests.process_death.rig import Seen
-from tests.simulate.laws.archived import read
 
 Records = NDArray[np.void]
 
@@ -56,7 +69,9 @@ def broken_by(
 ) -> tuple[list[str], dict[str, int]]:
     """Return broken laws, and figures; archives in `earlier` are not checked."""
     figures: dict[str, int] = {}
-    problems = [*_supervisor(seen), *_arm(seen), *_link(seen), *_entered(seen.entered, campaign)]
+    folder = campaign.folder.root
+    problems = [*_supervisor(seen), *_arm(seen), *_link(seen)]
+    problems += entries_kept(seen.entered, manifest_of(folder)[1])
     if seen.left:
         problems.append(f"processes are left over: {seen.left}")
     if seen.port_in_use:
@@ -78,9 +93,12 @@ def broken_by(
         cycles = archive.columns.get("cycle", np.zeros(0))
         recorded.append(Recorded(path, name, archive, np.asarray(cycles, np.int64)))
     for recording in recorded:
-        problems += _readable(recording, seen)
-        problems += _as_exchanged(recording, seen.records)
-        problems += _outcome(recording, seen)
+        texts = [
+            *_readable(recording, seen, campaign.cell.period),
+            *_as_exchanged(recording, seen.records),
+            *_outcome(recording, seen),
+        ]
+        problems += [f"{recording.path.name}: {text}" for text in texts]
     problems += _archived(recorded, seen, figures)
     problems += _motions(recorded, seen, campaign)
     return problems, figures
@@ -94,9 +112,8 @@ def _supervisor(seen: Seen) -> Iterator[str]:
         yield f"the supervisor ended with status {seen.status} and reported {seen.report}"
     text = seen.report.get("text", "")
     if seen.deaths and text:
-        names = [word for victim in seen.killed for word in NAMED.get(victim, ())]
-        if not any(word in text for word in names):
-            yield f"{' and '.join(seen.killed)} died, and the supervisor reported: {text}"
+        names = [name for victim in seen.killed for name in NAMED.get(victim, ())]
+        yield from names_one(f"{' and '.join(seen.killed)} died", text, names)
 
 
 def _arm(seen: Seen) -> Iterator[str]:
@@ -106,12 +123,12 @@ def _arm(seen: Seen) -> Iterator[str]:
         return
     if rows["rejected"][-1]:
         yield f"the controller rejected {rows['rejected'][-1]} answers"
-    stands = at_rest(rows) or (len(rows) < REST and np.abs(rows["velocity"]).max() <= 0.01)
-    if "controller" not in seen.killed and not stands:
-        yield (
-            f"the arm did not come to rest with axes closed: {Phase(rows['phase'][-1]).name}, "
-            f"{np.abs(rows['velocity'][-1]).max():.3g} rad/s"
-        )
+    short = len(rows) < REST
+    if "controller" not in seen.killed and not at_rest(rows):
+        phases = rows["phase"][-REST:]
+        is_open = not short and bool(np.isin(phases, (*IN_OPEN_MODE, Phase.TRIPPED)).any())
+        yield from closed(Phase(phases[-1]).name, any_open=is_open, when="at the end")
+        yield from stands(rows["velocity"][-REST:], STILL, "at the end")
     answered = rows[~rows["deserted"]]
     # The packet of the cycle in which the exchange ended is no fault.
     if not answered["replied"][:-1].all():
@@ -121,10 +138,9 @@ def _arm(seen: Seen) -> Iterator[str]:
         yield "the drive was lost while the exchange lived"
     if "exchange" not in seen.killed and "controller" not in seen.killed and len(answered):
         left_open = _seen_last(rows)
-        if left_open in (Phase.OPENING, Phase.OPEN, Phase.CLOSING):
-            yield f"the exchange ended by itself in {left_open.name}"
-        if np.abs(answered["velocity"][-1]).max() > 0.01:
-            yield "the exchange ended by itself while the arm moved"
+        when = "where the exchange ended by itself"
+        yield from closed(left_open.name, any_open=left_open in IN_OPEN_MODE, when=when)
+        yield from stands(answered["velocity"][-1], STILL, when)
 
 
 def _seen_last(rows: Records) -> Phase:
@@ -154,41 +170,22 @@ def _link(seen: Seen) -> Iterator[str]:
         yield f"the session ended in {State(records['state'][-1]).name}"
 
 
-def _entered(entered: list[Entry], campaign: Campaign) -> Iterator[str]:
-    """Entries of the manifest and their files are unchanged."""
-    there = {entry.name: entry for entry in campaign.folder.manifest()}
-    for entry in entered:
-        if there.get(entry.name) != entry:
-            yield f"the entry of {entry.name} is not what it was"
-        elif sha256(campaign.folder.archives / entry.name) != entry.sha256:
-            yield f"{entry.name} is not what was entered"
-
-
-def sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 def _is_newest(path: Path) -> bool:
     return path == max(path.parent.iterdir(), key=lambda sibling: sibling.stat().st_mtime_ns)
 
 
-def _readable(recording: Recorded, seen: Seen) -> Iterator[str]:
+def _readable(recording: Recorded, seen: Seen, period: float) -> Iterator[str]:
     """An archive is a gap-free prefix, also for the second reader."""
-    if recording.cycles.size and (np.diff(recording.cycles) != 1).any():
-        yield f"{recording.path.name} has gaps"
-    if not recording.archive.complete and not (
-        "archive" in seen.killed and _is_newest(recording.path)
-    ):
-        yield f"{recording.path.name} is not complete: {recording.archive.missing}"
-    second_count = len(read(recording.path).cycles)
-    if second_count != recording.cycles.size:
-        yield (
-            f"{recording.path.name}: {recording.cycles.size} cycles, but {second_count} for the "
-            f"second reader"
-        )
-    outcome = recording.archive.outcome
-    if outcome is not None and outcome.records_lost:
-        yield f"{recording.path.name} states that {outcome.records_lost} records were lost"
+    archive = recording.archive
+    yield from gap_free(recording.cycles)
+    yield from not_truncated(
+        complete=archive.complete,
+        problem=archive.missing or "",
+        excused="archive" in seen.killed and _is_newest(recording.path),
+    )
+    yield from readable(read(recording.path), period)
+    if archive.outcome is not None:
+        yield from nothing_lost(archive.outcome.records_lost)
 
 
 def _as_exchanged(recording: Recorded, records: Records) -> Iterator[str]:
@@ -197,12 +194,9 @@ def _as_exchanged(recording: Recorded, records: Records) -> Iterator[str]:
         return
     rows = _rows_of(recording, records)
     if rows is None:
-        yield f"{recording.path.name} holds cycles that were never exchanged"
+        yield "holds cycles that were never exchanged"
         return
-    columns = recording.archive.columns
-    for name in COMPARED:
-        if not np.array_equal(columns[name], rows[name], equal_nan=name != "state"):
-            yield f"{name} in {recording.path.name} is not what was exchanged"
+    yield from as_exchanged(recording.archive.columns, rows, COMPARED)
 
 
 def _outcome(recording: Recorded, seen: Seen) -> Iterator[str]:
@@ -210,18 +204,13 @@ def _outcome(recording: Recorded, seen: Seen) -> Iterator[str]:
     if recording.archive.outcome is None:
         return
     outcome = recording.archive.outcome.entries["outcome"]
-    if int(recording.archive.outcome.entries["samples"]) != recording.cycles.size:
-        yield (
-            f"{recording.path.name} has {recording.cycles.size} cycles and states "
-            f"{recording.archive.outcome}"
-        )
     if outcome not in ("completed", "stopped", "void", "lost", "refused"):
-        yield f"the outcome of {recording.path.name} is {outcome}"
+        yield f"its outcome is {outcome}"
     alone = "exchange" not in seen.killed and "controller" not in seen.killed
     if outcome == "lost" and alone:
-        yield f"{recording.path.name} is marked lost, and neither end of the link had died"
+        yield "is marked lost, and neither end of the link had died"
     if outcome == "void" and recording.cycles.size and _moving(recording.archive.columns).any():
-        yield f"{recording.path.name} is marked void, and holds motion"
+        yield "is marked void, and holds motion"
 
 
 def _moving(columns: Mapping[str, NDArray[Any]] | Records) -> NDArray[np.bool_]:
@@ -247,8 +236,7 @@ def _archived(recorded: list[Recorded], seen: Seen, figures: dict[str, int]) -> 
         return
     moving = records["cycle"][_moving(records)]
     there = np.concatenate([np.zeros(0, np.int64), *(recording.cycles for recording in recorded)])
-    if np.unique(there).size != there.size:
-        yield "a cycle is in two archives"
+    yield from in_one_archive(recording.cycles.tolist() for recording in recorded)
     missing = np.setdiff1d(moving, there)
     death = next((candidate for candidate in seen.deaths if candidate.victim == "archive"), None)
     if death is None:
@@ -290,19 +278,9 @@ def _motions(recorded: list[Recorded], seen: Seen, campaign: Campaign) -> Iterat
         commanded = commanded[~np.isnan(commanded).any(axis=1)]
         if not len(commanded):
             continue
-        if not _on_path(motion, commanded):
-            yield f"the motion of {recording.path.name} left its path"
+        for text in on_path(commanded, motion):
+            yield f"{recording.path.name}: {text}"
         ends = motion.sample(np.array([0.0, motion.duration]))[0]
         short = np.abs(commanded[-1] - commanded[0] - (ends[1] - ends[0])).max() > 1e-6
         if short and (recording.archive.outcome or ArchiveOutcome()).outcome == "completed":
             yield f"{recording.path.name} is marked completed, and its motion was not"
-
-
-def _on_path(motion: Any, commanded: NDArray[np.float64]) -> bool:
-    """Return whether set-points lie on a path, up to a constant rounding offset."""
-    step = 2e-4  # s
-    path, velocity, _ = motion.sample(np.arange(0.0, motion.duration + step, step))
-    offset = commanded[0] - path[0]
-    near = 0.5 * step * np.abs(velocity).max() + 1e-9
-    apart = np.abs(path[np.newaxis] + offset - commanded[::5, np.newaxis]).max(axis=2).min(axis=1)
-    return bool(np.abs(offset).max() < 1e-5 and apart.max() <= near)

@@ -6,14 +6,12 @@ import os
 import shutil
 import time
 import traceback
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from drivers.transports.simulated import SimulatedTransport
-from hil.archive import ArchiveName, open_archive
 from hil.campaign import Campaign, CampaignPlan, Stop, VirtualLink
 from hil.campaign.plan import design
 from hil.cell import Cell
@@ -23,10 +21,20 @@ from hil.progress import Silent
 from hil.simulation import simulated_controller
 from identification import Estimate
 from tests.hil.fast_cell import fast_cell
+from tests.laws.estimates import alike
+from tests.laws.manifests import (
+    completed,
+    entered_as_archived,
+    entered_once,
+    entries_kept,
+    manifest_of,
+    nothing_missing,
+)
+from tests.laws.motions import as_planned
+from tests.laws.second_reader import read
 from tests.process_death.laws import broken_by
 from tests.process_death.rig import ARCHIVE, EXCHANGE, Seen, made, run
 from tests.process_death.rounds import Round, round_of
-from tests.simulate.laws.estimated import alike
 
 
 @dataclass(frozen=True)
@@ -52,7 +60,7 @@ DEFECTS: Final = {
         EXCHANGE,
         "import os; from drivers.exchange.serving import CommandHandler; "
         "CommandHandler._detach = lambda *_: os._exit(0)",
-        "while the arm moved",
+        "where the exchange ended by itself the arm moves",
     ),
 }
 
@@ -161,7 +169,7 @@ def play(stage: Stage, number: int) -> dict[str, Any]:
 def finished(campaign: Campaign, played: Round, seen: Seen, folder: Path) -> list[str]:
     """Finish the campaign; return broken laws."""
     earlier = frozenset(path.name for path in campaign.folder.archives.iterdir())
-    before = campaign.folder.manifest()
+    before = manifest_of(campaign.folder.root)[1]
     problems: list[str] = []
     if played.over_sockets:
         again = run(campaign, played, (), folder / "report-again.json")
@@ -170,27 +178,23 @@ def finished(campaign: Campaign, played: Round, seen: Seen, folder: Path) -> lis
         problems += broken_by(again, campaign, earlier)[0]
     else:
         finish_in_virtual_time(campaign, seed=played.seed)
-    after = campaign.folder.manifest()
-    if after[: len(before)] != before:
-        problems.append("the next run changed entries of the one before")
-    return [*problems, *_whole(campaign, seen)]
+    problems += entries_kept(before, manifest_of(campaign.folder.root)[1])
+    return [*problems, *_complete(campaign, seen)]
 
 
-def _whole(campaign: Campaign, seen: Seen) -> Iterator[str]:
-    """Each interval of the plan is entered once as completed, and its archive is complete."""
-    settings = campaign.cell.campaign
-    wanted = {"standstill": 1, "excitation": settings.repetitions, "validation": 1}
-    entered = Counter(
-        (name.kind, name.index)
-        for entry in campaign.folder.manifest()
-        if entry.outcome == "completed" and (name := ArchiveName.parse(entry.name)) is not None
-    )
-    for kind, count in wanted.items():
-        for index in range(count):
-            if entered[kind, index] != 1:
-                yield f"{kind} {index} is entered {entered[kind, index]} times"
-        for path in campaign.folder.completed(kind):
-            if not open_archive(path).complete:
-                yield f"{path.name} is entered and not complete"
+def _complete(campaign: Campaign, seen: Seen) -> Iterator[str]:
+    """Each motion of the plan is entered once as completed, as it was planned."""
+    folder, plan = campaign.folder.root, campaign.plan
+    entries = manifest_of(folder)[1]
+    yield from nothing_missing(entries, (1, campaign.cell.campaign.repetitions, 1))
+    yield from entered_once(entries)
+    for entry in entries:
+        yield from entered_as_archived(entry, folder)
+    for entry in completed(entries):
+        kind, index = entry.motion
+        if kind != "standstill":
+            motion = plan.excitation if kind == "excitation" else plan.validation[index]
+            archived = read(folder / "archives" / entry.name)
+            yield from as_planned(archived, motion.trajectory, campaign.cell.period)
     if damaged := campaign.folder.damaged():
         yield f"after {seen.killed}: {damaged}"

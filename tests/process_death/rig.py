@@ -36,7 +36,7 @@ from hil.cell import Cell
 from hil.demo_link import LOOPBACK, free_port
 from hil.errors import HilError
 from hil.progress import Silent
-from hil.recorded_campaign import Entry
+from tests.laws.manifests import Entry, manifest_of
 from tests.process_death.controller import Page, Rows, at_rest, forked, serve
 from tests.process_death.rounds import Round, Victim
 
@@ -259,8 +259,8 @@ class Watched:
             "neither the campaign's end nor the kill",
         )
         if self.over("supervisor"):
-            return deaths, self.campaign.folder.manifest()
-        entered = self.campaign.folder.manifest()
+            return deaths, self._entries()
+        entered = self._entries()
         until = time.monotonic() + self.played.trigger.delay
         while (left := until - time.monotonic()) > 0.0:
             self.look()
@@ -277,6 +277,9 @@ class Watched:
                 if how not in ("SIGINT", "SIGHUP"):  # which end no process
                     deaths.append(Death(victim, written, max(self._behind, default=0)))
         return deaths, entered
+
+    def _entries(self) -> list[Entry]:
+        return manifest_of(self.campaign.folder.root)[1]
 
     def _strike(self, victim: Victim, how: Strike) -> None:
         pid = self.pids[victim]

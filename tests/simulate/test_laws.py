@@ -19,9 +19,9 @@ from hil.campaign.errors import MotionFailedError
 from hil.errors import ControllerError
 from tests.drivers import oracle
 from tests.hil.mcap_bytes import chunks
-from tests.simulate.laws.archived import read
+from tests.laws.estimates import FALSE_ALARM, SEEDS, bound, degrees_of_freedom
+from tests.laws.second_reader import read
 from tests.simulate.laws.conversation import Talk, heard
-from tests.simulate.laws.estimated import FALSE_ALARM, SEEDS, bound, degrees_of_freedom
 from tests.simulate.observed import Observed
 from tests.simulate.script import parse_script
 from tests.simulate.verdicts import LAWS
@@ -341,9 +341,9 @@ ALTERED: list[tuple[str, Alter, tuple[str, ...]]] = [
     ("guard", unrequested, ("moved without a motion requested",)),
     ("guard", ended_early, ("moved without a motion requested",)),
     ("rest", lambda o: with_arm(o, velocity=o.arm.velocity + 1.0),
-     ("the arm moves at the end", "ends on a moving arm")),
+     ("at the end the arm moves", "ends the arm moves")),
     ("rest", lambda o: with_arm(o, open_axes=np.ones(len(o.arm.phase), bool)),
-     ("axes are open at the end", "ends with open axes, phase ")),
+     ("at the end axes are open, phase ", "ends axes are open, phase ")),
     ("archives", unarchived, ("",)),
     ("resume", lambda o: with_life(o, 0, error=ValueError("what?")),
      ("life 1 ended with ValueError",)),
@@ -473,7 +473,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], dict[str, str]]] = {
      {"folder": "differs from its checksum"}),
     "an entry twice": (lambda path: entered(path, lambda entry: [entry, entry]),
      {"folder": "an archive is entered twice"}),
-    "no entry": (lambda path: entered(path, lambda entry: []), {"resume": "are missing"}),
+    "no entry": (lambda path: entered(path, lambda entry: []), {"resume": "is missing"}),
     "a rejection": (lambda path: entered(path, lambda entry: [entry | {"outcome": "rejected"}]),
      {"estimate": "{name} was pooled although"}),
     "the cell": (cell_edited, {"folder": "cell.toml is not the one in the manifest"}),

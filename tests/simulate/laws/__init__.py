@@ -1,4 +1,4 @@
-"""Laws of all simulated campaigns, one family per module.
+"""Laws of all simulated campaigns, one family per module, with those of `tests.laws`.
 
 The input of a law is an `Observed`: wire, archives and manifest are decoded here independently of
 the product, from the documentation.

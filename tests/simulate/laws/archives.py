@@ -1,8 +1,7 @@
-"""Archives contain what crossed the wire, except what they state as lost.
+"""Archives contain what crossed the simulated wire, except what they state as lost.
 
-`docs/archive-format.md`: one interval of motion per file, records as exchanged, increasing cycles,
-missing packets counted; a file that was not closed is readable to its last complete chunk. Records
-are compared with the packets and answers, decoded here.
+The laws of `tests.laws.archives`, and: one interval of motion per file; records agree with the
+packets and answers, decoded here.
 """
 
 from __future__ import annotations
@@ -16,12 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.events import MotionEnded, MotionStarted
-from hil.archive import open_archive
-from hil.errors import ArchiveError
 from tests.drivers import oracle
+from tests.laws.archives import (
+    as_exchanged,
+    consistent,
+    in_one_archive,
+    not_truncated,
+    ordered,
+    read_alike,
+    stated,
+)
+from tests.laws.second_reader import Archived, read
 from tests.simulate.observed import Life, Observed
 
-from .archived import Archived, read
 from .conversation import Talk, heard
 from .wire import REFUSALS, Array, Gears
 
@@ -83,13 +89,15 @@ def archives(observed: Observed) -> Iterator[str]:
     constants = np.array(observed.cell.drive_table.torque_constant, float)
     all_placed = placed(observed)
     for number, placed_archive in enumerate(all_placed):
-        name = placed_archive.archived.path.name
+        archived = placed_archive.archived
+        name = archived.path.name
         intact_too = number == observed.seed % len(all_placed)
         newest = any(placed_archive is p for p in _newest(all_placed, placed_archive.life))
         texts = [
             *_readable(placed_archive, intact_too=intact_too, newest=newest),
-            *_columns(placed_archive.archived, observed.cell.period),
-            *_stated(placed_archive),
+            *ordered(archived.cycles["cycle"], archived.cycles["gap"]),
+            *consistent(archived, observed.cell.period),
+            *stated(archived),
             *_made_of(placed_archive, gears, constants),
         ]
         for text in texts:
@@ -117,73 +125,13 @@ def _readable(placed_archive: Placed, *, intact_too: bool, newest: bool) -> Iter
     archived, life = placed_archive.archived, placed_archive.life
     name = archived.path.name
     being_written = newest and (life.died or bool(life.disk))  # at the fault
-    if not archived.whole and not being_written and name not in life.torn:
-        yield f"is incomplete ({archived.problem}) without a fault that truncated it"
-    if not archived.whole or intact_too:
-        yield from _as_the_product_reads(archived)
-
-
-def _as_the_product_reads(archived: Archived) -> Iterator[str]:
-    """The product reads the same rows and reports truncation."""
-    try:
-        archive = open_archive(archived.path, fields=("cycle", "position"))
-    except ArchiveError as error:
-        if len(archived.cycles):
-            yield f"it is refused ({error}) with {len(archived.cycles)} complete records"
-        return
-    if archive.complete is not archived.whole:
-        yield f"complete is {archive.complete}, expected {archived.whole}"
-    columns = archive.columns
-    if len(archived.cycles):
-        same = np.array_equal(columns["cycle"], archived.cycles["cycle"])
-        if not same or not np.array_equal(columns["position"], archived.cycles["position"]):
-            yield f"{len(columns['cycle'])} records are read of {len(archived.cycles)}"
-
-
-def _columns(archived: Archived, period: float) -> Iterator[str]:
-    """Channels are consistent with each other."""
-    rows = archived.cycles
-    if not len(rows):
-        return
-    cycle = rows["cycle"]
-    if not (np.diff(cycle) > 0).all():
-        yield "cycles do not increase"
-    stamps = np.rint(cycle * (period * 1e9)).astype(np.int64)
-    headers = rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"]
-    if not (np.array_equal(stamps, archived.stamps) and np.array_equal(stamps, headers)):
-        yield "times are not cycle times period"
-    if not np.array_equal(archived.sequences, np.arange(len(rows))):
-        yield "messages are not numbered consecutively"
-    state = np.concatenate([rows[name] for name in ("position", "velocity", "torque")], axis=1)
-    sent, inside = (
-        np.concatenate([rows[f"{whose}_{name}"] for name in ("position", "velocity")], axis=1)
-        for whose in ("commanded", "target")
+    yield from not_truncated(
+        complete=archived.whole,
+        problem=archived.problem,
+        excused=being_written or name in life.torn,
     )
-    sent = np.where(np.isnan(sent), inside, sent)
-    same = np.array_equal(state, archived.states, equal_nan=True)
-    if not (same and np.array_equal(sent, archived.commanded, equal_nan=True)):
-        yield "the JointState channels do not agree with the records"
-    # After a silence the number of missing packets is unknown, and not counted in the cycles.
-    if np.any(np.diff(cycle) < 1 + rows["gap"][1:]):
-        yield "more packets are missing than cycles between two records"
-
-
-def _stated(placed_archive: Placed) -> Iterator[str]:
-    """The numbers of the outcome agree with the records."""
-    archived, outcome = placed_archive.archived, placed_archive.archived.outcome
-    if outcome is None or not archived.whole:
-        return
-    rows = archived.cycles
-    expected = {"samples": len(rows), "events": len(archived.events)}
-    if len(rows):
-        expected["lost_packets"] = int(rows["gap"].sum())
-        expected["first_cycle"], expected["last_cycle"] = (
-            int(rows["cycle"][0]),
-            int(rows["cycle"][-1]),
-        )
-    for key, value in expected.items():
-        if outcome.get(key) != str(value):
-            yield f"{key} is stated as {outcome.get(key)}, and is {value}"
+    if not archived.whole or intact_too:
+        yield from read_alike(archived)
 
 
 def _made_of(placed_archive: Placed, gears: Gears, constants: Array) -> Iterator[str]:
@@ -205,9 +153,7 @@ def _made_of(placed_archive: Placed, gears: Gears, constants: Array) -> Iterator
     if not archived.whole and lost:
         yield f"{lost} cycles are missing within the truncated file"
     records = talk.records[rows]
-    for name in _SAME:
-        if not np.array_equal(records[name], cycles[name]):
-            yield f"{name} is not that of the cycle exchanged"
+    yield from as_exchanged(cycles, records, _SAME)
     if talk.init.slots:
         yield from _decoded(talk, rows, cycles, gears, constants)
 
@@ -277,12 +223,9 @@ def _each_interval(observed: Observed, all_placed: tuple[Placed, ...]) -> Iterat
                 period = observed.cell.period
                 for text in _interval(life, talk, interval, rows, mine, period, excused=excused):
                     yield f"life {number}, interval {interval}: {text}"
-        archived: set[tuple[int, int]] = set()
-        for p in mine:
-            records = {(id(p.talk), int(row)) for row in p.rows}
-            if archived & records:
-                yield f"life {number}: {len(archived & records)} records are in two archives"
-            archived |= records
+        records = [{(id(p.talk), int(row)) for row in p.rows} for p in mine]
+        for text in in_one_archive(records):
+            yield f"life {number}: {text}"
 
 
 def _at_risk(life: Life, mine: list[Placed]) -> int:

@@ -17,6 +17,7 @@ from drivers.states import State
 from hil.campaign.errors import MotionFailedError
 from hil.errors import ControllerError, HilError
 from sim_fixtures import Phase
+from tests.laws.arm import closed, stands
 from tests.simulate.observed import Life, Observed
 from tests.simulate.script import DISTURBS_THE_ARM, kind_of
 
@@ -31,11 +32,10 @@ def rest(observed: Observed) -> Iterator[str]:
     """Check the law of this module."""
     arm, period = observed.arm, observed.cell.period
     gears = Gears.of(observed.cell.drive_table)
-    if arm.open_axes[-1:].any():
-        yield f"axes are open at the end, phase {arm.phase[-1]}"
-    fastest = _speed(arm.velocity[-1:], gears, period)
-    if fastest > _STANDSTILL:
-        yield f"the arm moves at the end, by {fastest:.2g} motor revolutions a cycle"
+    phase = arm.phase[-1] if arm.phase else ""
+    yield from closed(phase, any_open=bool(arm.open_axes[-1:].any()), when="at the end")
+    revolutions = _revolutions(arm.velocity[-1:], gears, period)
+    yield from stands(revolutions, _STANDSTILL, "at the end", "motor revolutions per cycle")
     # A disturbed arm may still approach its set-points.
     disturbed = any(kind_of(line) in DISTURBS_THE_ARM for line in observed.struck)
     for number, life in enumerate(observed.runs, 1):
@@ -47,21 +47,21 @@ def rest(observed: Observed) -> Iterator[str]:
                 last = life.records[life.records["interval"] == life.records["interval"].max()]
                 moved = np.abs(arm.velocity[last["cycle"]]).max()
                 rests = np.maximum(rests, _SWING * moved)
-            if not disturbed and (speed > rests).any():
-                yield f"life {number} ends on a moving arm: {speed.max():.2g} rad/s"
+            if not disturbed:
+                yield from stands(speed, rests, f"where life {number} ends")
             # A controller that lost its drive closes the axes some cycles later, by itself. Axes
             # that open after the run's last packet are closed when the link is closed.
             excused = arm.phase[at] == Phase.TRIPPED.name or not arm.open_axes[at - 1]
-            if arm.open_axes[at] and not excused:
-                yield f"life {number} ends with open axes, phase {arm.phase[at]}"
+            still_open = bool(arm.open_axes[at]) and not excused
+            yield from closed(arm.phase[at], any_open=still_open, when=f"where life {number} ends")
         for interval, held, wanted in _held_too_short(life):
             text = f"interval {interval} is left {held} cycles after it moved, not {wanted}"
             yield f"life {number}: {text}"
 
 
-def _speed(velocity: Array, gears: Gears, period: float) -> float:
-    """Return the largest motor speed [rev per cycle] of joint velocities (k, n) [rad/s]."""
-    return float(np.abs(velocity @ gears.matrix.T).max(initial=0.0) * period)
+def _revolutions(velocity: Array, gears: Gears, period: float) -> Array:
+    """Return motor speeds [rev per cycle] of joint velocities (k, n) [rad/s]."""
+    return np.asarray(velocity @ gears.matrix.T * period)
 
 
 def _held_up(life: Life) -> bool:
