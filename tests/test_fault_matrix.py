@@ -36,6 +36,8 @@ from tests.fault_matrix.faulty_runs import (
     play,
     play_at,
 )
+from tests.laws.archives import readable
+from tests.laws.second_reader import read
 
 pytestmark = pytest.mark.safety
 
@@ -97,6 +99,7 @@ def on_ns16(
     archive = open_archive(file)
     assert controller.reason == "", "the drive stays on"
     assert archive.complete
+    assert list(readable(read(file), cell.period)) == []
     assert archive.outcome.outcome == ended.outcome == ("stopped" if fault else "completed")
     return archive
 

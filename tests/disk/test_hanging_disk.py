@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from hil.archive import ArchiveOutcome, open_archive
@@ -22,6 +21,8 @@ from hil.progress import Silent
 from tests.disk.disks import CREATE, SYNC, WRITE, Disk, Rule, processes_disk
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 from tests.hil.loopback import loopback_link
+from tests.laws.archives import gap_free, not_truncated, nothing_lost, readable
+from tests.laws.second_reader import read
 
 pytestmark = pytest.mark.safety
 
@@ -79,16 +80,20 @@ def run(campaign: Campaign, disk: Disk, rule: Rule | None, after: str) -> Ended:
     return Ended(process.returncode, output, arm)
 
 
-def lost(campaign: Campaign) -> dict[str, str]:
-    """Archives that lack an answered cycle between their first and their last."""
-    incomplete = {}
+def lost(campaign: Campaign) -> list[str]:
+    """What the laws of archives say: nothing of what was answered is lacking."""
+    problems = []
     for path in sorted(campaign.folder.archives.glob("*.mcap")):
         archive = open_archive(path)
-        missed = int(np.diff(archive.columns["cycle"]).sum()) - (archive.n_samples - 1)
-        stated = archive.outcome or ArchiveOutcome()
-        if not archive.complete or stated.records_lost != 0 or missed != stated.lost_packets:
-            incomplete[path.name] = str(archive.missing or stated)
-    return incomplete
+        outcome = archive.outcome or ArchiveOutcome()
+        texts = (
+            *not_truncated(complete=archive.complete, problem=archive.missing or "", excused=False),
+            *nothing_lost(outcome.records_lost),
+            *gap_free(archive.columns["cycle"], outcome.lost_packets or 0),
+            *readable(read(path), campaign.cell.period),
+        )
+        problems += [f"{path.name}: {text}" for text in texts]
+    return problems
 
 
 @pytest.mark.slow
@@ -100,7 +105,7 @@ def test_hang_of_seconds_loses_nothing(disk: Disk, tmp_path: Path, hang: float) 
     assert "fsync dryrun_000_a1.mcap" in disk.do_wrong()
     assert ended.status == 0, ended.output
     assert "0 rejected" in ended.output
-    assert not lost(campaign)
+    assert lost(campaign) == []
 
 
 @pytest.mark.slow
@@ -115,10 +120,10 @@ def test_longer_hang_stops_the_arm_and_is_named(disk: Disk, tmp_path: Path) -> N
     assert ended.arm["ended"], "open mode was left, and the session ended"
     dry_run = open_archive(campaign.folder.archives / "dryrun_000_a1.mcap")
     assert (dry_run.outcome or ArchiveOutcome()).outcome == "stopped"
-    assert not lost(campaign), "the ring stored what the disk did not accept"
+    assert lost(campaign) == [], "the ring stored what the disk did not accept"
     again = run(campaign, disk, None, "")
     assert again.status == 0, again.output
-    assert not lost(campaign)
+    assert lost(campaign) == []
 
 
 @pytest.mark.slow

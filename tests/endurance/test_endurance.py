@@ -79,7 +79,7 @@ def missing(sample: Line) -> None:
         (None, {"complete": False}, "campaign 159: abandoned"),
         (None, {"archives": 25}, "26 motions ended and there are 25 archives"),
         (None, {"faulty": ["a.mcap: ['x']"]}, "a.mcap"),
-        (None, {"records_lost": 3}, "3 records lost"),
+        (None, {"records_lost": 3}, "3 records were lost"),
         (None, {"descriptors": dict.fromkeys(PROCESSES, 13)}, "has 13 descriptors"),
     ],
 )

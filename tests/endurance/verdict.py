@@ -13,6 +13,7 @@ import numpy as np
 
 from drivers.exchange.control import quantile
 from tests.journal import entries
+from tests.laws.archives import nothing_lost
 
 PROCESSES: Final = ("exchange", "archive", "supervisor", "controller")
 BLOCK: Final = 10 * 60.0  # s at the beginning, after a warm-up of half of it, and at the end
@@ -117,8 +118,7 @@ def _faults(piece: Piece) -> Iterator[str]:
             what.append(f"abandoned after {campaign['restarts']}")
         if not campaign["stopped"] and moved != campaign["motions"]:
             what.append(f"{campaign['motions']} motions ended and there are {moved} archives")
-        if campaign["records_lost"]:
-            what.append(f"{campaign['records_lost']} records lost")
+        what += nothing_lost(campaign["records_lost"])
         yield from (f"campaign {campaign['number']}: {text}" for text in what)
     if piece.samples:
         counters = piece.samples[-1]["counters"]

@@ -35,6 +35,7 @@ from sim_fixtures import Phase, SimulatedController
 from sim_fixtures.faults import parse_fault, split_faults
 from tests.drivers.judge import Conduct, Judged
 from tests.fault_matrix import small_cell
+from tests.laws.arm import stands
 
 Array = NDArray[np.float64]
 
@@ -359,9 +360,9 @@ class Run:
         if self.session.state is not State.ENDED and self.controller.phase is not Phase.ENDED:
             self._exchange(long_at_rest, 900)
             if not self.session.requested and rested < 60:
-                self.broken.append(f"the arm does not come to rest: {self._speed():.4f} rad/s")
-        elif self._speed() >= AT_REST:
-            self.broken.append(f"the session ended on a moving arm: {self._speed():.4f} rad/s")
+                self.broken += stands(self._speed(), 0.0, "900 cycles after its motion")
+        else:
+            self.broken += stands(self._speed(), AT_REST, "where the session ended")
 
 
 def _leaves_open(event: Any) -> bool:

@@ -25,7 +25,10 @@ from hil.simulation import simulated_controller
 from planner import Move, TrajectoryPlayer, plan_moves
 from sim_fixtures import Phase, SimulatedController
 from tests.hil.fast_cell import fast_cell
-from tests.simulate.verdicts import Stage
+from tests.simulate.scenes import NEIGHBOURS, scene_of
+from tests.simulate.script import parse_script
+from tests.simulate.verdicts import Stage, judged, missed_alike
+from tests.simulate.world import _twin, play
 
 pytestmark = pytest.mark.safety
 
@@ -186,7 +189,7 @@ RECEIVED_TWICE = (202544,)  # beside a packet with another number
 CLOCK_SET_FORWARD = (201111,)  # behind an init packet: the start is over
 CLOCK_SET_BACK = (101575,)  # a start timeout of an hour, with the drive off
 SCATTERED_REPETITIONS = (100232,)  # they rejected one another in turn
-HALF_A_SECOND = (400869, 102383)  # motions so short that a restart or two late packets fill them
+HALF_A_SECOND = (400869, 102383)  # see `TestHalfASecond`
 
 
 @pytest.mark.parametrize(
@@ -207,3 +210,47 @@ HALF_A_SECOND = (400869, 102383)  # motions so short that a restart or two late 
 def test_seed_breaks_no_law(seed: int, tmp_path: Path) -> None:
     """In 5326 a motion that had just begun continued as if it had not been held."""
     assert not Stage(tmp_path).verdict(seed, shrink=False).broken
+
+
+class TestHalfASecond:
+    """Seeds 102383 and 400869: repetition 3 of a motion of half a second was rejected for ever.
+
+    Both broke the law `completion` while the servo of the simulated controller had one loop in 2 ms.
+    Since its loops run each millisecond, 102383 has its faults in other cycles and 400869 another
+    arm, so that the seeds say nothing about it any more. The reasons were two:
+
+    102383, two late packets. Repetitions 1 and 2 missed a packet at the same set-point. They
+    differed by 5 % of the rms current of joint 4 from each other, and by 20 to 29 % from every sound
+    one; 10 % are allowed. The product corrects this if one repetition counts, not if two do: it asks
+    for an inspection or a new campaign. That is right, as two that agree cannot be told from sound
+    ones. The law was wrong: it excused only faults that push the arm. It is so with either servo.
+
+    400869, a restart between two repetitions. The undisturbed repetitions of this arm differ by up
+    to 9 % of the rms current of joint 1, with either servo. The one after the restart differed by
+    8 % from the first and by 14 to 15 % from later ones, those by 9 to 10 % from the first: neither
+    law nor product, but an arm at the bound of 10 %, with which chance decides.
+    """
+
+    @pytest.fixture(scope="class")
+    def stage(self, tmp_path_factory: pytest.TempPathFactory) -> Stage:
+        return Stage(tmp_path_factory.mktemp("half_a_second"))
+
+    def test_two_repetitions_disturbed_alike_may_ask_for_an_inspection(self, stage: Stage) -> None:
+        seen = stage.observed(102383, ["delay@577x1:7ms", "delay@296x1:7ms"])
+        assert "RepetitionsRejectedError: repetition 3 was rejected 2 times" in seen.ended
+        assert "or begin a new one" in seen.ended
+        assert missed_alike(seen)
+        assert judged(seen) == []
+
+    def test_a_restart_of_an_arm_that_scatters_is_no_disturbance(self, tmp_path: Path) -> None:
+        twin = _twin(scene_of(400869 // NEIGHBOURS, variant=1), tmp_path / "twin")
+        assert "2 joints, upright, 2 ms; sines, 0.53 s; 3 repetitions" in twin.scene.words
+        script = parse_script(["restart@875:cold"])
+        assert judged(play(400869, twin, tmp_path, script)) == []
+
+    def test_one_that_is_disturbed_is_replaced(self, stage: Stage) -> None:
+        seen = stage.observed(102383, ["delay@296x1:7ms"])
+        assert seen.complete
+        assert not missed_alike(seen)
+        first = open_archive(seen.folder / "archives" / "excitation_000_a1.mcap").outcome
+        assert first is not None and first.outcome == "rejected"
