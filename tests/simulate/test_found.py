@@ -215,15 +215,16 @@ def test_seed_breaks_no_law(seed: int, tmp_path: Path) -> None:
 class TestHalfASecond:
     """Seeds 102383 and 400869: repetition 3 of a motion of half a second was rejected for ever.
 
-    Both broke the law `completion` while the servo of the simulated controller had one loop in 2 ms.
-    Since its loops run each millisecond, 102383 has its faults in other cycles and 400869 another
-    arm, so that the seeds say nothing about it any more. The reasons were two:
+    Both broke the law `completion` while the servo of the simulated controller had one loop in
+    2 ms. Since its loops run each millisecond, 102383 has its faults in other cycles and 400869
+    another arm, so that the seeds say nothing about it any more. The reasons were two:
 
     102383, two late packets. Repetitions 1 and 2 missed a packet at the same set-point. They
-    differed by 5 % of the rms current of joint 4 from each other, and by 20 to 29 % from every sound
-    one; 10 % are allowed. The product corrects this if one repetition counts, not if two do: it asks
-    for an inspection or a new campaign. That is right, as two that agree cannot be told from sound
-    ones. The law was wrong: it excused only faults that push the arm. It is so with either servo.
+    differed by 5 % of the rms current of joint 4 from each other, and by 20 to 29 % from every
+    sound one; 10 % are allowed. The product corrects this if one repetition counts, not if two do:
+    it asks for an inspection or a new campaign. That is right, as two that agree cannot be told
+    from sound ones. The law was wrong: it excused only faults that push the arm. It is so with
+    either servo.
 
     400869, a restart between two repetitions. The undisturbed repetitions of this arm differ by up
     to 9 % of the rms current of joint 1, with either servo. The one after the restart differed by
