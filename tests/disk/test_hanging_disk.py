@@ -15,12 +15,12 @@ import pytest
 from hil.archive import ArchiveOutcome, open_archive
 from hil.campaign import Campaign
 from hil.cell import Cell
-from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
+from hil.demo_link import LOOPBACK, SimulatorProcess
 from hil.errors import ControllerError
 from hil.progress import Silent
 from tests.disk.disks import CREATE, SYNC, WRITE, Disk, Rule, processes_disk
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
-from tests.hil.loopback import loopback_link
+from tests.hil.loopback import loopback_link, on_loopback
 from tests.laws.archives import gap_free, not_truncated, nothing_lost, readable
 from tests.laws.second_reader import read
 
@@ -47,7 +47,7 @@ class Ended:
 
 def made(disk: Disk, name: str, folder: Path) -> Campaign:
     cell = fast_cell(folder, repetitions=1, n_via=7)
-    text = cell.with_link(transport="udp", host=LOOPBACK, bind=LOOPBACK, port=free_port()).text
+    text = on_loopback(cell).text
     campaign = fast_campaign(disk.root / name, Cell.from_texts(text, cell.urdf, cell.path))
     pass_rehearsal(campaign.folder)
     return campaign

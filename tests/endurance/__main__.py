@@ -39,6 +39,7 @@ from hil.progress import Reporter, Silent, Task, reporter
 from tests.arguments import parser_of, time_above_0
 from tests.endurance.verdict import Verdict, judge, read_journal
 from tests.hil.fast_cell import fast_cell
+from tests.hil.loopback import on_loopback
 from tests.journal import Journal, JournalError
 
 LONGEST: Final = 90.0  # min of a piece
@@ -64,7 +65,7 @@ def run_piece(
         {"controller.cycle_ms": 1000 // rate}
     )
     port = free_port()
-    cell = cell.with_link(transport="udp", host=LOOPBACK, bind=LOOPBACK, port=port)
+    cell = on_loopback(cell, port)
     plan = design(cell, Silent())
     (work / "cell.toml").write_text(cell.text)
     options = ["--udp", f"{LOOPBACK}:{port}", "--missed", MISSED]

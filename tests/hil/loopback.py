@@ -14,6 +14,12 @@ from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
 from hil.errors import ControllerError, ExecutionError
 
 
+def on_loopback(cell: Cell, port: int | None = None) -> Cell:
+    """Return the cell with its controller on this computer, on this port or a free one."""
+    bound = free_port() if port is None else port
+    return cell.with_link(transport="udp", host=LOOPBACK, bind=LOOPBACK, port=bound)
+
+
 @contextmanager
 def loopback_link(
     cell: Cell,

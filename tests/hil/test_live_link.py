@@ -40,19 +40,13 @@ from hil.progress import Silent
 from planner import Move, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell, on_path, set_points
-from tests.hil.loopback import loopback_link
+from tests.hil.loopback import loopback_link, on_loopback
 from tests.hil.test_supervision import spec as spec_of
 
 pytestmark = pytest.mark.safety
 
 PATIENT = ("--patience", "2")
 """The controller waits while this computer pauses."""
-
-
-def on_loopback(cell: Cell, **changes: float) -> Cell:
-    """The cell with its controller on this computer."""
-    changed = cell.with_values({f"drive_train.{key}": value for key, value in changes.items()})
-    return changed.with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1")
 
 
 def campaign_of(folder: Path, cell: Cell, plan: CampaignPlan) -> Campaign:
@@ -115,7 +109,7 @@ def test_a_real_controller_is_not_driven_without_a_rehearsal(
 def test_each_difference_of_the_init_packet_is_named(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
-    wrong = on_loopback(cell, k65=0.045, k54=0.02)
+    wrong = on_loopback(cell.with_values({"drive_train.k65": 0.045, "drive_train.k54": 0.02}))
     right = tmp_path / "controller"
     right.mkdir()
     (right / "cell.toml").write_text(cell.text)
@@ -143,7 +137,7 @@ def test_an_archive_that_cannot_be_created_moves_nothing(
 
 def test_a_port_in_use_is_named(cell: Cell) -> None:
     with port_in_use() as port:
-        local = on_loopback(cell).with_link(port=port)
+        local = on_loopback(cell, port)
         with pytest.raises(ControllerError, match=str(port)):
             LiveLink.open(local)
 
@@ -216,7 +210,7 @@ def test_a_motion_is_slowed_held_and_stopped_with_a_viewer(cell: Cell, tmp_path:
     pytest.importorskip("websockets", reason="websockets is not installed")
     from tests.hil.live_viewer import Viewer
 
-    cell = cell.with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1")
+    cell = on_loopback(cell)
     stop = Stop()
     path = tmp_path / "a.mcap"
     with loopback_link(cell, options=PATIENT, live=LiveView(port=0)) as link:
@@ -334,7 +328,7 @@ def test_a_real_transport_makes_a_simulated_cell_a_real_one(cell: Cell) -> None:
 def test_a_live_view_that_cannot_be_served_is_refused(cell: Cell, tmp_path: Path) -> None:
     pytest.importorskip("foxglove", reason="the extra 'live' is not installed")
     with pytest.raises(LiveViewError, match="name an address of this computer"):
-        LiveLink.open(on_loopback(cell).with_link(port=free_port()), live=LiveView("192.0.2.1", 1))
+        LiveLink.open(on_loopback(cell), live=LiveView("192.0.2.1", 1))
     with pytest.raises(LiveViewError, match=r"--live nonsense is not HOST:PORT"):
         record(CELL_PATH, output=tmp_path, live="nonsense")
     assert not list(tmp_path.iterdir())

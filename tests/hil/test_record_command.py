@@ -34,6 +34,7 @@ from hil.progress import Silent
 from hil.recording import archive_path, record
 from hil.simulation import controller_settings, own_postures, simulated_controller
 from sim_fixtures.ns16 import CELL_PATH
+from tests.hil.loopback import on_loopback
 
 pytestmark = pytest.mark.long
 
@@ -180,8 +181,7 @@ def running(*command: object) -> Iterator[subprocess.Popen[str]]:
 def on_udp(tmp_path: Path, cell: Cell) -> tuple[Path, int]:
     """A cell file whose controller is on this computer, and its port."""
     port = free_port()
-    text = cell.with_link(transport="udp", host="127.0.0.1", port=port, bind="127.0.0.1").text
-    (tmp_path / "cell.toml").write_text(text)
+    (tmp_path / "cell.toml").write_text(on_loopback(cell, port).text)
     (tmp_path / "ns16.urdf").write_text(cell.urdf)
     return tmp_path / "cell.toml", port
 

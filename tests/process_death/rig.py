@@ -33,9 +33,10 @@ from drivers.record import RingReader, cycle_dtype
 from drivers.states import State
 from hil.campaign import Campaign, CampaignPlan, stop_on_interrupt
 from hil.cell import Cell
-from hil.demo_link import LOOPBACK, free_port
+from hil.demo_link import LOOPBACK
 from hil.errors import HilError
 from hil.progress import Silent
+from tests.hil.loopback import on_loopback
 from tests.laws.manifests import Entry, manifest_of
 from tests.process_death.controller import Page, Rows, at_rest, forked, serve
 from tests.process_death.rounds import Round, Victim
@@ -325,8 +326,7 @@ def _kill(pid: int) -> None:
 
 def made(folder: Path, cell: Cell, plan: CampaignPlan) -> Campaign:
     """A campaign in a new folder, on a port of the loopback device that is free."""
-    local = cell.with_link(transport="udp", host=LOOPBACK, bind=LOOPBACK, port=free_port())
-    return Campaign.create(folder / "campaign", local, plan)
+    return Campaign.create(folder / "campaign", on_loopback(cell), plan)
 
 
 def supervise(campaign: Path, report: Path, planted: Path | None) -> int:

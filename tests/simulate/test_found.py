@@ -212,6 +212,11 @@ def test_seed_breaks_no_law(seed: int, tmp_path: Path) -> None:
     assert not Stage(tmp_path).verdict(seed, shrink=False).broken
 
 
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
+    return Stage(tmp_path_factory.mktemp("half_a_second"))
+
+
 class TestHalfASecond:
     """Seeds 102383 and 400869: repetition 3 of a motion of half a second was rejected for ever.
 
@@ -231,10 +236,6 @@ class TestHalfASecond:
     8 % from the first and by 14 to 15 % from later ones, those by 9 to 10 % from the first: neither
     law nor product, but an arm at the bound of 10 %, with which chance decides.
     """
-
-    @pytest.fixture(scope="class")
-    def stage(self, tmp_path_factory: pytest.TempPathFactory) -> Stage:
-        return Stage(tmp_path_factory.mktemp("half_a_second"))
 
     def test_two_repetitions_disturbed_alike_may_ask_for_an_inspection(self, stage: Stage) -> None:
         seen = stage.observed(102383, ["delay@577x1:7ms", "delay@296x1:7ms"])
