@@ -7,7 +7,6 @@ they affected, so that other processes may write below it.
 from __future__ import annotations
 
 import builtins
-import errno
 import fnmatch
 import io
 import json
@@ -16,36 +15,24 @@ import stat
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 from unittest.mock import patch
 
 from hil.files import write_atomically
+from tests.faults import CREATE, REFUSALS, RENAME, SYNC, WRITE, DiskFault
 
 RULES, STRUCK = "rules.json", "struck.txt"
-CREATE, WRITE, SYNC, RENAME = "create", "write", "fsync", "rename"
-CHANGES: Final = (CREATE, WRITE, SYNC, RENAME)  # operations on which a disk may fail or hang
-REFUSALS: Final = {name: getattr(errno, name) for name in ("EIO", "EDQUOT", "ENOSPC", "EROFS")}
-
-
-@dataclass(frozen=True)
-class Rule:
-    operations: Sequence[str] = CHANGES  # on which of `CHANGES`
-    names: str = "*"  # pattern of the names of files it is about
-    after: int = 0  # how many matching operations pass before it begins
-    times: int = 0  # on how many it then acts; 0: on all
-    error: str = ""  # name of the error, "" for none
-    hang: float = 0.0  # s, counted from the first of them, until which none of them ends
 
 
 class Disk:
     def __init__(self, root: Path) -> None:
         self.root, self._count = root, 0
 
-    def do_wrong(self, *rules: Rule) -> list[str]:
+    def do_wrong(self, *rules: DiskFault) -> list[str]:
         """Activate these rules (none: no faults); return the operations affected before."""
         log = self.root.parent / STRUCK
         struck = log.read_text().splitlines() if log.exists() else []
@@ -62,7 +49,7 @@ class Faults:
     def __init__(self, root: Path) -> None:
         self.root, self._folder = root, root.parent
         self._lock, self._text = threading.Lock(), ""
-        self._rules: list[Rule] = []
+        self._rules: list[DiskFault] = []
         self._seen: dict[int, int] = {}
         self._until: dict[int, float] = {}
 
@@ -99,7 +86,7 @@ class Faults:
         text = file.read_text() if file.exists() else "[0]"
         if text != self._text:
             self._text, self._seen, self._until = text, {}, {}
-            self._rules = [Rule(**rule) for rule in json.loads(text)[1:]]
+            self._rules = [DiskFault(**rule) for rule in json.loads(text)[1:]]
 
 
 @contextmanager

@@ -18,7 +18,8 @@ from hil.cell import Cell
 from hil.demo_link import LOOPBACK, SimulatorProcess
 from hil.errors import ControllerError
 from hil.progress import Silent
-from tests.disk.disks import CREATE, SYNC, WRITE, Disk, Rule, processes_disk
+from tests.disk.disks import Disk, processes_disk
+from tests.faults import DiskFault, parse_disk_fault
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 from tests.hil.loopback import loopback_link, on_loopback
 from tests.laws.archives import gap_free, not_truncated, nothing_lost, readable
@@ -53,7 +54,7 @@ def made(disk: Disk, name: str, folder: Path) -> Campaign:
     return campaign
 
 
-def run(campaign: Campaign, disk: Disk, rule: Rule | None, after: str) -> Ended:
+def run(campaign: Campaign, disk: Disk, rule: DiskFault | None, after: str) -> Ended:
     """Run a campaign; the rule applies once the file `after` has some content."""
     port = campaign.cell.controller.port
     simulator = SimulatorProcess.start(
@@ -100,7 +101,7 @@ def lost(campaign: Campaign) -> list[str]:
 @pytest.mark.parametrize("hang", [1.0, 4.0])
 def test_hang_of_seconds_loses_nothing(disk: Disk, tmp_path: Path, hang: float) -> None:
     campaign = made(disk, f"hang_{hang:g}", tmp_path)
-    rule = Rule((WRITE, SYNC), "*.mcap", hang=hang)
+    rule = parse_disk_fault(f"hang={hang:g}s@write,fsync:*.mcap")
     ended = run(campaign, disk, rule, "dryrun_000_a1.mcap")
     assert "fsync dryrun_000_a1.mcap" in disk.do_wrong()
     assert ended.status == 0, ended.output
@@ -111,7 +112,7 @@ def test_hang_of_seconds_loses_nothing(disk: Disk, tmp_path: Path, hang: float) 
 @pytest.mark.slow
 def test_longer_hang_stops_the_arm_and_is_named(disk: Disk, tmp_path: Path) -> None:
     campaign = made(disk, "hang_7", tmp_path)
-    rule = Rule((WRITE, SYNC), "*.mcap", hang=7.0)
+    rule = parse_disk_fault("hang=7s@write,fsync:*.mcap")
     ended = run(campaign, disk, rule, "dryrun_000_a1.mcap")
     disk.do_wrong()
     assert ended.status == 4
@@ -135,7 +136,7 @@ def test_link_continues_after_an_archive_that_opened_too_late(
     with loopback_link(campaign.cell) as link:
         with monkeypatch.context() as short:
             short.setattr("hil.campaign.live_link.OPEN_TIMEOUT", 1.0)
-            disk.do_wrong(Rule((CREATE,), "*.mcap", hang=8.0))
+            disk.do_wrong(parse_disk_fault("hang=8s@create:*.mcap"))
             with pytest.raises(ControllerError, match=r"did not open .*move_000_a1\.mcap.*nothing"):
                 campaign.run(link, None, Silent(), accept_dry_run=True)
         result = campaign.run(link, None, Silent(), accept_dry_run=True)

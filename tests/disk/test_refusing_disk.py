@@ -27,17 +27,8 @@ from hil.cli import app
 from hil.errors import ArchiveError, HilError, NotAnArchiveError, OutputError
 from hil.progress import Silent
 from hil.simulation import controller_settings, simulated_controller
-from tests.disk.disks import (
-    CHANGES,
-    CREATE,
-    REFUSALS,
-    RENAME,
-    SYNC,
-    WRITE,
-    Disk,
-    Rule,
-    planted_disk,
-)
+from tests.disk.disks import Disk, planted_disk
+from tests.faults import CREATE, REFUSALS, RENAME, SYNC, WRITE, DiskFault, parse_disk_fault
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 from tests.laws.archives import gap_free, readable
 from tests.laws.arm import stands
@@ -87,11 +78,11 @@ def rehearsed(disk: Disk, name: str, designed: Designed) -> Campaign:
     return campaign
 
 
-def random_rule(rng: random.Random) -> Rule:
+def random_rule(rng: random.Random) -> DiskFault:
     """A refusal somewhere in a run: of one operation, or of all from there on."""
     names = rng.choice(sorted(DONE))
     operation = rng.choice(sorted(DONE[names]))
-    return Rule(
+    return DiskFault(
         (operation,),
         names,
         after=rng.randrange(DONE[names][operation]),
@@ -122,7 +113,7 @@ def unreadable(campaign: Campaign) -> Iterator[str]:
         yield from entered_as_archived(entry, campaign.folder.root)
 
 
-def refused_run(disk: Disk, campaign: Campaign, rule: Rule) -> list[str]:
+def refused_run(disk: Disk, campaign: Campaign, rule: DiskFault) -> list[str]:
     """Run on a disk that fails, then on one that works; return the failed operations."""
     before = entered(campaign)
     disk.do_wrong(rule)
@@ -163,6 +154,19 @@ def rounds(disk: Disk, designed: Designed, seeds: range) -> int:
     return count
 
 
+def test_the_line_of_a_disk_fault_says_all_of_it() -> None:
+    for seed in range(200):
+        fault = random_rule(random.Random(seed))
+        assert parse_disk_fault(str(fault)) == fault
+    assert parse_disk_fault("hang=7s@write,fsync:*.mcap").hang == pytest.approx(7.0)
+
+
+@pytest.mark.parametrize("line", ["EIO", "EIO@sit:*", "ESRCH@write:*", "hang@write:*", "EIO@write"])
+def test_a_disk_fault_that_cannot_be_read_is_refused_with_the_grammar(line: str) -> None:
+    with pytest.raises(ValueError, match="lines are"):
+        parse_disk_fault(line)
+
+
 def test_failing_disk_costs_one_motion_only(disk: Disk, designed: Designed) -> None:
     assert rounds(disk, designed, range(2)) >= 1
 
@@ -172,14 +176,14 @@ def test_manifest_that_cannot_be_written_is_reported(
     disk: Disk, designed: Designed, operation: str
 ) -> None:
     campaign = rehearsed(disk, f"manifest_{operation}", designed)
-    rule = Rule((operation,), "manifest.json*", after=2, times=1, error="EIO")
+    rule = parse_disk_fault(f"EIO@{operation}+2x1:manifest.json*")
     assert refused_run(disk, campaign, rule) == [f"{operation} manifest.json.tmp"]
 
 
 def test_campaign_without_manifest_is_removed(disk: Disk, designed: Designed) -> None:
     """Without a manifest it would look like one whose cell file was edited."""
     root = disk.root / "half"
-    disk.do_wrong(Rule((RENAME,), "manifest.json", error="EDQUOT"))
+    disk.do_wrong(parse_disk_fault("EDQUOT@rename:manifest.json"))
     with pytest.raises(OutputError, match=r"manifest\.json.*quota exceeded.*make room"):
         Campaign.create(root, *designed)
     assert disk.do_wrong()
@@ -191,7 +195,7 @@ def test_campaign_without_manifest_is_removed(disk: Disk, designed: Designed) ->
 def test_rehearsal_passes_after_a_disk_error(disk: Disk, designed: Designed) -> None:
     for number, (operation, after) in enumerate(((WRITE, 40), (RENAME, 12), (SYNC, 8))):
         campaign = Campaign.create(disk.root / f"rehearsed_{number}", *designed)
-        disk.do_wrong(Rule((operation,), after=after, error="EIO"))
+        disk.do_wrong(parse_disk_fault(f"EIO@{operation}+{after}:*"))
         with pytest.raises(HilError) as raised:
             campaign.rehearse()
         assert disk.do_wrong()
@@ -266,7 +270,7 @@ class TestCommands:
             shutil.rmtree(disk.root / made, ignore_errors=True)
         before = entered(prepared)
         command, written = STAGES[stage]
-        disk.do_wrong(Rule(CHANGES, error=error))
+        disk.do_wrong(parse_disk_fault(f"{error}@all:*"))
         refused = hil(*command.split())
         assert disk.do_wrong()
         assert entered(prepared) == before

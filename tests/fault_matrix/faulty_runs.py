@@ -32,9 +32,10 @@ from drivers.errors import GuardError
 from drivers.packets import Mode, cyclic_length
 from planner import JointLimits, TrajectoryPlayer, plan
 from sim_fixtures import Phase, SimulatedController
-from sim_fixtures.faults import parse_fault, split_faults
+from sim_fixtures.faults import split_faults
 from tests.drivers.judge import Conduct, Judged
 from tests.fault_matrix import small_cell
+from tests.faults import parse_script
 from tests.laws.arm import stands
 
 Array = NDArray[np.float64]
@@ -403,7 +404,7 @@ def play(fault: str, situation: str, while_silent: str = "hold") -> Run:
     cycle = cycles_without_a_fault(requested_first)[situation]
     number = cycle + 1
     ahead = next(bit for bit in (8, 16, 32, 64) if not number & bit)
-    parsed = parse_fault(FAULTS[fault].format(c=cycle, ahead=ahead))
+    ((_, parsed),) = parse_script([FAULTS[fault].format(c=cycle, ahead=ahead)]).faults
     of_link, of_controller = split_faults([parsed])
     # the servo never asks for more than the controller's limit; the cell's is narrower here
     share = 0.8 if fault == "current near its limit" else 1.0
@@ -441,4 +442,5 @@ def play_at(fault: str, speed: float, while_silent: str) -> Run:
         return made
 
     cycle = run((), 0).cycles["moving"]
-    return run(split_faults([parse_fault(FAULTS[fault].format(c=cycle))])[0], cycle)
+    ((_, lost),) = parse_script([FAULTS[fault].format(c=cycle)]).faults
+    return run(split_faults([lost])[0], cycle)

@@ -6,9 +6,11 @@ run completes the campaign. The number of a round is its seed.
 
     python -m tests.process_death --rounds 1000 --jobs 2 --journal deaths.jsonl
     python -m tests.process_death --rounds 1 --start 417      # this one again
+    python -m tests.process_death --rounds 1 --start 417 --script FILE    # other kills
 
 Rounds in the journal are not run again, so that an interrupted command may be repeated. Exit status
-1 if a law was broken (the folders of such rounds remain), 2 if the journal is not one of these.
+1 if a law was broken (the folders of such rounds remain), 2 if the journal is not one of these. A
+script has lines of `tests.faults.STRIKES`; without one, a round draws its own.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
 from tests.arguments import at_least_one, parser_of, whole_number  # noqa: E402
+from tests.faults import Strikes, parse_strikes  # noqa: E402
 from tests.journal import Journal, JournalError, rounds  # noqa: E402
 from tests.process_death.controller import die_with_parent  # noqa: E402
 from tests.process_death.laws import PROMISED  # noqa: E402
@@ -49,6 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     option("--start", type=whole_number, default=0, help="number of the first (0)")
     option("--jobs", type=at_least_one, default=1, help="rounds at a time (1)")
     option("--only", choices=VICTIMS, help="those rounds in which this process dies first")
+    option("--script", type=Path, metavar="FILE", help="script in place of those of the rounds")
     option("--journal", type=Path, help="JSON lines with the results; resumed if it exists")
     option("--json", action="store_true", help="print nothing but one JSON object")
     option("--defect", choices=sorted(DEFECTS), help="break the product, to see that it is found")
@@ -57,13 +61,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
     try:
+        strikes = None if given.script is None else script_of(given.script)
         recorded = rounds(given.journal, "broken", "seconds", "processor")
         journal = Journal(given.journal)
-    except JournalError as error:
+    except (JournalError, ValueError) as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
     numbers = range(given.start, given.start + given.rounds)
-    wanted = [n for n in numbers if given.only in (None, round_of(n).victims[0])]
+    wanted = [n for n in numbers if given.only in (None, round_of(n).strikes.victims[0])]
     results = [recorded[n] for n in wanted if n in recorded]
     missing = [n for n in wanted if n not in recorded]
     began = time.monotonic()
@@ -71,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     interrupted = False
     try:
         with journal:
-            for result in _played(missing, given.jobs, folder, given.defect):
+            for result in _played(missing, given.jobs, folder, given.defect, strikes):
                 results.append(result)
                 journal.add(**result)
                 _print(result, len(results), len(wanted), folder, quiet=given.json)
@@ -90,8 +95,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 130 if interrupted else 1 if report["failed"] else 0
 
 
+def script_of(path: Path) -> Strikes:
+    """Read a script; ValueError if that fails."""
+    try:
+        return parse_strikes(path.read_text("utf-8").splitlines())
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}; name a script") from error
+
+
 def _played(
-    numbers: Sequence[int], jobs: int, folder: Path, defect: str | None
+    numbers: Sequence[int],
+    jobs: int,
+    folder: Path,
+    defect: str | None,
+    strikes: Strikes | None,
 ) -> Iterator[dict[str, Any]]:
     global _stage
     if not numbers:
@@ -103,16 +120,16 @@ def _played(
     context = multiprocessing.get_context("fork")
     with ProcessPoolExecutor(jobs, mp_context=context, initializer=die_with_parent) as pool:
         try:
-            for future in as_completed([pool.submit(_play, number) for number in numbers]):
+            for future in as_completed([pool.submit(_play, number, strikes) for number in numbers]):
                 yield future.result()
         finally:
             pool.shutdown(cancel_futures=True)
 
 
-def _play(number: int) -> dict[str, Any]:
+def _play(number: int, strikes: Strikes | None) -> dict[str, Any]:
     if _stage is None:
         raise RuntimeError("this process was not forked from one that has set the stage")
-    return play(_stage, number)
+    return play(_stage, number, strikes)
 
 
 def _print(result: dict[str, Any], done: int, of: int, folder: Path, *, quiet: bool) -> None:

@@ -7,7 +7,7 @@ import shutil
 import time
 import traceback
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,6 +20,7 @@ from hil.identify.options import FIXED
 from hil.progress import Silent
 from hil.simulation import simulated_controller
 from identification import Estimate
+from tests.faults import Strikes
 from tests.hil.fast_cell import fast_cell
 from tests.laws.estimates import alike
 from tests.laws.manifests import (
@@ -131,9 +132,13 @@ def estimate_of(campaign: Campaign) -> Estimate:
     return identify_campaign(campaign.folder.root, Silent(), FIXED).estimate.pooled
 
 
-def play(stage: Stage, number: int) -> dict[str, Any]:
-    """Run a round and return its result; the folder remains if a law was broken."""
+def play(stage: Stage, number: int, strikes: Strikes | None = None) -> dict[str, Any]:
+    """Run a round, with its own script or another one, and return its result.
+
+    The folder remains if a law was broken.
+    """
     played, began = round_of(number), time.monotonic()
+    played = played if strikes is None else replace(played, strikes=strikes)
     used = os.times()
     folder = stage.folder / f"round_{number:05d}"
     shutil.rmtree(folder, ignore_errors=True)
@@ -142,7 +147,7 @@ def play(stage: Stage, number: int) -> dict[str, Any]:
     result: dict[str, Any] = {"round": number, "what": str(played)}
     campaign = made(folder, stage.cell, stage.plan)
     try:
-        seen = run(campaign, played, played.victims, folder / "report.json", stage.planted)
+        seen = run(campaign, played, played.strikes, folder / "report.json", stage.planted)
         broken, figures = broken_by(seen, campaign)
         result |= {
             "killed": list(seen.killed),
@@ -172,7 +177,7 @@ def finished(campaign: Campaign, played: Round, seen: Seen, folder: Path) -> lis
     before = manifest_of(campaign.folder.root)[1]
     problems: list[str] = []
     if played.over_sockets:
-        again = run(campaign, played, (), folder / "report-again.json")
+        again = run(campaign, played, None, folder / "report-again.json")
         if again.status != 0:
             problems.append(f"the next run failed with status {again.status}: {again.report}")
         problems += broken_by(again, campaign, earlier)[0]

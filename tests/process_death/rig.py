@@ -16,13 +16,13 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from socket import AF_INET, SOCK_DGRAM, socket
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,10 +36,11 @@ from hil.cell import Cell
 from hil.demo_link import LOOPBACK
 from hil.errors import HilError
 from hil.progress import Silent
+from tests.faults import StrikeKind, Strikes, Trigger, Victim
 from tests.hil.loopback import on_loopback
 from tests.laws.manifests import Entry, manifest_of
 from tests.process_death.controller import Page, Rows, at_rest, forked, serve
-from tests.process_death.rounds import Round, Victim
+from tests.process_death.rounds import Round
 
 EXCHANGE: Final = "drivers.exchange"
 ARCHIVE: Final = "hil.archive.process"
@@ -123,7 +124,12 @@ NOTICED: Final = 100  # Cycles within which an exchange has noticed the death of
 MAY_MOVE: Final = (State.OPENING, State.OPEN, State.EXITING)
 
 
-Strike = Literal["SIGKILL", "SIGSTOP", "SIGINT", "SIGHUP", "full disk"]
+SIGNALS: Final[Mapping[StrikeKind, signal.Signals]] = {
+    "kill": signal.SIGKILL,
+    "freeze": signal.SIGSTOP,
+    "interrupt": signal.SIGINT,
+    "hangup": signal.SIGHUP,
+}
 
 
 class NeverHappenedError(AssertionError):
@@ -252,48 +258,49 @@ class Watched:
         for victim in victims:
             self.until(partial(self.over, victim), f"the end of the {victim}", 5 * LOOK)
 
-    def struck(self, victims: tuple[Victim, ...], how: Strike) -> tuple[list[Death], list[Entry]]:
+    def struck(self, strikes: Strikes | None) -> tuple[list[Death], list[Entry]]:
         """Wait for the moment and strike; return the deaths, and the manifest before them."""
-        due, deaths = _Due(self), list[Death]()
+        due = None if strikes is None else _Due(self, strikes.trigger)
+        deaths = list[Death]()
         self.until(
-            lambda: self.over("supervisor") or (bool(victims) and due.now()),
+            lambda: self.over("supervisor") or (due is not None and due.now()),
             "neither the campaign's end nor the kill",
         )
-        if self.over("supervisor"):
+        if strikes is None or self.over("supervisor"):
             return deaths, self._entries()
         entered = self._entries()
-        until = time.monotonic() + self.played.trigger.delay
+        until = time.monotonic() + strikes.trigger.delay
         while (left := until - time.monotonic()) > 0.0:
             self.look()
             time.sleep(min(left, LOOK))
-        for place, victim in enumerate(victims):
+        for place, victim in enumerate(strikes.victims):
             if place:
-                time.sleep(self.played.apart)
+                time.sleep(strikes.apart)
             while victim not in self.pids and not self.over("supervisor"):
                 self.look()
                 time.sleep(LOOK)
             if victim in self.pids and not self.over(victim):
                 written = 0 if self.memory is None else self.memory.written
-                self._strike(victim, how)
-                if how not in ("SIGINT", "SIGHUP"):  # which end no process
+                self._strike(victim, strikes.kind)
+                if strikes.kind not in ("interrupt", "hangup"):  # which end no process
                     deaths.append(Death(victim, written, max(self._behind, default=0)))
         return deaths, entered
 
     def _entries(self) -> list[Entry]:
         return manifest_of(self.campaign.folder.root)[1]
 
-    def _strike(self, victim: Victim, how: Strike) -> None:
+    def _strike(self, victim: Victim, kind: StrikeKind) -> None:
         pid = self.pids[victim]
         with suppress(ProcessLookupError):
-            if how == "full disk":
+            if kind == "disk-full":
                 archives = self.campaign.folder.archives.iterdir()
                 newest = max(archives, key=lambda path: path.stat().st_mtime_ns)
                 most = newest.stat().st_size + 1000
                 resource.prlimit(pid, resource.RLIMIT_FSIZE, (most, most))
-            elif how in ("SIGINT", "SIGHUP"):  # as a terminal sends them
-                os.killpg(pid, signal.Signals[how])
+            elif kind in ("interrupt", "hangup"):  # as a terminal sends them
+                os.killpg(pid, SIGNALS[kind])
             else:
-                os.kill(pid, signal.Signals[how])
+                os.kill(pid, SIGNALS[kind])
 
     def rest(self) -> Rows:
         """Return the account up to where the controller alone has its arm at rest.
@@ -354,8 +361,8 @@ def supervise(campaign: Path, report: Path, planted: Path | None) -> int:
 class _Due:
     """Whether the moment of a trigger has come."""
 
-    def __init__(self, watched: Watched) -> None:
-        self._watched, self._trigger = watched, watched.played.trigger
+    def __init__(self, watched: Watched, trigger: Trigger) -> None:
+        self._watched, self._trigger = watched, trigger
         self._folder = watched.campaign.folder
         self._begun = self._modified()
         self._entered = 0
@@ -394,14 +401,13 @@ class _Due:
 def run(
     campaign: Campaign,
     played: Round,
-    victims: tuple[Victim, ...],
+    strikes: Strikes | None,
     report: Path,
     planted: Path | None = None,
-    how: Strike = "SIGKILL",
 ) -> Seen:
-    """Run a campaign with a new controller, and strike the `victims` at their moment."""
+    """Run a campaign with a new controller, and strike its processes, or none."""
     with Watched(campaign, played, report, planted) as watched:
-        deaths, entered = watched.struck(victims, how)
+        deaths, entered = watched.struck(strikes)
         watched.wait("supervisor", "exchange", "archive")
         rows, memory = watched.rest(), watched.memory
         records = np.zeros(0, cycle_dtype(JOINTS)) if memory is None else memory.records()

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 from drivers.states import State
 from sim_fixtures.settings import WHILE_SILENT, WhileSilent
-
-Victim = Literal["exchange", "archive", "supervisor", "controller"]
-Moment = Literal["start", "cycle", "motion", "archive", "entered", "state"]
+from tests.faults import Moment, Strikes, Trigger, Victim
 
 VICTIMS: Final[tuple[Victim, ...]] = ("exchange", "archive", "supervisor", "controller")
 OVER_SOCKETS: Final = 10
@@ -30,39 +28,11 @@ STATES: Final = (State.CLOSED, State.OPENING, State.OPEN, State.EXITING)
 
 
 @dataclass(frozen=True)
-class Trigger:
-    """When the first process is killed: `delay` s after its moment.
-
-    `moment` is the `start` of the supervisor, a `cycle` of the controller, a time of a `motion`, an
-    `archive` that is created or `entered` in the manifest, or a `state` of the exchange.
-    """
-
-    moment: Moment
-    count: int  # which cycle, or which motion, archive, entry or time that the state was entered
-    delay: float  # s from then to the kill
-    way: float = 0.0  # s of its own time that a motion has come, where one is waited for
-    state: State = State.CLOSED  # of the session, where one is waited for
-
-    def __str__(self) -> str:
-        what = {
-            "start": "the start",
-            "cycle": f"cycle {self.count}",
-            "motion": f"{self.way:.2f} s of motion {self.count}",
-            "archive": f"archive {self.count} was created",
-            "entered": f"archive {self.count} was entered",
-            "state": f"{self.state.name.lower()} for the {self.count}. time",
-        }[self.moment]
-        return f"{1e3 * self.delay:.1f} ms after {what}"
-
-
-@dataclass(frozen=True)
 class Round:
     """What happens in one round."""
 
     number: int  # of the round, and its seed
-    victims: tuple[Victim, ...]  # who is killed, in this order
-    apart: float  # s between two kills
-    trigger: Trigger  # when the first of them comes
+    strikes: Strikes  # who is killed, and when
     over_sockets: bool  # whether the campaign is finished over sockets, with a new controller
     loops: bool  # whether the controller's program opens the axes again and again
     while_silent: WhileSilent
@@ -75,7 +45,7 @@ class Round:
         return 1 + self.number
 
     def __str__(self) -> str:
-        return f"round {self.number}: {' and '.join(self.victims)} killed {self.trigger}"
+        return f"round {self.number}: {', '.join(self.strikes.lines)}"
 
 
 def round_of(number: int) -> Round:
@@ -88,11 +58,10 @@ def round_of(number: int) -> Round:
     trigger = _trigger(chance)
     while "controller" in victims and trigger.moment in EARLY and chance.random() > MINUTES:
         trigger = _trigger(chance)
+    apart = chance.choice((0.0, chance.uniform(0.0, 0.05), chance.uniform(0.0, 0.6)))
     return Round(
         number=number,
-        victims=victims,
-        apart=chance.choice((0.0, chance.uniform(0.0, 0.05), chance.uniform(0.0, 0.6))),
-        trigger=trigger,
+        strikes=Strikes("kill", trigger, victims, apart if more else 0.0),
         over_sockets=number % OVER_SOCKETS == 0,
         loops=chance.random() < LOOPS,
         while_silent=chance.choice(WHILE_SILENT),

@@ -18,6 +18,7 @@ from drivers.record import cycle_dtype
 from hil.campaign.plan import design
 from hil.progress import Silent
 from sim_fixtures import Phase
+from tests.faults import Moment, StrikeKind, Victim, parse_strikes
 from tests.hil.fast_cell import fast_cell
 from tests.process_death.controller import ROW
 from tests.process_death.laws import (
@@ -30,8 +31,8 @@ from tests.process_death.laws import (
     broken_by,
 )
 from tests.process_death.play import DEFECTS, NOISE, SHORT, finished
-from tests.process_death.rig import Death, Seen, Strike, made, run
-from tests.process_death.rounds import VICTIMS, Moment, Victim, round_of
+from tests.process_death.rig import Death, Seen, made, run
+from tests.process_death.rounds import VICTIMS, round_of
 
 pytestmark = pytest.mark.safety
 
@@ -151,21 +152,45 @@ def test_rounds_are_known_by_number_and_kill_all_at_all_moments() -> None:
     assert round_of(417) == round_of(417)
     rounds = [round_of(number) for number in range(1000)]
     assert len({str(played) for played in rounds[:200]}) > 190
-    assert [played.victims[0] for played in rounds[:4]] == list(VICTIMS)
-    assert all(len(set(played.victims)) == len(played.victims) for played in rounds)
-    assert {played.trigger.moment for played in rounds} == set(get_args(Moment))
-    pairs = {played.victims[:2] for played in rounds if len(played.victims) > 1}
+    assert [played.strikes.victims[0] for played in rounds[:4]] == list(VICTIMS)
+    assert all(len(set(played.strikes.victims)) == len(played.strikes.victims) for played in rounds)
+    assert {played.strikes.trigger.moment for played in rounds} == set(get_args(Moment))
+    pairs = {played.strikes.victims[:2] for played in rounds if len(played.strikes.victims) > 1}
     assert len(pairs) == len(VICTIMS) * (len(VICTIMS) - 1)
+
+
+def test_the_script_of_a_round_says_all_of_it() -> None:
+    for number in range(300):
+        strikes = round_of(number).strikes
+        assert parse_strikes(strikes.lines) == strikes
+    assert parse_strikes(["# by hand", "interrupt@motion3:way=0.3s:supervisor"]).victims
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["kill@motion"],
+        ["kill@noon:archive"],
+        ["maim@start:archive"],
+        ["kill@then:archive"],
+        ["kill@start:archive", "freeze@then:exchange"],
+        ["kill@state1:state=asleep:archive"],
+        [],
+    ],
+)
+def test_a_script_that_cannot_be_read_is_refused(lines: list[str]) -> None:
+    with pytest.raises(ValueError, match=r"lines are|the lines after|no state"):
+        parse_strikes(lines)
 
 
 def round_in_which(victim: Victim) -> int:
     """The first round that kills it alone, half way through a repetition."""
     for number in range(10_000):
         played = round_of(number)
-        trigger = played.trigger
+        trigger = played.strikes.trigger
         half_way = trigger.count in (3, 4) and 0.25 < trigger.way < 0.45
         if (
-            played.victims == (victim,)
+            played.strikes.victims == (victim,)
             and trigger.moment == "motion"
             and half_way
             and not played.loops
@@ -175,27 +200,28 @@ def round_in_which(victim: Victim) -> int:
 
 
 @pytest.mark.parametrize(
-    ("victim", "how", "status", "message"),
+    ("victim", "kind", "status", "message"),
     [
-        ("supervisor", "SIGINT", 4, "was stopped: a stop was requested"),
-        pytest.param("supervisor", "SIGHUP", 4, "was stopped", marks=pytest.mark.slow),
+        ("supervisor", "interrupt", 4, "was stopped: a stop was requested"),
+        pytest.param("supervisor", "hangup", 4, "was stopped", marks=pytest.mark.slow),
         (
             "archive",
-            "SIGSTOP",
+            "freeze",
             4,
             "sent no heartbeat for 5 s and was ended; the arm was brought to rest",
         ),
-        ("archive", "full disk", 2, "cannot be written further"),
+        ("archive", "disk-full", 2, "cannot be written further"),
     ],
 )
 def test_what_is_no_kill_brings_the_arm_to_rest_too(
-    victim: Victim, how: Strike, status: int, message: str, tmp_path: Path
+    victim: Victim, kind: StrikeKind, status: int, message: str, tmp_path: Path
 ) -> None:
     """Ctrl-C, a terminal that is closed, an archive process that hangs, a full disk."""
     cell = fast_cell(tmp_path, **SHORT).with_values({"simulation.current_noise": NOISE})
     campaign = made(tmp_path, cell, design(cell, Silent()))
     played = replace(round_of(round_in_which(victim)), over_sockets=False)
-    seen = run(campaign, played, (victim,), tmp_path / "report.json", how=how)
+    strikes = replace(played.strikes, kind=kind)
+    seen = run(campaign, played, strikes, tmp_path / "report.json")
     assert broken_by(seen, campaign)[0] == []
     assert seen.status == status
     assert message in seen.report["text"]

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from hil.progress import reporter
 from tests.arguments import at_least_one, parser_of, whole_number
+from tests.faults import GRAMMAR
 from tests.simulate.many import played, stage_folder
-from tests.simulate.script import GRAMMAR
 from tests.simulate.verdicts import Stage, Verdict, judged, runs_of, summary
 from tests.simulate.world import UndisturbedError
 

@@ -24,9 +24,9 @@ from hil.errors import ControllerError
 from hil.simulation import simulated_controller
 from planner import Move, TrajectoryPlayer, plan_moves
 from sim_fixtures import Phase, SimulatedController
+from tests.faults import parse_script
 from tests.hil.fast_cell import fast_cell
 from tests.simulate.scenes import NEIGHBOURS, scene_of
-from tests.simulate.script import parse_script
 from tests.simulate.verdicts import Stage, judged, missed_alike
 from tests.simulate.world import _twin, play
 

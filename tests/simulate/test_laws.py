@@ -18,12 +18,12 @@ from drivers.events import MotionEnded, RepliesLost
 from hil.campaign.errors import MotionFailedError
 from hil.errors import ControllerError
 from tests.drivers import oracle
+from tests.faults import parse_script
 from tests.hil.mcap_bytes import chunks
 from tests.laws.estimates import FALSE_ALARM, SEEDS, bound, degrees_of_freedom
 from tests.laws.second_reader import read
 from tests.simulate.laws.conversation import Talk, heard
 from tests.simulate.observed import Observed
-from tests.simulate.script import parse_script
 from tests.simulate.verdicts import LAWS
 from tests.simulate.world import NEIGHBOURS, Twin, play, twin_of
 

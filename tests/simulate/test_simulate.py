@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.faults import kind_of, parse_script
 from tests.simulate import world
 from tests.simulate.__main__ import main
+from tests.simulate.draws import DRAWS, Story, draw_script
 from tests.simulate.many import stage_folder
 from tests.simulate.scenes import NEIGHBOURS, scene_of
-from tests.simulate.script import DRAWS, Story, draw_script, kind_of, parse_script
 from tests.simulate.verdicts import Stage, Verdict, judged, shrunk, summary
 from tests.simulate.world import SceneError, _twin, twin_of
 

@@ -15,13 +15,14 @@ import numpy as np
 
 from drivers.events import Event, GapSeen, InitReceived, LinkLost, MotionEnded, RepliesLost
 from tests.drivers import oracle
+from tests.faults import DISTURBS_THE_ARM, kind_of, parse_script
 from tests.laws.manifests import completed, manifest_of
 from tests.laws.second_reader import read
+from tests.simulate.draws import DRAWS
 from tests.simulate.laws import LAWS as OTHERS
 from tests.simulate.laws.conversation import heard
 from tests.simulate.observed import Broken, Law, Life, Observed
 from tests.simulate.scenes import NEIGHBOURS
-from tests.simulate.script import DISTURBS_THE_ARM, DRAWS, kind_of, parse_script
 from tests.simulate.world import Twin, UndisturbedError, play, twin_of
 
 _NUMBERS: Final = 0x7FFF  # largest packet number

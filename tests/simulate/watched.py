@@ -19,8 +19,8 @@ from drivers.transports.simulated import SimulatedTransport
 from hil.campaign import VirtualLink
 from sim_fixtures import Phase, SimulatedController
 from sim_fixtures.faults import InjectedFault
+from tests.faults import Script
 from tests.simulate.observed import Act, ArmHistory, Exchanged
-from tests.simulate.script import Script
 
 Array = NDArray[np.float64]
 LONGEST_STALL = 1.0  # s

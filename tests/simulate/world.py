@@ -42,10 +42,11 @@ from planner import TrajectoryPlayer
 from planner.arrays import Array
 from sim_fixtures import ControllerSettings
 from sim_fixtures.settings import WHILE_SILENT
+from tests.faults import Script, ScriptedEvent, parse_script
 from tests.hil.fast_cell import pass_rehearsal
+from tests.simulate.draws import Story, draw_script
 from tests.simulate.observed import ArmHistory, Digests, Estimated, Life, Observed
 from tests.simulate.scenes import NEIGHBOURS, Scene, scene_of
-from tests.simulate.script import Script, ScriptedEvent, Story, draw_script, parse_script
 from tests.simulate.watched import (
     Clock,
     SessionLog,

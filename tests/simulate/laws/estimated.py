@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification import RobotModel, Samples
+from tests.faults import DISTURBS_THE_ARM, kind_of
 from tests.laws.estimates import alike
 from tests.laws.manifests import WANTED, manifest_of, parsed
 from tests.simulate.observed import Estimated, Observed
-from tests.simulate.script import DISTURBS_THE_ARM, kind_of
 
 Array = NDArray[np.float64]
 

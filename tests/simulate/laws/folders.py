@@ -10,6 +10,7 @@ import hashlib
 from collections.abc import Iterator
 from typing import Final
 
+from tests.faults import kind_of
 from tests.laws.manifests import (
     NAME,
     Entry,
@@ -21,7 +22,6 @@ from tests.laws.manifests import (
 )
 from tests.laws.second_reader import read
 from tests.simulate.observed import Observed
-from tests.simulate.script import kind_of
 
 _AT_SAVE: Final = ("save-full", "kill-at-save")
 _OUTCOMES: Final = ("completed", "stopped", "refused", "lost", "rejected")

@@ -17,9 +17,9 @@ from drivers.states import State
 from hil.campaign.errors import MotionFailedError
 from hil.errors import ControllerError, HilError
 from sim_fixtures import Phase
+from tests.faults import DISTURBS_THE_ARM, kind_of
 from tests.laws.arm import closed, stands
 from tests.simulate.observed import Life, Observed
-from tests.simulate.script import DISTURBS_THE_ARM, kind_of
 
 from .wire import Array, Gears
 
