@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from drivers.events import MotionEnded
 from hil.campaign.connection import active_checks
 from hil.campaign.errors import MotionRefusedError
-from hil.campaign.intervals import Interval, player_of, straight_move
 from hil.campaign.link import MotionLink
+from hil.campaign.motions import CampaignMotion, player_of, straight_move
 from hil.campaign.operator import MotionWatch, Stop, unwatched_motion
 from hil.campaign.plan import moves_to_dict
 from hil.cell import AngleFrame, Cell
@@ -36,14 +36,14 @@ class CheckedMove:
 
     start: Array
     target: Array
-    interval: Interval
+    motion: CampaignMotion
     speed: float
     checks: MotionChecks
 
     @property
     def duration(self) -> float:
         """Duration at full speed [s]."""
-        return self.interval.trajectory.duration
+        return self.motion.trajectory.duration
 
 
 def random_via_points(cell: Cell, frame: AngleFrame, count: int, seed: int) -> Array:
@@ -169,18 +169,18 @@ def send(
     """
     checks = active_checks(cell, link.connection, planned.checks)
     if checks is not planned.checks:
-        _require(checks, planned.interval.trajectory)
+        _require(checks, planned.motion.trajectory)
     spec = archive_spec(
         cell,
         path,
         {**kind_entry(path, "move"), **origin_of(cell, only_simulated=link.only_simulated)},
         {
-            "trajectory": planned.interval.trajectory.to_dict(),
-            **moves_to_dict(planned.interval.moves),
+            "trajectory": planned.motion.trajectory.to_dict(),
+            **moves_to_dict(planned.motion.moves),
         },
         durable=durable,
     )
-    return link.run(player_of(cell, planned.interval.trajectory), spec, stop, watch=watch)
+    return link.run(player_of(cell, planned.motion.trajectory), spec, stop, watch=watch)
 
 
 def _require(checks: MotionChecks, trajectory: PiecewiseCubic | FourierSeries) -> None:

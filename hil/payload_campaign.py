@@ -218,7 +218,7 @@ class PayloadCampaign:
             loaded
             for pair in range(self.limit)
             for loaded in _order(pair)
-            if self.side(loaded).folder.whole("excitation", pair) is None
+            if self.side(loaded).folder.complete_archive("excitation", pair) is None
         )
         loaded = next(missing, False)
         mounting.require(loaded, "--dry-run")
@@ -291,7 +291,9 @@ class PayloadCampaign:
     ) -> None:
         """Run a side up to a number of repetitions, if some are missing."""
         side = self.side(loaded)
-        missing = [k for k in range(wanted) if side.folder.whole("excitation", k) is None]
+        missing = [
+            k for k in range(wanted) if side.folder.complete_archive("excitation", k) is None
+        ]
         if not missing:
             return
         # Only a dry run that was seen can be accepted, and each side has its own.

@@ -125,7 +125,7 @@ class RecordedCampaign:
         """Return the closed archives in order (CampaignFolderError if it cannot be read)."""
         return self._manifest().archives
 
-    def whole(self, kind: str, index: int) -> str | None:
+    def complete_archive(self, kind: str, index: int) -> str | None:
         """Return the name of the completed archive of this interval, or None."""
         return self._whole(kind, index).get(index)
 

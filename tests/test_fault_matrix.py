@@ -15,7 +15,7 @@ import pytest
 from drivers import SimulatedTransport
 from hil.archive import Archive, ArchiveSpec, open_archive
 from hil.campaign import Stop, VirtualLink
-from hil.campaign.intervals import START_TOLERANCE, player_of
+from hil.campaign.motions import START_TOLERANCE, player_of
 from hil.cell import Cell
 from hil.cell.text import with_values
 from hil.simulation import controller_settings, simulated_controller

@@ -200,7 +200,7 @@ class CampaignFolder(RecordedCampaign):
         self._save(replace(manifest, archives=entries))
 
     def next_name(self, kind: str, index: int) -> ArchiveName:
-        """Return the name of the next attempt at an interval; no name is used twice."""
+        """Return the name of the next attempt at a motion; no name is used twice."""
         used = {entry.name for entry in self.manifest()}
         attempt = 1
         while (name := str(ArchiveName(kind, index, attempt))) in used or (

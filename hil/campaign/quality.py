@@ -29,7 +29,7 @@ from identification.text import percentage
 from planner import FourierSeries, PiecewiseCubic
 
 from .folder import CampaignFolder
-from .intervals import Interval
+from .motions import CampaignMotion
 
 Array = NDArray[np.float64]
 
@@ -280,16 +280,16 @@ class ArchiveReview:
         self.notes: list[str] = []
 
     def enter(
-        self, interval: Interval, name: str, stated_problem: Problem | None = None
+        self, motion: CampaignMotion, name: str, stated_problem: Problem | None = None
     ) -> Problem | None:
-        """Judge the complete archive of an interval and enter it; return its problem or None."""
+        """Judge the complete archive of a motion and enter it; return its problem or None."""
         problem = stated_problem
         executed = None
-        if problem is None and interval.kind == "excitation":
+        if problem is None and motion.kind == "excitation":
             executed = self._executed(name)
             problem = self._judged(executed)
-        elif problem is None and (judge := _JUDGES.get(interval.kind)) is not None:
-            problem = judge(self._executed(name), interval.trajectory, self._cell)
+        elif problem is None and (judge := _JUDGES.get(motion.kind)) is not None:
+            problem = judge(self._executed(name), motion.trajectory, self._cell)
         if problem is None:
             self._folder.add(name, "completed")
             if executed is not None:
@@ -298,15 +298,20 @@ class ArchiveReview:
         self._reject(name, problem.sentence)
         return problem
 
-    def adopt(self, intervals: Sequence[Interval], made: Callable[[ArchiveHeader], bool]) -> None:
+    def adopt(
+        self, motions: Sequence[CampaignMotion], made: Callable[[ArchiveHeader], bool]
+    ) -> None:
         """Enter archives of an earlier run that was killed before it entered them."""
-        sought = {(interval.kind, interval.index): interval for interval in intervals}
+        sought = {(motion.kind, motion.index): motion for motion in motions}
         entered = {entry.name for entry in self._folder.manifest()}
         archive_names = {path.name for path in self._folder.archives.glob("*.mcap")}
         for name in sorted(archive_names - entered):
             parsed = ArchiveName.parse(name)
-            interval = None if parsed is None else sought.get((parsed.kind, parsed.index))
-            if interval is None or self._folder.whole(interval.kind, interval.index) is not None:
+            motion = None if parsed is None else sought.get((parsed.kind, parsed.index))
+            if (
+                motion is None
+                or self._folder.complete_archive(motion.kind, motion.index) is not None
+            ):
                 continue
             try:
                 archive = open_archive(self._folder.archives / name, fields=())
@@ -315,7 +320,7 @@ class ArchiveReview:
             completed = archive.outcome is not None and archive.outcome.outcome == "completed"
             if archive.complete and completed and made(archive.header):
                 self.adopted.append(name)
-                self.enter(interval, name)
+                self.enter(motion, name)
 
     def _judged(self, executed: Executed) -> Problem | None:
         """Return the problem of a repetition, None for none.

@@ -15,7 +15,7 @@ from hil.version import software
 from sim_fixtures import SimulationError
 
 from .errors import MotionFailedError, RepetitionsRejectedError
-from .intervals import planned_intervals, require_runnable
+from .motions import planned_motions, require_runnable
 from .operator import RunWatch, Stop, Unattended
 from .rehearsal import (
     AS_MODELLED,
@@ -84,7 +84,7 @@ def _rehearsed(
         cell = twin.cell.with_campaign(repetitions=1) if effects else twin.cell
         rehearsal = CampaignState.create(campaign.folder.rehearsed / where, cell, campaign.plan)
         reporter.say(f"rehearsing on a simulated arm, {name}")
-        motions = planned_intervals(rehearsal.cell, rehearsal.plan)
+        motions = planned_motions(rehearsal.cell, rehearsal.plan)
         planned = sum(motion.trajectory.duration for motion in motions)
         link = twin.link(planned, effects=effects)
         failure = _failure(rehearsal, link, twin, reporter, stop)

@@ -17,8 +17,8 @@ from hil.progress import Reporter
 from .connection import active_checks, narrower_limits
 from .dry_run import OVERRIDE, DryRunState
 from .gates import require_as_rehearsed, require_dry_run, require_gates
-from .intervals import Interval, StraightMoves, require_allowed
 from .link import MotionLink
+from .motions import CampaignMotion, StraightMoves, require_allowed
 from .operator import RunWatch
 from .precision import PrecisionStage
 from .quality import Rejected
@@ -123,7 +123,7 @@ class _CampaignRun:
         """Run the missing motions; a controller is connected only where some are missing."""
         options = self._options
         dry_run = self._dry_run
-        self._archives.adopt(dry_run.intervals)
+        self._archives.adopt(dry_run.motions)
         if self._precision is not None:
             self._precision.begin()
         slow = dry_run.missing()
@@ -142,7 +142,9 @@ class _CampaignRun:
         return self._result()
 
     @contextmanager
-    def _connected(self, slow: Sequence[Interval], full: Sequence[Interval]) -> Iterator[Runner]:
+    def _connected(
+        self, slow: Sequence[CampaignMotion], full: Sequence[CampaignMotion]
+    ) -> Iterator[Runner]:
         """Connect the controller, check all motions with its limits, and close the link after."""
         cell = self._campaign.cell
         reporter = self._reporter
@@ -171,7 +173,7 @@ class _CampaignRun:
                 )
             # Dry run and warm-up use the moves of the motions that they are made of.
             straight = StraightMoves(cell, narrowed)
-            joined = straight.joining([*slow, *full], start)
+            joined = straight.with_moves([*slow, *full], start)
             runner = Runner(
                 self._campaign,
                 link,
@@ -185,7 +187,7 @@ class _CampaignRun:
             )
             before = link.cycles
             times = runner.times(joined, len(slow))
-            if any(interval.kind != "standstill" for interval in full):
+            if any(motion.kind != "standstill" for motion in full):
                 times += self._warm_up.expected()
             self._watch.expect(times)
             with reporter.task("running the campaign (s of motion)", sum(times)) as runner.task:
@@ -196,17 +198,17 @@ class _CampaignRun:
     def _run_missing(self, runner: Runner, kind: str) -> None:
         """Run the missing motions of a kind; repetitions only while the joints are warm."""
         _, total = self._campaign.progress(kind)
-        for interval in self._missing(kind):
+        for motion in self._missing(kind):
             precision = self._precision if kind == "excitation" else None
             if precision is not None and precision.ended:
                 return
-            runner.run_until_accepted(interval, interval.index + 1, total)
+            runner.run_until_accepted(motion, motion.index + 1, total)
             if precision is not None:
                 precision.repeated()
             if kind == "validation":
                 self._warm_up.motion_ended()
 
-    def _missing(self, *kinds: str) -> list[Interval]:
+    def _missing(self, *kinds: str) -> list[CampaignMotion]:
         """Return what is to be run at full speed, up to a number of repetitions if stated."""
         most = self._options.repetitions
         return [

@@ -29,8 +29,8 @@ from identification.excitation.excitation import trajectory_from_dict
 from .dry_run import OVERRIDE, SIMULATED, yes_or_no
 from .errors import MotionFailedError, RepetitionsRejectedError
 from .folder import CampaignFolder
-from .intervals import REPEATED, Interval, StraightMoves, player_of
 from .link import NOT_STARTED, MotionLink
+from .motions import REPEATED, CampaignMotion, StraightMoves, player_of
 from .operator import RunWatch
 from .plan import moves_to_dict
 from .quality import ArchiveReview, Problem
@@ -88,7 +88,7 @@ class RunArchives:
         trajectory = campaign.plan.excitation.trajectory
         self.review = ArchiveReview(campaign.folder, campaign.cell, trajectory)
 
-    def adopt(self, slow: Sequence[Interval]) -> None:
+    def adopt(self, slow: Sequence[CampaignMotion]) -> None:
         """Enter archives of an earlier run of the plan, and of its `slow` motions, see `review`."""
         arm = self.provenance.get(SIMULATED)
         plan_hash = self.plan_hash
@@ -98,10 +98,10 @@ class RunArchives:
 
         self.review.adopt([*self._campaign.motions, *slow], made)
 
-    def spec(self, interval: Interval) -> ArchiveSpec:
-        """Return the archive of the next attempt at an interval."""
+    def spec(self, motion: CampaignMotion) -> ArchiveSpec:
+        """Return the archive of the next attempt at a motion."""
         campaign = self._campaign
-        name = campaign.folder.next_name(interval.kind, interval.index)
+        name = campaign.folder.next_name(motion.kind, motion.index)
         # One seed gives one campaign to the byte, whatever the name of its folder.
         simulated = self.provenance.get(SIMULATED) == yes_or_no(True)
         metadata = {
@@ -111,14 +111,14 @@ class RunArchives:
             **{f"software.{package}": version for package, version in software().items()},
             **with_present_date(self.provenance),
         }
-        plan = {"trajectory": interval.trajectory.to_dict()}
-        if interval.kind in REPEATED:  # with how it was found
+        plan = {"trajectory": motion.trajectory.to_dict()}
+        if motion.kind in REPEATED:  # with how it was found
             plan = {"excitation": campaign.plan.excitation.to_dict()}
         return archive_spec(
             campaign.cell,
             campaign.folder.archives / name,
             metadata,
-            plan | moves_to_dict(interval.moves),
+            plan | moves_to_dict(motion.moves),
             durable=self._durable,
         )
 
@@ -187,34 +187,34 @@ class Runner:
         self._moves = 0
         self._seen = None if unrehearsed else seen_in_dry_run(campaign.folder)
 
-    def times(self, joined: Sequence[Interval], slow: int) -> list[float]:
+    def times(self, joined: Sequence[CampaignMotion], slow: int) -> list[float]:
         """Return the seconds of each motion and way; the first `slow` motions are run slowly."""
         times = []
         watched = slow > 0
-        for interval in joined:
+        for motion in joined:
             share = OVERRIDE if slow else 1.0
-            if interval.kind == "move":
-                unseen = interval.from_arm if watched else self._unseen(interval)
+            if motion.kind == "move":
+                unseen = motion.from_arm if watched else self._unseen(motion)
                 share = self._approach(OVERRIDE) if slow or unseen else 1.0
             else:
                 slow = max(0, slow - 1)
-            times.append(interval.trajectory.duration / share)
+            times.append(motion.trajectory.duration / share)
         return times
 
-    def run_motion(self, interval: Interval, number: int, total: int, most: float = 1.0) -> str:
+    def run_motion(self, motion: CampaignMotion, number: int, total: int, most: float = 1.0) -> str:
         """Move to the start of a motion, run it, and return its archive, not yet in the manifest.
 
         Raises:
             MotionFailedError: it ended otherwise than planned, or was not begun after a stop.
             ControllerError: it was not accepted, or the link broke.
         """
-        start, end = interval.places(self.campaign.cell.home)
+        start, end = motion.endpoints(self.campaign.cell.home)
         self._go(start, most)
-        name = self._execute(interval, number, total, most)
+        name = self._execute(motion, number, total, most)
         self._position = end
         return name
 
-    def run_until_accepted(self, interval: Interval, number: int, total: int) -> str:
+    def run_until_accepted(self, motion: CampaignMotion, number: int, total: int) -> str:
         """Run motion `number` (from 1) of `total` until it passes its check; return its archive.
 
         An arm that has cooled down is warmed up before a repetition; one begun cold is rejected.
@@ -223,23 +223,23 @@ class Runner:
             RepetitionsRejectedError: it failed too often.
         """
         reasons = list[str]()
-        warm_up = self._warmth if interval.kind == "excitation" else None
+        warm_up = self._warmth if motion.kind == "excitation" else None
         while len(reasons) <= self.campaign.cell.campaign.bad_repetitions:
             if warm_up is not None:
                 warm_up.rewarm(self)
-            name = self.run_motion(interval, number, total)
+            name = self.run_motion(motion, number, total)
             cold = None if warm_up is None else warm_up.cold_start(self._watch.began)
-            problem = self._archives.review.enter(interval, name, cold)
+            problem = self._archives.review.enter(motion, name, cold)
             if warm_up is not None and cold is None:
                 warm_up.motion_ended()
             if problem is None:
                 return name
-            self._watch.expect([interval.trajectory.duration])
+            self._watch.expect([motion.trajectory.duration])
             self._reporter.say(
-                f"{interval} ({name}) is rejected: {problem.sentence}; the motion is run again"
+                f"{motion} ({name}) is rejected: {problem.sentence}; the motion is run again"
             )
             reasons.append(problem.sentence)
-        raise RepetitionsRejectedError(str(interval), reasons)
+        raise RepetitionsRejectedError(str(motion), reasons)
 
     def go_back(self, most: float = 1.0) -> None:
         """Go home, and from there to the first position; `most` is the largest override."""
@@ -262,7 +262,7 @@ class Runner:
         """Return the override of a way, planned at `approach_speed`, for a share of full speed."""
         return min(1.0, share / self.campaign.cell.campaign.approach_speed)
 
-    def _unseen(self, way: Interval) -> bool:
+    def _unseen(self, way: CampaignMotion) -> bool:
         """Return whether the operator should have seen this move in the dry run, and has not.
 
         A move from or to the first position of the arm counts as unseen: the arm was jogged there.
@@ -271,13 +271,13 @@ class Runner:
             return False
         return way.from_arm or not any(way.connects(*ends) for ends in self._seen)
 
-    def _execute(self, interval: Interval, number: int, total: int, most: float) -> str:
+    def _execute(self, motion: CampaignMotion, number: int, total: int, most: float) -> str:
         if self._watch.stop.requested:
-            raise MotionFailedError(str(interval), "stopped", NOT_STARTED)
-        spec = self._archives.spec(interval)
-        duration = interval.trajectory.duration
-        self._watch.begin(interval.kind, number, total, duration, most)
-        player = player_of(self.campaign.cell, interval.trajectory)
+            raise MotionFailedError(str(motion), "stopped", NOT_STARTED)
+        spec = self._archives.spec(motion)
+        duration = motion.trajectory.duration
+        self._watch.begin(motion.kind, number, total, duration, most)
+        player = player_of(self.campaign.cell, motion.trajectory)
         ended = self._link.run(player, spec, self._watch.stop, override=most, watch=self._watch)
         archived = spec.path.name if ended.outcome == "completed" or spec.path.exists() else None
         if archived is not None:  # else it was stopped before
@@ -286,8 +286,8 @@ class Runner:
             if archived is not None:
                 self.campaign.folder.add(archived, ended.outcome, ended.reason)
             refused = self._link.connection.refused if ended.outcome == "refused" else None
-            raise MotionFailedError(str(interval), ended.outcome, ended.reason, archived, refused)
-        self.task.advance(duration / most, str(interval))
+            raise MotionFailedError(str(motion), ended.outcome, ended.reason, archived, refused)
+        self.task.advance(duration / most, str(motion))
         return spec.path.name
 
 
@@ -301,5 +301,5 @@ def seen_in_dry_run(folder: CampaignFolder) -> list[tuple[Array, Array]]:
             with suppress(ArchiveError, ValueError, KeyError, TypeError):  # then it is not seen
                 archive = open_archive(folder.archives / entry.name, fields=())
                 motion = trajectory_from_dict(parse_json(archive.text("plan.json"))["trajectory"])
-                ends.append(Interval("move", 0, motion).ends)
+                ends.append(CampaignMotion("move", 0, motion).ends)
     return ends

@@ -10,7 +10,7 @@ from hil.errors import OperatorStopError
 from hil.progress import Reporter
 
 from .dry_run import OVERRIDE, DryRunRecord, DryRunState, is_from, not_accepted
-from .intervals import Interval
+from .motions import CampaignMotion
 from .operator import RunWatch
 from .quality import Problem
 from .runner import RunArchives, Runner, RunOptions
@@ -41,9 +41,7 @@ class DryRunStage:
             motion for motion in campaign.motions
             if motion.kind == "validation" or (motion.kind, motion.index) == ("excitation", 0)
         ]  # fmt: skip
-        self.intervals = [
-            replace(motion, kind="dryrun", index=k) for k, motion in enumerate(motions)
-        ]
+        self.motions = [replace(motion, kind="dryrun", index=k) for k, motion in enumerate(motions)]
         # Only what an earlier run measured can be accepted, not what this one is going to.
         named = options.accept_torque
         self._known = named if named and self.found() else ()
@@ -56,20 +54,20 @@ class DryRunStage:
         return DryRunRecord.load_valid(
             self._folder,
             plan_hash=archives.plan_hash,
-            motions=len(self.intervals),
+            motions=len(self.motions),
             simulated=archives.simulated,
         )
 
-    def missing(self) -> list[Interval]:
+    def missing(self) -> list[CampaignMotion]:
         """Return the motions that were not run slowly yet."""
-        intervals = [] if self._options.unrehearsed else self.intervals
-        return [interval for interval in intervals if self._complete(interval) is None]
+        motions = [] if self._options.unrehearsed else self.motions
+        return [motion for motion in motions if self._complete(motion) is None]
 
     def run(self, runner: Runner) -> None:
         """Run what is missing slowly, and have it accepted; see `accept`."""
         missing = self.missing()
         for slow in missing:
-            name = runner.run_motion(slow, slow.index + 1, len(self.intervals), OVERRIDE)
+            name = runner.run_motion(slow, slow.index + 1, len(self.motions), OVERRIDE)
             self._archives.review.enter(slow, name)
         if missing:
             self.accept()
@@ -86,8 +84,8 @@ class DryRunStage:
         if self._options.unrehearsed:
             return
         if record is None:
-            names = [name for slow in self.intervals if (name := self._complete(slow)) is not None]
-            if len(names) < len(self.intervals):
+            names = [name for slow in self.motions if (name := self._complete(slow)) is not None]
+            if len(names) < len(self.motions):
                 return
             record = DryRunRecord.of(
                 self._campaign,
@@ -119,9 +117,9 @@ class DryRunStage:
             )
         return agreed
 
-    def _complete(self, slow: Interval) -> str | None:
+    def _complete(self, slow: CampaignMotion) -> str | None:
         """Return the name of its complete archive, if it is of this kind of arm."""
-        name = self._folder.whole(slow.kind, slow.index)
+        name = self._folder.complete_archive(slow.kind, slow.index)
         made = name is not None and is_from(self._folder.archives / name, self._archives.simulated)
         return name if made else None
 
@@ -160,9 +158,9 @@ class WarmUpStage:
         cold = f"the arm was not warm when the repetitions began ({record.sentence})"
         return [cold, *self._pauses]
 
-    def next_motion(self) -> list[Interval]:
+    def next_motion(self) -> list[CampaignMotion]:
         """Return the next motion of a warm-up; none where no warm-up is wanted."""
-        return [self._interval(self._state())] if self._threshold else []
+        return [self._motion_of(self._state())] if self._threshold else []
 
     def expected(self) -> list[float]:
         """Return the durations [s] of the motions that it runs at least."""
@@ -181,11 +179,11 @@ class WarmUpStage:
         settings = self._cell.campaign
         meter = FrictionMeter(self._campaign.cell, self._campaign.plan.excitation.trajectory)
         while state.outcome == "going on":
-            interval = self._interval(state)
+            motion = self._motion_of(state)
             done = len(state.motions)
             if done >= settings.warmup_least:
-                self._watch.expect([interval.trajectory.duration])
-            name = runner.run_until_accepted(interval, done + 1, settings.warmup_most)
+                self._watch.expect([motion.trajectory.duration])
+            name = runner.run_until_accepted(motion, done + 1, settings.warmup_most)
             friction = meter.measure(self._campaign.folder.archives / name)
             state = state.with_motion(name, friction, settings.warmup_least, settings.warmup_most)
             state = replace(state, moved_at=time.time())
@@ -223,10 +221,10 @@ class WarmUpStage:
         record = self._found() if self._threshold else None
         return record if record is not None and record.motions and record.cold(when) else None
 
-    def _interval(self, state: WarmUpRecord) -> Interval:
+    def _motion_of(self, state: WarmUpRecord) -> CampaignMotion:
         plan = self._campaign.plan
         index = len(state.earlier) + len(state.motions)
-        return Interval("warmup", index, plan.excitation.trajectory, plan.moves)
+        return CampaignMotion("warmup", index, plan.excitation.trajectory, plan.moves)
 
     def _present(self) -> WarmUpRecord:
         """Return the warm-up to continue; a new one if the joints have cooled down."""

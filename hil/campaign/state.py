@@ -19,7 +19,7 @@ from hil.reading import path_exists
 from identification.excitation import Excitation
 
 from .folder import CampaignFolder
-from .intervals import Interval, planned_intervals, require_runnable
+from .motions import CampaignMotion, planned_motions, require_runnable
 from .plan import CampaignPlan, plan_around
 from .precision_record import PrecisionRecord
 
@@ -119,9 +119,9 @@ class CampaignState:
         return self
 
     @cached_property
-    def motions(self) -> Sequence[Interval]:
+    def motions(self) -> Sequence[CampaignMotion]:
         """All motions of its plan in order, without the moves between them."""
-        return planned_intervals(self.cell, self.plan)
+        return planned_motions(self.cell, self.plan)
 
     @property
     def precision(self) -> PrecisionRecord | None:
@@ -130,7 +130,7 @@ class CampaignState:
             return None
         return PrecisionRecord.load(self.folder.precision, self.folder.plan_hash)
 
-    def missing(self, *kinds: str) -> list[Interval]:
+    def missing(self, *kinds: str) -> list[CampaignMotion]:
         """Return what is still to be run at full speed, of these kinds or of all.
 
         Repetitions that a required precision has ended are not missing.
@@ -138,11 +138,11 @@ class CampaignState:
         precision = self.precision
         ended = ("excitation",) if precision is not None and precision.ended else ()
         return [
-            interval
-            for interval in self.motions
-            if interval.kind in (kinds or (interval.kind,))
-            and interval.kind not in ended
-            and self.folder.whole(interval.kind, interval.index) is None
+            motion
+            for motion in self.motions
+            if motion.kind in (kinds or (motion.kind,))
+            and motion.kind not in ended
+            and self.folder.complete_archive(motion.kind, motion.index) is None
         ]
 
     def progress(self, kind: str) -> tuple[int, int]:
@@ -151,4 +151,4 @@ class CampaignState:
         precision = self.precision if kind == "excitation" else None
         if precision is not None and precision.ended:
             return done, done
-        return done, sum(interval.kind == kind for interval in self.motions)
+        return done, sum(motion.kind == kind for motion in self.motions)

@@ -17,7 +17,7 @@ from hil.campaign import (
     plan_around,
     stop_on_interrupt,
 )
-from hil.campaign.intervals import require_runnable
+from hil.campaign.motions import require_runnable
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption
 from hil.cli.verdict import finish

@@ -201,7 +201,7 @@ def _described(move: CheckedMove, cell: Cell, link: MotionLink) -> str:
     frame = AngleFrame.of(cell)
     start = frame.shown(move.start)
     end = frame.shown(move.target)
-    peaks = np.degrees(move.interval.trajectory.extrema().velocity)
+    peaks = np.degrees(move.motion.trajectory.extrema().velocity)
     width = max(len(name) for name in (*cell.joint_names, "joint"))
     lines = [f"{'joint':{width}}  {'from':>9}  {'to':>9}  {'by':>9}   peak speed"]
     lines += [

@@ -30,10 +30,10 @@ from hil.campaign import (
 )
 from hil.campaign import state as state_module
 from hil.campaign.errors import refusal_text
-from hil.campaign.intervals import (
-    Interval,
+from hil.campaign.motions import (
+    CampaignMotion,
     StraightMoves,
-    planned_intervals,
+    planned_motions,
     player_of,
     require_allowed,
     rest,
@@ -364,13 +364,13 @@ def test_an_older_folder_with_a_collision_is_refused(
 
 def test_only_a_move_from_the_arm_asks_for_jogging(cell: Cell, plan: CampaignPlan) -> None:
     low = cell.home + np.array([0.0, 1.6, -1.5, 0.0, 0.0, 0.0])
-    intervals = planned_intervals(cell, plan)
-    moves = StraightMoves(cell, MotionChecks.of(cell)).joining(intervals, low)
-    assert [interval.from_arm for interval in moves if interval.kind == "move"] == [True, True]
+    motions = planned_motions(cell, plan)
+    joined = StraightMoves(cell, MotionChecks.of(cell)).with_moves(motions, low)
+    assert [motion.from_arm for motion in joined if motion.kind == "move"] == [True, True]
     buried = MotionChecks.of(written(cell, "floor = 0.0", "floor = 0.3"))
     with pytest.raises(MotionRefusedError, match=r"move 1 .*jog the arm"):
-        StraightMoves(cell, buried).joining(intervals, low)
-    wild = Interval("excitation", 0, rest(cell.home + 10.0, 1.0))
+        StraightMoves(cell, buried).with_moves(motions, low)
+    wild = CampaignMotion("excitation", 0, rest(cell.home + 10.0, 1.0))
     with pytest.raises(MotionRefusedError, match=r"repetition 1 .*; design another motion\."):
         require_allowed([wild], buried)
 
@@ -433,7 +433,7 @@ def test_a_solver_that_crashes_ends_the_campaign_only(
     def crashing(*arguments: object, **settings: object) -> None:
         raise PlannerCrashed(-11)
 
-    monkeypatch.setattr("hil.campaign.intervals.in_child", crashing)
+    monkeypatch.setattr("hil.campaign.motions.in_child", crashing)
     with pytest.raises(PlannerCrashed, match="signal 11"):
         execute(arm.campaign, arm.link)
     assert arm.campaign.folder.manifest() == []

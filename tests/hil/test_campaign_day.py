@@ -22,7 +22,7 @@ from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError
 from hil.campaign.campaign import campaign_of_design
 from hil.campaign.dry_run import Acceptance, DryRunRecord
 from hil.campaign.folder import CampaignFolder
-from hil.campaign.intervals import at_limit, straight_move
+from hil.campaign.motions import at_limit, straight_move
 from hil.campaign.status import conduct_of, status_of
 from hil.campaign.warmup import WarmMotion, WarmUpRecord
 from hil.cell import Cell

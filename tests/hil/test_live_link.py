@@ -27,9 +27,9 @@ from hil.campaign import (
     NotRehearsedError,
     Stop,
 )
-from hil.campaign.intervals import player_of
 from hil.campaign.link import archive_silence
 from hil.campaign.live_link import LiveLink
+from hil.campaign.motions import player_of
 from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.campaign.plan import design
 from hil.cell import Cell

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from hil.campaign.intervals import rest
+from hil.campaign.motions import rest
 from hil.cell import AngleFrame, Cell, CellError
 from hil.cell.text import with_values
 from hil.design import preset, problem_of

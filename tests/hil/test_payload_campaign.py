@@ -97,7 +97,7 @@ def recorded(weighed: PayloadCampaign) -> list[str]:
         f"{side} {index + 1}"
         for side in SIDES
         for index in range(9)
-        if CampaignFolder(weighed.root / side).whole("excitation", index) is not None
+        if CampaignFolder(weighed.root / side).complete_archive("excitation", index) is not None
     )
 
 

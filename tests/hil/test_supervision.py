@@ -21,9 +21,9 @@ from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
 from hil.campaign import Stop
 from hil.campaign.connection import StartTimeout
-from hil.campaign.intervals import player_of
 from hil.campaign.link import Standstill
 from hil.campaign.live_link import STALL, Heartbeat
+from hil.campaign.motions import player_of
 from hil.campaign.operator import MotionProgress, OperatorRequest, RunStatus, RunWatch
 from hil.campaign.virtual_link import VirtualLink
 from hil.cell import Cell

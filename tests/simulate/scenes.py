@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.campaign.intervals import require_runnable
+from hil.campaign.motions import require_runnable
 from hil.campaign.plan import CampaignPlan, PlannedMotion
 from hil.cell import Cell
 from hil.errors import HilError

@@ -17,7 +17,7 @@ from drivers.record import cycle_dtype
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveOutcome, ArchiveSpec, open_archive
 from hil.campaign import VirtualLink, virtual_link
-from hil.campaign.intervals import START_TOLERANCE
+from hil.campaign.motions import START_TOLERANCE
 from hil.campaign.operator import Stop
 from hil.cell import Cell
 from hil.errors import ControllerError

@@ -68,7 +68,7 @@ def manifest(path: Path) -> None:
     folder = CampaignFolder(path.parent)
     for ask in (
         folder.damaged, lambda: folder.completed("excitation"),
-        lambda: folder.whole("excitation", 0), lambda: folder.next_name("excitation", 0),
+        lambda: folder.complete_archive("excitation", 0), lambda: folder.next_name("excitation", 0),
         folder.require_unchanged, lambda: folder.plan_hash,
     ):  # fmt: skip
         try:

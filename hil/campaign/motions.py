@@ -38,8 +38,8 @@ REPEATED: Final = ("excitation", "warmup")  # Kinds of motion that run the excit
 
 
 @dataclass(frozen=True, eq=False)
-class Interval:
-    """One interval of motion.
+class CampaignMotion:
+    """One motion of a campaign, or a move between two of them.
 
     Attributes:
         kind: "standstill", "excitation", "validation", "move", "dryrun" or "warmup".
@@ -68,7 +68,7 @@ class Interval:
         apart = max(np.max(np.abs(first - start)), np.max(np.abs(last - end)))
         return bool(apart <= AT_REST_TOLERANCE)
 
-    def places(self, home: Array) -> tuple[Array, Array]:
+    def endpoints(self, home: Array) -> tuple[Array, Array]:
         """Return the position of the arm before and after it (n,) [rad]: home, or its own ends."""
         at_own_ends = self.kind in (*REPEATED, "dryrun") or isinstance(
             self.trajectory, FourierSeries
@@ -83,7 +83,7 @@ def at_limit(posture: Array, limits: JointLimits) -> Array:
     return np.where(np.abs(posture - within) <= rounding, within, posture)
 
 
-def beyond(cell: Cell, posture: Array, verb: str = "stands at") -> str | None:
+def limit_violation(cell: Cell, posture: Array, verb: str = "stands at") -> str | None:
     """Return which joint of a posture (n,) [rad] is outside its limits, in degrees, or None."""
     limits = cell.joint_limits
     frame = AngleFrame.of(cell)
@@ -99,14 +99,17 @@ def beyond(cell: Cell, posture: Array, verb: str = "stands at") -> str | None:
     )
 
 
-def planned_intervals(cell: Cell, plan: CampaignPlan) -> list[Interval]:
+def planned_motions(cell: Cell, plan: CampaignPlan) -> list[CampaignMotion]:
     """Return all motions of a plan, without the moves between them."""
     repetitions = cell.campaign.repetitions
     excitation = plan.excitation.trajectory
     return [
-        Interval("standstill", 0, rest(cell.home, cell.campaign.standstill_s)),
-        *(Interval("excitation", k, excitation, plan.moves) for k in range(repetitions)),
-        *(Interval("validation", k, m.trajectory, m.moves) for k, m in enumerate(plan.validation)),
+        CampaignMotion("standstill", 0, rest(cell.home, cell.campaign.standstill_s)),
+        *(CampaignMotion("excitation", k, excitation, plan.moves) for k in range(repetitions)),
+        *(
+            CampaignMotion("validation", k, m.trajectory, m.moves)
+            for k, m in enumerate(plan.validation)
+        ),
     ]
 
 
@@ -116,24 +119,22 @@ class StraightMoves:
     def __init__(self, cell: Cell, checks: MotionChecks) -> None:
         self._cell = cell
         self._checks = checks
-        self._known: list[Interval] = []
+        self._known: list[CampaignMotion] = []
 
     def between(
         self, start: Array, end: Array, index: int, *, from_arm: bool = False
-    ) -> Interval | None:
+    ) -> CampaignMotion | None:
         """Return the checked motion from `start` to `end` (n,) [rad]; None if they are the same."""
         if np.max(np.abs(end - start)) <= AT_REST_TOLERANCE:
             return None
-        interval = next((earlier for earlier in self._known if earlier.connects(start, end)), None)
-        if interval is None:
-            interval = replace(
-                straight_move(self._cell, start, end), index=index, from_arm=from_arm
-            )
-            require_allowed([interval], self._checks)
-            self._known.append(interval)
-        return replace(interval, index=index)
+        motion = next((earlier for earlier in self._known if earlier.connects(start, end)), None)
+        if motion is None:
+            motion = replace(straight_move(self._cell, start, end), index=index, from_arm=from_arm)
+            require_allowed([motion], self._checks)
+            self._known.append(motion)
+        return replace(motion, index=index)
 
-    def joining(self, intervals: Sequence[Interval], where: Array) -> list[Interval]:
+    def with_moves(self, motions: Sequence[CampaignMotion], where: Array) -> list[CampaignMotion]:
         """Return these motions with the moves between them, from `where` (n,) [rad] and back.
 
         Raises:
@@ -141,20 +142,20 @@ class StraightMoves:
         """
         at = where
         home = self._cell.home
-        joined = list[Interval]()
+        joined = list[CampaignMotion]()
 
         def go(target: Array) -> None:
             nonlocal at
-            index = sum(interval.kind == "move" for interval in joined)
+            index = sum(motion.kind == "move" for motion in joined)
             from_arm = at is where or target is where
             if (move := self.between(at, target, index, from_arm=from_arm)) is not None:
                 joined.append(move)
             at = target
 
-        for interval in intervals:
-            start, end = interval.places(home)
+        for motion in motions:
+            start, end = motion.endpoints(home)
             go(start)
-            joined.append(interval)
+            joined.append(motion)
             at = end
         go(home)
         go(where)
@@ -163,21 +164,21 @@ class StraightMoves:
         return joined
 
 
-def require_allowed(intervals: Sequence[Interval], checks: MotionChecks) -> None:
+def require_allowed(motions: Sequence[CampaignMotion], checks: MotionChecks) -> None:
     """Check motions, each once; raise MotionRefusedError for one that must not be sent."""
-    different: dict[int, Interval] = {}
-    for interval in intervals:
-        different.setdefault(id(interval.trajectory), interval)
-    for interval in different.values():
-        _require(interval, checks.refusal(interval.trajectory))
+    different: dict[int, CampaignMotion] = {}
+    for motion in motions:
+        different.setdefault(id(motion.trajectory), motion)
+    for motion in different.values():
+        _require(motion, checks.refusal(motion.trajectory))
 
 
 def require_runnable(cell: Cell, plan: CampaignPlan, checks: MotionChecks | None = None) -> None:
     """Check that a plan can run on a cell, from any position of its arm (MotionRefusedError)."""
     checks = checks or MotionChecks.of(cell)
-    intervals = planned_intervals(cell, plan)
-    require_allowed(intervals, checks)  # before moves to them are planned
-    StraightMoves(cell, checks).joining(intervals, cell.home)
+    motions = planned_motions(cell, plan)
+    require_allowed(motions, checks)  # before moves to them are planned
+    StraightMoves(cell, checks).with_moves(motions, cell.home)
 
 
 def player_of(cell: Cell, trajectory: PiecewiseCubic | FourierSeries) -> TrajectoryPlayer:
@@ -203,7 +204,9 @@ def rest(position: Array, duration: float) -> PiecewiseCubic:
     )
 
 
-def straight_move(cell: Cell, start: Array, end: Array, speed: float | None = None) -> Interval:
+def straight_move(
+    cell: Cell, start: Array, end: Array, speed: float | None = None
+) -> CampaignMotion:
     """Return the straight motion between two postures (n,) [rad], planned in a child process.
 
     Its speed is a fraction of the joints' speeds, by default the cell's `approach_speed`.
@@ -216,26 +219,26 @@ def straight_move(cell: Cell, start: Array, end: Array, speed: float | None = No
         (start, "stands at", "jog the arm to within [limits]"),
         (end, "would go to", "use a posture within [limits]"),
     ):
-        if (problem := beyond(cell, posture, verb)) is not None:
+        if (problem := limit_violation(cell, posture, verb)) is not None:
             raise MotionRefusedError("the motion", problem, remedy)
     speed = cell.campaign.approach_speed if speed is None else speed
     move = Move(at_limit(end, limits), speed=speed)
     motion = in_child(plan_moves, at_limit(start, limits), (move,), limits)
-    return Interval("move", 0, motion.trajectory, PlanFile.of(motion, cell.joint_names))
+    return CampaignMotion("move", 0, motion.trajectory, PlanFile.of(motion, cell.joint_names))
 
 
-def _require(interval: Interval, problem: str | None) -> None:
+def _require(motion: CampaignMotion, problem: str | None) -> None:
     if problem is None:
         return
     remedy = "design another motion"
-    if interval.from_arm:
+    if motion.from_arm:
         remedy = "jog the arm to where the straight way to the motion is free"
-    elif interval.kind == "standstill":
+    elif motion.kind == "standstill":
         remedy = "correct home_deg or standstill_s in [campaign], or [workspace], of the cell file"
-    raise MotionRefusedError(str(interval), problem, remedy)
+    raise MotionRefusedError(str(motion), problem, remedy)
 
 
-def _jump(before: Interval, after: Interval) -> str | None:
+def _jump(before: CampaignMotion, after: CampaignMotion) -> str | None:
     """Return why `after` cannot follow `before`, None if it begins where that ends."""
     end = before.ends[1]
     start = after.ends[0]
