@@ -60,7 +60,7 @@ _CONFIGURATION: Final = {
 }
 
 
-class Unused(NamedTuple):
+class SkippedArchive(NamedTuple):
     """An archive or campaign that was not used, and why."""
 
     path: str
@@ -297,11 +297,12 @@ class Cluster:
         done: Callable[[int], None] | None = None,
         *,
         archives: int | None = None,
-    ) -> list[T | Unused]:
+    ) -> list[T | SkippedArchive]:
         """Return the results of tasks in their order.
 
-        A task that fails gives an `Unused`, as does one that ends its process, again when it runs
-        alone. `done` is called with 1 for each result; `archives` are read, by default one a task.
+        A task that fails gives a `SkippedArchive`, as does one that ends its process, again when it
+        runs alone. `done` is called with 1 for each result; `archives` are read, by default one a
+        task.
 
         Raises:
             ClusterError: the scheduler does not answer any more, or has no worker left.
@@ -311,7 +312,7 @@ class Cluster:
             return []
         count = len(tasks) if archives is None else archives
         places: dict[str, int] = {}
-        results: dict[int, T | Unused] = {}
+        results: dict[int, T | SkippedArchive] = {}
         deaths: list[int] = []
 
         def submitted() -> Iterator[Future]:
@@ -333,11 +334,11 @@ class Cluster:
             results[number] = self._alone(tasks[number], count)
         return [results[number] for number in range(len(tasks))]
 
-    def _alone(self, task: Task[T], archives: int) -> T | Unused:
+    def _alone(self, task: Task[T], archives: int) -> T | SkippedArchive:
         (future,) = self.completed(iter([self.submit(task, archives=archives)]))
-        result: T | Unused | Death = self.outcome_of(future)
+        result: T | SkippedArchive | Death = self.outcome_of(future)
         if isinstance(result, Death):
-            return Unused(task.path, "ended the process that read it, twice")
+            return SkippedArchive(task.path, "ended the process that read it, twice")
         return result
 
 
@@ -370,7 +371,9 @@ def dask_setup(worker: Worker) -> None:
             logger.setLevel(logging.CRITICAL)
 
 
-def run_task(code: str, path: str, function: Callable[..., T], *arguments: Any) -> T | Unused:
+def run_task(
+    code: str, path: str, function: Callable[..., T], *arguments: Any
+) -> T | SkippedArchive:
     """Return the result of a task, or why there is none.
 
     Raises:
@@ -386,7 +389,7 @@ def run_task(code: str, path: str, function: Callable[..., T], *arguments: Any) 
     except CacheError:
         raise
     except Exception as error:
-        return Unused(path, reason_of(error))
+        return SkippedArchive(path, reason_of(error))
 
 
 def other_version(address: str) -> ClusterError:

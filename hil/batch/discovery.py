@@ -26,7 +26,7 @@ from hil.terminal_text import typed
 from identification.selection.settings import Settings
 
 from .cache import BESIDE, CacheError, CacheLocation, code_digest
-from .cluster import Cluster, Task, Unused, reason_of
+from .cluster import Cluster, SkippedArchive, Task, reason_of
 from .places import (
     SUFFIX,
     Stamp,
@@ -139,8 +139,8 @@ class Discovery(NamedTuple):
     """Result of a search."""
 
     refs: tuple[ArchiveRef, ...]  #: archives to use, in the order of sums
-    broken: tuple[Unused, ...]  #: files that cannot be used and folders that cannot be read
-    skipped: tuple[Unused, ...]  #: archives that are not intended for fitting
+    broken: tuple[SkippedArchive, ...]  #: files that cannot be used and folders that cannot be read
+    skipped: tuple[SkippedArchive, ...]  #: archives that are not intended for fitting
 
 
 def discover(
@@ -163,7 +163,7 @@ def discover(
             *(" ".join(unused) for unused in refused[:1]),
         ]
         raise InputError(", ".join(roots), "; ".join(reasons), remedy="name others")
-    refs: dict[str, ArchiveRef | Unused] = {}
+    refs: dict[str, ArchiveRef | SkippedArchive] = {}
     with reporter.task("reading the metadata of archives", len(places)) as task:
         for place in places:
             with suppress(ArchiveError):  # it has disappeared: the worker reports it
@@ -181,15 +181,15 @@ def _inspected(
     cache: CacheLocation,
     cluster: Cluster,
     advance: Callable[[float], None],
-) -> dict[str, ArchiveRef | Unused]:
+) -> dict[str, ArchiveRef | SkippedArchive]:
     """Return what workers find in archives; those of a task that fails are tried one by one."""
-    refs: dict[str, ArchiveRef | Unused] = {}
+    refs: dict[str, ArchiveRef | SkippedArchive] = {}
     chunks = [places[k : k + _CHUNK] for k in range(0, len(places), _CHUNK)]
     tasks = [Task(chunk[0], inspect_archives, (chunk, cache)) for chunk in chunks]
     failed: list[str] = []
     results = cluster.results(tasks, lambda n: advance(n * _CHUNK), archives=len(places))
     for chunk, result in zip(chunks, results, strict=True):
-        if isinstance(result, Unused):
+        if isinstance(result, SkippedArchive):
             failed += chunk
         else:
             refs.update(zip(chunk, result, strict=True))
@@ -198,7 +198,7 @@ def _inspected(
     return refs
 
 
-def find_archives(roots: Sequence[str]) -> tuple[list[str], list[Unused]]:
+def find_archives(roots: Sequence[str]) -> tuple[list[str], list[SkippedArchive]]:
     """Return the paths or URLs of archives at or below some folders or archives, sorted.
 
     Further, folders and files that cannot be read. Links are followed; a folder reached by several
@@ -208,12 +208,12 @@ def find_archives(roots: Sequence[str]) -> tuple[list[str], list[Unused]]:
         InputError: a place does not exist, or a URL cannot be reached.
     """
     archives: set[str] = set()
-    refused: list[Unused] = []
+    refused: list[SkippedArchive] = []
     visited: set[Path] = set()
 
     def refuse(error: OSError) -> None:
         folder = Path(os.fsdecode(error.filename)).as_posix()
-        refused.append(Unused(folder, f"cannot be read: {error.strerror}"))
+        refused.append(SkippedArchive(folder, f"cannot be read: {error.strerror}"))
 
     def walk(root: Path) -> None:
         for name, folders, files in os.walk(root, followlinks=True, onerror=refuse):
@@ -229,7 +229,9 @@ def find_archives(roots: Sequence[str]) -> tuple[list[str], list[Unused]]:
                 if os.path.isfile(path):  # noqa: PTH113 - False where it cannot be reached
                     archives.add(path.as_posix())
                 else:
-                    refused.append(Unused(path.as_posix(), "is no regular file that can be read"))
+                    refused.append(
+                        SkippedArchive(path.as_posix(), "is no regular file that can be read")
+                    )
 
     for root in roots:
         path = Path(root)
@@ -349,20 +351,22 @@ def describe_setup(cell: Cell) -> str:
     return ", ".join(phrases)
 
 
-def inspect_archives(places: Sequence[str], cache: CacheLocation) -> list[ArchiveRef | Unused]:
+def inspect_archives(
+    places: Sequence[str], cache: CacheLocation
+) -> list[ArchiveRef | SkippedArchive]:
     """Return what `inspect_archive` finds in each archive, or why it cannot be used.
 
     Raises:
         CacheError: the cache cannot be written.
     """
-    refs: list[ArchiveRef | Unused] = []
+    refs: list[ArchiveRef | SkippedArchive] = []
     for place in places:
         try:
             refs.append(inspect_archive(place, cache))
         except CacheError:
             raise
         except Exception as error:
-            refs.append(Unused(place, reason_of(error)))
+            refs.append(SkippedArchive(place, reason_of(error)))
     return refs
 
 
@@ -445,25 +449,25 @@ _Attempts = dict[tuple[str, str, int], int]
 """The last attempt by folder, kind and index."""
 
 
-def _select(inspected: dict[str, ArchiveRef | Unused]) -> Discovery:
+def _select(inspected: dict[str, ArchiveRef | SkippedArchive]) -> Discovery:
     """Separate archives to be fitted from copies, failures and earlier attempts."""
     manifests, broken = _manifests(inspected)
     read = list[ArchiveRef]()
-    unusable = list[Unused]()
-    skipped = list[Unused]()
+    unusable = list[SkippedArchive]()
+    skipped = list[SkippedArchive]()
     for place, archive in inspected.items():
         entries = manifests.get(folder_of(place))
         entry = None if entries is None else entries.get(name_of(place))
-        if isinstance(archive, Unused):
+        if isinstance(archive, SkippedArchive):
             unusable.append(archive)
         elif entry is None:
             if entries is not None and archive.use in USES and ArchiveName.parse(archive.name):
-                skipped.append(Unused(place, _UNCHECKED))
+                skipped.append(SkippedArchive(place, _UNCHECKED))
             else:
                 read.append(archive)
         elif entry.sha256 != archive.sha256:
             reason = "differs from its entry in the campaign's manifest.json"
-            unusable.append(Unused(place, reason))
+            unusable.append(SkippedArchive(place, reason))
         else:
             refused = entry.outcome not in ("", _COMPLETED)
             read.append(replace(archive, outcome=entry.outcome) if refused else archive)
@@ -474,21 +478,21 @@ def _select(inspected: dict[str, ArchiveRef | Unused]) -> Discovery:
             latest[key] = max(latest.get(key, 0), ref.attempt)
     for archive in unusable:
         if reason := _not_needed(archive.path, latest):
-            skipped.append(Unused(archive.path, reason))
+            skipped.append(SkippedArchive(archive.path, reason))
         else:
             broken.append(archive)
     seen: dict[str, str] = {}
     refs: list[ArchiveRef] = []
     for ref in read:
         if reason := _exclusion(ref, latest, seen):
-            skipped.append(Unused(ref.location, reason))
+            skipped.append(SkippedArchive(ref.location, reason))
         else:
             refs.append(ref)
     refs.sort(key=lambda ref: ref.order)
     return Discovery(tuple(refs), tuple(broken), tuple(skipped))
 
 
-def _manifests(places: Iterable[str]) -> tuple[dict[str, dict[str, Entry]], list[Unused]]:
+def _manifests(places: Iterable[str]) -> tuple[dict[str, dict[str, Entry]], list[SkippedArchive]]:
     """Return the manifest entries by name of each folder of archives, and damaged manifests."""
     by_folder: dict[str, dict[str, Entry]] = {}
     broken = []
@@ -501,7 +505,7 @@ def _manifests(places: Iterable[str]) -> tuple[dict[str, dict[str, Entry]], list
                     by_folder[folder] = {entry.name: entry for entry in records.manifest()}
         except (CampaignFolderError, ArchiveError) as error:
             reason = f"{error}; the campaign's archives are used without being checked against it"
-            broken.append(Unused(f"{campaign}/manifest.json", reason))
+            broken.append(SkippedArchive(f"{campaign}/manifest.json", reason))
     return by_folder, broken
 
 

@@ -22,7 +22,7 @@ from identification.estimators.least_squares import no_narrower
 from identification.factor.factor import QR_CONDITION, Estimate, Factor, require_rows
 from identification.selection.settings import Settings
 
-from .cluster import Unused
+from .cluster import SkippedArchive
 from .discovery import ArchiveRef, cell_from
 from .reduction import Reduction, Summary, added, plus, settings_digest
 
@@ -133,7 +133,7 @@ class CampaignResult:
     """Estimates of a campaign, which the client receives."""
 
     estimates: tuple[BatchEstimate, ...]  #: of its repetitions, then of itself; none if it failed
-    broken: tuple[Unused, ...]
+    broken: tuple[SkippedArchive, ...]
     read: int  #: archives whose factor was computed
     cached: int  #: archives whose factor was cached
 
@@ -142,7 +142,7 @@ class CampaignResult:
 
 
 def estimate_campaign(
-    parts: Sequence[Reduction | Unused], arm: ArmModel, settings: Settings, campaign: str
+    parts: Sequence[Reduction | SkippedArchive], arm: ArmModel, settings: Settings, campaign: str
 ) -> tuple[CampaignResult, Group]:
     """Estimate one campaign from its reduced archives; return also what a pooled estimate needs.
 
@@ -152,7 +152,7 @@ def estimate_campaign(
     estimator = Estimator(arm)
     group = Group.of(reduction, settings)
     estimates: list[BatchEstimate] = []
-    broken = [*reduction.broken, *(part for part in parts if isinstance(part, Unused))]
+    broken = [*reduction.broken, *(part for part in parts if isinstance(part, SkippedArchive))]
     if group.total is not None:
         try:
             posterior, notes = estimator.posterior(group.total)
@@ -166,23 +166,25 @@ def estimate_campaign(
             group = replace(group, values=tuple(each.estimate.values for each in repetitions))
             estimates = [*repetitions, estimator.sum("campaign", group, posterior, notes)]
         except IdentificationError as error:
-            broken.append(Unused(campaign, str(error)))
+            broken.append(SkippedArchive(campaign, str(error)))
     result = CampaignResult(tuple(estimates), tuple(broken), reduction.read, reduction.cached)
     return result, group
 
 
-def result_of(pair: tuple[CampaignResult, Group] | Unused) -> CampaignResult | Unused:
+def result_of(
+    pair: tuple[CampaignResult, Group] | SkippedArchive,
+) -> CampaignResult | SkippedArchive:
     """Return what the client receives of a campaign."""
-    return pair if isinstance(pair, Unused) else pair[0]
+    return pair if isinstance(pair, SkippedArchive) else pair[0]
 
 
-def group_of(pairs: Sequence[tuple[CampaignResult, Group] | Unused]) -> Group:
+def group_of(pairs: Sequence[tuple[CampaignResult, Group] | SkippedArchive]) -> Group:
     """Return the campaigns with an excitation as one group."""
-    groups = [pair[1] for pair in pairs if not isinstance(pair, Unused)]
+    groups = [pair[1] for pair in pairs if not isinstance(pair, SkippedArchive)]
     return sum((group for group in groups if group.total is not None), Group())
 
 
-def estimate_arm(parts: Sequence[Group], arm: ArmModel) -> BatchEstimate | Unused | None:
+def estimate_arm(parts: Sequence[Group], arm: ArmModel) -> BatchEstimate | SkippedArchive | None:
     """Estimate an arm from sums over its campaigns; None if there is no excitation."""
     group = sum(parts, Group())
     if group.total is None:
@@ -199,7 +201,7 @@ def estimate_arm(parts: Sequence[Group], arm: ArmModel) -> BatchEstimate | Unuse
         posterior, others = estimator.posterior(group.total)
         return estimator.sum("pooled", group, posterior, [*others, *notes])
     except IdentificationError as error:
-        return Unused(f"arm {arm.digest[:8]}", str(error))
+        return SkippedArchive(f"arm {arm.digest[:8]}", str(error))
 
 
 # Estimates

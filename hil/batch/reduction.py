@@ -22,7 +22,7 @@ from identification.factor.factor import Estimate, Factor
 from identification.selection.settings import Settings
 
 from .cache import Arrays, CacheLocation, code_digest
-from .cluster import Unused, reason_of
+from .cluster import SkippedArchive, reason_of
 from .discovery import ArchiveRef, cell_in, open_ref
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ class Reduction:
     summaries: tuple[Summary, ...] = ()  #: of the readable ones, in their order
     #: sum of the factors, by time, of those that are fitted; None if there are none
     total: Factor | None = None
-    broken: tuple[Unused, ...] = ()  #: the others
+    broken: tuple[SkippedArchive, ...] = ()  #: the others
     read: int = 0  #: number of archives that were read, broken ones included
     cached: int = 0  #: number of the others
 
@@ -152,7 +152,7 @@ def _reduce_archive(ref: ArchiveRef, settings: Settings, cache: CacheLocation) -
     try:
         summary, factor = archive_factor(ref, settings)
     except Exception as error:
-        return Reduction(broken=(Unused(ref.location, reason_of(error)),), read=1)
+        return Reduction(broken=(SkippedArchive(ref.location, reason_of(error)),), read=1)
     result = Reduction((summary,), factor if ref.use == "excitation" else None, read=1)
     _write(result, settings, cache)
     return result
@@ -167,7 +167,7 @@ def added(parts: Iterable[Reduction]) -> Reduction:
     """Add reductions in their order."""
     result = Reduction()
     summaries = list[Summary]()
-    broken = list[Unused]()
+    broken = list[SkippedArchive]()
     for part in parts:
         summaries += part.summaries
         broken += part.broken

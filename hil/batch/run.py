@@ -23,7 +23,7 @@ from hil.progress import Reporter, Silent
 from identification.selection.settings import Settings
 
 from .cache import CacheLocation, code_digest
-from .cluster import Cluster, Death, Task, Unused, reason_of
+from .cluster import Cluster, Death, SkippedArchive, Task, reason_of
 from .discovery import (
     ArchiveRef,
     CellTexts,
@@ -89,7 +89,7 @@ def cached_settings(
 
 def decide_settings(
     refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, cache: CacheLocation
-) -> tuple[Settings | None, list[Unused]]:
+) -> tuple[Settings | None, list[SkippedArchive]]:
     """Decide a campaign's settings from `archives_for_settings` and cache them.
 
     They are those of the arm, if it has any, with the campaign's own noise. Returned with the
@@ -99,7 +99,7 @@ def decide_settings(
         RecordingError: a recording cannot be prepared.
         IdentificationError: a delay was requested and there is no usable row.
     """
-    broken: list[Unused] = []
+    broken: list[SkippedArchive] = []
     standstill: Source | None = None
     fitted: list[tuple[Archive, Source]] = []
     for ref in refs:
@@ -109,7 +109,7 @@ def decide_settings(
             elif standstill is None:
                 standstill = load_source(ref, to_fit=False)[1]
         except Exception as error:
-            broken.append(Unused(ref.location, reason_of(error)))
+            broken.append(SkippedArchive(ref.location, reason_of(error)))
     if not fitted:
         return None, broken
     noise = None if standstill is None else standstill.recording
@@ -148,8 +148,8 @@ class BatchResult:
     repetitions: tuple[BatchEstimate, ...]  #: of all campaigns, in the order of `ArchiveRef.order`
     campaigns: tuple[BatchEstimate, ...]  #: in the same order
     pooled: tuple[BatchEstimate, ...]  #: one per arm
-    broken: tuple[Unused, ...]  #: archives and campaigns (by folder) that could not be used
-    skipped: tuple[Unused, ...]  #: archives that are not intended for fitting
+    broken: tuple[SkippedArchive, ...]  #: archives and campaigns (by folder) that could not be used
+    skipped: tuple[SkippedArchive, ...]  #: archives that are not intended for fitting
     read: int  #: archives whose factor was computed
     cached: int  #: archives whose factor was cached
     code: str  #: digest of the programs
@@ -219,7 +219,7 @@ class _ArmWork:
     model: ArmModel
     campaigns: list[_Campaign]
     results: dict[GroupKey, CampaignResult]
-    pooled: BatchEstimate | Unused | None = None
+    pooled: BatchEstimate | SkippedArchive | None = None
 
     @property
     def has_pooled(self) -> bool:
@@ -240,7 +240,7 @@ class _Batch:
     cluster: Cluster
     cache: CacheLocation
     reporter: Reporter
-    broken: list[Unused]
+    broken: list[SkippedArchive]
 
     # Settings
 
@@ -283,7 +283,7 @@ class _Batch:
         archives = sum(len(refs) for _, (refs, *_) in asked)
         results = self._results(tasks, "deciding settings", archives)
         for (campaign, (refs, *_)), decision in zip(asked, results, strict=True):
-            if isinstance(decision, Unused):  # perhaps an archive ends its process
+            if isinstance(decision, SkippedArchive):  # perhaps an archive ends its process
                 alone = [Task(ref.location, open_only, (ref,)) for ref in refs]
                 opened = self._results(alone, "opening archives one by one", len(alone))
                 broken = [other for other in opened if other is not None]
@@ -298,7 +298,7 @@ class _Batch:
             if campaign.settings is None and broken and campaign.refs:
                 again.append(campaign)
             elif campaign.settings is None and reason:
-                self.broken.append(Unused(campaign.key.campaign, reason))
+                self.broken.append(SkippedArchive(campaign.key.campaign, reason))
         return again
 
     def _results(self, tasks: Sequence[Task[Any]], title: str, archives: int) -> list[Any]:
@@ -309,7 +309,9 @@ class _Batch:
 
     # Estimates
 
-    def result(self, campaigns: Sequence[_Campaign], skipped: tuple[Unused, ...]) -> BatchResult:
+    def result(
+        self, campaigns: Sequence[_Campaign], skipped: tuple[SkippedArchive, ...]
+    ) -> BatchResult:
         """Reduce and estimate everything."""
         arms = [
             _ArmWork(self._model(digest, members), members, {})
@@ -326,7 +328,8 @@ class _Batch:
         lost = [unused for result in results for unused in result.broken]
         # Some reasons begin with the path.
         reasons = (
-            Unused(path, text.removeprefix(f"{path}: ")) for path, text in [*self.broken, *lost]
+            SkippedArchive(path, text.removeprefix(f"{path}: "))
+            for path, text in [*self.broken, *lost]
         )
         broken = tuple(dict.fromkeys(reasons))
         repetitions = tuple(estimate for estimate in estimates if estimate.level == "repetition")
@@ -446,7 +449,7 @@ class _Batch:
     def _pooled(self, arm: _ArmWork) -> list[BatchEstimate]:
         """Return the pooled estimate of an arm; that of its only campaign, if it has one."""
         if arm.has_pooled:
-            if isinstance(arm.pooled, Unused):
+            if isinstance(arm.pooled, SkippedArchive):
                 self.broken.append(arm.pooled)
             return [arm.pooled] if isinstance(arm.pooled, BatchEstimate) else []
         return [
@@ -474,8 +477,8 @@ def _advance(
 
 
 def _receive_campaign(arm: _ArmWork, key: GroupKey) -> Callable[[Any], None]:
-    def receive(result: CampaignResult | Unused) -> None:
-        if isinstance(result, Unused):
+    def receive(result: CampaignResult | SkippedArchive) -> None:
+        if isinstance(result, SkippedArchive):
             result = CampaignResult((), (result,), 0, 0)
         arm.results[key] = result
 

@@ -13,7 +13,7 @@ import typer
 
 from hil.batch import run
 from hil.batch.cache import CacheLocation
-from hil.batch.cluster import Cluster, Unused
+from hil.batch.cluster import Cluster, SkippedArchive
 from hil.batch.estimates import BatchEstimate, BatchEstimator, relative_error
 from hil.batch.run import BatchResult
 from hil.batch.table import write_tables
@@ -132,7 +132,7 @@ def _last(lines: Sequence[str]) -> Iterator[str]:
     yield from lines[-_MOST_LINES:]
 
 
-def skipped_line(skipped: Sequence[Unused]) -> str:
+def skipped_line(skipped: Sequence[SkippedArchive]) -> str:
     """Count the skipped archives by reason, without the name of another archive in it."""
     counts = Counter(re.sub(r"\S*(/|\.mcap)\S*", "another", unused.reason) for unused in skipped)
     reasons = "; ".join(f"{count} {reason}" for reason, count in counts.most_common())

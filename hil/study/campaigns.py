@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from hil.batch.cluster import Cluster, Task, Unused
+from hil.batch.cluster import Cluster, SkippedArchive, Task
 from hil.campaign import Campaign, CampaignFolder, CampaignPlan, Stop
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.plan import moves_of, plan_around
@@ -230,7 +230,7 @@ def in_children(
     with reporter.task(title, len(tasks)) as task:
         results = cluster.results(tasks, task.advance)
     for result in results:
-        if isinstance(result, Unused):
+        if isinstance(result, SkippedArchive):
             raise StudyError(f"{result.path}: {result.reason}; start the study again to resume")
         values.append(result)
     return values

@@ -162,7 +162,7 @@ def test_the_line_of_a_disk_fault_says_all_of_it() -> None:
 
 
 @pytest.mark.parametrize("line", ["EIO", "EIO@sit:*", "ESRCH@write:*", "hang@write:*", "EIO@write"])
-def test_a_disk_fault_that_cannot_be_read_is_refused_with_the_grammar(line: str) -> None:
+def test_an_unreadable_disk_fault_is_refused(line: str) -> None:
     with pytest.raises(ValueError, match="lines are"):
         parse_disk_fault(line)
 

@@ -17,7 +17,7 @@ from typing import Final
 from distributed import WorkerPlugin
 
 from hil.batch import discovery
-from hil.batch.cluster import Cluster, Task, Unused
+from hil.batch.cluster import Cluster, SkippedArchive, Task
 from hil.errors import ArchiveError
 
 NOTHING_OPEN: Final = (
@@ -153,5 +153,5 @@ def task(function, argument):
 
 
 def check_unused(result, name, reason):
-    assert isinstance(result, Unused)
+    assert isinstance(result, SkippedArchive)
     assert (result.path, reason in result.reason) == (name, True), result

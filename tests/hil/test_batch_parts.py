@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 
 from hil.batch.cache import HEADER, CacheError, CacheLocation, code_digest
-from hil.batch.cluster import Unused
+from hil.batch.cluster import SkippedArchive
 from hil.batch.discovery import ArchiveRef, arm_digest
 from hil.batch.estimates import Arm
 from hil.batch.reduction import cached_reduction, reduction_key, settings_digest
@@ -268,8 +268,8 @@ def result():
         repetitions=(repetition,),
         campaigns=(first, other),
         pooled=(replace(pooled, unseen_torque_rms=first.torque_rms),),
-        broken=(Unused("a/truncated.mcap", "its footer is missing"),),
-        skipped=(Unused("a/slow.mcap", "holds a validation run"),),
+        broken=(SkippedArchive("a/truncated.mcap", "its footer is missing"),),
+        skipped=(SkippedArchive("a/slow.mcap", "holds a validation run"),),
         read=1,
         cached=0,
         code="c0de",

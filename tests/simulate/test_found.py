@@ -237,14 +237,14 @@ class TestHalfASecond:
     law nor product, but an arm at the bound of 10 %, with which chance decides.
     """
 
-    def test_two_repetitions_disturbed_alike_may_ask_for_an_inspection(self, stage: Stage) -> None:
+    def test_two_repetitions_disturbed_alike_need_an_operator(self, stage: Stage) -> None:
         seen = stage.observed(102383, ["delay@577x1:7ms", "delay@296x1:7ms"])
         assert "RepetitionsRejectedError: repetition 3 was rejected 2 times" in seen.ended
         assert "or begin a new one" in seen.ended
         assert missed_alike(seen)
         assert judged(seen) == []
 
-    def test_a_restart_of_an_arm_that_scatters_is_no_disturbance(self, tmp_path: Path) -> None:
+    def test_a_restart_disturbs_no_repetition(self, tmp_path: Path) -> None:
         twin = _twin(scene_of(400869 // NEIGHBOURS, variant=1), tmp_path / "twin")
         assert "2 joints, upright, 2 ms; sines, 0.53 s; 3 repetitions" in twin.scene.words
         script = parse_script(["restart@875:cold"])
