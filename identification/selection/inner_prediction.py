@@ -254,7 +254,8 @@ def choose_settings(
     asked: set[str] = {*questions}
     if "estimator" in asked:
         asked |= {"strength", "consistency"}
-    if trial.duration(now) < SHORT:
+    short = trial.duration(now) < SHORT
+    if short:
         asked -= IF_LONG
     first = now
     trial.weigh(first)
@@ -265,7 +266,8 @@ def choose_settings(
         now, choices = _compare_low_passes(trial, first, now, choices, asked, low_passes)
     if "friction" in asked:
         had_load = trial.model(now).friction.has_load
-        for decide in (_friction_terms, _load_friction):
+        # Segments of a short motion have the same speeds: they do not test a law of speed.
+        for decide in (_load_friction,) if short else (_friction_terms, _load_friction):
             decision = decide(trial, now)
             now = decision.settings
             choices = [*choices, decision.choice]

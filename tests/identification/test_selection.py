@@ -268,7 +268,8 @@ class TestChosenSettings:
 
     def test_the_true_friction_term_is_found(self):
         cubic = MODEL.with_friction(third="cubic")
-        settings, _ = chosen(a_recording(cubic, np.append(truth(), [0.5, 0.3])), {"friction"})
+        recording = a_recording(cubic, np.append(truth(), [0.5, 0.3]), duration=LONG)
+        settings, _ = chosen(recording, {"friction"})
         assert settings.friction["third"] == "cubic"
 
     def test_a_stated_stribeck_speed_is_a_candidate(self):
@@ -280,7 +281,7 @@ class TestChosenSettings:
         assert settings.friction["stribeck"] == 0.3
 
     def test_no_friction_term_is_added_without_cause(self):
-        settings, _ = chosen(a_recording(), {"friction"})
+        settings, _ = chosen(a_recording(duration=LONG), {"friction"})
         assert settings.friction["third"] == "none"
 
     def test_torque_ripple_is_estimated_only_if_present(self):
@@ -310,7 +311,7 @@ class TestChosenSettings:
     def test_the_stated_term_stays_unless_another_is_clearly_better(self):
         """Friction without a third term, and a statement that there is one."""
         stated = MODEL.with_friction(third="quadratic")
-        settings, choices = chosen(a_recording(), {"friction"}, model=stated)
+        settings, choices = chosen(a_recording(duration=LONG), {"friction"}, model=stated)
         assert settings.friction["third"] == "quadratic"
         errors = next(choice.errors for choice in choices if choice.name == "friction at speed")
         assert min(errors) > (1.0 - WORTHWHILE) * errors[0]
@@ -350,12 +351,12 @@ class TestChosenSettings:
 
     def test_a_short_recording_asks_fewer_questions(self):
         """The first candidates stay."""
-        asked = {"bandwidth", "presliding", "rows", "velocity", "estimator"}
+        asked = {"bandwidth", "presliding", "rows", "velocity", "friction", "estimator"}
         names = {
             duration: {choice.name for choice in chosen(a_recording(duration=duration), asked)[1]}
             for duration in (0.9 * SHORT, LONG)
         }
-        assert names[LONG] - names[0.9 * SHORT] == {STRENGTH}
+        assert names[LONG] - names[0.9 * SHORT] == {STRENGTH, "friction at speed"}
         assert "rows that are left out" in names[0.9 * SHORT]
 
     def test_a_joint_may_rest_in_some_segments(self):
