@@ -10,9 +10,7 @@ While axes are open, following error and current are checked, and that the targe
 within 10 % of the following-error threshold of one of the last `max_gap` + 1 set-points sent, or of
 the last one extrapolated by as many steps as packets were missed, and within 25 % of the last. An
 older target is a rejected reply: the last set-point is sent again until it is accepted, and more
-than `max_gap` rejected replies in 100 cycles stop the motion on its path. A stop continues no
-faster than the arm moves (D4) after a set-point that was sent again: from the target held where it
-was sent again more than `max_gap` times, else from that set-point once it is accepted.
+than `max_gap` rejected replies in 100 cycles stop the motion on its path.
 
 Without replies a controller may hold the last target, extrapolate it, or leave open mode, move the
 arm and come back; the next set-point at full speed would then be a jump. Hence, after a gap longer
@@ -170,7 +168,6 @@ class SentSetPoints:
         self.target_latency = 0
         self._resent = 0
         self._resent_before = False
-        self._held = False
         self.resend_needed = False
         self._every = np.ones(n, dtype=np.bool_)
 
@@ -178,7 +175,7 @@ class SentSetPoints:
         """Record that the first set-point (n,), the target received, was sent."""
         self._sent[...] = target
         self.target_latency = self._resent = 0
-        self._resent_before = self._held = self.resend_needed = False
+        self._resent_before = self.resend_needed = False
 
     def resume_from(self, target: Array, step: Array) -> None:
         """Record that the controller extrapolated to this target (n,) by this step (n,)."""
@@ -193,32 +190,10 @@ class SentSetPoints:
         """Record that the last set-point was sent once more."""
         self._resent += 1
 
-    @property
-    def is_accepted(self) -> bool:
-        """Whether the last set-point was sent again and is accepted now."""
-        return self._resent > 0 and not self.resend_needed
-
-    @property
-    def is_held(self) -> bool:
-        """Whether the controller holds an older target for longer than it may report one late."""
-        return self.resend_needed and self._resent >= self._depth
-
-    def stop_from(self, target: Array, step: Array) -> None:
-        """Record that a stop begins anew at the target (n,) held, by this step (n,).
-
-        The next set-point counts as sent again where the one before was not accepted.
-        """
-        resent = self._resent
-        held = self.is_held
-        self.resume_from(target, step)
-        self._resent = resent
-        self._held = held
-
     def add(self, target: Array) -> None:
         """Record that the next set-point (n,) was sent."""
-        self._resent_before = self._resent > 0 and not self._held
-        self._resent = self._resent + 1 if self._held else 0
-        self._held = False
+        self._resent_before = self._resent > 0
+        self._resent = 0
         self._newest = newest = (self._newest + 1) % len(self._sent)
         self._sent[newest] = target
 
@@ -463,21 +438,17 @@ class SetPointGenerator:
         """Send the motion's next set-point, or the last one without a motion."""
         cycle = self._cycle
         commanded = self._commanded
-        stopping = execution is not None and execution.outcome == "stopped"
         self._check_feedback(self._sent)
-        self._check_accepted(stopping=stopping)
+        self._check_accepted(stopping=execution is not None and execution.outcome == "stopped")
         if execution is None:
             self._guard.check_set_point(self.set_point, self._still, "plan", cycle)
             self._rest()
             return
         frame = self._builder.floats
-        history = self._history
-        if stopping and execution.is_resumable and (history.is_held or history.is_accepted):
-            self._stop_from_target(execution)
-        elif history.resend_needed:
+        if self._history.resend_needed:
             # The controller holds the target before the last one: send that once more.
             frame[self._slots] = self._last_reply
-            history.resend()
+            self._history.resend()
             commanded[0] = self.set_point
             commanded[1] = self._velocity
             return
@@ -491,25 +462,8 @@ class SetPointGenerator:
         self._wire.write(frame, motor, step)
         self.set_point = position
         self._sent = motor
-        history.add(motor)
+        self._history.add(motor)
         self._last_reply = frame[self._slots]
-
-    def _stop_from_target(self, execution: Execution) -> None:
-        """Continue a stop from the target received, no faster than the arm moves along its path.
-
-        While the controller held its target, the arm has slowed down.
-        """
-        sent = self._velocity
-        measured = self._wire.joint_difference(self._raw[ACTUAL_VELOCITY]) / self._guard.period
-        square = float(sent @ sent)
-        share = min(max(float(measured @ sent) / square, 0.0), 1.0) if square else 0.0
-        target = self._raw[TARGET].copy()
-        position = self.set_point + self._wire.joint_difference(target - self._sent)
-        execution.resume_from(position, share * sent, 0, self._cycle)
-        self._guard.resume_from(position, share * sent, 0)
-        self._history.stop_from(target, share * self._step)
-        self.set_point = position
-        self._sent = target
 
     def _require_closed_still(self, motor: Array) -> None:
         """Require closed axes to stay where the controller holds them, wrist couplings included."""

@@ -66,7 +66,6 @@ class Conduct:
     max_gap: int = 2
     lag: int = 0
     repeats: int = 0
-    held_longer: bool = False
     answered: np.ndarray | None = None
     lost: int = 0
     exiting: bool = False
@@ -263,8 +262,6 @@ class Conduct:
             if self.at_most > self.max_gap:
                 self._resume_from_target(a, r)
                 rounding_of_target = np.spacing(np.float32(np.abs(r[0])))
-            elif self.stopping and self.repeats and self._stops_from_target(a, r):
-                rounding_of_target = np.spacing(np.float32(np.abs(r[0])))
             assert (np.abs(r[2] - self.motor) <= self.threshold * (1 + 2e-6)).all(), "not there"
             near = np.concatenate((self.motors[-self.max_gap - 1 :], self._extrapolated()))
             nearest = np.abs(near - r[0]).min(axis=0)
@@ -289,9 +286,7 @@ class Conduct:
         assert (q <= self.limits.upper + 2e-6 * span).all(), "position"
         if self.motor is not None:
             self._count_lost(r[0])
-        self.repeats = self.repeats + 1 if self.held_longer else 0
-        self.held_longer = False
-        self.answered = a
+        self.repeats, self.answered = 0, a
         self.motors = [*self.motors, motor][-(self.max_gap + 2) :]
         self.motor = motor
         del self.sent[:-3]
@@ -325,29 +320,6 @@ class Conduct:
         self.motors = [r[0] - k * r[1] for k in (3, 2, 1, 0)]
         self.sent, self.motor = [self.train.joint_position(row) for row in self.motors], r[0]
         self._count("resumed from the target")
-
-    def _stops_from_target(self, a: np.ndarray, r: np.ndarray) -> bool:
-        """Let a stop continue from the target received, after a set-point that was sent again.
-
-        It is the set-point sent again, accepted now, or the one before, held by the controller
-        while the other was sent again more than `max_gap` times. The velocity is the share of the
-        arm's own in that of the last step, so that the motion does not speed up.
-        """
-        rounding = np.spacing(np.float32(np.abs(a[0]).max()))
-        begun = a[0] - a[1]
-        accepted = np.abs(self.motor - r[0]).max() <= self.limits.standstill
-        from_target = np.abs(begun - r[0]).max() <= 2 * rounding
-        if not from_target or not (accepted or self.repeats > self.max_gap):
-            return False
-        step = self._last_step()
-        sent, moves = (self.train.joint_velocity(each, self.period) for each in (step, r[3]))
-        square = sent @ sent
-        share = np.clip(moves @ sent / square, 0.0, 1.0) if square else 0.0
-        self.motors = [r[0] - k * share * step for k in (3, 2, 1, 0)]
-        self.sent, self.motor = [self.train.joint_position(row) for row in self.motors], r[0]
-        self.without_jerk_bound, self.held_longer = 2, not accepted
-        self._count("stops from the target")
-        return True
 
     def _extrapolated(self) -> np.ndarray:
         """(k, n) of a controller that extrapolates over missed packets, motor revolutions."""
