@@ -143,12 +143,12 @@ class _Joint:
         columns, error = self._equations(delay)
         size = _sizes(columns)
         projected = self.instruments.T @ (columns / size)
-        found = scipy.optimize.lsq_linear(
+        scaled = scipy.optimize.lsq_linear(
             projected, self.instruments.T @ error, bounds=(0.0, np.inf)
         ).x
-        shown = self.instruments.T @ error - projected @ found
-        scatter = float(np.mean((error - columns @ (found / size)) ** 2))
-        coefficients = found / size
+        shown = self.instruments.T @ error - projected @ scaled
+        scatter = float(np.mean((error - columns @ (scaled / size)) ** 2))
+        coefficients = scaled / size
         compliance = coefficients[0]
         values = np.zeros(len(NAMES))
         if compliance > 0.0:
