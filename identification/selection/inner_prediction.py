@@ -254,8 +254,7 @@ def choose_settings(
     asked: set[str] = {*questions}
     if "estimator" in asked:
         asked |= {"strength", "consistency"}
-    short = trial.duration(now) < SHORT
-    if short:
+    if trial.duration(now) < SHORT:
         asked -= IF_LONG
     first = now
     trial.weigh(first)
@@ -266,8 +265,7 @@ def choose_settings(
         now, choices = _compare_low_passes(trial, first, now, choices, asked, low_passes)
     if "friction" in asked:
         had_load = trial.model(now).friction.has_load
-        # Segments of a short motion have the same speeds: they do not test a law of speed.
-        for decide in (_load_friction,) if short else (_friction_terms, _load_friction):
+        for decide in (_friction_terms, _load_friction):
             decision = decide(trial, now)
             now = decision.settings
             choices = [*choices, decision.choice]
@@ -316,15 +314,20 @@ def _friction_terms(trial: _Trial, now: Settings) -> _Decision:
     """Choose the terms beside Coulomb and viscous friction, the stated ones first.
 
     A term must also predict fast motion from slower one no worse, and leave friction at all speeds:
-    the law is the choice that carries over to another motion least.
+    the law is the choice that carries over to another motion least. Segments of a short motion have
+    the same speeds and do not test it: there a term must predict the fast motion clearly better.
     """
     law = trial.model(now).friction.laws[0].table()
     stated = {"third": law["third"], "stribeck": law["stribeck"]}
     terms = [stated, *(term for term in FRICTION_TERMS if term != stated)]
     candidates = [now.with_friction(**term) for term in terms]
 
+    limit = trial.fast_error(now)
+    if trial.duration(now) < SHORT:
+        limit *= 1.0 - TERM_WORTHWHILE
+
     def possible(term: Settings) -> bool:
-        return trial.fast_error(term) <= trial.fast_error(now) and trial.has_friction(term)
+        return trial.fast_error(term) <= limit and trial.has_friction(term)
 
     return trial.decide("friction at speed", candidates, TERM_WORTHWHILE, possible=possible)
 

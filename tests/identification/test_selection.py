@@ -356,7 +356,7 @@ class TestChosenSettings:
             duration: {choice.name for choice in chosen(a_recording(duration=duration), asked)[1]}
             for duration in (0.9 * SHORT, LONG)
         }
-        assert names[LONG] - names[0.9 * SHORT] == {STRENGTH, "friction at speed"}
+        assert names[LONG] - names[0.9 * SHORT] == {STRENGTH}
         assert "rows that are left out" in names[0.9 * SHORT]
 
     def test_a_joint_may_rest_in_some_segments(self):
