@@ -227,9 +227,8 @@ class TestHalfASecond:
     102383, two late packets. Repetitions 1 and 2 missed a packet at the same set-point. They
     differed by 5 % of the rms current of joint 4 from each other, and by 20 to 29 % from every
     sound one; 10 % are allowed. The product corrects this if one repetition counts, not if two do:
-    it asks for an inspection or a new campaign. That is right, as two that agree cannot be told
-    from sound ones. The law was wrong: it excused only faults that push the arm. It is so with
-    either servo.
+    it asks for an inspection or a new campaign, because two that agree cannot be told from sound
+    ones. The law was wrong: it excused only faults that push the arm. The servo does not matter.
 
     400869, a restart between two repetitions. The undisturbed repetitions of this arm differ by up
     to 9 % of the rms current of joint 1, with either servo. The one after the restart differed by
