@@ -20,6 +20,8 @@ $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "no python3.11 or python3 found: install Python 3.11, or name one: make setup PYTHON=..."; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	# Where Python may write no bytecode, each start would otherwise compile all sources, a second of it.
+	$(BIN)/python -m compileall -q drivers hil identification planner sim_fixtures
 	touch $(STAMP)
 
 demo: $(STAMP)  ## the whole way on the simulated NS 16; leaves runs/demo/report.html

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -28,7 +29,11 @@ class Frozen(BaseModel):
     """A section of the file: immutable, without unknown fields."""
 
     model_config = ConfigDict(
-        frozen=True, extra="ignore", ser_json_inf_nan="strings", from_attributes=True
+        frozen=True,
+        extra="ignore",
+        ser_json_inf_nan="strings",
+        from_attributes=True,
+        defer_build=True,
     )
 
     @classmethod
@@ -449,7 +454,9 @@ class SettingsResult(Frozen):
     @classmethod
     def entries(cls, settings: Settings) -> dict[str, Any]:
         """Return the value of `settings`: their choices are in :attr:`Results.choices`."""
-        entries: dict[str, Any] = _SETTINGS.dump_python(replace(settings, choices=()), mode="json")
+        entries: dict[str, Any] = _settings_adapter().dump_python(
+            replace(settings, choices=()), mode="json"
+        )
         return entries
 
     def decided(self) -> Settings:
@@ -458,10 +465,12 @@ class SettingsResult(Frozen):
         Raises:
             ValueError: they are those of another version.
         """
-        return _SETTINGS.validate_python(self.settings)
+        return _settings_adapter().validate_python(self.settings)
 
 
-_SETTINGS: Final = TypeAdapter(Settings)
+@cache
+def _settings_adapter() -> TypeAdapter[Settings]:
+    return TypeAdapter(Settings)
 
 
 class Results(Frozen):

@@ -35,7 +35,7 @@ _SAME_RATES = 1e-6
 
 
 class _Data(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True)
+    model_config = ConfigDict(extra="forbid", strict=True, defer_build=True)
 
 
 class _MoveData(_Data):

@@ -126,7 +126,7 @@ def _readable_or_default(
 class Findings(BaseModel):
     """Results of an import: time base and ranges; possible errors of the column map."""
 
-    model_config = ConfigDict(frozen=True, strict=True)
+    model_config = ConfigDict(frozen=True, strict=True, defer_build=True)
 
     lines: tuple[str, ...]
     warnings: tuple[str, ...] = Field(validation_alias=AliasChoices("warnings", "doubts"))
@@ -166,7 +166,7 @@ class ArchiveHeader(BaseModel):
         entries: all entries as texts, without the checksum.
     """
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, defer_build=True)
 
     kind: str
     joint_names: Json[Annotated[tuple[_Name, ...], Field(min_length=1)]]
@@ -253,7 +253,7 @@ class ArchiveOutcome(BaseModel):
         record: all entries as texts, without the checksum of the record.
     """
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, defer_build=True)
 
     outcome: str = "unknown"
     reason: str = ""

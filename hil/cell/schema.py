@@ -56,7 +56,7 @@ def field(description: str, default: Any = ..., **bounds: Any) -> Any:
 class Table(BaseModel):
     """A TOML table; unknown fields are refused."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
 
 class SimulatedDriveTable(Table):

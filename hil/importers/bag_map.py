@@ -29,7 +29,7 @@ class BagMap(BaseModel):
         rename: joint in the URDF by name in the bag, where they differ.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
     topic: str | None = None
     clock: Clock = "auto"

@@ -28,7 +28,7 @@ _PerJoint = Annotated[Vector | None, Field(description="a list of numbers, one p
 
 
 class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
 
 class Quantity(_Table):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import csv
 import math
+from html import escape
 from os import PathLike
 from pathlib import Path
 from typing import Final, Literal, NamedTuple, cast, get_args
-from xml.sax.saxutils import quoteattr
 
 from hil.errors import InputError
 from hil.reading import read_input
@@ -59,7 +59,7 @@ def urdf_of_dh(path: str | PathLike[str], convention: Convention) -> str:
     """
     path = Path(path)
     rows = _rows(path)
-    parts = [f"<robot name={quoteattr(path.stem or 'robot')}>", _link("base_link")]
+    parts = [f'<robot name="{escape(path.stem or "robot")}">', _link("base_link")]
     parent = "base_link"
     # The fixed transform follows a joint (standard) or precedes the next one (modified).
     for number, row in enumerate(rows, 1):
@@ -97,7 +97,7 @@ def convention_of(text: str | None) -> Convention:
 
 
 def _link(name: str) -> str:
-    return f"<link name={quoteattr(name)}/>"
+    return f'<link name="{escape(name)}"/>'
 
 
 def _fixed(
@@ -118,7 +118,7 @@ def _moving(row: _Row, parent: str, child: str, lift: float) -> tuple[str, str]:
         "" if row.type == "continuous" else '<limit lower="0" upper="0" effort="0" velocity="0"/>'
     )
     joint = (
-        f'<joint name={quoteattr(row.joint)} type="{row.type}"><parent link="{parent}"/>'
+        f'<joint name="{escape(row.joint)}" type="{row.type}"><parent link="{parent}"/>'
         f'<child link="{child}"/><origin xyz="0 0 {lift!r}" rpy="0 0 {row.theta_offset!r}"/>'
         f'<axis xyz="0 0 1"/>{limit}</joint>'
     )

@@ -247,13 +247,15 @@ def _regular(shares: Array, scores: Array) -> tuple[Array, list[int]]:
     dependent = []
     work = np.empty((k, k), order="F")
     diagonal = np.arange(k)
+    largest = np.sqrt(np.einsum("bij,bij->b", shares, shares))  # at least the largest leverage
     for b, (share, score) in enumerate(zip(shares, scores, strict=True)):
-        np.add(share, share.T, out=work)
-        work *= -0.5
-        work[diagonal, diagonal] += _LOW_LEVERAGE
-        if lapack.dpotrf(work, overwrite_a=1, clean=0)[1] != 0:
-            dependent.append(b)
-            continue
+        if largest[b] >= _LOW_LEVERAGE:
+            np.add(share, share.T, out=work)
+            work *= -0.5
+            work[diagonal, diagonal] += _LOW_LEVERAGE
+            if lapack.dpotrf(work, overwrite_a=1, clean=0)[1] != 0:
+                dependent.append(b)
+                continue
         np.negative(share, out=work)
         work[diagonal, diagonal] += 1.0
         corrected[b] = lapack.dgesv(work, score, overwrite_a=1)[2]

@@ -32,6 +32,7 @@ from identification.factor.factor import (
     joint_weights,
     mark_undetermined,
     require_rows,
+    solve_positive,
     solve_rows,
 )
 from identification.model.robot import RobotModel
@@ -209,7 +210,7 @@ def posterior_values(
         scale = np.sqrt(equations.A.diagonal() + least)
         values = (
             prior.mean
-            + np.linalg.solve(
+            + solve_positive(
                 (equations.A + precision) / (scale[:, None] * scale),
                 (equations.b - equations.A @ prior.mean) / scale,
             )

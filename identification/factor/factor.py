@@ -14,6 +14,7 @@ from itertools import pairwise
 from typing import Final, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
@@ -186,7 +187,7 @@ class Factor:
         whole = np.zeros((self.n_joints, width, width))
         for joint, joint_sum in enumerate(self._sums):
             place = self._places(joint)
-            whole[joint][np.ix_(place, place)] = joint_sum
+            whole[joint, place[:, None], place] = joint_sum
         return whole
 
     @cached_property
@@ -397,7 +398,11 @@ class Factor:
 
     def _places(self, joint: int) -> Indices:
         """Return the indices of a joint's columns among all p + 1, torque last."""
-        return np.append(self.columns[joint], self.n_parameters)
+        used = self.columns[joint]
+        places = np.empty(len(used) + 1, dtype=np.intp)
+        places[:-1] = used
+        places[-1] = self.n_parameters
+        return places
 
     def _wide(self, joint: int) -> Array:
         """Return the triangles of a joint as rows (k, p + 1)."""
@@ -552,7 +557,18 @@ def solve_with_ridge(gram: Array, cross: Array, ridge: float) -> Array:
     scale = np.where(present, length, 1.0)
     normal = gram / np.outer(scale, scale)
     np.fill_diagonal(normal, np.where(present, 1.0 + ridge, 1.0))
-    return np.asarray(np.linalg.solve(normal, cross / scale) / scale)
+    return solve_positive(normal, cross / scale) / scale
+
+
+def solve_positive(matrix: Array, right: Array) -> Array:
+    """Solve ``M x = r`` with a positive definite matrix (k, k), (k,).
+
+    Raises:
+        numpy.linalg.LinAlgError: the matrix is singular.
+    """
+    _, solution, failed = scipy.linalg.lapack.dposv(matrix.T, right)
+    # A matrix that rounding made indefinite.
+    return np.asarray(np.linalg.solve(matrix, right) if failed else solution)
 
 
 def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -> Solution:

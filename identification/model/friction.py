@@ -256,7 +256,7 @@ class FrictionLaw:
         """Return the table `[robot.friction]` of the law."""
         return {k: ABSENT[k] if v is None else v for k, v in asdict(self).items()}
 
-    @property
+    @cached_property
     def terms(self) -> tuple[FrictionTerm, ...]:
         """The terms in the order of the parameters."""
         return tuple(term for kind in TERMS if (term := kind.of(self)) is not None)

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Final, NamedTuple
 from xml.etree.ElementTree import Element
 
@@ -158,7 +159,12 @@ def chain_from_urdf(urdf: str, locked: Mapping[str, float] | None = None) -> Cha
             of another type than revolute, continuous, prismatic or fixed, or no joint of a name
             in `locked` (positions [rad or m]).
     """
-    model = pinocchio_model(urdf, locked)
+    return _chain(urdf, tuple((locked or {}).items()))
+
+
+@lru_cache(maxsize=8)  # models of one arm differ in drives and friction
+def _chain(urdf: str, locked: tuple[tuple[str, float], ...]) -> Chain:
+    model = pinocchio_model(urdf, dict(locked))
     if model.njoints < 2:
         raise ModelError("the robot description has no revolute or prismatic joint")
     if model.njoints > 1 + MOST_JOINTS:

@@ -456,6 +456,7 @@ class _Trial:
         self.ripples = {ripple[0].orders: ripple for ripple in ripples if ripple}
         self._model = model
         self._models: dict[Columns, RobotModel] = {}
+        self._laws: dict[tuple[tuple[str, object], ...], tuple[FrictionLaw, ...]] = {}
         self._ready = ready
         self._known = stated
         self._samples: dict[Preprocessing, list[Samples]] = {}
@@ -476,7 +477,10 @@ class _Trial:
     def _columns(self, settings: Settings) -> Columns:
         entries = {**settings.friction}
         orders = tuple(entries.pop("ripple", ()))
-        return tuple(law.changed(entries) for law in self._model.friction.laws), orders
+        key = tuple(entries.items())
+        if key not in self._laws:
+            self._laws[key] = tuple(law.changed(entries) for law in self._model.friction.laws)
+        return self._laws[key], orders
 
     def factor_key(self, settings: Settings) -> tuple[Columns, Preprocessing]:
         """Return the key of the settings that change factors."""

@@ -603,18 +603,18 @@ def _score(tables: _Tables, added: Array, target: Array) -> _Score:
     usual = np.maximum(whole.squares(_solved(whole.weighted(np.ones(n)))), floor)
     weights = np.maximum(tables.rows.sum(axis=0), 1) / usual
     total = whole.weighted(weights)
+    of_folds = total - folds.weighted(weights)
     squares = np.zeros((blocks, n))
     coefficients = []
     for k in range(_FOLDS):
         fold_blocks = slice(k, None, _FOLDS)
-        fold = _Sums(*(part[k] for part in folds))
-        values = _solved(total - fold.weighted(weights))
+        values = _solved(of_folds[k])
         coefficients.append(values)
         squares[fold_blocks] = _Sums(*(part[fold_blocks] for part in sums)).squares(values)
     squares = np.where(tables.rows >= _FEWEST_ROWS, np.maximum(squares, floor / blocks), 0.0)
     fitted = np.maximum(whole.squares(_solved(total)), floor)
-    of_folds = np.array(coefficients)
-    return _Score(squares, fitted, torque, of_folds[:, :p], of_folds[:, p:])
+    fold_values = np.array(coefficients)
+    return _Score(squares, fitted, torque, fold_values[:, :p], fold_values[:, p:])
 
 
 class _Sums(NamedTuple):
@@ -625,9 +625,20 @@ class _Sums(NamedTuple):
     beside: Array  # the others, torque last (..., n, r + 1, r + 1)
 
     def weighted(self, weights: Array) -> Array:
-        """Return the sum (p + r + 1, p + r + 1) over the joints with weights (n,)."""
-        parameters, mixed, beside = (np.tensordot(weights, part, axes=1) for part in self)
-        return np.block([[parameters, mixed], [mixed.T, beside]])
+        """Return the sum (..., p + r + 1, p + r + 1) over the joints with weights (n,)."""
+        p, count = self.mixed.shape[-2:]
+        total = np.empty((*self.mixed.shape[:-3], p + count, p + count))
+        parameters, mixed, beside = (
+            (weights @ part.reshape(*part.shape[:-2], -1)).reshape(
+                *part.shape[:-3], *part.shape[-2:]
+            )
+            for part in self
+        )
+        total[..., :p, :p] = parameters
+        total[..., :p, p:] = mixed
+        total[..., p:, :p] = np.swapaxes(mixed, -1, -2)
+        total[..., p:, p:] = beside
+        return total
 
     def squares(self, values: Array) -> Array:
         """Return the sum of squared errors (..., n) of coefficients (p + r,)."""
