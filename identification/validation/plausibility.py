@@ -538,6 +538,8 @@ _MOVES: Final = 3.0  # multiples of the usual departure of a joint that moves
 _OFTEN: Final = 3  # departures by a whole step that an encoder does not repeat by chance
 _ON_PATH: Final = 0.25  # distance from the extrapolated path, as a share of the step
 _WHOLE: Final = 0.15  # tolerance of departures by whole steps of the motion, as a share of a step
+# Resolutions by which rounding moves a step: one at its ends, half of one in the speed beside it.
+_ROUNDED: Final = 1.5
 _NORMAL: Final = 1.4826  # standard deviation over median absolute value
 
 
@@ -567,8 +569,9 @@ def position_steps(recording: Recording, name: str = "the recording") -> Positio
     """Return lasting steps of the positions of a named recording, apart from those of its log."""
     jumps: list[PositionJump] = []
     logged: list[PositionJump] = []
+    rounded = _ROUNDED * np.array([_resolution(column) for column in recording.position.T])
     for parts in _pieces(recording):
-        steps = _steps_of(recording, parts, name)
+        steps = _steps_of(recording, parts, name, rounded)
         jumps += steps.jumps
         logged += steps.logged
     return PositionSteps(tuple(jumps), tuple(logged))
@@ -591,8 +594,10 @@ def _pieces(recording: Recording) -> Iterator[list[slice]]:
         yield parts
 
 
-def _steps_of(recording: Recording, parts: Sequence[slice], name: str) -> PositionSteps:
-    """Return the lasting steps within stretches of a recording."""
+def _steps_of(
+    recording: Recording, parts: Sequence[slice], name: str, rounded: Array
+) -> PositionSteps:
+    """Return the lasting steps within stretches of a recording, larger than by rounding (n,)."""
     time = recording.time
     position = recording.position
     pieces = [_departures(time[part], position[part]) for part in parts]
@@ -604,8 +609,9 @@ def _steps_of(recording: Recording, parts: Sequence[slice], name: str) -> Positi
     spread = _NORMAL * np.median(size, axis=0)
     usual = np.partition(size, -_USUAL, axis=0)[-_USUAL] if len(size) > 10 * _USUAL else 0.0
     least = np.maximum(np.maximum(_STANDS_OUT * spread, _BEYOND_USUAL * usual), _FASTEST * steps**2)
-    # Missing or repeated rows cause departures by whole steps of the motion.
-    motion_step = speed * steps
+    least = np.maximum(least, rounded)
+    # Missing or repeated rows cause departures by whole steps of the motion, also beside a gap.
+    motion_step = speed * np.median(steps)
     count = np.clip(
         np.rint(departure / np.where(motion_step == 0.0, np.inf, motion_step)), -1.0, GAP_STEPS
     )
@@ -631,7 +637,8 @@ def _steps_of(recording: Recording, parts: Sequence[slice], name: str) -> Positi
             name, recording.joint_names[joint], float(time[row] - time[0]), jump
         )
         by_log = every[k] or (by_whole_steps[k, joint] and often)
-        by_log |= _on_path(time, position[:, joint], row, jump)
+        tolerance = _ON_PATH * abs(jump) + float(rounded[joint])
+        by_log |= _on_path(time, position[:, joint], row, tolerance)
         (logged if by_log else jumps).append(position_jump)
     return PositionSteps(tuple(jumps), tuple(logged))
 
@@ -642,7 +649,13 @@ def _nearby(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(padded[:-2] | padded[1:-1] | padded[2:])
 
 
-def _on_path(time: Array, position: Array, row: int, jump: float) -> bool:
+def _resolution(position: Array) -> float:
+    """Return the smallest step of a position (m,), zero if it never moves."""
+    steps = np.abs(np.diff(position))
+    return float(np.min(steps, where=steps > 0.0, initial=np.inf)) if steps.any() else 0.0
+
+
+def _on_path(time: Array, position: Array, row: int, tolerance: float) -> bool:
     """Return whether a step to a row of a position (m,) begins or ends a frozen value, on its path.
 
     A sample that repeats the one before it exactly, while the joint moves, was not measured anew.
@@ -657,7 +670,7 @@ def _on_path(time: Array, position: Array, row: int, jump: float) -> bool:
     before = (position[first] - position[first - _BESIDE]) / (time[first] - time[first - _BESIDE])
     behind = (position[row + _BESIDE] - position[row]) / (time[row + _BESIDE] - time[row])
     expected = position[first] + 0.5 * (before + behind) * (time[row] - time[first])
-    return bool(abs(position[row] - expected) < _ON_PATH * abs(jump))
+    return bool(abs(position[row] - expected) < tolerance)
 
 
 def _departures(time: Array, position: Array) -> tuple[Array, Array, Array]:

@@ -6,6 +6,7 @@ All recordings are simulated, but for those of the folder of real recordings.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ from hil.importers import ColumnMap, Robot, import_log, import_rosbag2
 from hil.importers.proposal import proposed_map
 from hil.importers.recording import import_recording
 from hil.output_folder import SOURCES, folder_beside, sources_text
+from hil.recordings import open_recording
+from identification.validation.plausibility import position_jumps
 from tests.hil.simulated_logs import urdf_path, write_moving_log
 from tests.hil.simulated_logs import write_log as log
 from tests.hil.test_bag_kinds import WHOLE
@@ -387,6 +390,21 @@ def test_real_logs_are_read_as_by_their_maps(
     import_log(source, tmp_path / "b.mcap", robot=robot, columns=columns)
     first, second = (open_archive(tmp_path / f"{name}.mcap").columns for name in "ab")
     assert all(np.array_equal(first[name], second[name]) for name in second)
+
+
+@pytest.mark.parametrize("bits", [10, 11, 12, 13])
+def test_rounded_positions_of_a_real_log_that_repeats_samples_do_not_jump(
+    tmp_path: Path, shared_data: Path, bits: int
+) -> None:
+    folder = shared_data / "gen3"
+    archive = tmp_path / "b.mcap"
+    import_recording(
+        folder / "a_sensor.csv", archive, lambda _: Robot.from_urdf(folder / "robot.urdf")
+    )
+    recording = open_recording(archive)
+    resolution = np.ptp(recording.position, axis=0) / 2**bits
+    coarse = np.rint(recording.position / resolution) * resolution
+    assert position_jumps(replace(recording, position=coarse)) == []
 
 
 def test_a_real_bag_is_read_with_file_and_urdf_alone(tmp_path: Path, shared_data: Path) -> None:

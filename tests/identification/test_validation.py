@@ -685,6 +685,12 @@ class TestStepsOfTheLog:
         steps = position_steps(recording, "log.mcap")
         assert steps.logged and steps.jumps == ()
 
+    def test_a_repetition_whose_row_is_lost_is_of_the_log(self):
+        """The step across the gap is that of one row, not of two."""
+        repeating = slipping(uneven(1000.0), np.arange(500, 11500, 500))
+        lost = repeating.rows(np.delete(np.arange(len(repeating.time)), [6000, 8500]))
+        assert position_steps(lost).jumps == ()
+
     def test_an_encoder_that_slips_while_frozen_has_jumped(self):
         stalled = frozen(uneven(1000.0), slice(5000, 5030))
         steps = position_steps(with_jump(stalled, 0.2, slice(5030, None)))
