@@ -8,9 +8,9 @@ narrow bands of frequency; the residual of any filter is then a weighted sum of 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import pairwise, product
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -49,6 +49,8 @@ _SHORTEST: Final = 0.5 / LOWEST_BANDWIDTH  # s
 _TAPERED: Final = 0.5
 _UNEVEN: Final = 0.01  # of a step; rows at other times are interpolated
 _PADDING: Final = 1.0 / LOWEST_BANDWIDTH  # s of zeros, against the periodicity of the transform
+_LONGEST: Final = 120.0  # s; longer segments are transformed in parts, whose tables stay small
+_BESIDE: Final = 5  # signals beside the columns: load and torque, and three made of the torque
 
 # Gains and phases are constant in a band. A delay of 50 ms turns the phase by 3 mrad in the lowest
 # bands and by 0.15 rad at 30 Hz from its centre, where arms have hardly any torque.
@@ -184,17 +186,25 @@ class _Spectra:
         torque = samples.torque + load
         step = float(np.median(np.diff(time)))
         edges = _band_edges(0.5 / step)
-        segments = [_Segment.of(time, segment, edges) for segment in samples.segments]
+        segments = [_Segment.of(time, rows, edges) for rows in _parts(time, samples.segments)]
         count = np.sum([segment.bins for segment in segments], axis=0)
         bands = np.flatnonzero(count)
         total = np.sum([segment.bins * segment.frequency for segment in segments], axis=0)
-        joints = []
-        for joint, (block, columns) in enumerate(zip(*samples.regressor(model), strict=True)):
-            table = np.vstack([block.T, load[:, joint], torque[:, joint]])
-            gram = np.zeros((len(count), len(table) + 3, len(table) + 3))
-            rows = sum(segment.add(gram, table, usable[:, joint]) for segment in segments)
-            if rows > 0.0:
-                joints.append(_Joint.of(columns, gram[bands], rows))
+        columns = model.plan.columns
+        sizes = [len(used) + _BESIDE for used in columns]
+        grams = [np.zeros((len(count), size, size)) for size in sizes]
+        rows = np.zeros(model.n_joints)
+        for segment in segments:
+            part = segment.rows
+            blocks = model.regressor(*samples.motion.rows(part)[1:]).blocks
+            for joint, (gram, block) in enumerate(zip(grams, blocks, strict=True)):
+                table = np.vstack([block.T, load[part, joint], torque[part, joint]])
+                rows[joint] += segment.add(gram, table, usable[part, joint])
+        joints = [
+            _Joint.of(used, gram[bands], weight)
+            for used, gram, weight in zip(columns, grams, rows.tolist(), strict=True)
+            if weight > 0.0
+        ]
         frequency = total[bands] / count[bands]
         return cls(tuple(joints), frequency, delay, 0.25 / step, model.n_parameters)
 
@@ -338,18 +348,17 @@ class _Segment:
         runs = equal_runs(np.repeat(index, 2))
         return cls(time, rows, step, length, runs, bins, total / np.maximum(bins, 1))
 
-    def add(self, gram: Array, table: Array, usable: NDArray[np.bool_]) -> float:
-        """Add the spectra of a joint's table to its sums, in place.
+    def add(self, gram: Array, signals: Array, usable: NDArray[np.bool_]) -> float:
+        """Add the spectra of a joint's signals to its sums, in place.
 
-        The table (c + 2, m) has the torque last. The sums (B, c + 5, c + 5) are of its rows, the
+        The signals (c + 2, m) have the torque last. The sums (B, c + 5, c + 5) are of them, the
         torque turned by -90 degrees, the torque in the window's slope, and that turned. Returned is
         the sum of the squared window.
         """
-        signals = table[:, self.rows]
-        windowed = np.zeros((len(table) + 1, len(self.time)))
+        windowed = np.zeros((len(signals) + 1, len(self.time)))
         levels = []
         rows = 0.0
-        for start, stop in _stretches(self.time, usable[self.rows]):
+        for start, stop in _stretches(self.time, usable):
             window = _window(stop - start + 2)
             slope = np.gradient(window, self.step)[1:-1]
             window = window[1:-1]
@@ -381,6 +390,15 @@ class _Segment:
         if np.abs(self.time - even).max() <= _UNEVEN * step:
             return signals
         return np.array([np.interp(even, self.time, signal) for signal in signals])
+
+
+def _parts(time: Array, segments: Iterable[slice]) -> Iterator[slice]:
+    """Yield segments of rows, long ones in parts of equal length."""
+    for segment in segments:
+        duration = float(time[segment.stop - 1] - time[segment.start])
+        count = max(1, math.ceil(duration / _LONGEST))
+        edges = np.linspace(segment.start, segment.stop, count + 1).round().astype(int).tolist()
+        yield from (slice(start, stop) for start, stop in pairwise(edges))
 
 
 def _window(length: int) -> Array:

@@ -542,6 +542,7 @@ class _Trial:
             better = _clearly_better(segments[k], segments[0], share, certainty)
             if better and (possible is None or possible(candidates[k])):
                 chosen = k
+        self._retain_samples(candidates[chosen])
         described = _differences([_description(self.model(each), each) for each in candidates])
         return _Decision(candidates[chosen], Choice(name, described, tuple(means), chosen))
 
@@ -685,6 +686,12 @@ class _Trial:
         reduced = self._reduced(without)
         values = self._estimator(without, reduced)(reduced.folds.fitted)
         return [each.with_load(self.model(without), values) for each in samples]
+
+    def _retain_samples(self, settings: Settings) -> None:
+        """Give up the samples of all other settings: those of a long recording are large."""
+        how = settings.preprocessing
+        self._samples = {key: value for key, value in self._samples.items() if key == how}
+        self._directed = {key: value for key, value in self._directed.items() if key[0] == how}
 
     def _reduced(self, settings: Settings) -> _Reduced:
         key = self.factor_key(settings)

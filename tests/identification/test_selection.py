@@ -17,6 +17,7 @@ from identification.factor.factor import Factor, estimate
 from identification.model.elements import TorqueRipple
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
+from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.selection.essential import CutRule, choose_essential, eliminate
 from identification.selection.inner_prediction import (
@@ -547,6 +548,23 @@ class TestPossibleLowPasses:
         (best,) = self.of_kind(possible_low_passes(recording, MODEL), shape.causal)
         assert best.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.03)
         assert best.torque_shape == shape
+
+    @pytest.mark.parametrize("shape", [LowPassShape(2), LowPassShape(2, causal=True)], ids=str)
+    def test_parts_of_a_long_recording_have_the_low_pass_of_the_whole(self, shape, monkeypatch):
+        """A table of the regressor is of one part at most."""
+        monkeypatch.setattr("identification.estimators.torque_channel._LONGEST", 6.0)
+        rows = []
+        evaluate = RegressorPlan.evaluate
+
+        def counted(self, q, *others):
+            rows.append(len(q))
+            return evaluate(self, q, *others)
+
+        monkeypatch.setattr(RegressorPlan, "evaluate", counted)
+        recording = a_recording(noise=0.5 * NOISE, duration=20.0, shape=shape)
+        (best,) = self.of_kind(possible_low_passes(recording, MODEL), shape.causal)
+        assert best.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.05)
+        assert max(rows) <= 6.0 * RATE
 
     @pytest.mark.parametrize("rate", [1000.0, 80.0])
     def test_the_rate_does_not_matter(self, rate):
