@@ -56,6 +56,7 @@ _UNSTATED_SPEED: Final = 2.0  # rad/s
 _FASTEST: Final = 20.0  # rad/s that a URDF may state
 _ACCELERATION: Final = 4.0  # 1/s, largest acceleration over largest speed
 _SMOOTH: Final = 20.0  # Hz, above which no arm follows
+_BESIDE: Final = 0.5  # s before and after a log
 _POSTURES: Final = 60  # that give each joint's scale of torque
 _POSITION_NOISE: Final = 1e-5  # rad
 _VELOCITY_NOISE: Final = 0.003  # of the largest speed
@@ -368,9 +369,13 @@ def drawn(seed: int) -> Drawn:
     fine = 8 if logger.rate <= 250.0 else 1
 
     def log(kind: str, duration: float, still: Sequence[int], begin: float) -> JointLog:
-        time = np.arange(round(duration * logger.rate * fine)) / (logger.rate * fine)
+        # The filters of motion and torque swing at the ends, which are no part of the log.
+        beside = round(_BESIDE * logger.rate)
+        count = round(duration * logger.rate)
+        time = np.arange((count + 2 * beside) * fine) / (logger.rate * fine)
         motion = drawn_motion(random, arm, kind, time, still)
-        return logged(random, arm, motion, time, logger, begin)
+        whole = logged(random, arm, motion, time, logger, begin)
+        return whole.rows(slice(beside, beside + count))
 
     log_fitted = log(kind, duration, still, 0.0)
     case = f"{name}, {kind}, {duration:.3g} s, {logger.rate:g} Hz, {standing} stand"

@@ -205,27 +205,29 @@ def spread(information: Array, scores: Array, root: Array, left: Array | None = 
     Of information (B, p, p), with sum A, and scores (B, p) of blocks; S = root (p, k), and S L' is
     the inverse of A on what is determined, with L = left (p, k), by default S.
     """
+    symmetric = left is None
     left = root if left is None else left
-    return leverage_corrected(_shares(information, root, left), scores @ left) @ root.T
+    shares = _shares(information, root, left)
+    return leverage_corrected(shares, scores @ left, symmetric=symmetric) @ root.T
 
 
-def leverage_corrected(shares: Array, scores: Array) -> Array:
+def leverage_corrected(shares: Array, scores: Array, *, symmetric: bool = True) -> Array:
     """Return rows (R, k), R >= B, whose outer products sum to the covariance for unit information.
 
     Scores (B, k) times (1 - H_b)^-1, with H = `shares` (B, k, k). From `_LOW_LEVERAGE` to
     `_HIGH_LEVERAGE` the residual of the block, which vanishes, is replaced by the variance of white
     residuals, ``h``, times the design effect of the rest, at least one.
     """
-    corrected, dependent = _regular(shares, scores)
+    corrected, dependent = _regular(shares, scores, symmetric)
     regular = np.ones(len(scores), dtype=np.bool_)
     regular[dependent] = False
     squares = float((scores * corrected).sum())  # zero where dependent
     leverage = float(np.einsum("bii,b->", shares, regular.astype(np.float64)))
     rows = [corrected[regular]]
     added = []
-    identity = np.eye(scores.shape[1])
+    factors = _without_by_eigenvectors if symmetric else _without_by_singular_vectors
     for b in dependent:
-        u, singular, vt = np.linalg.svd(identity - shares[b])
+        u, singular, vt = factors(shares[b])
         trusted = np.clip(
             (singular - (1.0 - _HIGH_LEVERAGE)) / (_HIGH_LEVERAGE - _LOW_LEVERAGE), 0.0, 1.0
         )
@@ -239,9 +241,22 @@ def leverage_corrected(shares: Array, scores: Array) -> Array:
     return np.concatenate([*rows, *(np.sqrt(effect) * vectors for vectors in added)])
 
 
-def _regular(shares: Array, scores: Array) -> tuple[Array, list[int]]:
+def _without_by_singular_vectors(share: Array) -> tuple[Array, Array, Array]:
+    """Return u, s and v' with ``1 - H = u s v'`` of a share H (k, k)."""
+    u, singular, vt = np.linalg.svd(np.eye(len(share)) - share)
+    return u, singular, vt
+
+
+def _without_by_eigenvectors(share: Array) -> tuple[Array, Array, Array]:
+    """Return the same of a symmetric share, in half the time."""
+    eigenvalues, vectors = np.linalg.eigh(share)
+    return vectors * np.sign(1.0 - eigenvalues), np.abs(1.0 - eigenvalues), vectors.T
+
+
+def _regular(shares: Array, scores: Array, symmetric: bool) -> tuple[Array, list[int]]:
     """Return corrected scores (B, k), zero for blocks of high leverage, and those blocks."""
     lapack = scipy.linalg.lapack
+    solve_without = lapack.dposv if symmetric else lapack.dgesv  # the solution is last but one
     k = scores.shape[1]
     corrected = np.zeros_like(scores)
     dependent = []
@@ -258,7 +273,7 @@ def _regular(shares: Array, scores: Array) -> tuple[Array, list[int]]:
                 continue
         np.negative(share, out=work)
         work[diagonal, diagonal] += 1.0
-        corrected[b] = lapack.dgesv(work, score, overwrite_a=1)[2]
+        corrected[b] = solve_without(work, score, overwrite_a=1)[-2]
     return corrected, dependent
 
 

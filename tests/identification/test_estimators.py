@@ -185,6 +185,20 @@ class TestBlocks:
         rows = spread(a_blocks, scores, solve(phase.weighted(weights)).root)
         np.testing.assert_allclose(rows.T @ rows, moved.T @ moved, rtol=1e-9)
 
+    @pytest.mark.parametrize("largest", [0.1, 0.7, 1.0])
+    def test_symmetric_shares_have_the_covariance_of_general_ones(self, largest):
+        """Of blocks of low leverage, and one of a high one that has a direction for itself."""
+        rng = np.random.default_rng(11)
+        rows = rng.standard_normal((30, 4, 5))
+        rows[:, :, -1] *= np.sqrt(1.0 - largest)
+        rows[7, 0, -1] = 20.0 * np.sqrt(largest)
+        information = np.swapaxes(rows, 1, 2) @ rows
+        scores = (np.swapaxes(rows, 1, 2) @ rng.standard_normal((30, 4, 1)))[..., 0]
+        root = solve(NormalEquations(information.sum(axis=0), scores.sum(axis=0))).root
+        symmetric = spread(information, scores, root)
+        general = spread(information, scores, root, left=root)
+        np.testing.assert_allclose(symmetric.T @ symmetric, general.T @ general, rtol=1e-9)
+
     @pytest.mark.parametrize("shared", [0.0, 0.09])
     def test_correlation_of_neighbouring_blocks_counts(self, shared):
         """Mean of blocks that are correlated with the next one."""
