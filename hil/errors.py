@@ -118,6 +118,10 @@ class SourceError(InputError):
     """A foreign recording that cannot be imported."""
 
 
+class UnrecordedJointError(SourceError):
+    """A foreign recording without a joint of its robot."""
+
+
 class OutputError(HilError):
     """A folder that cannot be written to; nothing in it was changed."""
 

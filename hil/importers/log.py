@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Samples
-from hil.errors import SourceError
+from hil.errors import SourceError, UnrecordedJointError
 from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.column_map import HOLE, ColumnMap, Quantity, TimeColumn
 from hil.importers.findings import are_degrees, has_degrees_per_second
@@ -371,7 +371,7 @@ class _Log:
         missing = [name for name in chosen if not has(name)]
         if missing:
             joint = chosen.index(missing[0])
-            raise SourceError(
+            raise UnrecordedJointError(
                 self.path,
                 f"there is no {what[:-1]} {missing[0]!r} for {self.joints[joint]}, joint "
                 f"{joint + 1} of {count}; there are {', '.join(available) or 'none'}",
@@ -401,7 +401,8 @@ class _Log:
             along = "rows" if matrix.shape[0] < matrix.shape[1] else "columns"
         upright = matrix.T if along == "rows" else matrix
         if upright.shape[1] != count:
-            raise SourceError(
+            kind = UnrecordedJointError if upright.shape[1] < count else SourceError
+            raise kind(
                 path,
                 f"{name} has the shape {matrix.shape}, joints along its {along}, and there are "
                 f"{count} joints: {', '.join(self.joints)}",
@@ -427,7 +428,7 @@ class _Log:
         """Return the column of the log of each joint of the robot."""
         missing = [name for name in robot.joint_names if name not in self.joints]
         if missing or len(set(self.joints)) < len(self.joints):
-            raise SourceError(
+            raise (UnrecordedJointError if missing else SourceError)(
                 self.path,
                 f"the map names the joints {', '.join(self.joints)}",
                 field="joints",

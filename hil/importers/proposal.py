@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NoReturn
 
-from hil.errors import SourceError
+from hil.errors import SourceError, UnrecordedJointError
 from hil.importers.channels import CHANNEL_NAMES, Channel, channels_of, kind_of
 from hil.importers.column_map import ColumnMap, Format, ready_map, ready_maps
 from hil.importers.robot import Robot
@@ -325,16 +325,18 @@ class _Search:
             f"{count} {'channel is' if count == 1 else 'channels are'} named as {kind} "
             f"({group.label}), and the URDF has {len(self._joints)} joints: {joints}"
         )
+        otherwise = "or name the URDF's joint of each channel in joints of a map (--map map.toml)"
         if count < len(self._joints):
             last = " ".join(f"--locked {name}" for name in self._joints[count:])
             remedy = f"fix the joints that were not recorded, for the last ones with {last}"
-        else:
-            some = ",".join(group.names[: len(self._joints)])
-            remedy = "give the URDF of this arm"
-            if len(group.names) == count:
-                remedy += f", or the channels of its joints, such as --columns '{kind}={some}'"
-        remedy += "; or name the URDF's joint of each channel in joints of a map (--map map.toml)"
-        raise SourceError(self._log, problem, field=kind, remedy=remedy)
+            raise UnrecordedJointError(
+                self._log, problem, field=kind, remedy=f"{remedy}; {otherwise}"
+            )
+        some = ",".join(group.names[: len(self._joints)])
+        remedy = "give the URDF of this arm"
+        if len(group.names) == count:
+            remedy += f", or the channels of its joints, such as --columns '{kind}={some}'"
+        raise SourceError(self._log, problem, field=kind, remedy=f"{remedy}; {otherwise}")
 
     def _refuse_missing(self, missing: Sequence[str]) -> NoReturn:
         """Raise SourceError with the quantities without a channel, and what would name them."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 from hil.archive import open_archive
-from hil.errors import ArchiveError, NotAnArchiveError, SourceError
+from hil.errors import ArchiveError, NotAnArchiveError, SourceError, UnrecordedJointError
 from hil.importers.bag_map import BagMap
 from hil.importers.bags import open_bag
 from hil.importers.channels import channels_of
@@ -111,12 +111,77 @@ def import_recording(
 ) -> ImportedRecording:
     """Import a log or a bag; what no column map states is concluded from names and units.
 
-    `held_joints` and the following are those of :func:`hil.importers.import_log`.
+    Joints of a gripper that were not recorded are fixed. `held_joints` and the following are those
+    of :func:`hil.importers.import_log`.
 
     Raises:
         SourceError: it cannot be read, or its channels leave a quantity open.
         ArchiveWriteError: the archive exists or cannot be written.
     """
+    read = partial(
+        _imported,
+        source,
+        output,
+        options=options,
+        held_joints=held_joints,
+        use=use,
+        coupled=coupled,
+        force=force,
+    )
+    try:
+        return read(robot_of)
+    except UnrecordedJointError:
+        robots = _WithoutGripper(robot_of, source, options)
+        try:
+            imported = read(robots)
+        except SourceError:
+            imported = None  # of the arm with its gripper the remedy is right
+        if imported is None or robots.line is None:
+            raise
+    return replace(imported, lines=(*imported.lines, robots.line))
+
+
+class _WithoutGripper:
+    """Robots whose gripper's joints are fixed, but those that a bag has."""
+
+    def __init__(self, robot_of: RobotOf, source: Path, options: ImportOptions) -> None:
+        self._robot_of = robot_of
+        self._source = source
+        self._options = options
+        self.line: str | None = None  #: what was fixed
+
+    def __call__(self, recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
+        robot = self._robot_of(recorded)
+        arm = robot.without_gripper(self._recorded())
+        fixed = [name for name in robot.joint_names if name not in arm.joint_names]
+        if fixed:
+            names = ", ".join(fixed)
+            places = ", ".join(f"{arm.locked[name]:.3g}" for name in fixed)
+            self.line = f"{names}: fixed, at {places} (rad or m), as of an unrecorded gripper"
+        return arm
+
+    def _recorded(self) -> tuple[str, ...]:
+        """Return the joints of a bag; none of a log, which has too few channels for them."""
+        options = self._options
+        if not has_joint_states(self._source) or _read_as_log(self._source, options):
+            return ()
+        stated = None if options.columns is None else BagMap.load(options.columns)
+        bag = stated or BagMap(topic=options.topic, rename=options.joint_names)
+        return recorded_joints(self._source, bag.topic, bag.rename)
+
+
+def _imported(
+    source: Path,
+    output: Path,
+    robot_of: RobotOf,
+    *,
+    options: ImportOptions,
+    held_joints: Sequence[str],
+    use: Use,
+    coupled: bool,
+    force: bool,
+) -> ImportedRecording:
+    """Import with the robot as it is described; see :func:`import_recording`."""
     stated = None if options.columns is None else BagMap.load(options.columns)
     if stated is not None:
         return _import_bag(source, output, robot_of, stated, options, held_joints, use, force=force)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hil.archive import Findings, Samples, write_samples
 from hil.cell import Cell
+from hil.cell.gripper import gripper_joints
 from hil.cell.text import urdf_limits, with_values
 from hil.errors import ArchiveWriteError, SourceError
 from hil.files import file_digest, replace_file
@@ -134,6 +135,17 @@ class Robot:
         values = {"robot.gravity": [float(value) for value in gravity]}
         return self._checked(with_values(self.cell, values), self.urdf, Path("cell.toml"))
 
+    def without_gripper(self, recorded: Collection[str] = ()) -> Robot:
+        """Return this robot with the joints of a gripper fixed, but those that were recorded."""
+        fingers = [
+            name for name in gripper_joints(self.urdf, self.joint_names) if name not in recorded
+        ]
+        if not fingers:
+            return self
+        held = {**self.locked, **_places(self.urdf, fingers)}
+        text = with_values(self.cell, {"robot.locked": _writable_names(held)})
+        return self._checked(text, self.urdf, Path("cell.toml"))
+
     @classmethod
     def _checked(cls, text: str, urdf: str, path: Path) -> Robot:
         cell = Cell.from_texts(text, urdf, path)
@@ -181,12 +193,17 @@ def _held(
             "a log, --rename RECORDED=URDF of a bag)"
         )
         raise SourceError(path, problem, field="--lock-others", remedy=remedy)
+    unrecorded = [name for name in names if name not in recorded]
+    return _places(urdf, unrecorded) | {**locked}
+
+
+def _places(urdf: str, names: Sequence[str]) -> dict[str, float]:
+    """Return zero for each joint, or the middle of its range if that excludes zero."""
     limits = urdf_limits(urdf, names)
-    unrecorded = {
+    return {
         name: 0.0 if low <= 0.0 <= high else 0.5 * (low + high)
         for name, low, high in zip(names, limits.lower.tolist(), limits.upper.tolist(), strict=True)
     }
-    return {name: at for name, at in unrecorded.items() if name not in recorded} | {**locked}
 
 
 def _writable(name: str) -> str:

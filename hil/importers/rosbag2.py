@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Samples
-from hil.errors import SourceError
+from hil.errors import SourceError, UnrecordedJointError
 from hil.importers.bags import Bag, BagMessage, open_bag
 from hil.importers.mcap_messages import Topic
 from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
@@ -242,7 +242,7 @@ class _States:
         if missing:
             problem = f"joint {missing[0]} was not recorded; recorded are {recorded}"
             remedy = f"give a URDF with the recorded names, or {NOT_RECORDED}"
-            raise SourceError(self._source, problem, field="joints", remedy=remedy)
+            raise UnrecordedJointError(self._source, problem, field="joints", remedy=remedy)
         whole = [part for part in parts if len(part.joints) == len(self._joints)]
         if whole:
             others = sum(len(part.numbers) for part in parts) - len(whole[0].numbers)

@@ -23,6 +23,7 @@ from tomlkit.items import Table
 
 from drivers.drive_train import WRIST_AXES
 from hil.cell.errors import UNKNOWN, WHERE, models_of
+from hil.cell.gripper import gripper_joints, links_of
 from hil.cell.schema import CellFile
 from hil.cell.text import urdf_limits
 from hil.errors import InputError
@@ -371,37 +372,12 @@ def _joints_between(path: Path, text: str, base: str | None, tip: str | None) ->
     return list(joints)
 
 
-_GRIPPER: Final = re.compile(
-    r"finger|gripper|hand_|_hand|thumb|knuckle|claw|jaw|pinky|palm"
-    r"|(?:^|_)(?:index|middle|ring|little)(?:_|$)",
-    re.IGNORECASE,
-)
 _MOST_NAMES: Final = 12
-
-
-def _links_of(text: str) -> dict[str, tuple[str, str]]:
-    """Return the links that each joint connects, parent and child."""
-    return {
-        joint.get("name", ""): (parent.get("link", ""), child.get("link", ""))
-        for joint in urdf_tree(text).findall("joint")
-        for parent in joint.findall("parent")
-        for child in joint.findall("child")
-    }
-
-
-def _of_gripper(text: str, chain: Chain) -> list[str]:
-    """Return the joints that are of a gripper or hand by their names or those of both links."""
-    links = _links_of(text)
-    return [
-        name
-        for name in chain.joint_names
-        if _GRIPPER.search(name) or all(_GRIPPER.search(link) for link in links[name])
-    ]
 
 
 def _note_on_gripper(fingers: Sequence[str], chain: Chain, text: str) -> str:
     """Return a note on joints that look like those of a gripper."""
-    links = _links_of(text)
+    links = links_of(text)
     parents = dict(zip(chain.joint_names, chain.parents.tolist(), strict=True))
     wrists = {
         links[chain.joint_names[parents[name]]][1]
@@ -423,12 +399,12 @@ def _note_on_gripper(fingers: Sequence[str], chain: Chain, text: str) -> str:
 def _note_on_branches(text: str, chain: Chain) -> list[str]:
     """Return notes on a gripper and on further arms among the joints that move."""
     notes = []
-    fingers = _of_gripper(text, chain)
+    fingers = gripper_joints(text, chain.joint_names)
     if fingers:
         notes.append(_note_on_gripper(fingers, chain, text))
     arm = [k for k, name in enumerate(chain.joint_names) if name not in fingers]
     inner = {int(chain.parents[k]) for k in arm}
-    links = _links_of(text)
+    links = links_of(text)
     ends = [links[chain.joint_names[k]][1] for k in arm if k not in inner]
     if len(ends) > 1:
         notes.append(
@@ -440,7 +416,7 @@ def _note_on_branches(text: str, chain: Chain) -> list[str]:
 
 def _lifting(text: str, chain: Chain) -> list[str]:
     """Return the prismatic joints along gravity with all joints at zero, without grippers'."""
-    gripper = _of_gripper(text, chain)
+    gripper = gripper_joints(text, chain.joint_names)
     rotations = list[Array]()
     lifting = []
     for joint, name in enumerate(chain.joint_names):

@@ -18,9 +18,10 @@ from typer.testing import CliRunner
 from hil.archive import open_archive
 from hil.cli import app
 from hil.errors import InputError, SourceError
+from hil.identify.sources import cell_of
 from hil.importers import ColumnMap, Robot, import_log, import_rosbag2
 from hil.importers.proposal import proposed_map
-from hil.importers.recording import import_recording
+from hil.importers.recording import ImportOptions, import_recording
 from hil.output_folder import SOURCES, folder_beside, sources_text
 from hil.recordings import open_recording
 from identification.validation.plausibility import position_jumps
@@ -371,6 +372,59 @@ class TestOutputFolder:
         result = hil("identify", source, "--urdf", urdf, "--output", tmp_path)
         assert "is the recording itself" in str(result.exception)
         assert source.read_bytes() == content
+
+
+FINGER = """<link name="palm"/><joint name="palm_mount" type="fixed"><parent link="c"/>
+<child link="palm"/></joint><link name="finger"><inertial><mass value="0.02"/>
+<inertia ixx="1e-6" iyy="1e-6" izz="1e-6" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="finger_joint" type="prismatic"><parent link="palm"/><child link="finger"/>
+<axis xyz="1 0 0"/><limit lower="0.01" upper="0.05" velocity="0.1" effort="20"/></joint></robot>"""
+
+
+class TestGripperThatWasNotRecorded:
+    """The URDF of an arm with its gripper, and a log of the arm."""
+
+    @pytest.fixture
+    def urdf(self, tmp_path: Path) -> Path:
+        path = tmp_path / "gripping.urdf"
+        path.write_text(URDF.replace("</robot>", FINGER.replace('"c"', f'"l{JOINTS[-1]}"')))
+        return path
+
+    def test_its_joints_are_fixed_within_their_range_and_said(
+        self, tmp_path: Path, urdf: Path
+    ) -> None:
+        path = log(tmp_path / "a.csv", ["t", "q{}", "tau{}"], TIME, POSITION, TORQUE)
+        imported = import_recording(path, tmp_path / "a.mcap", lambda _: Robot.from_urdf(urdf))
+        locked = cell_of(open_archive(imported.archive)).file.robot.locked
+        assert locked == {"finger_joint": pytest.approx(0.03)}
+        assert (
+            "finger_joint: fixed, at 0.03 (rad or m), as of an unrecorded gripper" in imported.lines
+        )
+
+    def test_the_map_reads_the_log_again(self, tmp_path: Path, urdf: Path) -> None:
+        path = log(tmp_path / "a.csv", ["t", "q{}", "tau{}"], TIME, POSITION, TORQUE)
+        robot = Robot.from_urdf(urdf)
+        first = import_recording(path, tmp_path / "a.mcap", lambda _: robot)
+        (tmp_path / "map.toml").write_text(first.text or "")
+        options = ImportOptions(tmp_path / "map.toml")
+        import_recording(path, tmp_path / "b.mcap", lambda _: robot, options)
+        read, again = (open_archive(tmp_path / f"{name}.mcap").columns for name in "ab")
+        assert all(np.array_equal(read[name], again[name]) for name in again)
+
+    def test_a_joint_of_the_arm_is_never_fixed(self, tmp_path: Path, urdf: Path) -> None:
+        path = log(tmp_path / "a.csv", ["t", "q{}", "tau{}"], TIME, POSITION[:, :2], TORQUE[:, :2])
+        with pytest.raises(SourceError, match="2 channels are named as position"):
+            import_recording(path, tmp_path / "a.mcap", lambda _: Robot.from_urdf(urdf))
+
+    def test_a_finger_that_a_bag_has_is_not_fixed(self, tmp_path: Path, urdf: Path) -> None:
+        names = (*JOINTS, "finger_joint")
+        both = [state(9 + 10**7 * k, [0.0] * 4, names=names, effort=[1.0] * 4) for k in range(9)]
+        arm = [state(9 + 10**7 * k, [0.0] * 3, names=JOINTS, effort=[1.0] * 3) for k in range(9)]
+        robot = Robot.from_urdf(urdf)
+        for name, messages, joints in (("both", both, 4), ("arm", arm, 3)):
+            source = bag(tmp_path / f"{name}.db3", {"/joint_states": (STATE, messages)})
+            imported = import_recording(source, tmp_path / f"{name}.mcap", lambda _: robot)
+            assert open_archive(imported.archive).columns["position"].shape[1] == joints
 
 
 REAL: Sequence[tuple[str, str]] = [
