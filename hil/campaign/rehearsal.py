@@ -390,7 +390,7 @@ def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> 
 
 
 _CORRECT = (
-    "correct what it names in [limits] or [drive_train] of the cell file, or what the simulated arm"
+    "correct the cause, by [limits] or [drive_train] of the cell file, or what the simulated arm"
     " is made from ([nominal], [controller], [simulation])"
 )
 

@@ -213,7 +213,7 @@ def test_a_motion_beyond_a_speed_limit_is_no_completed_one(designed: Campaign) -
 def test_a_refused_motion_names_the_tables_to_correct(designed: Campaign) -> None:
     plain = CampaignFolder(designed.folder.rehearsed / "plain")
     sentence = of_motions(designed.cell, plain, "plain", "move 2 was refused").sentence
-    assert "plain: move 2 was refused: correct what it names in [limits]" in sentence
+    assert "plain: move 2 was refused: correct the cause, by [limits]" in sentence
     for table in ("[drive_train]", "[nominal]", "[controller]", "[simulation]"):
         assert table in sentence
     assert "`hil plot " in sentence

@@ -439,7 +439,7 @@ def test_piped_output_has_messages_and_no_progress(capsys: pytest.CaptureFixture
     assert (printed.out, printed.err) == ("the cell is open\n", "")
 
 
-def test_progress_goes_to_standard_error_only_if_that_is_a_terminal(
+def test_progress_is_shown_on_a_terminal_only(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """`hil ... > file` at a terminal: messages in the file, progress on the terminal."""

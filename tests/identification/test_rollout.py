@@ -184,7 +184,7 @@ class TestServo:
         assert servo.kp == pytest.approx(kp, rel=0.05)
         assert servo.kd == pytest.approx(kd, rel=0.2)
 
-    def test_a_torque_that_opposes_the_error_is_named_by_its_joint(self) -> None:
+    def test_a_torque_opposing_the_error_names_its_joint(self) -> None:
         opposed = self.stretches(np.array([2000.0, -500.0]), np.array([40.0, 0.0]), 0.010)
         with pytest.raises(NoServoError, match="the torque of elbow does not grow with"):
             identify_servo(opposed, 0.005, ("shoulder", "elbow"))
