@@ -84,9 +84,10 @@ def _parameters(start: Driven, best: Driven) -> list[PolishedParameter]:
     if old is None or new is None:
         add("delay of the torque", "s", start.motion.delay, best.motion.delay)
         return rows
-    for name, unit in (("kp", "N·m/rad"), ("kd", "N·m·s/rad")):
+    for name, turning, along in (("kp", "N·m/rad", "N/m"), ("kd", "N·m·s/rad", "N·s/m")):
         gains = getattr(old, name).tolist(), getattr(new, name).tolist()
         for joint, (before, after) in enumerate(zip(*gains, strict=True)):
+            unit = turning if model.chain.revolute[joint] else along
             add(f"{name}_{joint + 1}", unit, before, after)
     add("delay of the servo", "s", old.delay, new.delay)
     return rows

@@ -37,6 +37,12 @@ def say(text: str, *, err: bool = False) -> None:
     put(Console(stderr=err), text)
 
 
+def progress_console() -> Console | None:
+    """Return the terminal that shows progress: standard output, else standard error, else None."""
+    consoles = (Console(), Console(stderr=True))
+    return next((console for console in consoles if console.is_terminal), None)
+
+
 class Task:
     """Progress of a task: shows how much is done, and what is being done."""
 
@@ -54,7 +60,10 @@ class Reporter(Protocol):
     """Receiver of messages and progress of long work."""
 
     def say(self, text: str) -> None:
-        """Report a line."""
+        """Report a line of the result."""
+
+    def step(self, text: str) -> None:
+        """Report what is being done now: progress in words."""
 
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
@@ -66,6 +75,10 @@ class Silent:
 
     def say(self, text: str) -> None:
         """Drop the line."""
+
+    def step(self, text: str) -> None:
+        """Report the step as a line."""
+        self.say(text)
 
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
@@ -98,6 +111,9 @@ class LineReporter(Silent):
 class Messages(LineReporter):
     """Messages without progress: for output that is piped or redirected."""
 
+    def step(self, text: str) -> None:
+        """Report nothing."""
+
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
         """Report nothing: the result is what the output is for."""
@@ -106,14 +122,19 @@ class Messages(LineReporter):
 
 
 class Bar:
-    """rich progress bars."""
+    """rich progress bars on a terminal; `output` receives the messages, by default it too."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, output: Console | None = None) -> None:
         self._console = console
+        self._output = output or console
 
     def say(self, text: str) -> None:
+        """Print the line, on a terminal above the bar."""
+        put(self._output, text)
+
+    def step(self, text: str) -> None:
         """Print the line above the bar."""
-        self._console.print(printable(text), highlight=False, markup=False)
+        put(self._console, text)
 
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
@@ -150,11 +171,13 @@ class _WithNote(Progress):
 
 
 def reporter(*, quiet: bool = False) -> Reporter:
-    """Return a reporter: bars on a terminal, messages only elsewhere, nothing if `quiet`."""
+    """Return a reporter, silent if `quiet`: messages on standard output, progress on a terminal."""
     if quiet:
         return Silent()
-    console = Console()
-    return Bar(console) if console.is_terminal else Messages()
+    console = progress_console()
+    if console is None:
+        return Messages()
+    return Bar(console, Console() if console.stderr else console)
 
 
 def say_at_once(text: str, descriptor: int = 1) -> None:

@@ -181,10 +181,16 @@ def _servo_of(model: IdentifiedModel, options: RolloutOptions) -> tuple[Servo | 
         return servo, f"a servo as stated, delay {1e3 * servo.delay:.3g} ms"
     fitted = with_commands(prepared.sources.training, prepared.fitted)
     stretches, _ = recorded_stretches(arm.model, fitted, STEP)
-    servo = identify_servo(stretches, STEP)
-    gains = ", ".join(f"{kp:.3g}" for kp in servo.kp)
+    servo = identify_servo(stretches, STEP, arm.model.joint_names)
+    gains = "; ".join(
+        f"{joint} {kp:.3g} {'N·m/rad' if turns else 'N/m'}"
+        for joint, kp, turns in zip(
+            arm.model.joint_names, servo.kp, arm.model.chain.revolute, strict=True
+        )
+    )
     return servo, (
-        f"a servo identified from the fitted motion (kp {gains}; delay {1e3 * servo.delay:.3g} ms)"
+        f"a servo identified from the fitted motion (gains {gains}; delay"
+        f" {1e3 * servo.delay:.3g} ms)"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -80,8 +81,8 @@ class ServoResult(Frozen):
         )
         return f"{text} Not determined: {', '.join(unknown)}." if unknown else text
 
-    def lines(self) -> list[str]:
-        """Return a row for each joint."""
+    def lines(self, joint_names: Sequence[str]) -> list[str]:
+        """Return a row for each joint, with the number that ends its parameters' names."""
         by_joint: dict[str, dict[str, ServoParameter]] = {}
         for parameter in self.parameters:
             name, _, joint = parameter.name.partition("_")
@@ -89,10 +90,12 @@ class ServoResult(Frozen):
         names = list(next(iter(by_joint.values())))
         first = next(iter(by_joint.values()))
         heads = [f"{name} [{first[name].unit}]" for name in names]
-        rows = ["joint" + "".join(f"{head:>20}" for head in heads)]
-        for joint, row in by_joint.items():
+        labels = [f"{number} {name}" for number, name in enumerate(joint_names, 1)]
+        width = max(map(len, ["joint", *labels]))
+        rows = [f"{'joint':{width}}" + "".join(f"{head:>20}" for head in heads)]
+        for label, row in zip(labels, by_joint.values(), strict=True):
             figures = "".join(f"{_with_deviation(row[name]):>20}" for name in names)
-            rows.append(f"{joint:5}{figures}")
+            rows.append(f"{label:{width}}{figures}")
         spread = "" if self.delay_deviation is None else f" ± {_milli(self.delay_deviation)}"
         return [*rows, f"delay of the command: {_milli(self.delay)}{spread} ms", self.message]
 
@@ -216,7 +219,7 @@ class RolloutResult(Frozen):
         lines = [
             f"{self.windows} windows of {self.cell}, driven by {self.drive}",
             *self.notes,
-            *([] if self.servo is None else self.servo.lines()),
+            *([] if self.servo is None else self.servo.lines(self.joint_names)),
             f"{'position error (rms)':42}{columns}",
         ]
         arms = {"identified": self.identified, "nominal": self.nominal}

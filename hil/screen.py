@@ -32,7 +32,7 @@ from rich.text import Text
 from hil.campaign.dry_run import DryRunRecord
 from hil.campaign.operator import REFUSED, MotionProgress, OperatorRequest, RunStatus, Stop
 from hil.cell import Cell
-from hil.progress import Silent, Task, put
+from hil.progress import Silent, Task, progress_console, put
 from hil.terminal_text import plural, printable
 from identification.text import percentage
 
@@ -319,8 +319,8 @@ class Screen:
         title: of the run.
         controller: `SIMULATED`, or the controller's address.
         quiet: show nothing and read no keys.
-        console: written to; standard output if left out. Without a terminal the status lines
-            go to standard error, so that piped output is quiet.
+        console: written to; standard output if left out. If that is no terminal, status lines
+            go to standard error, and only if it is one.
     """
 
     def __init__(
@@ -334,7 +334,7 @@ class Screen:
         console: Console | None = None,
     ) -> None:
         self._console = console or Console()
-        self._log = console or Console(stderr=True)
+        self._log = console or progress_console()
         self._full = not quiet and self._console.is_terminal and not self._console.is_dumb_terminal
         self._quiet = quiet
         self._stop = stop
@@ -408,6 +408,10 @@ class Screen:
         """Print a line at once, or after the screen has closed."""
         if not self._quiet:
             self._messages.append(text)
+
+    def step(self, text: str) -> None:
+        """Print a line; a run has no steps but those that its status shows."""
+        self.say(text)
 
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
@@ -536,7 +540,7 @@ class Screen:
         """Print new messages, and a status line every `LINE_EVERY` s and for each motion."""
         self._print_messages()
         status = self._status
-        if status is None or self.age > LINE_EVERY:
+        if status is None or self._log is None or self.age > LINE_EVERY:
             return
         at = (status.phase, status.number)
         if at != self._line_of or time.monotonic() >= self._line_due:

@@ -229,7 +229,8 @@ def unmodelled_effects(cell: Cell) -> UnmodelledEffects:
 def simulated_provenance(cell: Cell, effects: bool) -> dict[str, str]:
     """Return the metadata of a simulated archive."""
     sizes = unmodelled_effects(cell) if effects else UnmodelledEffects()
-    elasticity = ", ".join(f"{compliance:g}" for compliance in sizes.elasticity)
+    pairs = zip(cell.joint_names, sizes.elasticity, strict=False)  # none without effects
+    elasticity = ", ".join(f"{joint} {compliance:g}" for joint, compliance in pairs)
     ripple = percentage(sizes.torque_ripple)
     drift = percentage(sizes.friction_drift)
     described = {

@@ -389,12 +389,18 @@ def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> 
     )
 
 
+_CORRECT = (
+    "correct the cause, by [limits] or [drive_train] of the cell file, or what the simulated arm"
+    " is made from ([nominal], [controller], [simulation])"
+)
+
+
 def of_motions(cell: Cell, folder: CampaignFolder, name: str, failure: str) -> Criterion:
     """Judge whether all motions were completed (`failure` is ""), within the speed limits."""
     entries = folder.manifest()
     if failure:
         place = folder.archives / entries[-1].name if entries else None
-        remedy = "" if place is None else _motion_remedy(cell, place, None, "correct the cell file")
+        remedy = "" if place is None else _motion_remedy(cell, place, None, _CORRECT)
         text = f"{name}: {failure}"
         return criterion(f"motions ({name})", 1.0, 0.0, text, remedy)
     shares = [_speed_shares(cell, folder.archives / entry.name) for entry in entries]

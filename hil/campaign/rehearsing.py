@@ -83,7 +83,7 @@ def _rehearsed(
         # One repetition shows the effects that the model leaves out.
         cell = twin.cell.with_campaign(repetitions=1) if effects else twin.cell
         rehearsal = CampaignState.create(campaign.folder.rehearsed / where, cell, campaign.plan)
-        reporter.say(f"rehearsing on a simulated arm, {name}")
+        reporter.step(f"rehearsing on a simulated arm, {name}")
         motions = planned_motions(rehearsal.cell, rehearsal.plan)
         planned = sum(motion.trajectory.duration for motion in motions)
         link = twin.link(planned, effects=effects)

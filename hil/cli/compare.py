@@ -57,9 +57,9 @@ def compare(
                     f"change {change.change:+.3g} ± {change.half:.2g} (95 %),"
                     f" p {change.p_value:.1g}"
                 )
-                typer.echo(printable(line), err=True)
+                typer.echo(printable(line))
             for warning in comparison.warnings:
-                typer.echo(printable(f"note: {warning}"), err=True)
+                typer.echo(printable(f"note: {warning}"))
         typer.echo(printable(f"{comparison.verdict}."))
     if fail_on_change and comparison.changed:
         raise typer.Exit(CHANGED)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping
 from functools import partial
@@ -19,7 +18,7 @@ from hil.campaign.live_link import LiveLink
 from hil.cell import AngleFrame, Cell
 from hil.cli.arguments import JsonOption, QuietOption, print_json
 from hil.errors import ControllerError, HilError, OperatorStopError
-from hil.progress import say
+from hil.progress import progress_console, put, say
 from hil.recording import archive_path
 from hil.recording import record as record_motion
 
@@ -128,12 +127,13 @@ def _line(figures: Mapping[str, object]) -> str:
 class View:
     """Progress of a recording: a line every 5 s, and one when it is over.
 
-    Progress goes to standard error unless standard output is a terminal.
+    Progress is shown on a terminal: standard output, else standard error.
     """
 
     def __init__(self, cell: Cell, *, quiet: bool) -> None:
         self._cell = cell
         self._quiet = quiet
+        self._progress = None if quiet else progress_console()
         self._over = ""
         self._next = 0.0
 
@@ -149,10 +149,9 @@ class View:
             # Also when quiet: the arm still moves, and needs replies.
             how = "replying until the arm is at rest (Ctrl-C to exit at once)"
             say(f"{progress.over}; {how}", err=self._quiet)
-        if time.monotonic() >= self._next:
+        if self._progress is not None and time.monotonic() >= self._next:
             self._next = time.monotonic() + LINE_PERIOD
-            if not self._quiet:
-                say(self._line(progress), err=not sys.stdout.isatty())
+            put(self._progress, self._line(progress))
 
     def _line(self, progress: Progress) -> str:
         if progress.waiting:

@@ -28,9 +28,9 @@ def finish(
     quiet: bool = False,
     written: tuple[Path, Path] | None = None,
 ) -> None:
-    """Print table and findings to stderr, then the verdict or JSON; exit 5 if it is not good.
+    """Print table, findings and verdict, or JSON; exit 5 if it is not good.
 
-    `written` are folder and report, which the last line names, on stderr.
+    With `quiet`, warnings go to stderr. `written` are folder and report, which the last line names.
     """
     if json:
         typer.echo(as_json(results))
@@ -41,12 +41,12 @@ def finish(
                 lines.insert(0, results.calibration.words)
             lines.insert(0, results.fitted.words)
             for line in table(results):
-                typer.echo(line, err=True)
+                typer.echo(line)
         for line in lines:
-            say(line, err=True)
+            say(line, err=quiet)
         say(results.verdict.line)
     if written is not None and not quiet:
-        say(f"results: {written[0]}, report: {written[1]}", err=True)
+        say(f"results: {written[0]}, report: {written[1]}")
     if not results.verdict.good:
         raise typer.Exit(NOT_GOOD)
 

@@ -226,7 +226,7 @@ def examine(
 ) -> Diagnosis:
     """Run all checks, and measure for twice `seconds`; archives will be written to `place`."""
     system = System()
-    reporter.say("checking this PC; no packet is sent to the controller")
+    reporter.step("checking this PC; no packet is sent to the controller")
     checks = [
         *computer_checks(realtime_permissions(), system),
         *link_checks(link, system),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hil.report.chart import Caption, Chart, Legend, Plot, padded
 from hil.report.drawing import BAND, FIRST, MUTED, Panel, matrix_panel, panel, single
-from hil.report.numbers import fixed, percent, significant
+from hil.report.numbers import MISSING, fixed, percent, significant
 from hil.report.series import ReportSeries
 from hil.results import FittedResult, Results, ValidationResult, by_id
 
@@ -52,12 +52,18 @@ def joints_of(results: Results) -> list[Joint]:
             j,
             judgement.joint,
             judgement.unit,
-            f"error in motion {percent(moving)} %, whole recording {percent(every)} %",
+            f"error in motion {_share(moving)}, whole recording {_share(every)}",
         )
         for j, (judgement, (moving, every)) in enumerate(
             zip(results.judgement.joints, errors, strict=True)
         )
     ]
+
+
+def _share(fraction: float | None) -> str:
+    """Format a fraction in per cent; that of a joint that stands is missing, without a sign."""
+    text = percent(fraction)
+    return text if text == MISSING else f"{text} %"
 
 
 MEASURED = Legend("measured", "measured", "--wide", 4.0)

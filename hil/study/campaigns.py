@@ -96,7 +96,7 @@ def run_searches(
         place = DesignFolder(folder.design(search.key))
         result = DesignResult.load(place.result) if place.result.exists() else None
         if result is None or not result.complete or result.settings != search.settings:
-            reporter.say(f"search {number} of {len(wanted)}: {search.words}")
+            reporter.step(f"search {number} of {len(wanted)}: {search.words}")
             resume = place.settings.exists()
             try:
                 result = run_design(

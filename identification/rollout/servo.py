@@ -50,7 +50,7 @@ def command_of(stretch: Stretch, delay: float) -> tuple[Array, Array]:
     return position, (later - earlier) / (2.0 * half)
 
 
-def identify_servo(stretches: Sequence[Stretch], step: float) -> Servo:
+def identify_servo(stretches: Sequence[Stretch], step: float, joint_names: Sequence[str]) -> Servo:
     """Return the servo of some stretches, by least squares for each delay on a grid of `step` [s].
 
     Raises:
@@ -66,8 +66,8 @@ def identify_servo(stretches: Sequence[Stretch], step: float) -> Servo:
     if not (servo.kp > 0.0).all():
         joint = int(np.argmin(servo.kp))
         raise NoServoError(
-            f"the torque of joint {joint + 1} does not grow with its position error; state kp, kd"
-            " and delay"
+            f"the torque of {joint_names[joint]} does not grow with its position error; state kp,"
+            " kd and delay"
         )
     return servo
 

@@ -320,7 +320,10 @@ class TestJudgement:
         with nullcontext() if good else pytest.raises(typer.Exit) as left:
             finish(identification.results.model_copy(update={"verdict": verdict}), json=False)
         assert good or left.value.exit_code == NOT_GOOD
-        assert capsys.readouterr().out == verdict.line + "\n"
+        printed = capsys.readouterr()
+        assert printed.out.splitlines()[0].startswith("joint ")
+        assert printed.out.splitlines()[-1] == verdict.line
+        assert printed.err == ""
 
 
 @pytest.fixture(scope="module")

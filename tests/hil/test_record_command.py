@@ -12,11 +12,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from drivers.errors import ModeRefused
 from drivers.packets import DRIVE_ON, INIT_LENGTH
@@ -26,6 +28,7 @@ from hil.archive import open_archive
 from hil.archive.recorder import Recorded
 from hil.campaign import Progress, Stop, VirtualLink
 from hil.cell import Cell
+from hil.cli import record as record_cli
 from hil.cli.record import record as record_command
 from hil.demo_link import SIMULATE, free_port
 from hil.errors import ArchiveError, ControllerError, HilError, InputError
@@ -332,6 +335,15 @@ def test_a_hanging_archive_process_is_ended(on_udp: tuple[Path, int]) -> None:
     assert open_archive(archive).n_samples > 500
 
 
+def test_on_a_terminal_it_shows_what_it_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = StringIO()
+    terminal = Console(file=shown, force_terminal=True, width=200)
+    monkeypatch.setattr(record_cli, "progress_console", lambda: terminal)
+    waiting = Progress(0, 0, State.SYNC, waiting="no packet from 127.0.0.1 (0 packets)")
+    record_cli.View(Cell.load(CELL_PATH), quiet=False).show(waiting)
+    assert "no packet from 127.0.0.1 (0 packets)" in shown.getvalue()
+
+
 def test_a_missing_controller_is_waited_for_as_stated(on_udp: tuple[Path, int]) -> None:
     path, _ = on_udp
     with recorder_of(path, "--wait", "0.5") as recorder:
@@ -340,13 +352,12 @@ def test_a_missing_controller_is_waited_for_as_stated(on_udp: tuple[Path, int]) 
     assert "no init packet within 0.5 s; no packet from 127.0.0.1" in " ".join(errors.split())
     with recorder_of(path) as recorder:
         assert "waiting for the controller" in recorder.stdout.readline()
-        # Notes on what the system refused come before it. Piped output has no progress.
-        line = next(line for line in recorder.stderr if "packets from" in line)
-        assert "no packet from 127.0.0.1 (0 packets" in line
+        time.sleep(0.5)
         recorder.send_signal(signal.SIGINT)
         _, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 130
     assert "nothing was recorded" in errors.replace("\n", " ")
+    assert "packets from" not in errors, "piped output has no progress"
     assert not (path.parent / "a.mcap").exists()
     with pytest.raises(HilError, match=r"controller\.transport"):
         record_command(CELL_PATH, output=path.parent / "a.mcap")

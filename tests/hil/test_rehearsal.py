@@ -210,6 +210,15 @@ def test_a_motion_beyond_a_speed_limit_is_no_completed_one(designed: Campaign) -
     assert "of its speed limit" in criterion.sentence and "hil plot" in criterion.sentence
 
 
+def test_a_refused_motion_names_the_tables_to_correct(designed: Campaign) -> None:
+    plain = CampaignFolder(designed.folder.rehearsed / "plain")
+    sentence = of_motions(designed.cell, plain, "plain", "move 2 was refused").sentence
+    assert "plain: move 2 was refused: correct the cause, by [limits]" in sentence
+    for table in ("[drive_train]", "[nominal]", "[controller]", "[simulation]"):
+        assert table in sentence
+    assert "`hil plot " in sentence
+
+
 def test_a_cell_of_hardware_is_rehearsed_from_nominal_figures(
     tmp_path: Path, designed: Campaign
 ) -> None:

@@ -675,6 +675,16 @@ class TestFigures:
             assert all(drawn.svg.count("<path") >= 4 for drawn in panels)
             assert [drawn.joint for drawn in panels] == [JOINTS.index(name) for name in expected]
 
+    def test_a_joint_that_stands_has_no_error_in_motion(self, results):
+        run = results.validation[0]
+        standing = run.model_copy(update={"relative_error": [math.nan, *run.relative_error[1:]]})
+        captions = [
+            joint.error
+            for joint in figures.joints_of(results.model_copy(update={"validation": [standing]}))
+        ]
+        assert captions[0].startswith("error in motion –, whole recording ")
+        assert not any("– %" in caption for caption in captions)
+
     def test_show_the_nominal_model_where_it_is_known(self, results):
         series = make_series(samples=200)
         names = [[t.name for t in p.traces] for p in torque_chart(series, results).plots]

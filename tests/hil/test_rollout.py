@@ -1,9 +1,11 @@
 """Rollouts, ensembles and annotated archives of an identified campaign, from the command line."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +26,7 @@ from hil.plots.chart_picture import draw_charts
 from hil.report.rollout import overview_charts, overview_legends
 from hil.rollout import POLISHED
 from hil.rollout_result import ROLLOUT, ArmErrors, RolloutResult
+from identification.rollout.servo import Servo
 from identification.text import percentage
 
 pytestmark = pytest.mark.long
@@ -202,6 +205,24 @@ def test_a_servo_needs_gains_and_a_delay(folder: Path, servo: str, problem: str)
     done = run("rollout", folder, "--servo", servo)
     assert isinstance(done.exception, InputError)
     assert problem in str(done.exception)
+
+
+def test_gains_of_an_identified_servo_are_named(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stiff(_stretches: object, _step: float, joint_names: Sequence[str]) -> Servo:
+        n = len(joint_names)
+        return Servo(np.full(n, 2e4), np.full(n, 200.0), 0.004)
+
+    monkeypatch.setattr("hil.rollout.identify_servo", stiff)
+    done = run("rollout", folder, "--servo", "identified", "--samples", "3")
+    assert done.exit_code in (0, 5), done.output
+    result = RolloutResult.load(folder / ROLLOUT)
+    gains = re.search(r"gains (.*); delay [\d.]+ ms\)$", result.drive)
+    assert gains, result.drive
+    shown = gains[1].split("; ")
+    assert [gain.split()[0] for gain in shown] == result.joint_names
+    assert all(gain.endswith(" N·m/rad") for gain in shown)
 
 
 def test_an_ensemble_is_written_as_files_or_arrays(folder: Path, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import json
 import os
 import pty
 import signal
+import sys
 import termios
 import threading
 import time
@@ -435,7 +436,34 @@ def test_piped_output_has_messages_and_no_progress(capsys: pytest.CaptureFixture
         screen.show(status())
         time.sleep(0.3)
     printed = capsys.readouterr()
-    assert printed.out == "the cell is open\n"
+    assert (printed.out, printed.err) == ("the cell is open\n", "")
+
+
+def test_progress_is_shown_on_a_terminal_only(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`hil ... > file` at a terminal: messages in the file, progress on the terminal."""
+    piped = reporter()
+    with piped.task("fitting", 10) as task:
+        task.advance(10)
+        piped.step("rehearsing")
+        piped.say("written to runs")
+    printed = capsys.readouterr()
+    assert (printed.out, printed.err) == ("written to runs\n", "")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
+    shown = reporter()
+    with shown.task("fitting", 10) as task:
+        task.advance(10)
+        shown.step("rehearsing")
+        shown.say("written to runs")
+    with Screen(NAMES, Stop()) as screen:
+        screen.say("the cell is open")
+        screen.show(status())
+        time.sleep(0.3)
+    printed = capsys.readouterr()
+    assert printed.out == "written to runs\nthe cell is open\n"
+    assert "fitting" in printed.err and "rehearsing" in printed.err
     assert "repetition 7 of 30" in printed.err.replace("\n", " ")
 
 

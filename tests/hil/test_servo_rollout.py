@@ -1,5 +1,6 @@
 """A log with commanded and measured positions and no torque, from the command line."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,8 @@ def test_the_servo_is_identified_as_far_as_determined(archive: Path, tmp_path: P
     assert not rows["f1_1"].determined
     assert "in proportion to the masses of the URDF only" in done.output
     assert "Not determined: f1_1, f1_2." in done.output
+    for number, joint in enumerate(result.joint_names, 1):
+        assert re.search(rf"^{number} {joint} +[\d.]+ ± ", done.output, re.M), done.output
     assert result.identified.overall(2) < result.nominal.overall(2)  # at 0.5 s
     assert result.identified.unstable == 0
     assert "nan" not in (tmp_path / ROLLOUT).read_text().lower()

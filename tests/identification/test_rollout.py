@@ -179,12 +179,17 @@ class TestServo:
 
     def test_is_found_from_commanded_and_measured_positions(self) -> None:
         kp, kd = np.array([2000.0, 500.0]), np.array([40.0, 10.0])
-        servo = identify_servo(self.stretches(kp, kd, 0.010), 0.005)
+        servo = identify_servo(self.stretches(kp, kd, 0.010), 0.005, ("a", "b"))
         assert servo.delay == pytest.approx(0.010)
         assert servo.kp == pytest.approx(kp, rel=0.05)
         assert servo.kd == pytest.approx(kd, rel=0.2)
 
+    def test_a_torque_opposing_the_error_names_its_joint(self) -> None:
+        opposed = self.stretches(np.array([2000.0, -500.0]), np.array([40.0, 0.0]), 0.010)
+        with pytest.raises(NoServoError, match="the torque of elbow does not grow with"):
+            identify_servo(opposed, 0.005, ("shoulder", "elbow"))
+
     def test_needs_commanded_positions(self) -> None:
         stretches = [replace(stretch, commanded=None) for stretch in self.stretches(1.0, 1.0, 0.0)]
         with pytest.raises(NoServoError, match="no commanded positions"):
-            identify_servo(stretches, 0.005)
+            identify_servo(stretches, 0.005, ("a", "b"))
