@@ -57,7 +57,7 @@ class Stopped:
     share=st.sampled_from((0.3, 0.6, 1.0)),
     again=st.sampled_from((0, 1, 4, 30)),
 )
-def test_the_motion_does_not_speed_up_before_it_stops(late, lost, share, again):
+def test_it_does_not_speed_up_before_it_stops(late, lost, share, again):
     first = faulty_runs.cycles_without_a_fault(True)["moving"] + late
     stopped = Stopped(first, lost, share, again)
     assert stopped.run.outcome == "" and not stopped.run.session.broken
@@ -84,7 +84,7 @@ def lose_slowing(lost: int, others: float = 0.95):
 
 
 @pytest.mark.parametrize("lost", [4, 8, 30])
-def test_a_stop_begins_at_the_set_point_sent_last_with_the_speed_of_the_arm(lost):
+def test_a_stop_begins_with_the_speed_of_the_arm(lost):
     rig = lose_slowing(lost)
     last = rig.records["commanded_position"][-1]
     before = rig.records["commanded_velocity"][-1]
@@ -106,7 +106,7 @@ def test_the_joint_that_slowed_down_least_says_how_fast():
     assert 0.8 * 0.95**8 <= share <= 0.95**7
 
 
-def test_an_arm_at_rest_stays_at_the_set_point_sent_last():
+def test_an_arm_at_rest_stays_there():
     rig = running(planned(), 60, guard_limits=limits(**FAR))
     lose(rig, 6)
     last = rig.records["commanded_position"][-1]
@@ -115,7 +115,7 @@ def test_an_arm_at_rest_stays_at_the_set_point_sent_last():
     np.testing.assert_array_equal(sent[np.isfinite(sent).all(axis=1)][-1], last)
 
 
-def test_single_losses_slow_a_stop_by_no_more_than_the_arm():
+def test_after_single_losses_it_does_not_go_back():
     rig = running(planned(), 60, guard_limits=limits(**FAR))
     for _ in range(3):
         lose(rig, 1)

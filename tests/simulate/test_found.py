@@ -259,9 +259,7 @@ class TestHalfASecond:
         first = open_archive(seen.folder / "archives" / "excitation_000_a1.mcap").outcome
         assert first is not None and first.outcome == "rejected"
 
-    def test_other_ends_and_repetitions_that_do_not_count_are_not_excused(
-        self, stage: Stage
-    ) -> None:
+    def test_other_ends_are_not_excused(self, stage: Stage) -> None:
         """The excuse is for two that count and were disturbed alike, and their rejections."""
         alike = stage.observed(102383, ["delay@577x1:7ms", "delay@296x1:7ms"])
         rejected = alike.runs[-1].error
