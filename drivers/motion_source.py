@@ -30,7 +30,8 @@ class MotionSource(Protocol):
       follow a hold. One that does not come to rest is stopped after `session.STOP_TIMEOUT`.
     - ``resume_from(position, velocity, cycles)``: continue along the path from the target, (n,) rad
       and rad/s, to which a controller has extrapolated the motion. A velocity across the path
-      decays within `cycles`. Raises if the target is off the path.
+      decays within `cycles`. During a stop also from the set-point sent last, at a lower velocity.
+      Raises if the target is off the path.
 
     Attributes ``motion_time`` (s) and ``rate`` (1 as planned), if both exist, are displayed.
     """

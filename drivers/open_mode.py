@@ -10,7 +10,8 @@ While axes are open, following error and current are checked, and that the targe
 within 10 % of the following-error threshold of one of the last `max_gap` + 1 set-points sent, or of
 the last one extrapolated by as many steps as packets were missed, and within 25 % of the last. An
 older target is a rejected reply: the last set-point is sent again until it is accepted, and more
-than `max_gap` rejected replies in 100 cycles stop the motion on its path.
+than `max_gap` rejected replies in 100 cycles stop the motion on its path, from the set-point sent
+last and no faster than the joint that slowed down least meanwhile (D4).
 
 Without replies a controller may hold the last target, extrapolate it, or leave open mode, move the
 arm and come back; the next set-point at full speed would then be a jump. Hence, after a gap longer
@@ -186,6 +187,11 @@ class SentSetPoints:
         self._resent_before = False
         self.resend_needed = False
 
+    @property
+    def is_resent(self) -> bool:
+        """Whether the last set-point was sent again, or is to be."""
+        return self._resent > 0 or self.resend_needed
+
     def resend(self) -> None:
         """Record that the last set-point was sent once more."""
         self._resent += 1
@@ -302,6 +308,8 @@ class SetPointGenerator:
         self._sent = self._still
         self._step = self._still
         self._velocity = self._still
+        # Least share of that velocity that the arm had since the set-point was sent again.
+        self._arm_share = 1.0
         self._slots = wire.joint_slots[wire.opened]
         self._last_reply = builder.floats[self._slots]
         self._continuing = wire.opened.copy()
@@ -438,13 +446,16 @@ class SetPointGenerator:
         """Send the motion's next set-point, or the last one without a motion."""
         cycle = self._cycle
         commanded = self._commanded
+        stopping = execution is not None and execution.outcome == "stopped"
         self._check_feedback(self._sent)
-        self._check_accepted(stopping=execution is not None and execution.outcome == "stopped")
+        self._check_accepted(stopping=stopping)
         if execution is None:
             self._guard.check_set_point(self.set_point, self._still, "plan", cycle)
             self._rest()
             return
         frame = self._builder.floats
+        if self._history.is_resent:
+            self._arm_share = min(self._arm_share, self._share_of_arm())
         if self._history.resend_needed:
             # The controller holds the target before the last one: send that once more.
             frame[self._slots] = self._last_reply
@@ -452,6 +463,8 @@ class SetPointGenerator:
             commanded[0] = self.set_point
             commanded[1] = self._velocity
             return
+        if stopping and self._arm_share < 1.0 and execution.is_resumable:
+            self._slow_down(execution)
         position, velocity, bounds = execution.advance(cycle)
         self._guard.check_set_point(position, velocity, bounds, cycle)
         motor = self._wire.motor(position)
@@ -463,7 +476,35 @@ class SetPointGenerator:
         self.set_point = position
         self._sent = motor
         self._history.add(motor)
+        self._arm_share = 1.0
         self._last_reply = frame[self._slots]
+
+    def _share_of_arm(self) -> float:
+        """Share of the speed sent last at which the joint that slowed down least moves (D4).
+
+        Inf where no joint moves faster than `SLOW`, NaN where a velocity was not sent.
+        """
+        step = self._step
+        fast = np.abs(step) > SLOW * self._guard.limits.standstill
+        if not fast.any():
+            return np.inf
+        return max(float((self._raw[ACTUAL_VELOCITY][fast] / step[fast]).max()), 0.0)
+
+    def _slow_down(self, execution: Execution) -> None:
+        """Continue a stop from the set-point sent last, no faster than the arm has moved meanwhile.
+
+        While replies were lost the controller held its target, and each joint slowed down as fast
+        as its current and its servo allow. The stop begins with the speed of the joint that slowed
+        down least: that joint does not speed up again, the others do as far as the path requires.
+        With the mean of all joints, which is less, one that cannot brake as fast would leave its
+        target behind by more than the following-error threshold (axis 2 of an NS 16 after five
+        replies at full speed). The least share of all packets since counts, as the arm is pushed by
+        the step to the set-point that was accepted late. The stop does not begin at the older
+        target that was held: the set-points would go back along the path.
+        """
+        velocity = self._arm_share * self._velocity
+        execution.resume_from(self.set_point, velocity, 0, self._cycle)
+        self._guard.resume_from(self.set_point, velocity, 0)
 
     def _require_closed_still(self, motor: Array) -> None:
         """Require closed axes to stay where the controller holds them, wrist couplings included."""

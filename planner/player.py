@@ -290,6 +290,8 @@ class TrajectoryPlayer:
         if velocity.any() and np.max(np.abs(offset)) <= self._tolerance:
             self._offset = offset
             self._last = position
+            if self._stopping:
+                self._slow_to(velocity)
             return
         s = self.motion_time
         here = position - self._offset
@@ -312,14 +314,27 @@ class TrajectoryPlayer:
         # One tolerance for the start, one for all gaps together.
         self._offset = self._offset_from(point, position, 2.0 * self._tolerance)
         self._last = position
-        self._tabled = False
         rate = min(max(0.0, float(velocity @ speed) / square), self._fastest)
+        shares = np.arange(1.0, cycles + 1.0)[:, None] / (cycles + 1.0)
+        self._across = list(shares * (velocity - rate * speed)) if velocity.any() else []
+        self._restart(s, rate)
+
+    def _slow_to(self, velocity: Array) -> None:
+        """Continue a stop with the share of `velocity` (n,) along the path, if that is slower."""
+        s = self.motion_time
+        _, speed = self._path.read(s)
+        square = float(speed @ speed)
+        rate = float(velocity @ speed) / square if square else 0.0
+        if rate < self._law.rate:
+            self._restart(s, max(0.0, rate))
+
+    def _restart(self, s: float, rate: float) -> None:
+        """Continue at this motion time and rate, within the bounds of a stop."""
+        self._tabled = False
         stopping = self._allowed["stop"]
         # A deceleration continues: restarted after each of many gaps, it would never end.
         slope = max(min(self._law.slope, 0.0), -sqrt(2.0 * stopping.change * rate))
         self._law.restart(s, rate, slope)
-        shares = np.arange(1.0, cycles + 1.0)[:, None] / (cycles + 1.0)
-        self._across = list(shares * (velocity - rate * speed)) if velocity.any() else []
         self._law.aim(0.0 if self._held or self._stopping else self._override, stopping)
         self._ramp = self.bounds = "stop"
         self.finished = self._stopping and self._settled

@@ -37,6 +37,7 @@ from tests.fault_matrix.faulty_runs import (
     play_at,
 )
 from tests.laws.archives import readable
+from tests.laws.motions import slows_down
 from tests.laws.second_reader import read
 
 pytestmark = pytest.mark.safety
@@ -150,6 +151,10 @@ class TestNs16AtSpeed:
         along = (q @ way) / (way @ way)
         assert np.all(np.diff(along) >= 0.0) and along[-1] < 0.95
         np.testing.assert_allclose(q, along[:, None] * way, atol=1e-6)
+        if "to_controller" in fault:
+            # The planned speed is constant here; a set-point sent again is recorded with its own.
+            speed = v[np.isfinite(v).all(axis=1), 0] / limits.velocity[0]
+            assert list(slows_down(speed[strike - begun :], along)) == []
 
     @pytest.mark.parametrize("part", [0.15, 0.3, 0.45, 0.6, 0.75])
     def test_it_stops_on_a_curved_path(self, cell, begun, tmp_path, part):

@@ -66,6 +66,7 @@ class Conduct:
     max_gap: int = 2
     lag: int = 0
     repeats: int = 0
+    arm_share: float = 1.0
     answered: np.ndarray | None = None
     lost: int = 0
     exiting: bool = False
@@ -270,8 +271,12 @@ class Conduct:
             assert ((low <= a[0]) & (a[0] <= high)).all(), "sent and recorded differ"
             if np.array_equal(a, self.answered) and a[1].any():
                 assert np.array_equal(q, self.sent[-1]), "sent again, and recorded otherwise"
-                self._again(r[0])
+                self._again(r[0], r[3])
                 return
+            if self.repeats:
+                self._note_arm(r[3])
+            if self.stopping and self.arm_share < 1.0:
+                self._slow_down()
             step = motor - self.motor
             # Positions are compared in float64; both carry the rounding of their making.
             slack = 3 * rounding + np.spacing(np.float32(np.abs(a[1]))) + rounding_of_target
@@ -286,7 +291,7 @@ class Conduct:
         assert (q <= self.limits.upper + 2e-6 * span).all(), "position"
         if self.motor is not None:
             self._count_lost(r[0])
-        self.repeats, self.answered = 0, a
+        self.repeats, self.answered, self.arm_share = 0, a, 1.0
         self.motors = [*self.motors, motor][-(self.max_gap + 2) :]
         self.motor = motor
         del self.sent[:-3]
@@ -339,11 +344,31 @@ class Conduct:
         behind = (back[0] > self.limits.standstill) & (back.min(axis=0) <= ahead)
         return int(back.argmin(axis=0)[behind].max(initial=0))
 
-    def _again(self, target: np.ndarray) -> None:
+    def _note_arm(self, velocity: np.ndarray) -> None:
+        """Note the share of the last step at which the joint that slowed down least moves (D4)."""
+        step = self._last_step()
+        shares = [
+            moved / sent
+            for moved, sent in zip(velocity, step, strict=True)
+            if abs(sent) > 4.0 * self.limits.standstill
+        ]
+        if shares and np.isfinite(shares).all():
+            self.arm_share = min(self.arm_share, max(0.0, *shares))
+
+    def _slow_down(self) -> None:
+        """A stop after lost replies begins at the set-point sent last, no faster than the arm."""
+        last = self.sent[-1]
+        step = last - self.sent[-2]
+        self.sent = [last - k * self.arm_share * step for k in (3, 2, 1, 0)]
+        self.without_jerk_bound = max(self.without_jerk_bound, 2)
+        self._count("slowed down")
+
+    def _again(self, target: np.ndarray, velocity: np.ndarray) -> None:
         """Check a set-point sent again because it was not accepted: the motion waits."""
         lag = self._lag(target)
         assert lag > self.lag, "sent again although it was accepted"
         self.lost += 1 if self.repeats else lag - self.lag
+        self._note_arm(velocity)
         self.repeats += 1
         self.stopping = self.stopping or self.lost > self.max_gap
         self._count("again")

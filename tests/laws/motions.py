@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
@@ -57,3 +57,19 @@ def on_path(commanded: Array, motion: Motion) -> Iterator[str]:
     apart = np.abs(path[np.newaxis] + offset - commanded[::5, np.newaxis]).max(axis=2).min(axis=1)
     if not (np.abs(offset).max() < 1e-5 and apart.max() <= near):
         yield f"its motion left its path by {max(np.abs(offset).max(), apart.max()):.2g} rad"
+
+
+def slows_down(rates: Sequence[float], along: Sequence[float]) -> Iterator[str]:
+    """From the begin of a stop the motion neither speeds up nor goes back.
+
+    Args:
+        rates: of motion time, one a cycle, 1 as planned.
+        along: set-points of the same cycles, along a straight path.
+    """
+    growth = np.diff(np.asarray(rates, float))
+    if (growth > 1e-9).any():
+        yield f"its rate grew by {growth.max():.3g} after the stop began"
+    steps = np.diff(np.asarray(along, float))
+    steps = steps[np.isfinite(steps)]
+    if (steps < -1e-12).any():
+        yield f"its set-points went back by {-steps.min():.3g}"

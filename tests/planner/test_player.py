@@ -217,6 +217,19 @@ class TestResumeFrom:
         np.testing.assert_array_equal(position, last + step)
         assert not velocity.any()
 
+    @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
+    def test_a_stop_continues_at_a_slower_speed_given(self, extrapolated, share):
+        """From the same set-point, or near it; at no speed it stays there."""
+        player, last, step = extrapolated
+        player.stop()
+        first, velocity = player.advance()
+        player.resume_from(first, share * velocity, 0)
+        before = np.linalg.norm(velocity)
+        assert player.rate <= share
+        while not player.finished:
+            _, velocity = player.advance()
+            assert np.linalg.norm(velocity) <= 1.001 * share * before
+
     def test_away_from_its_path_it_is_refused(self, extrapolated):
         player, last, step = extrapolated
         with pytest.raises(StartMismatch, match="the motion at"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from drivers.record import cycle_dtype
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveOutcome, ArchiveSpec, open_archive
 from hil.campaign import VirtualLink, virtual_link
+from hil.campaign.errors import MotionFailedError
 from hil.campaign.motions import START_TOLERANCE
 from hil.campaign.operator import Stop
 from hil.cell import Cell
@@ -26,8 +28,9 @@ from planner import Move, TrajectoryPlayer, plan_moves
 from sim_fixtures import Phase, SimulatedController
 from tests.faults import parse_script
 from tests.hil.fast_cell import fast_cell
+from tests.simulate.observed import Observed
 from tests.simulate.scenes import NEIGHBOURS, scene_of
-from tests.simulate.verdicts import Stage, judged, missed_alike
+from tests.simulate.verdicts import Stage, completion, judged, missed_alike
 from tests.simulate.world import _twin, play
 
 pytestmark = pytest.mark.safety
@@ -255,3 +258,20 @@ class TestHalfASecond:
         assert not missed_alike(seen)
         first = open_archive(seen.folder / "archives" / "excitation_000_a1.mcap").outcome
         assert first is not None and first.outcome == "rejected"
+
+    def test_other_ends_are_not_excused(self, stage: Stage) -> None:
+        """The excuse is for two that count and were disturbed alike, and their rejections."""
+        alike = stage.observed(102383, ["delay@577x1:7ms", "delay@296x1:7ms"])
+        rejected = alike.runs[-1].error
+        assert rejected is not None
+        lost = MotionFailedError("repetition 3", "lost", "the drive went off")
+        assert list(completion(alike)) == []
+        assert len(list(completion(_ended_by(alike, lost)))) == 1
+        single = stage.observed(102383, ["delay@296x1:7ms"])  # in the same folder
+        assert len(list(completion(_ended_by(single, rejected)))) == 1
+
+
+def _ended_by(seen: Observed, error: BaseException) -> Observed:
+    """The same campaign as if its last run had ended by this error."""
+    *earlier, last = seen.runs
+    return replace(seen, runs=(*earlier, replace(last, result=None, error=error)))

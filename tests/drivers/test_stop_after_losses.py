@@ -1,0 +1,125 @@
+"""After lost replies the motion does not speed up again before it stops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from drivers import SimulatedTransport
+from drivers.events import RepliesLost
+from sim_fixtures.faults import parse_fault, split_faults
+from tests.drivers.rig import limits, running
+from tests.drivers.test_session_losses import FAR, lose, planned
+from tests.fault_matrix import faulty_runs, small_cell
+from tests.laws.motions import slows_down
+
+
+class Stopped:
+    """A motion of the simulated arm of which replies are lost: its set-points and its rates.
+
+    Args:
+        first: cycle of the first lost reply.
+        lost: replies lost in a row.
+        share: of full speed.
+        again: cycles after which two more replies are lost; 0 for never.
+    """
+
+    def __init__(self, first: int, lost: int, share: float, again: int) -> None:
+        losses = [f"lose@{first}x{lost}:to_controller"]
+        if again:
+            losses.append(f"lose@{first + lost + again}x2:to_controller")
+        faults, _ = split_faults([parse_fault(text) for text in losses])
+        cell = faulty_runs.controller("hold", tolerated=10_000)
+        self.run = faulty_runs.Run(cell, True, speed=share)
+        self.run._over = first
+        self.run.transport = SimulatedTransport(cell, faults)
+        self.motion = faulty_runs.motion(np.array(small_cell.HOME), faulty_runs.WAY, share)
+        self.run.session.request(self.motion)
+        self.rates: list[float] = []
+        self.along: list[float] = []
+        self.run._exchange(self._ended, 1500)
+
+    def _ended(self) -> bool:
+        if self.run.session.stop_reason is not None:
+            sent = self.run.session._ring.last(1)["commanded_position"][0]
+            self.rates.append(self.motion.rate)
+            self.along.append(float((sent - small_cell.HOME) @ faulty_runs.WAY))
+        return self.run.transport.cycle > 100 and not self.run.session.requested
+
+
+@pytest.mark.safety
+@settings(max_examples=10, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@given(
+    late=st.integers(0, 60),
+    lost=st.integers(3, 120),
+    share=st.sampled_from((0.3, 0.6, 1.0)),
+    again=st.sampled_from((0, 1, 4, 30)),
+)
+def test_it_does_not_speed_up_before_it_stops(late, lost, share, again):
+    first = faulty_runs.cycles_without_a_fault(True)["moving"] + late
+    stopped = Stopped(first, lost, share, again)
+    assert stopped.run.outcome == "" and not stopped.run.session.broken
+    assert list(slows_down(stopped.rates, stopped.along)) == []
+
+
+def lose_slowing(lost: int, others: float = 0.95):
+    """A motion whose target is held for some cycles, in each of which its joints slow down.
+
+    The first slows down by a factor of 0.95, the others by `others`.
+    """
+    rig = running(planned(), 60, guard_limits=limits(**FAR))
+    follow, d = rig._follow, rig.axes["d"]
+
+    def brake(answer):
+        d[:, 1] = 0.0
+        d[0, 3] *= 0.95
+        d[1:, 3] *= others
+
+    rig._follow = brake
+    rig.cycle(lost)
+    rig._follow = follow
+    return rig
+
+
+@pytest.mark.parametrize("lost", [4, 8, 30])
+def test_a_stop_begins_with_the_speed_of_the_arm(lost):
+    rig = lose_slowing(lost)
+    last = rig.records["commanded_position"][-1]
+    before = rig.records["commanded_velocity"][-1]
+    rig.cycle(2)
+    begun, velocity = (rig.records[f"commanded_{name}"][-1] for name in ("position", "velocity"))
+    np.testing.assert_allclose(begun - last, velocity * rig.session._guard.period, atol=1e-12)
+    share = np.linalg.norm(velocity) / np.linalg.norm(before)
+    assert 0.8 * 0.95**lost <= share <= 0.95 ** (lost - 1)
+    rig.run_to("stopped")
+    assert rig.ended.reason == "3 replies were lost in 100 cycles"
+
+
+def test_the_joint_that_slowed_down_least_says_how_fast():
+    """One that cannot brake as fast as the others must not leave its target behind."""
+    rig = lose_slowing(8, others=0.5)
+    before = rig.records["commanded_velocity"][-1]
+    rig.cycle(2)
+    share = np.linalg.norm(rig.records["commanded_velocity"][-1]) / np.linalg.norm(before)
+    assert 0.8 * 0.95**8 <= share <= 0.95**7
+
+
+def test_an_arm_at_rest_stays_there():
+    rig = running(planned(), 60, guard_limits=limits(**FAR))
+    lose(rig, 6)
+    last = rig.records["commanded_position"][-1]
+    rig.run_to("stopped")
+    sent = rig.records["commanded_position"]
+    np.testing.assert_array_equal(sent[np.isfinite(sent).all(axis=1)][-1], last)
+
+
+def test_after_single_losses_it_does_not_go_back():
+    rig = running(planned(), 60, guard_limits=limits(**FAR))
+    for _ in range(3):
+        lose(rig, 1)
+        rig.cycle(5)
+    sent = rig.records["commanded_position"][:, 0]
+    assert sum(event.count for event in rig.seen(RepliesLost)) == 3
+    assert (np.diff(sent[-40:]) * np.sign(sent[-1] - sent[-40]) >= -1e-12).all()
