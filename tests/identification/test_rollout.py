@@ -1,6 +1,7 @@
 """Windows of a measured motion, simulated by MuJoCo and compared."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from identification.rollout.comparison import (
 )
 from identification.rollout.polish import Driven, polished
 from identification.rollout.servo import NoServoError, identify_servo
-from identification.rollout.simulation import LARGEST_ERROR, Feedback
+from identification.rollout.simulation import LARGEST_ERROR, Feedback, SimulatedArm
 from identification.rollout.windows import (
     NoWindowError,
     mean_about,
@@ -32,7 +33,7 @@ from identification.rollout.windows import (
 )
 from tests.identification.two_link import MODEL, URDF, four_sines, simulated
 
-pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
+mujoco = pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 
 N = MODEL.n_joints
 NO_LIMITS = Ranges(*(np.full(N, limit) for limit in (-np.inf, np.inf, np.inf, np.inf)))
@@ -88,6 +89,28 @@ def test_an_unstable_arm_is_counted_and_silent(capfd) -> None:
     assert np.isfinite(errors.joints).all()
     assert errors.joints[-1].max() == pytest.approx(LARGEST_ERROR)
     assert capfd.readouterr() == ("", "")
+
+
+def test_the_solver_of_dry_friction_changes_no_position() -> None:
+    arm = an_arm(coulomb=3.0)
+    motion = a_recording(arm, 0.005)
+    windows = motion.windows
+    simulated = SimulatedArm.of(arm, windows.step, NOTHING)
+    force = motion.force(arm, simulated)
+    run = partial(simulated.simulate, windows.position[:, 0], windows.start, force)
+    positions = run(windows.position)
+    simulated.model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    assert positions == pytest.approx(run(windows.position), abs=1e-6)  # rad, of a motion of one
+
+
+def test_the_clock_of_mujoco_runs_after_a_rollout() -> None:
+    """A rollout stops it, as reading it takes a fifth of a step."""
+    arm = an_arm()
+    final_errors(arm, a_recording(arm, 0.005))
+    model = mujoco.MjModel.from_xml_string(mjcf(arm, "arm"))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    assert data.timer[mujoco.mjtTimer.mjTIMER_STEP].duration > 0.0
 
 
 @pytest.mark.long
