@@ -17,6 +17,7 @@ from identification.rollout.comparison import (
     coverage,
     errors_of,
     horizon_rows,
+    joint_inertia,
     leading_joint,
     light_feedback,
     recorded_stretches,
@@ -125,6 +126,20 @@ def test_a_polish_finds_friction_rotor_and_delay() -> None:
     friction = best.arm.values[MODEL.friction_part] / true.values[MODEL.friction_part]
     assert friction[true.values[MODEL.friction_part] != 0.0] == pytest.approx(1.0, abs=0.15)
     assert best.motion.delay == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.long
+def test_a_polish_finds_a_rotor_heavier_than_what_the_joint_turns() -> None:
+    def with_rotor(inertia: float) -> Arm:
+        arm = an_arm()
+        standard = arm.standard.copy()
+        standard[MODEL.layout.rotors] = (0.4, inertia)
+        values = np.concatenate([MODEL.base.grouping @ standard, arm.values[MODEL.friction_part]])
+        return replace(arm, standard=standard, values=values)
+
+    heavy = 4.0 * joint_inertia(with_rotor(0.0), 0.005)[1]
+    best = polished(Driven(with_rotor(0.0), a_recording(with_rotor(heavy), 0.005), NOTHING))
+    assert best.arm.rotors[1, 1] == pytest.approx(heavy, rel=0.15)
 
 
 def test_friction_that_accelerates_acts_as_measured() -> None:
