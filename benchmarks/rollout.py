@@ -12,11 +12,12 @@ errors at 0.5 s and their ratio to those of the nominal arm (at most 0.5 is want
 has masses), and the share of measured positions in the 95 % band at 0.2 s (88 to 99 % is wanted);
 and what misses that.
 
-With `--sysid` an arm by `hil identify` is compared with one by the minimiser of `mujoco.sysid`
-(`benchmarks.sysid_rival`) that is fitted to windows of one second which cover the same recording.
-Both are then simulated in the same held-out windows, under the recorded torque and a feedback of
-1 Hz. Prints errors and processor time; wanted are no larger error and a tenth of the time. The
-recording is that of a simulated NS 16, or those of `--only`.
+With `--sysid` an arm by `hil identify`, and the same polished on windows of one second which cover
+the fitted recording, are compared with one that the minimiser of `mujoco.sysid`
+(`benchmarks.sysid_rival`) fits to these windows. All are then simulated in the same held-out
+windows, under the recorded torque and a feedback of 1 Hz. Prints errors, processor time from the
+recording on, and the error of positions that continue at the start velocity; wanted are no larger
+error and a tenth of the time. The recording is that of a simulated NS 16, or those of `--only`.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks import parser_of
 from benchmarks.board import DATA, import_all, simulated_logs
@@ -50,8 +52,11 @@ from identification.rollout.comparison import (
     recorded_stretches,
     simulate,
 )
+from identification.rollout.polish import Driven, polished
 from identification.rollout.windows import STEP, windows_of
 from sim_fixtures.ns16 import CELL_PATH
+
+Array = NDArray[np.float64]
 
 WINDOWS, ARMS = 1000, 50
 LARGEST_RATIO = 0.5
@@ -128,6 +133,9 @@ def _print_comparison(name: str, archives: Sequence[Path], iterations: int) -> N
     fitted = _windows_of(model, model.prepared.fitted, HORIZONS[-1])
     held_out = _windows_of(model, model.prepared.held_out, 0.1)
     begin = time.process_time()
+    polished_arm = polished(Driven(arm, fitted, feedback))
+    polished_seconds = seconds + time.process_time() - begin
+    begin = time.process_time()
     rival = fit_by_sysid(nominal, fitted, feedback, iterations)
     rival_seconds = time.process_time() - begin
     print(
@@ -137,8 +145,10 @@ def _print_comparison(name: str, archives: Sequence[Path], iterations: int) -> N
     )
     rows = {
         "hil identify": (simulate(arm, held_out, feedback), seconds),
+        "the same, polished": (polished_arm.on(held_out).positions(), polished_seconds),
         "mujoco.sysid": (positions_of(rival, nominal, held_out, feedback), rival_seconds),
         "nominal": (simulate(nominal, held_out, feedback), None),
+        "start velocity": (_continued(held_out), None),
     }
     print(f"{'position error (rms) [mrad]':30}" + "".join(f"{f'{h:g} s':>10}" for h in HORIZONS))
     measured = held_out.windows.reached[:, horizon_rows(held_out.windows)]
@@ -149,6 +159,13 @@ def _print_comparison(name: str, archives: Sequence[Path], iterations: int) -> N
         print(
             f"{label:30}{figures}" + ("" if spent is None else f"   in {spent:.1f} s"), flush=True
         )
+
+
+def _continued(motion: RecordedMotion) -> Array:
+    """Return the positions at the horizons (w, h, n) of joints that keep their start velocity."""
+    windows = motion.windows
+    moved = windows.start[:, None] * np.array(HORIZONS)[:, None]
+    return np.asarray(windows.position[:, :1] + moved)
 
 
 def _windows_of(

@@ -128,7 +128,9 @@ class Cell:
         tables = dict(zip(self.joint_names, laws, strict=False))
         common = FrictionTable.model_validate(dict(laws[0]))
         joints = {
-            name: JointFrictionTable.model_validate({k: v for k, v in law.items() if k != "ripple"})
+            name: JointFrictionTable.model_validate(
+                {k: v for k, v in law.items() if k not in ("ripple", "springs")}
+            )
             for name, law in tables.items()
         }
         changed = self._with_robot(friction=common.model_copy(update={"joints": joints}))

@@ -62,6 +62,8 @@ def robot_model(
     elements = [_element(path, place, table, chain) for place, table in enumerate(robot.elements)]
     if friction.ripple:
         elements += ripples(chain.joint_names, drive_train(), friction.ripple)
+    _require(path, "robot.friction.springs", friction.springs, chain.joint_names)
+    elements += springs(friction.springs)
     laws = {}
     for name, joint_table in friction.joints.items():
         table = friction.model_copy(update=joint_table.model_dump(exclude_unset=True))
@@ -95,9 +97,14 @@ def ripples(
     ]
 
 
+def springs(joints: Sequence[str]) -> list[TorsionSpring]:
+    """Return identified torsion springs; an offset of the torque moves their rest angles."""
+    return [TorsionSpring(name, rest=0.0, identified=True) for name in joints]
+
+
 def _law(path: Path, field: str, table: FrictionTable) -> FrictionLaw:
     with _cell_errors(path, field, None, "correct that table"):
-        return FrictionLaw.from_table(table.model_dump(exclude={"joints", "ripple"}))
+        return FrictionLaw.from_table(table.model_dump(exclude={"joints", "ripple", "springs"}))
 
 
 def _coupling(

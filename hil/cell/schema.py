@@ -189,6 +189,11 @@ class FrictionTable(JointFrictionTable):
         "gear ratio of 10 or more; nothing for automatic choice",
         [],
     )
+    springs: list[str] = field(
+        "names of joints with an identified torsion spring about URDF angle 0, such as a hose; "
+        "nothing for automatic choice",
+        [],
+    )
     joints: dict[str, JointFrictionTable] = field(
         "tables of fields that differ for a joint, by its name", {}
     )

@@ -248,6 +248,7 @@ def _questions(sources: Sources, options: Options, suggested: Sequence[float]) -
         # A cell file with a drive train states the friction terms.
         "friction": options.friction == "auto" and sources.cell.file.drive_train is None,
         "ripple": options.friction == "auto" and bool(_ripples(sources.cell)),
+        "springs": options.friction == "auto" and bool(_spring_joints(sources.cell)),
         # Currents of a controller are unfiltered.
         "low-pass": options.torque_bandwidth == "auto"
         and options.method == "default"
@@ -345,6 +346,7 @@ def _chosen(
             low_passes,
             suggested,
             _ripples(cell),
+            _spring_joints(cell),
             known_parameters(cell),
         )
         task.advance(1)
@@ -357,6 +359,19 @@ def _ripples(cell: Cell) -> list[list[TorqueRipple]]:
         return []
     motors = cell.drive_train.motor_from_joint
     return [ripples(cell.joint_names, motors, orders) for orders in RIPPLE]
+
+
+def _spring_joints(cell: Cell) -> tuple[str, ...]:
+    """Candidates of joints with a torsion spring: with an offset of the torque, and no element.
+
+    None if the cell states some, or the drive train, with which it states the friction terms.
+    """
+    if cell.file.drive_train is not None or cell.file.robot.friction.springs:
+        return ()
+    stated = {element.joint for element in cell.file.robot.elements}
+    laws = cell.model.friction.laws
+    joints = zip(cell.joint_names, cell.model.chain.revolute, laws, strict=False)
+    return tuple(name for name, turns, law in joints if turns and law.offset and name not in stated)
 
 
 def _delays(

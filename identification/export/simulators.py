@@ -237,7 +237,7 @@ _BEYOND: Final = "beyond that at the load for which it is written"
 _ACCELERATES: Final = "where its coefficient is negative and would accelerate a joint"
 _REVERSALS: Final = "dry friction between the two directions (velocity reversals, standstill)"
 _ROUNDED: Final = "effect of rounded angles of the URDF on the base parameters"
-_MOST_ROUNDED: Final = 2000  # rows that show whether there is one
+_MOST_ROUNDED: Final = 200  # rows that show whether there is one
 
 
 Part = tuple[str, Callable[[], Array], bool]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 
 from identification.distributions import student_limit
 from identification.export.arm import Arm
-from identification.export.simulators import rigid_torque, unsupported_torque
+from identification.export.simulators import unsupported_torque
 from identification.model.kinematics import pinocchio_model
+from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.rollout.servo import Servo, command_of
 from identification.rollout.simulation import LARGEST_ERROR, Feedback, SimulatedArm
@@ -132,10 +134,21 @@ def _removed(stretch: Stretch, samples: Samples, arm: Arm) -> Array:
 
 def _late(stretch: Stretch, arm: Arm) -> Array:
     """Return what centrifugal torques (g, n) lack, which MuJoCo computes half a step early."""
-    before = stretch.motion._replace(velocity=stretch.before)
-    late = rigid_torque(arm, before) - rigid_torque(arm, stretch.motion)
-    load = arm.model.load_torque
-    return np.asarray(late + load(*before[1:4]) - load(*stretch.motion[1:4]))
+    model = arm.model
+    motion = stretch.motion
+    before = motion._replace(velocity=stretch.before)
+    late = _late_of_links(model, arm.standard[model.layout.links].tobytes(), stretch)
+    return np.asarray(late + model.load_torque(*before[1:4]) - model.load_torque(*motion[1:4]))
+
+
+@lru_cache(maxsize=64)
+def _late_of_links(model: RobotModel, links: bytes, stretch: Stretch) -> Array:
+    """Return that of links without payload; a polish changes none of them in hundreds of arms."""
+    plan = RegressorPlan.of_bodies(model.chain, model.gravity)
+    parameters = np.frombuffer(links)
+    motion = stretch.motion
+    early = plan.torque(parameters, motion.position, stretch.before, motion.acceleration)
+    return early - plan.torque(parameters, *motion[1:4])
 
 
 def _delayed(stretch: Stretch, delay: float) -> Array:

@@ -33,9 +33,10 @@ Array = NDArray[np.float64]
 _WEIGHT: Final = 0.03  # lambda: of a change by one unit, beside an error that stays as it is
 _UNIT: Final = 0.3  # of the logarithm of friction and gains
 _DELAY_UNIT: Final = 5e-3  # s
-_ROTOR_UNIT: Final = 0.1  # of the inertia that the joint turns
+_ROTOR_UNIT: Final = 0.3  # of the logarithm of the inertia that the joint turns, rotor included
 _STEP: Final = 0.02  # of finite differences: dry friction makes the error rough
 _LARGEST: Final = 5.0  # change of a quantity, in its units
+_LARGEST_ROTOR: Final = 10.0  # likewise: twenty times the inertia
 _ITERATIONS: Final = 8
 _SETTLED: Final = 1e-3  # relative change
 _DRY = ("f0", "fl")
@@ -136,11 +137,14 @@ def _quantities(start: Driven) -> list[Quantity]:
             if arm.values[rows].any():
                 quantities.append(Quantity(partial(_with_friction, rows)))
     if model.layout.rotor_inertia:
-        rotors = arm.standard[model.layout.rotors]
-        for joint, inertia in enumerate(joint_inertia(arm, start.motion.windows.step)):
-            unit = _ROTOR_UNIT * float(inertia)
-            least = max(-float(rotors[joint]) / unit, -_LARGEST)
-            quantities.append(Quantity(partial(_with_rotor, joint, unit), least))
+        rotors = arm.standard[model.layout.rotors].tolist()
+        inertias = joint_inertia(arm, start.motion.windows.step).tolist()
+        for joint, (rotor, inertia) in enumerate(zip(rotors, inertias, strict=True)):
+            # A rotor of a wrist, seen through its gear, is heavier than what it moves.
+            others = max((inertia - rotor) / inertia, np.exp(-_LARGEST_ROTOR * _ROTOR_UNIT))
+            change = partial(_with_rotor, joint, inertia)
+            least = float(np.log(others)) / _ROTOR_UNIT
+            quantities.append(Quantity(change, least, _LARGEST_ROTOR))
     if servo is None:
         return [*quantities, Quantity(_with_delay)]
     for joint in range(model.n_joints):
@@ -155,13 +159,13 @@ def _with_friction(rows: NDArray[np.intp], driven: Driven, change: float) -> Dri
     return replace(driven, arm=replace(driven.arm, values=values))
 
 
-def _with_rotor(joint: int, unit: float, driven: Driven, change: float) -> Driven:
+def _with_rotor(joint: int, inertia: float, driven: Driven, change: float) -> Driven:
     arm = driven.arm
     model = driven.arm.model
     standard = arm.standard.copy()
     values = arm.values.copy()
     rotors = standard[model.layout.rotors]
-    rotors[joint] = max(0.0, rotors[joint] + unit * change)
+    rotors[joint] = max(0.0, rotors[joint] + inertia * np.expm1(_ROTOR_UNIT * change))
     standard[model.layout.rotors] = rotors
     values[: model.base.rank] = model.base.grouping @ standard
     return replace(driven, arm=replace(arm, standard=standard, values=values))

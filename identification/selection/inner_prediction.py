@@ -34,7 +34,7 @@ from identification.factor.factor import (
     equal_runs,
     total_factor,
 )
-from identification.model.elements import TorqueRipple
+from identification.model.elements import Element, TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.selection.settings import Choice, Settings, Strength
@@ -51,6 +51,7 @@ Question = Literal[
     "rows",
     "friction",
     "ripple",
+    "springs",
     "low-pass",
     "estimator",
 ]
@@ -61,7 +62,7 @@ RATE: Final = 125.0
 SHORT: Final = 15.0
 """Time of motion [s] below which fewer questions are asked: ten segments of less than a second and
 a half show no period of an exciting motion."""
-IF_LONG: Final[frozenset[str]] = frozenset({"strength"})
+IF_LONG: Final[frozenset[str]] = frozenset({"strength", "springs"})
 """Questions that are asked of long recordings only: their answers correct small errors, and a wrong
 one costs much on another motion."""
 DETAILS: Final[frozenset[str]] = frozenset({"bandwidth", "presliding"})
@@ -73,6 +74,7 @@ DELAY: Final = "delay of the torque"
 LOAD: Final = "friction that grows with load"
 STRENGTH: Final = "strength of the prior"
 CONSISTENT: Final = "physical consistency"
+SPRINGS: Final = "torsion springs"
 """Names of decisions."""
 # A drive differentiates its encoder at a higher rate than the log has.
 VELOCITIES: Final[tuple[VelocitySource, ...]] = ("measured", "position")
@@ -103,6 +105,7 @@ FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
 WORTHWHILE: Final = 0.01
 LOW_PASS_WORTHWHILE: Final = 0.05
 TERM_WORTHWHILE: Final = 0.02
+SPRING_WORTHWHILE: Final = 0.3  # of the error of its own joint
 # Bodies that cannot exist are of no use in a simulator, so they must predict much better.
 IMPOSSIBLE_WORTHWHILE: Final = 0.05
 # An error above the torque itself chooses nothing.
@@ -130,6 +133,11 @@ class Errors:
         """``||e|| / ||tau||`` over all joints of each segment with torque (k,)."""
         loaded = self.torque.sum(axis=1) > 0.0
         return _relative(self.squares.sum(axis=1)[loaded], self.torque.sum(axis=1)[loaded])
+
+    def segments_of(self, joint: int) -> Array:
+        """``||e|| / ||tau||`` of a joint in each segment in which it has torque (k,)."""
+        loaded = self.torque[:, joint] > 0.0
+        return _relative(self.squares[loaded, joint], self.torque[loaded, joint])
 
     @property
     def joints(self) -> Array:
@@ -215,8 +223,8 @@ class Folds:
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
 """Prepares the fitted data for a model, averaged to `RATE`."""
 
-Columns = tuple[tuple[FrictionLaw, ...], tuple[int, ...]]
-"""Friction of a model, and periods of its torque ripple per motor turn."""
+Columns = tuple[tuple[FrictionLaw, ...], tuple[int, ...], tuple[str, ...]]
+"""Friction of a model, periods of its torque ripple per motor turn, joints with a spring."""
 
 LowPasses = Callable[[RobotModel, Preprocessing], Sequence[Preprocessing]]
 """Returns settings with candidate low-passes of the torque."""
@@ -233,13 +241,15 @@ def choose_settings(
     low_passes: LowPasses,
     delays: Sequence[float] = (),
     ripples: Sequence[Sequence[TorqueRipple]] = (),
+    springs: Sequence[str] = (),
     stated: Known | None = None,
 ) -> Settings:
     """Choose settings one after the other, from data that `ready` prepares for the arm's `model`.
 
     Significant `delays` of the torque [s] are candidates for "delay" that must predict no worse
-    than that of `start`, and `ripples` those for "ripple". Returns settings with their choices;
-    `start` if the data are too short, or predict no part of themselves.
+    than that of `start`, `ripples` those for "ripple", and joints `springs` those for "springs".
+    Returns settings with their choices; `start` if the data are too short, or predict no part of
+    themselves.
     """
     trial = _Trial(model, ready, stated, ripples)
     now = start
@@ -276,6 +286,10 @@ def choose_settings(
         decision = trial.decide("torque ripple", [now, *rippled])
         now = decision.settings
         choices = [*choices, decision.choice]
+    if "springs" in asked:
+        for decision in _torsion_springs(trial, now, springs):
+            now = decision.settings
+            choices = [*choices, decision.choice]
     trial.weigh(now)
     compared, now, decided = _choose_prior(trial, now, asked)
     if not trial.errors(compared).overall < _MEANINGLESS:
@@ -300,8 +314,7 @@ def _choose_prior(
     compared = now
     if "consistency" in asked:
         possible = replace(now, strength=replace(now.strength, consistent=True))
-        # What bodies that cannot exist fit better is the most that they can predict better.
-        if trial.fitted_error(now) < (1.0 - IMPOSSIBLE_WORTHWHILE) * trial.fitted_error(possible):
+        if trial.fits_impossible(now, possible):
             decision = trial.decide(CONSISTENT, [possible, now], IMPOSSIBLE_WORTHWHILE)
             now = decision.settings
             choices = [*choices, decision.choice]
@@ -345,6 +358,29 @@ def _load_friction(trial: _Trial, now: Settings) -> _Decision:
         TERM_WORTHWHILE,
         possible=lambda each: law.load or trial.has_load_shares(each),
     )
+
+
+def _torsion_springs(trial: _Trial, now: Settings, joints: Sequence[str]) -> list[_Decision]:
+    """Choose the joints with a torsion spring, such as a hose that their motion twists.
+
+    Bodies that cannot exist, with a negative inertia, predict the torque of a spring as well; so
+    possible ones are compared, where they fit worse. Each spring must predict its own joint much
+    better, which the error over all joints does not show of one with little torque.
+    """
+    possible = replace(now, strength=replace(now.strength, consistent=True))
+    if not trial.fits_impossible(now, possible):
+        return []
+    every = possible.with_friction(springs=tuple(joints))
+    shown = tuple(
+        name
+        for name in joints
+        if trial.is_better_for(name, every, possible) and trial.stiffness(name, every) > 0.0
+    )
+    if not shown:
+        return []
+    candidates = [possible, possible.with_friction(springs=shown)]
+    decision = trial.decide(SPRINGS, candidates, by_joint=True)
+    return [decision._replace(settings=replace(decision.settings, strength=now.strength))]
 
 
 def _compare_delays(
@@ -468,19 +504,22 @@ class _Trial:
 
     def model(self, settings: Settings) -> RobotModel:
         """Return the model of the arm with the friction and the torque ripple of settings."""
-        laws, orders = key = self._columns(settings)
+        laws, orders, springs = key = self._columns(settings)
         if key not in self._models:
             model = self._model.with_friction_laws(laws)
-            self._models[key] = model.with_elements(self.ripples.get(orders, ()))
+            elements: list[Element] = [*self.ripples.get(orders, ())]
+            elements += [TorsionSpring(joint, rest=0.0, identified=True) for joint in springs]
+            self._models[key] = model.with_elements(elements)
         return self._models[key]
 
     def _columns(self, settings: Settings) -> Columns:
         entries = {**settings.friction}
         orders = tuple(entries.pop("ripple", ()))
+        springs = tuple(entries.pop("springs", ()))
         key = tuple(entries.items())
         if key not in self._laws:
             self._laws[key] = tuple(law.changed(entries) for law in self._model.friction.laws)
-        return self._laws[key], orders
+        return self._laws[key], orders, springs
 
     def factor_key(self, settings: Settings) -> tuple[Columns, Preprocessing]:
         """Return the key of the settings that change factors."""
@@ -545,6 +584,32 @@ class _Trial:
         self._retain_samples(candidates[chosen])
         described = _differences([_description(self.model(each), each) for each in candidates])
         return _Decision(candidates[chosen], Choice(name, described, tuple(means), chosen))
+
+    def fits_impossible(self, settings: Settings, possible: Settings) -> bool:
+        """Return whether bodies that cannot exist fit better than possible ones.
+
+        What they fit better is the most that they can predict better.
+        """
+        limit = (1.0 - IMPOSSIBLE_WORTHWHILE) * self.fitted_error(possible)
+        return self.fitted_error(settings) < limit
+
+    def is_better_for(self, joint: str, settings: Settings, others: Settings) -> bool:
+        """Return whether settings predict a joint much better than others."""
+        index = self._model.joint_names.index(joint)
+        after, before = (self.errors(each).segments_of(index) for each in (settings, others))
+        return _clearly_better(after, before, SPRING_WORTHWHILE, CERTAIN)
+
+    def stiffness(self, joint: str, settings: Settings) -> float:
+        """Return the fitted stiffness of the torsion spring of a joint [N·m/rad]."""
+        model = self.model(settings)
+        reduced = self._reduced(settings)
+        values = self._estimator(settings, reduced)(reduced.folds.fitted)
+        springs = [
+            placed.part
+            for placed in model.elements.identified
+            if isinstance(placed.element, TorsionSpring) and placed.element.joint == joint
+        ]
+        return float(values[model.element_part][springs[0]][0])
 
     def walk(self, candidates: Sequence[Settings], size: Callable[[Settings], float]) -> list[int]:
         """Return the indices of the first candidate and, to both sides by size, of improvements.
@@ -801,6 +866,7 @@ def _description(model: RobotModel, settings: Settings) -> tuple[str, ...]:
     ripple = "no torque ripple"
     if orders:
         ripple = f"torque ripple, {' and '.join(map(str, orders))} per motor turn"
+    springs = [part.joint for part in elements if isinstance(part, TorsionSpring)]
     left_out = {
         "slow": "slow rows and reversals",
         "halts": "long halts of each joint",
@@ -812,6 +878,7 @@ def _description(model: RobotModel, settings: Settings) -> tuple[str, ...]:
         "measured velocity" if how.velocity == "measured" else "velocity from positions",
         *model.friction.laws[0].summary(),
         ripple,
+        f"torsion springs of {', '.join(springs)}" if springs else "no torsion spring",
         left_out.get(how.left_out or "", "by the friction law"),
         f"delay of {1e3 * how.torque_delay:.3g} ms",
         "no low-pass" if width is None else f"low-pass of {width:.3g} Hz, {how.torque_shape}",

@@ -127,6 +127,8 @@ FAULTS = [
     (r"^\[limits\]\n(?:[^\[].*\n|\n)*", "", "limits: is missing", "add a table [limits]"),
     (r"^\[robot\]$", "[robot]\nlocked = { joint_6 = 0.1 }", "robot.locked", "[limits]"),
     ("$", '[robot.friction.joints.joint_9]\nthird = "none"', "robot.friction.joints", "joint_9"),
+    (r"^\[robot.friction\]", '[robot.friction]\nsprings = ["joint_9"]', "robot.friction.springs",
+     "joint_9"),
     ("$", '[robot.friction.joints.joint_5]\nthirds = "none"', "robot.friction.joints.joint_5",
      "third"),
     ("$", '[robot.friction.joints.joint_5]\nstandstill = 0.0\nzone = "linear"',

@@ -1,6 +1,7 @@
 """Windows of a measured motion, simulated by MuJoCo and compared."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from identification.rollout.comparison import (
     coverage,
     errors_of,
     horizon_rows,
+    joint_inertia,
     leading_joint,
     light_feedback,
     recorded_stretches,
@@ -23,7 +25,7 @@ from identification.rollout.comparison import (
 )
 from identification.rollout.polish import Driven, polished
 from identification.rollout.servo import NoServoError, identify_servo
-from identification.rollout.simulation import LARGEST_ERROR, Feedback
+from identification.rollout.simulation import LARGEST_ERROR, Feedback, SimulatedArm
 from identification.rollout.windows import (
     NoWindowError,
     mean_about,
@@ -32,7 +34,7 @@ from identification.rollout.windows import (
 )
 from tests.identification.two_link import MODEL, URDF, four_sines, simulated
 
-pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
+mujoco = pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 
 N = MODEL.n_joints
 NO_LIMITS = Ranges(*(np.full(N, limit) for limit in (-np.inf, np.inf, np.inf, np.inf)))
@@ -90,6 +92,28 @@ def test_an_unstable_arm_is_counted_and_silent(capfd) -> None:
     assert capfd.readouterr() == ("", "")
 
 
+def test_the_solver_of_dry_friction_changes_no_position() -> None:
+    arm = an_arm(coulomb=3.0)
+    motion = a_recording(arm, 0.005)
+    windows = motion.windows
+    simulated = SimulatedArm.of(arm, windows.step, NOTHING)
+    force = motion.force(arm, simulated)
+    run = partial(simulated.simulate, windows.position[:, 0], windows.start, force)
+    positions = run(windows.position)
+    simulated.model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    assert positions == pytest.approx(run(windows.position), abs=1e-6)  # rad, of a motion of one
+
+
+def test_the_clock_of_mujoco_runs_after_a_rollout() -> None:
+    """A rollout stops it, as reading it takes a fifth of a step."""
+    arm = an_arm()
+    final_errors(arm, a_recording(arm, 0.005))
+    model = mujoco.MjModel.from_xml_string(mjcf(arm, "arm"))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    assert data.timer[mujoco.mjtTimer.mjTIMER_STEP].duration > 0.0
+
+
 @pytest.mark.long
 def test_a_polish_finds_friction_rotor_and_delay() -> None:
     true, motion = an_arm(coulomb=3.0), a_recording(an_arm(coulomb=3.0), 0.005)
@@ -102,6 +126,20 @@ def test_a_polish_finds_friction_rotor_and_delay() -> None:
     friction = best.arm.values[MODEL.friction_part] / true.values[MODEL.friction_part]
     assert friction[true.values[MODEL.friction_part] != 0.0] == pytest.approx(1.0, abs=0.15)
     assert best.motion.delay == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.long
+def test_a_polish_finds_a_rotor_heavier_than_what_the_joint_turns() -> None:
+    def with_rotor(inertia: float) -> Arm:
+        arm = an_arm()
+        standard = arm.standard.copy()
+        standard[MODEL.layout.rotors] = (0.4, inertia)
+        values = np.concatenate([MODEL.base.grouping @ standard, arm.values[MODEL.friction_part]])
+        return replace(arm, standard=standard, values=values)
+
+    heavy = 4.0 * joint_inertia(with_rotor(0.0), 0.005)[1]
+    best = polished(Driven(with_rotor(0.0), a_recording(with_rotor(heavy), 0.005), NOTHING))
+    assert best.arm.rotors[1, 1] == pytest.approx(heavy, rel=0.15)
 
 
 def test_friction_that_accelerates_acts_as_measured() -> None:

@@ -14,7 +14,7 @@ from scipy.signal import butter, sosfilt, sosfiltfilt
 from identification.errors import IdentificationError
 from identification.estimators.torque_channel import possible_low_passes
 from identification.factor.factor import Factor, estimate
-from identification.model.elements import TorqueRipple
+from identification.model.elements import TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.regressor import RegressorPlan
@@ -245,7 +245,9 @@ def cut(recording):
     return round(0.7 * recording.n_samples)
 
 
-def chosen(recording, questions, *, model=MODEL, leaks=False, ripple=(), low_passes=None):
+def chosen(
+    recording, questions, *, model=MODEL, leaks=False, ripple=(), springs=(), low_passes=None
+):
     """Choose settings on the fitted rows, or on all of them with a leak."""
     fitted = recording if leaks else recording.between(0, cut(recording))
 
@@ -256,7 +258,9 @@ def chosen(recording, questions, *, model=MODEL, leaks=False, ripple=(), low_pas
         return possible_low_passes(fitted, model, options=how) if low_passes is None else low_passes
 
     start = Settings(Preprocessing())
-    settings = choose_settings(model, ready, start, questions, possible, ripples=[ripple])
+    settings = choose_settings(
+        model, ready, start, questions, possible, ripples=[ripple], springs=springs
+    )
     return settings, settings.choices
 
 
@@ -293,6 +297,20 @@ class TestChosenSettings:
         assert settings.friction["ripple"] == (2,)
         settings, _ = chosen(a_recording(), {"ripple"}, ripple=ripple)
         assert "ripple" not in settings.friction
+
+    @pytest.mark.parametrize("stiffness", [0.0, 20.0])
+    def test_a_torsion_spring_is_estimated_only_where_one_is(self, stiffness):
+        """A slow motion: without the spring its joint would have a negative inertia."""
+        joint = MODEL.joint_names[1]
+        sprung = MODEL.with_elements([TorsionSpring(joint, rest=0.0, identified=True)])
+        slow = np.array([[0.3, 0.5], [0.7, 0.4], [1.1, 0.9]])
+        motion = sine_motion(np.arange(0.0, LONG, 0.005), 0.4, slow, slow)
+        recording = a_recording(sprung, np.append(truth(), stiffness), motion=motion)
+        settings, choices = chosen(recording, {"springs"}, springs=MODEL.joint_names)
+        assert settings.friction.get("springs") == ((joint,) if stiffness else None)
+        assert not settings.strength.consistent  # nobody asked for it
+        named = [choice.candidates[choice.chosen] for choice in choices]
+        assert named == ([f"torsion springs of {joint}"] if stiffness else [])
 
     @pytest.mark.parametrize(("shape", "name"), [(None, DELAY), (CAUSAL, LOW_PASS)])
     def test_a_delay_is_not_called_a_low_pass(self, shape, name):
