@@ -119,7 +119,7 @@ def _require_one_kind_of_arm(folder: CampaignFolder, simulated: bool) -> None:
             raise CampaignFolderError(
                 folder.root,
                 f"holds archives of {whose}, and its link leads to {link}",
-                "begin a new campaign folder (`hil design`), or restore the cell's [controller]",
+                "begin a new campaign folder (`hil design`)",
             )
 
 

@@ -101,6 +101,12 @@ class _CampaignRun:
         require_gates(
             campaign, link, plan_hash, simulated=simulated, unrehearsed=options.unrehearsed
         )
+        # A requirement that cannot be measured is refused before an operator watches a dry run.
+        self._precision = (
+            PrecisionStage(campaign, options.until_precise, plan_hash, reporter)
+            if options.until_precise
+            else None
+        )
         self._archives = RunArchives(campaign, link, options, plan_hash)
         self._dry_run = DryRunStage(campaign, self._archives, watch, options)
         if not options.unrehearsed:
@@ -113,11 +119,6 @@ class _CampaignRun:
                 can_answer=watch.operator.can_answer,
             )
         self._warm_up = WarmUpStage(campaign, self._archives, watch, reporter)
-        self._precision = (
-            PrecisionStage(campaign, options.until_precise, plan_hash, reporter)
-            if options.until_precise
-            else None
-        )
 
     def execute(self) -> RunResult:
         """Run the missing motions; a controller is connected only where some are missing."""

@@ -104,6 +104,7 @@ _ROUNDING: Final = 1e-9
 _STEP_QUANTILE: Final = 0.01  # of the changes between samples: one step of a coarse encoder
 _GRID: Final = 0.05  # distance from a multiple of the step, in steps
 _MAX_ROUNDING: Final = 0.02  # of accelerations, as a share
+_EXACT: Final = 1e-4  # relative error below the resolution of any sensor
 _FAST: Final = 2.0  # a low-pass above this multiple of the motion's bandwidth has no effect
 
 
@@ -218,6 +219,8 @@ def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
             advice,
         )
         return
+    if any(choice.errors[choice.chosen] < _EXACT for choice in prepared.settings.choices):
+        return  # computed for this motion, or it would not be predicted to rounding
     above = torque_noiseless_above(prepared.sources.training[0].recording)
     if above is not None and width is None and above < _FAST * how.rigid_bandwidth:
         yield _condition(

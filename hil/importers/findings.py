@@ -25,6 +25,7 @@ from identification.signals.recording import STUCK_MOVEMENT, unwrap
 Array = NDArray[np.float64]
 
 _TOLERANCE: Final = 0.05  # rad or m beyond a limit, for calibration and overshoot
+_APART: Final = 0.1  # rad or m between samples of one stamp, 20 ms at 5 rad/s
 _LEAST_TRAVEL: Final = 0.1  # rad or m
 _SCALE_TOLERANCE: Final = 0.1  # of velocity over slope of the position, for filters
 _CORRELATED: Final = 0.7
@@ -234,6 +235,9 @@ def _positions(
     moved = np.abs(np.diff(position[::stride], axis=0))[steps[:, 0] > 0.0]
     if not len(moved):
         return
+    if apart := _of_one_stamp(time, position):
+        yield apart
+        return  # its speeds are none of the arm
     usual = np.quantile(moved / steps[steps[:, 0] > 0.0], 0.9, axis=0)
     for name, speed, limit in zip(names, usual, limits.velocity, strict=True):
         if speed > _TOO_FAST * limit:
@@ -241,6 +245,21 @@ def _positions(
                 f"{name} would move at {speed:.3g} rad/s (or m/s), its limit in the URDF is "
                 f"{limit:.3g}: check the units of position (degrees?) and time (milliseconds?)"
             )
+
+
+def _of_one_stamp(time: Array, position: Array) -> str:
+    """Return how far apart positions (m, n) of one stamp are, "" if they are near."""
+    starts = np.flatnonzero(np.diff(time, prepend=time[0] - 1.0))
+    highest = np.maximum.reduceat(position, starts)
+    lowest = np.minimum.reduceat(position, starts)
+    apart = (highest - lowest).max(axis=1)
+    count = np.count_nonzero(apart > _APART)
+    if not count:
+        return ""
+    return (
+        f"samples with the same time stamp are up to {apart.max():.3g} rad or m apart ({count} such"
+        " stamps): two sources write this log, or its clock is much coarser than its samples"
+    )
 
 
 def _velocities(

@@ -128,12 +128,26 @@ class _Log:
         """Return a quantity in SI units, (m, k), columns in the log's joint order."""
         quantity = self._map.quantities()[name]
         values, units = self._numbers(name, quantity)
+        if len(values) and values.shape[1] == len(self.joints):
+            self._require_any(name, values)
         scales = {"scale": quantity.scale, "offset": quantity.offset, "rated": quantity.rated}
         for key, value in scales.items():
             if isinstance(value, tuple):
                 self._check_count(value, f"{name}.{key}")
         factor = self._factor(name, quantity, [unit_of(unit or "", name) for unit in units])
         return np.asarray((values + quantity.offset) * np.multiply(factor, quantity.scale))
+
+    def _require_any(self, name: str, values: Array) -> None:
+        """Refuse a quantity (m, k) that some joints have and others have in no row."""
+        has = np.isfinite(values).any(axis=0)
+        if has.all() or not has.any():
+            return
+        joint = self.joints[int(np.argmin(has))]
+        problem = f"joint {joint} has no number in any row, the others have"
+        remedy = f"name the column that has it, or leave out [{name}]"
+        if name == "position":
+            remedy = f"name the column that has it, or lock the joint: --locked {joint}=POSITION"
+        raise SourceError(self.path, problem, field=name, remedy=remedy)
 
     def _factor(self, name: str, quantity: Quantity, stated: Sequence[str | None]) -> float | Array:
         """Return the factors to SI units: of the map's unit, or of those that the file states."""

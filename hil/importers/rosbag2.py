@@ -272,9 +272,11 @@ class _States:
         silent = self._second_publisher(values["position"])
         if silent.any():
             keep &= ~silent
+            pose = values["position"][np.argmax(silent)]
+            where = ", ".join(f"{angle:.3g}" for angle in pose) if pose.any() else "0"
             self.notes.append(
-                f"{np.count_nonzero(silent)} of {len(stamp)} messages have 0 for all positions "
-                "between others that do not: those of a second publisher, left out"
+                f"{np.count_nonzero(silent)} of {len(stamp)} messages have {where} for all "
+                "positions between others that do not: those of a second publisher, left out"
             )
         order = np.flatnonzero(keep)
         swapped = swapped_messages(stamp[order])
@@ -316,13 +318,22 @@ class _States:
 
     @staticmethod
     def _second_publisher(position: Array) -> NDArray[np.bool_]:
-        """Return which messages have exact zeros between others that move (m,)."""
-        silent = (position == 0.0).all(axis=1)
+        """Return which messages have one and the same pose between others that move (m,)."""
+        none = np.zeros(len(position), np.bool_)
+        jumps = np.abs(np.diff(position, axis=0)).max(axis=1) > _APART
+        if np.count_nonzero(jumps) <= 2 * _STALLED:
+            return none
+        poses, counts = np.unique(position, axis=0, return_counts=True)
+        pose = poses[np.argmax(counts)]
+        silent = (position == pose).all(axis=1)
         others = position[~silent]
         alternating = np.count_nonzero(np.diff(silent.astype(np.int8))) > 2 * _STALLED
-        if not alternating or not len(others) or np.abs(others).max(axis=1).min() < _APART:
-            return np.zeros(len(position), np.bool_)
-        return np.asarray(silent)
+        if not alternating or not len(others):
+            return none
+        moved = np.diff(others, axis=0).any(axis=1)
+        if pose.any() and 2 * np.count_nonzero(moved) < len(moved):
+            return none  # an arm that goes to and fro between two poses
+        return none if np.abs(others - pose).max(axis=1).min() < _APART else np.asarray(silent)
 
     def _check_repeats(
         self,
@@ -383,8 +394,9 @@ class _States:
             stamp = stamp[(stamp >= samples.stamp[0]) & (stamp <= samples.stamp[-1])]
         exact = all(np.isin(stamp, samples.stamp).all() for samples in joined)
         kinds = " and ".join(f"({', '.join(part.joints)})" for part in parts)
-        if len(stamp) < 2 or (not exact and not self._are_close(stamp, joined)):
-            problem = f"{kinds} come in messages of their own, not at the same time"
+        apart = "" if exact else self._too_far_apart(stamp, parts, joined)
+        if len(stamp) < 2 or apart:
+            problem = f"{kinds} come in messages of their own, {apart or 'not at the same time'}"
             remedy = f"record them in one message; {_AT_REST}"
             raise SourceError(self._source, problem, field="joints", remedy=remedy)
         how = "with the same stamps" if exact else "interpolated to the stamps of the first"
@@ -401,17 +413,24 @@ class _States:
         return _Joined(stamp, {name: array[:, order] for name, array in values.items()})
 
     @staticmethod
-    def _are_close(stamp: NDArray[np.int64], joined: Sequence[_Joined]) -> bool:
-        """Return whether all parts that move have samples within two periods of each stamp."""
+    def _too_far_apart(
+        stamp: NDArray[np.int64], parts: Sequence[_Part], joined: Sequence[_Joined]
+    ) -> str:
+        """Return which part moves and has no samples within two periods of a stamp, or ""."""
+        if len(stamp) < 2:
+            return ""
         period = float(np.median(np.diff(stamp)))
-        for samples in joined:
+        for part, samples in zip(parts, joined, strict=True):
             if np.ptp(samples.values["position"], axis=0).max() < _STATIC:
                 continue
             after = np.clip(np.searchsorted(samples.stamp, stamp), 1, len(samples.stamp) - 1)
             gap = samples.stamp[after] - samples.stamp[after - 1]
             if (gap > _MOST_APART * period).any():
-                return False
-        return True
+                return (
+                    f"those of ({', '.join(part.joints)}) up to {1e-6 * gap.max():.3g} ms apart, "
+                    f"where {parts[0].joints[0]} comes every {1e-6 * period:.3g} ms"
+                )
+        return ""
 
 
 def _at(stamp: NDArray[np.int64], stamps: NDArray[np.int64], values: Array) -> Array:

@@ -276,9 +276,9 @@ class Table:
         texts = self._texts(index)
         numerals = _normalised(texts, self.dialect)
         values = np.array([_number(text) for text in numerals])
-        if self.gaps:
+        if self.gaps or (not np.isfinite(values).any() and len(set(texts)) == 1):
             values[~np.isfinite(values)] = np.nan
-            return values
+            return values  # of a column without any number the reader knows the joint
         invalid = np.flatnonzero(~np.isfinite(values))
         if not invalid.size:
             return values

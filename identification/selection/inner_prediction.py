@@ -108,8 +108,9 @@ TERM_WORTHWHILE: Final = 0.02
 SPRING_WORTHWHILE: Final = 0.3  # of the error of its own joint
 # Bodies that cannot exist are of no use in a simulator, so they must predict much better.
 IMPOSSIBLE_WORTHWHILE: Final = 0.05
-# An error above the torque itself chooses nothing.
+# An error above the torque itself chooses nothing, nor does one that no sensor resolves.
 _MEANINGLESS: Final = 1.0
+_EXACT: Final = 1e-5
 # Speeds above this share of the largest are predicted from slower ones to try friction terms.
 _FAST: Final = 0.85
 # Smallest friction within the range of speeds, as a share of Coulomb friction.
@@ -576,7 +577,7 @@ class _Trial:
         means = [_mean(part) for part in segments]
         chosen = 0
         for k, mean in enumerate(means):
-            if not (mean < means[chosen] and mean < _MEANINGLESS):
+            if not (mean < means[chosen] and mean < _MEANINGLESS) or means[0] < _EXACT:
                 continue
             better = _clearly_better(segments[k], segments[0], share, certainty)
             if better and (possible is None or possible(candidates[k])):

@@ -98,7 +98,7 @@ def mask_rows(
     low-pass of torque and regressor; `current_limit` (n,) [A] of motors. `left_out` excludes
 
     - "rests": rows in which no joint moves for more than `LONGEST_HALT`: a joint that stands while
-        another moves holds its load;
+        another moves holds its load; and the two rows at each reversal of a joint;
     - "halts": rows of a joint slower than standstill for more than `LONGEST_HALT`, and the two rows
         at a change of its velocity's sign;
     - "slow": all rows slower than standstill, or near a velocity reversal;
@@ -118,12 +118,14 @@ def mask_rows(
         edge |= edge_rows(recording, min(LONGEST_END, END_PERIODS / float(torque_bandwidth.min())))
     reversal = near_any_reversal(model, motion, REVERSAL_PERIODS / bandwidth)
     reasons = {EDGE: np.broadcast_to(edge[:, None], shape)}
+    # Errors of velocity and delay turn dry friction there, always to less of it at low speed.
+    turning = near_any_reversal(model, motion, np.zeros(shape[1]))
+    halts = long_rests(motion.time, still)
     if left_out == "rests":
         resting = long_rests(motion.time, np.all(still, axis=1)[:, None])
-        reasons |= {REST: np.broadcast_to(resting, shape)}
+        reasons |= {REST: np.broadcast_to(resting, shape), REVERSAL: turning & ~halts}
     elif left_out == "halts":
-        at_once = near_any_reversal(model, motion, np.zeros(shape[1]))
-        reasons |= {REST: long_rests(motion.time, still), REVERSAL: at_once}
+        reasons |= {REST: halts, REVERSAL: turning}
     elif left_out == "slow":
         reasons |= {STANDSTILL: still, REVERSAL: reversal}
     reasons[SATURATED] = saturated

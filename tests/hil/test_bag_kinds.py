@@ -127,7 +127,9 @@ class TestPublishers:
         rare += [message(k, joints=(2,)) for k in range(0, COUNT, 20)]
         typed = Typed(urdf, rare, "--lock-others")
         assert typed.refused
-        assert "come in messages of their own, not at the same time" in typed.message
+        assert "come in messages of their own, those of (ankle) up to 80 ms apart, where hip " in (
+            typed.message
+        )
         assert "(hip, knee) and (ankle)" in typed.message
         assert typed.again("--locked", "ankle=0.0").archive.joint_names == ("hip", "knee")
 
@@ -153,6 +155,27 @@ class TestPublishers:
         assert_right(typed.archive)
         assert f"{COUNT} of {2 * COUNT} messages have 0 for all positions" in typed.message
         assert "second publisher" in typed.message
+
+    @pytest.mark.parametrize("share", [1, 4])
+    def test_so_is_one_of_a_fixed_pose(self, urdf, share: int) -> None:
+        pose = POSITION * 0.0 + (0.3, -0.4, 1.5)
+        both = [
+            sent
+            for k in range(COUNT)
+            for sent in (
+                message(k),
+                message(k, stamp=STAMPS[k] + PERIOD // 2, position=pose, late=PERIOD // 2),
+            )[: 2 if k % share == 0 else 1]
+        ]
+        typed = Typed(urdf, both)
+        assert_right(typed.archive)
+        assert "messages have 0.3, -0.4, 1.5 for all positions between others" in typed.message
+
+    def test_a_pose_to_which_the_arm_returns_is_none(self, urdf) -> None:
+        """It moves between two poses within a sample, as in a log of steps."""
+        steps = POSITION * 0.0 + np.where(np.arange(COUNT) // 20 % 2, 0.5, -0.5)[:, None]
+        typed = Typed(urdf, [message(k, position=steps) for k in range(COUNT)])
+        assert typed.archive.n_samples == COUNT
 
     def test_contradicting_samples_of_one_stamp_are_refused(self, urdf) -> None:
         both = [sent for k in range(COUNT)

@@ -331,6 +331,28 @@ class TestRemedies:
         torque = {"columns": "tau{}", "rated": (100.0, 100.0, 100.0)}
         assert_right(imported(tmp_path / "log.csv", content, urdf, torque=torque))
 
+    @pytest.mark.parametrize("cell", ["", "nan", "#N/A"])
+    @pytest.mark.parametrize("missing", [{}, {"format": {"missing": "drop"}}])
+    def test_the_joint_without_torque_is_named(
+        self, tmp_path: Path, urdf: Path, cell: str, missing: dict[str, Any]
+    ) -> None:
+        content = text([[*row[:5], cell, *row[6:]] for row in rows()])
+        with pytest.raises(SourceError, match=r"joint knee has no number in any row") as refused:
+            imported(tmp_path / "log.csv", content, urdf, **missing)
+        assert "leave out [torque]" in str(refused.value)
+        archive = imported(tmp_path / "log.csv", content, urdf, torque=None, **missing)
+        assert archive.columns["position"] == pytest.approx(POSITION, abs=1e-6)
+
+    def test_samples_of_one_stamp_that_are_apart_are_named(
+        self, tmp_path: Path, urdf: Path
+    ) -> None:
+        """No unit is suspected of their speeds."""
+        other = [[row[0], *(f"{float(q) + 1.0:.6f}" for q in row[1:4]), *row[4:]] for row in rows()]
+        both = [row for pair in zip(rows(), other, strict=True) for row in pair]
+        archive = imported(tmp_path / "log.csv", text(both), urdf)
+        (line,) = archive.header.findings.warnings
+        assert "up to 1 rad or m apart (400 such stamps)" in line
+
     def test_a_clock_that_was_set_back_is_refused(self, tmp_path: Path, urdf: Path) -> None:
         for back in (0.5, 3600.0, 5.0):
             time = np.where(np.arange(COUNT) < 200, TIME, TIME - back)
@@ -338,7 +360,11 @@ class TestRemedies:
                 imported(tmp_path / "log.csv", text(rows(time=time.tolist())), urdf)
 
     def test_every_row_dropped_is_no_recording(self, tmp_path: Path, urdf: Path) -> None:
-        content = text([[*row[:-1], "x"] for row in rows()])
+        odd = [
+            [cell if 1 + k % 6 != place else "x" for place, cell in enumerate(row)]
+            for k, row in enumerate(rows())
+        ]
+        content = text(odd)
         with pytest.raises(SourceError, match="has a missing number in every row"):
             imported(tmp_path / "log.csv", content, urdf, format={"missing": "drop"})
 

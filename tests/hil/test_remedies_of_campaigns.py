@@ -2,23 +2,27 @@
 
 A small simulated arm is designed for, rehearsed, run and identified by nothing but the commands
 that the messages name; its folder has a blank in its name. `TYPED` says which test types which
-message, and a test that every message is in it, in `ELSEWHERE` or in `UNTYPED`.
+message, and a test that every message is in it or in `ELSEWHERE`.
 """
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from distributed import LocalCluster
 
-from hil.campaign.folder import CampaignFolder
+from hil.campaign.folder import SIDES, CampaignFolder
 from hil.design import DesignResult
 from hil.errors import InputError
+from hil.simulation import simulated_link
 from tests.docs.test_messages import COMMAND, FIELD, MESSAGES, OPTION
 from tests.hil.fast_cell import fast_campaign, fast_cell, mirrored, pass_rehearsal
 from tests.hil.test_campaign_day import QUICK
@@ -51,6 +55,21 @@ TYPED = {
     "add --until-precise": "test_a_precision_without_an_end",
     "omit --workers, or --scheduler": "test_workers_of_a_cluster",
     "make room, or name another folder with --cache, or none": "test_a_cache_that_is_no_folder",
+    "resume with the same cell and settings, or start again (--force)":
+        "test_another_cell_than_that_of_the_search",
+    "name a file that `hil design` wrote": "test_the_name_of_no_design",
+    "for a payload add --for payload": "test_the_mass_of_a_payload",
+    "FIELD; no motion of this arm can meet it": "test_a_torque_of_uncertain_scale",
+    "FIELD % of each joint's torque; recordings measure it (--given)":
+        "test_an_assumed_torque_error",
+    "no more repetitions; another motion adds": "test_a_precision_out_of_reach",
+    "run it with --payload NAME": "test_the_mass_of_a_payload_of_a_campaign",
+    "run the campaign that it was copied from": "test_a_copy_of_a_loaded_side",
+    "begin a new campaign folder (`hil design`)": "test_a_link_to_another_kind_of_arm",
+    "design a better excitation (`hil design`)": "test_an_excitation_that_determines_too_little",
+    "FIELD workers of Dask did not start": "test_workers_that_do_not_start",
+    "the scaled condition number is FIELD": "test_parameters_that_are_poorly_separated",
+    "FIELD more: see --output and --json": "test_more_campaigns_than_are_shown",
 }  # fmt: skip
 ELSEWHERE = {
     "find the torque constants with `hil torque-constants`": "tests/hil/test_importers.py",
@@ -59,25 +78,8 @@ ELSEWHERE = {
     "stopped before the end of the search": "tests/hil/test_design_command.py, interrupted",
     "repeat with --resume to draw it": "a picture on a full disk",
     "free disk space": "tests/disk",
+    "the FIELD joints form FIELD arms": "tests/hil/test_design_settings.py",
 }
-
-UNTYPED = (
-    "resume with the same cell and settings, or start again (--force)",
-    "name a file that `hil design` wrote",
-    "for a payload add --for payload",
-    "FIELD; no motion of this arm can meet it",
-    "FIELD % of each joint's torque; recordings measure it (--given)",
-    "run it with --payload NAME",
-    "FIELD more: see --output and --json",
-    "the FIELD joints form FIELD arms",
-    "FIELD workers of Dask did not start",
-    "the scaled condition number is FIELD",
-    "run the campaign that it was copied from",
-    "begin a new campaign folder (`hil design`)",
-    "no more repetitions; another motion adds",
-    "design a better excitation (`hil design`)",
-)
-"""Messages whose remedy no test types yet."""
 
 
 def commands(text: str) -> list[list[str]]:
@@ -108,6 +110,16 @@ def accepted(*words: object) -> str:
 
 
 DESIGN = ("design", "cell.toml", "--settings", "quick.toml")
+PRECISE = ("design", "cell.toml", "--workers", 1, "--settings", "gradient.toml")
+GRADIENT = """\
+method = "gradient"
+[search]
+population = 8
+generations = 1
+gradient = 2
+[via_points]
+n_via = 4
+"""
 
 
 @pytest.fixture(scope="module")
@@ -116,6 +128,7 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("template")
     fast_cell(folder, repetitions=2)
     (folder / "quick.toml").write_text(QUICK)
+    (folder / "gradient.toml").write_text(GRADIENT)
     with pytest.MonkeyPatch.context() as inside:
         inside.chdir(folder)
         accepted(*DESIGN, "-o", "my runs/a")
@@ -163,6 +176,79 @@ class TestDesign:
             DesignResult.load(file)
         accepted(*DESIGN, "-o", designed, "--force")
         DesignResult.load(file)
+
+    def test_another_cell_than_that_of_the_search(self, designed: Path, here: Path) -> None:
+        cell = here / "cell.toml"
+        before = cell.read_text()
+        cell.write_text(before.replace("[400.0, 400.0]", "[300.0, 300.0]"))
+        text = refusal(*DESIGN, "-o", designed, "--resume")
+        assert "resume with the same cell and settings, or start again (--force)" in text
+        cell.write_text(before)
+        accepted(*DESIGN, "-o", designed, "--resume")
+        cell.write_text(before.replace("[400.0, 400.0]", "[300.0, 300.0]"))
+        accepted(*DESIGN, "-o", designed, "--force")
+
+    def test_the_name_of_no_design(self, designed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("hil.cli.demo.CELL_PATH", designed / "cell.toml")
+        line = ("demo", "--repetitions", 2, "--validation", 1, "-o", "shown", "--excitation")
+        assert "name a file that `hil design` wrote" in refusal(*line, "absent.toml")
+        accepted(*line, designed / "excitation.toml")
+
+    def test_the_mass_of_a_payload(self, here: Path) -> None:
+        line = (*PRECISE, "--precision", "mass of payload 5 %", "-o", "b")
+        text = refusal(*line)
+        (options,) = re.findall(r"add (--for payload)", text)
+        assert "mass of payload 5 %" in accepted(*line, *options.split())
+
+    def test_a_torque_of_uncertain_scale(self, here: Path) -> None:
+        """Of a load that is weighed see `tests/hil/test_payload_command.py`."""
+        cell = here / "cell.toml"
+        before = cell.read_text()
+        scale = "[drive_train]\ntorque_uncertainty = {}"
+        line = (*PRECISE, "--precision", "parameters 5 %", "-o")
+        cell.write_text(before.replace("[drive_train]", scale.format(0.04)))
+        assert "no motion of this arm can meet it" in accepted(*line, "b")
+        cell.write_text(before.replace("[drive_train]", scale.format(0.004)))
+        assert "no motion of this arm can meet it" not in accepted(*line, "c")
+
+
+@pytest.fixture(scope="module")
+def repeated(template: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A campaign that was run until more repetitions do not help, and what was printed."""
+    folder = tmp_path_factory.mktemp("repeated")
+    fast_campaign(folder / "two words", fast_cell(folder, repetitions=6))
+    precision = ("--until-precise", "--precision", "parameters 0.01 %")
+    text = accepted("run", folder / "two words", "--accept-dry-run", *precision)
+    return folder / "two words", text
+
+
+def pass_both_rehearsals(campaign: Path, text: str) -> None:
+    """Of the sides of the payload campaign whose refused start printed the text."""
+    assert "hil rehearse" in text
+    for side in SIDES:
+        pass_rehearsal(CampaignFolder(campaign / "payload" / "gripper" / side))
+
+
+class TestPrecision:
+    def test_an_assumed_torque_error(self, here: Path, repeated: tuple[Path, str]) -> None:
+        line = (*PRECISE, "--precision", "parameters 50 %", "-o")
+        assert "recordings measure it (--given)" in accepted(*line, "b")
+        text = accepted(*line, "c", "--given", repeated[0])
+        assert "of the given recordings" in text and "(--given)" not in text
+
+    def test_a_precision_out_of_reach(self, here: Path, repeated: tuple[Path, str]) -> None:
+        root, text = repeated
+        assert "(hil design --given, with the same --precision)" in text
+        same = ("--precision", "parameters 0.01 %")
+        accepted(*PRECISE, "--given", root, *same, "-o", "b")
+
+    def test_the_mass_of_a_payload_of_a_campaign(self, rehearsed: Path) -> None:
+        mass = ("--until-precise", "--precision", "mass of payload 10 %")
+        text = refusal("run", rehearsed, *mass)
+        assert "run it with --payload NAME" in text
+        line = ("run", rehearsed, "--payload", "gripper", "--payload-mass", 2, *mass)
+        pass_both_rehearsals(rehearsed, refusal(*line))
+        assert "no more pairs" in accepted(*line, "--accept-dry-run")
 
 
 class TestCampaign:
@@ -217,6 +303,36 @@ class TestCampaign:
         typed(*accepts[-1])
         assert (here / "m" / "results.json").exists()
 
+    def test_a_copy_of_a_loaded_side(self, rehearsed: Path, here: Path) -> None:
+        line = ("run", rehearsed, "--payload", "gripper", "--payload-mass", 2, "--dry-run")
+        pass_both_rehearsals(rehearsed, refusal(*line))
+        shutil.copytree(rehearsed / "payload" / "gripper" / "loaded", here / "copy")
+        text = refusal("run", "copy", "--dry-run")
+        assert "run the campaign that it was copied from, with --payload" in text
+        accepted(*line)
+
+    def test_a_link_to_another_kind_of_arm(self, here: Path) -> None:
+        """A script ran the campaign of a real arm on a simulated one."""
+        cell = fast_cell(here).with_values({"controller.transport": "udp"})
+        real = fast_campaign(here / "real", cell)
+        simulated = simulated_link(cell, instead_of_hardware=True)
+        real.run(simulated, dry_run_only=True, provenance={"simulated": "yes"})
+        text = refusal("run", "real", "--dry-run")
+        assert "begin a new campaign folder (`hil design`)" in text
+        (here / "udp.toml").write_text(cell.text)
+        accepted("design", "udp.toml", "--settings", "quick.toml", "-o", "b")
+        assert "next: hil rehearse b" in accepted("status", "b")
+
+    def test_an_excitation_that_determines_too_little(
+        self, designed: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        with monkeypatch.context() as strict:
+            strict.setattr("hil.campaign.rehearsal.MOST_ERROR", 0.0)
+            text = refusal("rehearse", designed)
+        assert "design a better excitation (`hil design`)" in text
+        accepted(*DESIGN, "-o", "b")
+        accepted("rehearse", "b")
+
     def test_no_precision(self, rehearsed: Path) -> None:
         text = refusal("run", rehearsed, "--until-precise")
         (example,) = re.findall(r"for example (--precision \".*\")", text)
@@ -249,6 +365,38 @@ class TestBatch:
         accepted("batch", folder, "--cache", here / "other")
         accepted("batch", folder, "--cache", "none")
 
+    def test_workers_that_do_not_start(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """As where memory or processes are limited."""
+
+        def limited(n_workers: int, **options: Any) -> LocalCluster:
+            if n_workers > 1:
+                raise RuntimeError("Nanny failed to start.")
+            return LocalCluster(n_workers=n_workers, **options)
+
+        monkeypatch.setattr("distributed.LocalCluster", limited)
+        text = refusal("batch", folder, "--workers", 2)
+        assert "2 workers of Dask did not start" in text and "fewer with --workers" in text
+        accepted("batch", folder, "--workers", 1)
+
+    def test_parameters_that_are_poorly_separated(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        for module in ("batch.estimates", "identify.estimating"):
+            monkeypatch.setattr(f"hil.{module}.QR_CONDITION", 1.0)
+        text = accepted("batch", folder, "--estimator", "wls")
+        assert "`hil identify` on these archives uses QR" in text
+        accepted("identify", folder / "a", "--estimator", "wls")
+
+    def test_more_campaigns_than_are_shown(
+        self, folder: Path, here: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("hil.cli.batch._MOST_LINES", 0)
+        assert "1 more: see --output and --json" in accepted("batch", folder)
+        accepted("batch", folder, "--output", "tables")
+        assert list((here / "tables").glob("*.csv"))
+        printed = json.loads(typed("batch", folder, "--json").stdout)
+        assert printed["arms"].popitem()[1]["campaigns"]
+
 
 def remedies() -> Iterator[tuple[str, str]]:
     """Messages of these packages that name a command or an option to type."""
@@ -269,16 +417,15 @@ def test_every_remedy_is_typed() -> None:
     missing = [
         f"{place}: {text}"
         for place, text in remedies()
-        if not any(part in text for part in (*TYPED, *ELSEWHERE, *UNTYPED))
+        if not any(part in text for part in (*TYPED, *ELSEWHERE))
     ]
     assert not missing, "\n".join(missing)
 
 
 def test_every_test_and_message_of_the_table_exists() -> None:
-    tests = {name for group in (TestDesign, TestCampaign, TestBatch) for name in vars(group)}
+    groups = (TestDesign, TestPrecision, TestCampaign, TestBatch)
+    tests = {name for group in groups for name in vars(group)}
     texts = [text for _, text in remedies()]
     assert {*TYPED.values()} <= tests
-    stale = [
-        part for part in (*TYPED, *ELSEWHERE, *UNTYPED) if not any(part in text for text in texts)
-    ]
+    stale = [part for part in (*TYPED, *ELSEWHERE) if not any(part in text for text in texts)]
     assert not stale, stale

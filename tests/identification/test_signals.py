@@ -651,7 +651,7 @@ class TestExcludedRows:
     def test_a_joint_that_stands_while_another_moves_holds_its_load(self):
         halt, masks = self.still(1)
         assert not masks["rests"].reasons[REST].any()
-        assert masks["rests"].usable[halt].all()
+        assert masks["rests"].usable[halt, 1].all()
         assert masks["halts"].reasons[REST][halt, 1].all()
         assert not masks["halts"].reasons[REST][:, 0].any()
         assert masks["slow"].reasons[STANDSTILL][halt, 1].all()
@@ -660,9 +660,22 @@ class TestExcludedRows:
         halt, masks = self.still(0, 1)
         assert masks["rests"].reasons[REST][halt].all()
         assert masks["none"].usable[halt].all()
-        # A reversal of one joint is none, and stays.
+        # A reversal of one joint is none.
         assert not masks["rests"].reasons[REST][~halt].any()
-        assert REVERSAL not in masks["rests"].reasons
+
+    def test_rests_exclude_two_rows_at_a_reversal_but_none_of_a_joint_that_stands(self):
+        """A motion as noise turns it: what a standing joint holds is its load."""
+        motion, recording = motion_and_recording()
+        halt = np.zeros(len(TIME), dtype=np.bool_)
+        halt[len(TIME) // 4 : 3 * len(TIME) // 4] = True
+        motion.velocity[halt, 1] = 1e-6 * (-1.0) ** np.arange(np.count_nonzero(halt))
+        mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), left_out="rests")
+        turns = np.flatnonzero(motion.velocity[1:, 0] * motion.velocity[:-1, 0] < 0.0)
+        expected = np.zeros(len(TIME), dtype=np.bool_)
+        expected[[*turns, *(turns + 1)]] = True
+        assert turns.size
+        np.testing.assert_array_equal(mask.reasons[REVERSAL][:, 0], expected)
+        assert not mask.reasons[REVERSAL][halt, 1].any()
 
     def test_halts_exclude_two_rows_at_a_reversal(self):
         motion, recording = motion_and_recording()

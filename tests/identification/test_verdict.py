@@ -394,6 +394,14 @@ class TestJudgement:
         (cause,) = (finding for finding in judged(**changes).findings if finding.role == "cause")
         assert cause.level == level and message in cause.words
 
+    @pytest.mark.parametrize(("changed", "named"), [(0, False), (1, True), (None, True)])
+    def test_a_torque_that_changed_is_no_reference_of_constants(self, changed, named):
+        """The constant of axis 1 is relative to axis 0."""
+        changes = () if changed is None else (Change("gain", changed, 0.91, 0.001, 0.01),)
+        causes = caused("gain", 1, ratio=0.86)
+        findings = judged(causes=causes, changes=changes, held_out=an_error(0.1)).findings
+        assert named == any(finding.check == "torque constant" for finding in findings)
+
     def test_a_body_that_explains_the_error_is_not_unexplained(self):
         changes = {"held_out": an_error(0.1), "noise_floor": np.full(2, 0.1), "causes": ()}
         load = CarriedLoad(mass=2.0, explained=0.98, axes=2, half_interval=0.1)

@@ -125,7 +125,7 @@ class FaultFacts:
         gravity: GravityFacts | None,
         signs: SignFacts,
     ) -> FaultFacts:
-        """Leave out the faults that outliers, gravity or opposite torques explain better."""
+        """Leave out what outliers, gravity, opposite or changed torques explain better."""
         causes = evidence.causes or ()
         if outliers is not None and outliers.decide:
             causes = ()
@@ -133,6 +133,15 @@ class FaultFacts:
             causes = tuple(cause for cause in causes if not cause.ratio > gravity.error)
         if signs.all_opposite:
             causes = tuple(cause for cause in causes if cause.fault.kind not in _SIGN_OR_SCALE)
+        # A constant is relative to those of the other axes, of which one is wrong in one motion.
+        changed = {change.joint for change in evidence.changes if change.kind == "gain"}
+        causes = tuple(
+            cause
+            for cause in causes
+            if cause.fault.kind != "gain"
+            or cause.ratio < limits.cause
+            or changed <= {*cause.fault.joints}
+        )
         return cls(causes, limits.cause)
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
