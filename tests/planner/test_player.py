@@ -220,7 +220,7 @@ class TestResumeFrom:
     @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
     def test_a_stop_continues_at_a_slower_speed_given(self, extrapolated, share):
         """From the same set-point, or near it; at no speed it stays there."""
-        player, last, step = extrapolated
+        player, _, _ = extrapolated
         player.stop()
         first, velocity = player.advance()
         player.resume_from(first, share * velocity, 0)
