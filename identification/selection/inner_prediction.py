@@ -287,15 +287,16 @@ def choose_settings(
         decision = trial.decide("torque ripple", [now, *rippled])
         now = decision.settings
         choices = [*choices, decision.choice]
-    if "springs" in asked:
-        for decision in _torsion_springs(trial, now, springs):
-            now = decision.settings
-            choices = [*choices, decision.choice]
     trial.weigh(now)
     compared, now, decided = _choose_prior(trial, now, asked)
     if not trial.errors(compared).overall < _MEANINGLESS:
         return start
     choices = [*choices, *decided]
+    if "springs" in asked:
+        # Last: what is left of a spring that impossible bodies stand for is theirs as before.
+        for decision in _torsion_springs(trial, now, springs):
+            now = decision.settings
+            choices = [*choices, decision.choice]
     return replace(now, choices=tuple(choice for choice in choices if len(choice.candidates) > 1))
 
 

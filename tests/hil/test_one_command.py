@@ -447,7 +447,7 @@ def test_real_logs_are_read_as_by_their_maps(
 
 
 @pytest.mark.parametrize("bits", [10, 11, 12, 13])
-def test_rounded_positions_of_a_real_log_that_repeats_samples_do_not_jump(
+def test_rounded_positions_of_a_repeating_log_do_not_jump(
     tmp_path: Path, shared_data: Path, bits: int
 ) -> None:
     folder = shared_data / "gen3"

@@ -129,7 +129,7 @@ def test_a_polish_finds_friction_rotor_and_delay() -> None:
 
 
 @pytest.mark.long
-def test_a_polish_finds_a_rotor_heavier_than_what_the_joint_turns() -> None:
+def test_a_polish_finds_a_heavy_rotor() -> None:
     def with_rotor(inertia: float) -> Arm:
         arm = an_arm()
         standard = arm.standard.copy()

@@ -568,7 +568,7 @@ class TestPossibleLowPasses:
         assert best.torque_shape == shape
 
     @pytest.mark.parametrize("shape", [LowPassShape(2), LowPassShape(2, causal=True)], ids=str)
-    def test_parts_of_a_long_recording_have_the_low_pass_of_the_whole(self, shape, monkeypatch):
+    def test_parts_of_a_recording_have_its_low_pass(self, shape, monkeypatch):
         """A table of the regressor is of one part at most."""
         monkeypatch.setattr("identification.estimators.torque_channel._LONGEST", 6.0)
         rows = []

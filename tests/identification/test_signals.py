@@ -663,7 +663,7 @@ class TestExcludedRows:
         # A reversal of one joint is none.
         assert not masks["rests"].reasons[REST][~halt].any()
 
-    def test_rests_exclude_two_rows_at_a_reversal_but_none_of_a_joint_that_stands(self):
+    def test_rests_exclude_two_rows_at_a_reversal_of_a_moving_joint(self):
         """A motion as noise turns it: what a standing joint holds is its load."""
         motion, recording = motion_and_recording()
         halt = np.zeros(len(TIME), dtype=np.bool_)
