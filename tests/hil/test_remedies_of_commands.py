@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 DRY = np.array([0.5, 0.4, 0.3])  # N·m
 FOURTH = (
     "<link name='hand'><inertial><mass value='0.1'/><inertia ixx='1e-3' iyy='1e-3' izz='1e-3'"
-    " ixy='0' ixz='0' iyz='0'/></inertial></link><joint name='finger' type='revolute'>"
+    " ixy='0' ixz='0' iyz='0'/></inertial></link><joint name='lift' type='revolute'>"
     "<parent link='lankle'/><child link='hand'/><origin xyz='0 0 0.4'/><axis xyz='0 1 0'/>"
     "<limit lower='-3' upper='3' effort='99' velocity='9'/></joint></robot>"
 )
@@ -112,7 +112,7 @@ class TestJointsThatWereNotRecorded:
         line = ["identify", folder / "log.csv", "--urdf", folder / "longer.urdf", "-q"]
         refused = message(typed(*line))
         (option,) = re.findall(r"--locked \w+", refused)
-        assert option == "--locked finger"
+        assert option == "--locked lift"
         assert typed(*line, *option.split(), "-o", folder / "locked").exit_code == 0
 
     def test_all_others_are_locked_with_a_map_that_has_joints(self, folder: Path) -> None:
@@ -128,9 +128,9 @@ class TestJointsThatWereNotRecorded:
 
     def test_a_position_that_is_none(self, folder: Path) -> None:
         line = ["identify", folder / "log.csv", "--urdf", folder / "longer.urdf", "-q"]
-        refused = message(typed(*line, "--locked", "finger=half"))
+        refused = message(typed(*line, "--locked", "lift=half"))
         (example,) = re.findall(r"--locked \w+=[\d.]+", refused)
-        option = example.replace("joint_7", "finger").split()
+        option = example.replace("joint_7", "lift").split()
         assert typed(*line, *option, "-o", folder / "bent").exit_code == 0
 
 
