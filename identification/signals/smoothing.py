@@ -188,7 +188,9 @@ def fit_smoothing_spline(
     for samples_per_knot in (4, 2, 1):
         problem = _Problem.of(time, values, samples_per_knot * float(np.median(np.diff(time))))
         fine = problem.spacing <= _KNOT_OF_CUTOFF / (2.0 * np.pi * widest)
-        if fine or np.all(np.mean(problem.closest_residual**2, axis=0) <= tolerance):
+        # Without the squares of all samples, which are the largest array of a long recording.
+        squares = np.einsum("mc,mc->c", problem.closest_residual, problem.closest_residual)
+        if fine or np.all(squares / len(time) <= tolerance):
             break
     penalties = np.array(
         [problem.penalty_for(c, float(variance), widest) for c, variance in enumerate(tolerance)]
