@@ -17,6 +17,17 @@ from hil.cell.text import with_values
 from hil.progress import Silent
 from planner import PiecewiseCubic
 
+QUICK_GRADIENT = """\
+method = "gradient"
+[search]
+population = 8
+generations = 1
+gradient = 2
+[via_points]
+n_via = 4
+"""
+"""Settings of a search of some seconds."""
+
 URDF = """<robot name="fast">
 <link name="base"/>
 <link name="upper">

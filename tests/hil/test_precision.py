@@ -17,19 +17,9 @@ from hil.design.precision import PrecisionDesign
 from hil.design.requirements import FORMS, Requirement, require_known, requirements_from
 from hil.errors import InputError
 from hil.motion_checks import MotionChecks
-from tests.hil.fast_cell import fast_cell
+from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell
 
 pytestmark = pytest.mark.long
-
-SETTINGS = """\
-method = "gradient"
-[search]
-population = 8
-generations = 1
-gradient = 2
-[via_points]
-n_via = 4
-"""
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +143,7 @@ class _Excitation:
 
 class TestCommand:
     def test_a_design_states_what_it_promises(self, cell, tmp_path: Path) -> None:
-        (tmp_path / "my.toml").write_text(SETTINGS)
+        (tmp_path / "my.toml").write_text(QUICK_GRADIENT)
         out = tmp_path / "out"
         arguments = ["design", str(cell.path), "--settings", str(tmp_path / "my.toml")]
         arguments += ["--precision", "parameters 5%, torque 5", "-o", str(out), "--workers", "1"]

@@ -24,7 +24,13 @@ from hil.design import DesignResult
 from hil.errors import InputError
 from hil.simulation import simulated_link
 from tests.docs.test_messages import COMMAND, FIELD, MESSAGES, OPTION
-from tests.hil.fast_cell import fast_campaign, fast_cell, mirrored, pass_rehearsal
+from tests.hil.fast_cell import (
+    QUICK_GRADIENT,
+    fast_campaign,
+    fast_cell,
+    mirrored,
+    pass_rehearsal,
+)
 from tests.hil.test_campaign_day import QUICK
 from tests.hil.test_remedies_of_commands import message, typed
 
@@ -111,15 +117,6 @@ def accepted(*words: object) -> str:
 
 DESIGN = ("design", "cell.toml", "--settings", "quick.toml")
 PRECISE = ("design", "cell.toml", "--workers", 1, "--settings", "gradient.toml")
-GRADIENT = """\
-method = "gradient"
-[search]
-population = 8
-generations = 1
-gradient = 2
-[via_points]
-n_via = 4
-"""
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +125,7 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("template")
     fast_cell(folder, repetitions=2)
     (folder / "quick.toml").write_text(QUICK)
-    (folder / "gradient.toml").write_text(GRADIENT)
+    (folder / "gradient.toml").write_text(QUICK_GRADIENT)
     with pytest.MonkeyPatch.context() as inside:
         inside.chdir(folder)
         accepted(*DESIGN, "-o", "my runs/a")

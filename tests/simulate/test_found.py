@@ -230,7 +230,7 @@ class TestHalfASecond:
     102383, two late packets. Repetitions 1 and 2 missed a packet at the same set-point. They
     differed by 5 % of the rms current of joint 4 from each other, and by 20 to 29 % from every
     sound one; 10 % are allowed. The product corrects this if one repetition counts, not if two do:
-    it asks for an inspection or a new campaign, because two that agree cannot be told from sound
+    it asks for an inspection or a new campaign, because two that agree may as well be the sound
     ones. The law was wrong: it excused only faults that push the arm. The servo does not matter.
 
     400869, a restart between two repetitions. The undisturbed repetitions of this arm differ by up
