@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import ast
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
@@ -55,6 +55,11 @@ class Sources:
         return {name: ast.parse(path.read_text("utf-8")) for name, path in self.files.items()}
 
     @cached_property
+    def nodes(self) -> dict[str, tuple[ast.AST, ...]]:
+        """All nodes of each module."""
+        return {name: tuple(ast.walk(tree)) for name, tree in self.trees.items()}
+
+    @cached_property
     def imports(self) -> dict[str, set[str]]:
         """Modules of ours that each module imports when it is loaded, or for its types."""
         return {
@@ -96,11 +101,8 @@ class Sources:
         """Imports of ours inside functions."""
         return [
             f"{name}:{node.lineno} {target}"
-            for name, tree in self.trees.items()
-            for function in ast.walk(tree)
-            if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
-            for node in ast.walk(function)
-            if isinstance(node, ast.Import | ast.ImportFrom)
+            for name, nodes in self.nodes.items()
+            for node in _imports(nodes) - _imports(_loaded(self.trees[name]))
             for target in self._targets(name, node)
         ]
 
@@ -119,9 +121,9 @@ class Sources:
     def banned_names(self) -> list[str]:
         """Modules, functions, classes, arguments and variables with an idiom for a name."""
         banned = []
-        for name, tree in self.trees.items():
+        for name, nodes in self.nodes.items():
             names = [(1, name.rpartition(".")[2])]
-            for node in ast.walk(tree):
+            for node in nodes:
                 if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.AsyncFunctionDef):
                     names.append((node.lineno, node.name))
                 elif isinstance(node, ast.arg):
@@ -139,8 +141,8 @@ class Sources:
         """Functions of more lines than `_LONG`, docstring included."""
         return [
             f"{name}:{node.lineno} {node.name}, {node.end_lineno - node.lineno + 1} lines"
-            for name, tree in self.trees.items()
-            for node in ast.walk(tree)
+            for name, nodes in self.nodes.items()
+            for node in nodes
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
             and node.end_lineno is not None
             and node.end_lineno - node.lineno >= _LONG
@@ -155,6 +157,10 @@ def long_test_names() -> list[str]:
         for name in re.findall(r"def (test_\w+)", path.read_text("utf-8"))
         if len(name) > _LONG
     ]
+
+
+def _imports(nodes: Iterable[ast.AST]) -> set[ast.Import | ast.ImportFrom]:
+    return {node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)}
 
 
 def _loaded(tree: ast.AST) -> Iterator[ast.AST]:

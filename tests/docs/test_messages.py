@@ -6,13 +6,14 @@ import ast
 import re
 import shlex
 from collections.abc import Iterator
+from functools import cache
 
 from pydantic import BaseModel
 
 from hil.cell.schema import CellFile
 from hil.design.settings import DesignSettings
 from hil.importers.column_map import ColumnMap
-from tests.docs.test_words import MODULES, docstrings
+from tests.docs.test_words import MODULES, docstrings, nodes_of
 from tests.docs.typed import ROOT, command_of, options
 
 FIELD = "FIELD"
@@ -27,27 +28,30 @@ NOT_OF_HIL = ("hil/report/", "hil/study/run.py", "hil/cli/suggestions.py", "hil/
 """Variables of a style sheet, misspelt options, commands of the system."""
 
 
-def messages() -> Iterator[tuple[str, str]]:
+@cache
+def messages() -> tuple[tuple[str, str], ...]:
+    return tuple(_messages())
+
+
+def _messages() -> Iterator[tuple[str, str]]:
     """Place and text of each string that is no docstring; each field of an f-string is FIELD."""
     for module in MODULES:
         name = str(module.relative_to(ROOT))
         if name.startswith(NOT_OF_HIL):
             continue
-        tree = ast.parse(module.read_text("utf-8"))
-        inner = docstrings(tree)
-        for text in (node for node in ast.walk(tree) if isinstance(node, ast.JoinedStr)):
-            inner |= {id(node) for node in ast.walk(text) if node is not text}
+        inner = docstrings(module)
+        for text in (node for node in nodes_of(module) if isinstance(node, ast.JoinedStr)):
+            inner |= {node for node in ast.walk(text) if node is not text}
             parts = [
                 part.value if isinstance(part, ast.Constant) else FIELD for part in text.values
             ]
             yield f"{name}:{text.lineno}", "".join(map(str, parts))
-        for node in ast.walk(tree):
+        for node in nodes_of(module):
             is_text = isinstance(node, ast.Constant) and isinstance(node.value, str)
-            if is_text and id(node) not in inner:
+            if is_text and node not in inner:
                 yield f"{name}:{node.lineno}", re.sub(r"{[^{}]*}", FIELD, node.value)
 
 
-MESSAGES = list(messages())
 PATH = re.compile(r"root|path|folder|campaign|output|location|source|file")
 
 
@@ -73,7 +77,7 @@ TABLES = {model.__name__: model for model in subclasses(BaseModel) if "hil." in 
 def test_every_option_is_one() -> None:
     wrong = [
         f"{place}: {name}"
-        for place, text in MESSAGES
+        for place, text in messages()
         for name in OPTION.findall(text)
         if name not in options()
     ]
@@ -82,7 +86,7 @@ def test_every_option_is_one() -> None:
 
 def test_every_command_has_the_options_beside_it() -> None:
     wrong = []
-    commands = [(place, line) for place, text in MESSAGES for line in COMMAND.findall(text)]
+    commands = [(place, line) for place, text in messages() for line in COMMAND.findall(text)]
     assert len(commands) > 30
     for place, line in commands:
         command, _ = command_of(shlex.split(line.replace("'", ""))[1:])
@@ -95,7 +99,7 @@ def test_every_entry_is_one_of_a_file() -> None:
     existing = {entry for model in (ColumnMap, CellFile, DesignSettings) for entry in keys(model)}
     entries = [
         (place, match["table"], match["key"])
-        for place, text in MESSAGES
+        for place, text in messages()
         for pattern in ENTRIES
         for match in pattern.finditer(text)
         if match["key"] not in OTHER_WORDS
@@ -110,7 +114,7 @@ def test_paths_in_commands_are_quoted() -> None:
     """A command with a path of the user is typed as it is printed."""
     wrong = []
     for module in MODULES:
-        for text in ast.walk(ast.parse(module.read_text("utf-8"))):
+        for text in nodes_of(module):
             if isinstance(text, ast.JoinedStr):
                 line = "".join(
                     str(part.value)

@@ -32,27 +32,28 @@ INDEX = re.compile(r"\bpypi\b|\bconda\b|\bnpm\b|https?://\S*/simple\b", re.IGNOR
 MOST_TERMS = 72
 
 
-def docstrings(tree: ast.AST) -> set[int]:
-    """Identities of the constants that are statements of their own."""
-    return {
-        id(node.value)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-    }
-
-
 @cache
 def tree_of(module: Path) -> ast.Module:
     return ast.parse(module.read_text("utf-8"))
 
 
 @cache
+def nodes_of(module: Path) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(tree_of(module)))
+
+
+def docstrings(module: Path) -> set[ast.AST]:
+    """Texts that are statements of their own."""
+    return {node.value for node in nodes_of(module) if isinstance(node, ast.Expr)}
+
+
+@cache
 def texts(module: Path) -> tuple[tuple[int, str, bool], ...]:
     """Line and value of each string, and whether it is a docstring."""
-    inner = docstrings(tree_of(module))
+    inner = docstrings(module)
     return tuple(
-        (node.lineno, node.value, id(node) in inner)
-        for node in ast.walk(tree_of(module))
+        (node.lineno, node.value, node in inner)
+        for node in nodes_of(module)
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     )
 

@@ -6,12 +6,15 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.golden.cases import CASES, HERE, PUBLISHED, RECORDINGS
 
-# Rounding, through the condition of the estimates.
+# Rounding of the processor's linear algebra, which the condition of an estimate enlarges: relative
+# for plain numbers, in standard errors for estimates.
 SAME = 1e-9
+SAME_ESTIMATE = 1e-6
 LONG = ("batch",)  # cases that take many seconds
 
 
@@ -19,7 +22,11 @@ def assert_same(result: Any, golden: Any, place: str) -> None:
     """Words alike, numbers to rounding of the largest of their list."""
     if isinstance(golden, dict):
         assert result.keys() == golden.keys(), place
-        for key in golden:
+        estimates = {"values", "std"} & golden.keys() if "std" in golden else set()
+        for key in estimates:
+            change = np.abs(np.subtract(result[key], golden[key]))
+            assert np.all(change <= SAME_ESTIMATE * np.array(golden["std"])), f"{place}.{key}"
+        for key in golden.keys() - estimates:
             assert_same(result[key], golden[key], f"{place}.{key}")
     elif isinstance(golden, list) and golden and isinstance(golden[0], float):
         scale = max(map(abs, golden))

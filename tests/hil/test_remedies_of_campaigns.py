@@ -23,7 +23,7 @@ from hil.campaign.folder import SIDES, CampaignFolder
 from hil.design import DesignResult
 from hil.errors import InputError
 from hil.simulation import simulated_link
-from tests.docs.test_messages import COMMAND, FIELD, MESSAGES, OPTION
+from tests.docs.test_messages import COMMAND, FIELD, OPTION, messages
 from tests.hil.fast_cell import (
     QUICK_GRADIENT,
     fast_campaign,
@@ -397,7 +397,7 @@ class TestBatch:
 
 def remedies() -> Iterator[tuple[str, str]]:
     """Messages of these packages that name a command or an option to type."""
-    for place, text in MESSAGES:
+    for place, text in messages():
         names_command = COMMAND.search(text) or "`hil " in text
         is_label = re.fullmatch(r" ?--[a-z-]+", text) or text.startswith(
             ("#", FIELD + ", for `hil")
