@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # The tests start processes by the hundred, and each would compile all sources anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo docs pictures lint test test-safety test-all test-slow coverage mutants audit bench clean
+.PHONY: help setup demo docs pictures lint quick test test-safety test-all test-slow coverage mutants audit bench clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
