@@ -164,8 +164,11 @@ def similar_path(path: Path) -> Path | None:
         names = [entry.name for entry in islice(folder.iterdir(), _MOST_SIBLINGS)]
     except OSError:
         return None
-    matches = get_close_matches(path.name, names, n=1)
-    return folder / matches[0] if matches else None
+    # Names with a common suffix alone are not alike.
+    for name in get_close_matches(path.name, names):
+        if get_close_matches(path.stem, [Path(name).stem]):
+            return folder / name
+    return None
 
 
 def remedy_for_missing(path: Path, otherwise: str) -> str:

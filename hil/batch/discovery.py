@@ -21,6 +21,7 @@ from hil.errors import ArchiveError, CampaignFolderError, InputError
 from hil.files import digest, file_digest, json_digest
 from hil.identify.prepared import stated_delay
 from hil.progress import Reporter
+from hil.reading import remedy_for_missing
 from hil.recorded_campaign import Entry, RecordedCampaign
 from hil.terminal_text import typed
 from identification.selection.settings import Settings
@@ -242,7 +243,8 @@ def find_archives(roots: Sequence[str]) -> tuple[list[str], list[SkippedArchive]
         elif path.is_dir():
             walk(path.resolve())
         else:
-            raise InputError(root, "does not exist", remedy="name a folder with archives below it")
+            remedy = remedy_for_missing(path, "name a folder with archives below it")
+            raise InputError(root, "does not exist", remedy=remedy)
     return sorted(archives), refused
 
 

@@ -125,6 +125,22 @@ class StartTimeout:
         return None
 
 
+def waiting_text(state: State, received: str) -> str:
+    """Return what keeps a controller from moving, with a remedy; "" while it is getting ready.
+
+    `received` is what came from a controller without a session.
+    """
+    match state:
+        case State.SYNC:
+            return f"{received}; start its Open program"
+        case State.DRIVE_OFF | State.FAULTED:
+            return "its drive is off; switch it on"
+        case State.ENDED:
+            return "it has ended its session; start its Open program again"
+        case _:
+            return ""
+
+
 def not_ready(state: State, waited: float) -> ControllerError:
     """Return the error of a controller that was not ready for a motion after `waited` s."""
     after = f"within {waited:.3g} s"

@@ -30,7 +30,7 @@ from hil.archive.recorder import Recorded, describe
 from hil.cell import Cell
 from hil.errors import ArchiveWriteError, ControllerError, OperatorStopError
 
-from .connection import Connection, StartTimeout, active_guard, described, not_ready
+from .connection import Connection, StartTimeout, active_guard, described, not_ready, waiting_text
 from .errors import refusal_text
 from .operator import MotionWatch, Stop, unwatched_motion
 from .operator_control import REQUEST_PERIOD, OperatorControl
@@ -45,6 +45,7 @@ SLOW_DISK: Final = 1.0  # Duration of one flush that is reported as a fault of t
 NOT_STARTED: Final = "it had not begun"
 """Reason of a motion that was stopped before it was requested."""
 STOPPED: Final = "stopped by the operator"
+WAIT_REPORTED: Final = 2.0  # s after which a controller that is not ready is reported
 READY: Final = frozenset((State.CLOSED, State.OPENING, State.OPEN))
 """States with the drive on. A controller may open its axes at once: they are held where they are
 until a motion is requested."""
@@ -91,6 +92,7 @@ class MotionLink:
         self.cycles = 0
         self.connection = Connection(cell=cell)
         self._inits = 0  # until the controller was connected
+        self._reported = ""
         self._ended_before = 0
         self._position: Array | None = None
 
@@ -135,18 +137,30 @@ class MotionLink:
             self.connection.require_usable()
             if len(records := port.new_records()):
                 target = records["target_position"][-1].copy()
-            ready = target is not None and port.status().state in READY
-            return ready or stop.requested or port.now - began > timeout
+            state = port.status().state
+            ready = target is not None and state in READY
+            waited = port.now - began
+            if not ready and waited > WAIT_REPORTED:
+                self._report_waiting(state, timeout)
+            return ready or stop.requested or waited > timeout
 
         self._exchange_until(finished, "the controller gets no replies")
         self._poll()
         self.connection.require_usable()
         if stop.requested:
-            raise ControllerError("stopped by the operator before anything moved")
+            raise ControllerError("ended by the operator before anything moved")
         if target is None or port.status().state not in READY:
             raise not_ready(port.status().state, port.now - began)
         self._inits = self.connection.inits
         return target
+
+    def _report_waiting(self, state: State, timeout: float) -> None:
+        """Report once why no motion can begin yet, and what the operator does about it."""
+        reason = self._waiting() if state is State.SYNC else ""
+        text = waiting_text(state, reason)
+        if text and text != self._reported:
+            self._reported = text
+            self.connection.report(f"waiting up to {timeout:g} s for the controller: {text}")
 
     # --- one motion; nothing here delays a reply
 

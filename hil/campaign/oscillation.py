@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-SMOOTHED: Final = 0.05  # Moving mean that is subtracted from the following error, s
-WINDOW: Final = 0.1  # Windows whose rms is compared, s
-SHORTEST: Final = 5  # Fewest windows of uninterrupted growth
+SMOOTHED: Final = 0.05
+"""Moving mean that is subtracted from the following error, s. It leaves what oscillates within it:
+slower parts are those of the motion."""
+BLOCKS: Final = (1, 4, 16)
+"""Half-waves whose rms is compared: noise hides slow growth from one half-wave to the next."""
+SHORTEST: Final = 8  # Fewest blocks of uninterrupted growth
 GROWTH: Final = 10.0  # Least growth of the rms
-SLOWEST: Final = 40.0
-"""Lowest frequency, Hz: slower parts of the following error are those of the motion, which the
-moving mean does not remove, and grow where it begins."""
-NARROW: Final = 0.5  # Least share of the power within two bins of the dominant frequency
+REGULAR: Final = 0.25  # Largest deviation of the length of a half-wave from the median
+MOSTLY: Final = 0.75  # Least share of half-waves of regular length
 
 
 @dataclass(frozen=True)
@@ -37,49 +38,61 @@ class Oscillation:
         )
 
 
-def growing_oscillation(error: Array, period: float) -> Oscillation | None:
+def growing_oscillation(error: Array, period: float, resolution: Array) -> Oscillation | None:
     """Return the strongest growing oscillation in a following error; None without one.
 
     Args:
         error: commanded minus measured position (m, n) [rad], one row per cycle.
         period: cycle [s].
+        resolution: of the measured positions (n,) [rad]; growth below it is none.
     """
-    smoothed = max(1, round(SMOOTHED / period))
-    length = max(2, round(WINDOW / period))
-    windows = len(error) // length
-    if windows < SHORTEST:
+    width = max(1, round(SMOOTHED / period))
+    if len(error) < width:
         return None
+    window = np.ones(width)
+    rows = np.convolve(np.ones(len(error)), window, "same")
     candidates = []
     for joint, column in enumerate(error.T):
-        fast = column - np.convolve(column, np.full(smoothed, 1.0 / smoothed), "same")
-        cut = fast[: windows * length].reshape(windows, length)
-        rms = np.sqrt(np.mean(cut**2, axis=1))
-        start, end = _longest_growth(rms)
-        growth = rms[end] / max(rms[start], np.finfo(np.float64).tiny)
-        if end - start < SHORTEST or growth < GROWTH:
-            continue
-        frequency, share = _dominant(fast[(end - 1) * length : (end + 1) * length], period)
-        if frequency >= SLOWEST and share >= NARROW:
-            seconds = (end - start) * length * period
-            candidates.append(Oscillation(joint, frequency, float(growth), seconds))
+        fast = column - np.convolve(column, window, "same") / rows
+        lengths, amplitudes = _half_waves(fast)
+        amplitudes = np.maximum(amplitudes, resolution[joint])
+        for block in BLOCKS:
+            growth, first, last = _strongest_growth(amplitudes, block)
+            if growth < GROWTH:
+                continue
+            section = lengths[first:last]
+            typical = float(np.median(section))
+            regular = np.mean(np.abs(section / typical - 1.0) <= REGULAR)
+            frequency = 0.5 / (typical * period)
+            if regular >= MOSTLY and frequency >= 1.0 / SMOOTHED:
+                seconds = float(section.sum()) * period
+                candidates.append(Oscillation(joint, frequency, growth, seconds))
     return max(candidates, key=lambda each: each.growth, default=None)
 
 
-def _longest_growth(rms: Array) -> tuple[int, int]:
-    """Return first and last window of the longest uninterrupted growth."""
-    best = (0, 0)
-    start = 0
-    for end in range(1, len(rms)):
-        if rms[end] < rms[end - 1]:
-            start = end
-        elif end - start > best[1] - best[0]:
-            best = (start, end)
+def _half_waves(values: Array) -> tuple[Array, Array]:
+    """Return lengths (samples) and amplitudes of the values between two changes of their sign."""
+    before = np.flatnonzero(np.diff(np.signbit(values)))
+    if len(before) < 2:
+        return np.empty(0), np.empty(0)
+    crossings = before + values[before] / (values[before] - values[before + 1])
+    return np.diff(crossings), np.maximum.reduceat(np.abs(values), before + 1)[:-1]
+
+
+def _strongest_growth(amplitudes: Array, block: int) -> tuple[float, int, int]:
+    """Return growth, first and last half-wave (exclusive) of the strongest uninterrupted growth.
+
+    The growth is that of the rms of blocks of positive amplitudes; 0 if no section has `SHORTEST`
+    of them.
+    """
+    n_blocks = len(amplitudes) // block
+    offset = len(amplitudes) - n_blocks * block
+    rms = np.sqrt(np.mean(amplitudes[offset:].reshape(n_blocks, block) ** 2, axis=1))
+    falls = np.flatnonzero(np.diff(rms) < 0.0)
+    best = (0.0, 0, 0)
+    for start, end in zip([0, *(falls + 1)], [*falls, n_blocks - 1], strict=True):
+        if end - start + 1 < SHORTEST:
+            continue
+        growth = float(rms[end] / rms[start])
+        best = max(best, (growth, offset + start * block, offset + (end + 1) * block))
     return best
-
-
-def _dominant(values: Array, period: float) -> tuple[float, float]:
-    """Return the dominant frequency [Hz] and the share of the power within two bins of it."""
-    power = np.abs(np.fft.rfft(values * np.hanning(len(values)))) ** 2
-    peak = int(np.argmax(power))
-    share = float(power[max(0, peak - 2) : peak + 3].sum() / max(power.sum(), 1e-300))
-    return peak / (len(values) * period), share

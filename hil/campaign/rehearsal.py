@@ -382,6 +382,7 @@ def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> 
         f"{cell.joint_names[motor]}, {where}), at most {percentage(bound)} is allowed",
         _motion_remedy(
             cell,
+            name,
             folder.archives / where,
             motor,
             "lower acceleration_deg in [limits] of the cell file, and design again",
@@ -400,7 +401,7 @@ def of_motions(cell: Cell, folder: CampaignFolder, name: str, failure: str) -> C
     entries = folder.manifest()
     if failure:
         place = folder.archives / entries[-1].name if entries else None
-        remedy = "" if place is None else _motion_remedy(cell, place, None, _CORRECT)
+        remedy = "" if place is None else _motion_remedy(cell, name, place, None, _CORRECT)
         text = f"{name}: {failure}"
         return criterion(f"motions ({name})", 1.0, 0.0, text, remedy)
     shares = [_speed_shares(cell, folder.archives / entry.name) for entry in entries]
@@ -419,6 +420,7 @@ def of_motions(cell: Cell, folder: CampaignFolder, name: str, failure: str) -> C
         f"({where}), at most {percentage(MOST_SPEED)} is allowed",
         _motion_remedy(
             cell,
+            name,
             folder.archives / where,
             joint,
             "lower velocity_deg in [limits] of the cell file, and design again",
@@ -432,9 +434,7 @@ def _speed_shares(cell: Cell, path: Path) -> Array:
     Two encoder counts between two packets may be noise and do not count.
     """
     columns = open_archive(path).columns
-    drives = cell.drive_train
-    count = 2.0 * np.pi / cell.drive_table.encoder_counts_per_revolution
-    noise = 2.0 * count * np.abs(drives.joint_from_motor).sum(axis=1)
+    noise = 2.0 * _encoder_resolution(cell)
     cycles = np.diff(columns["cycle"].astype(np.float64))[:, np.newaxis]
     steps = np.maximum(np.abs(np.diff(columns["position"], axis=0)) - noise, 0.0)
     speeds = np.divide(
@@ -447,22 +447,30 @@ def _speed_shares(cell: Cell, path: Path) -> Array:
     return shares
 
 
-def _motion_remedy(cell: Cell, path: Path, joint: int | None, remedy: str) -> str:
-    """Return what to do about a motion, and the command that plots it.
+def _encoder_resolution(cell: Cell) -> Array:
+    """Return the motion of each joint (n,) [rad] in an encoder count of all its motors."""
+    count = 2.0 * np.pi / cell.drive_table.encoder_counts_per_revolution
+    return np.asarray(count * np.abs(cell.drive_train.joint_from_motor).sum(axis=1))
+
+
+def _motion_remedy(cell: Cell, name: str, path: Path, joint: int | None, remedy: str) -> str:
+    """Return what to do about a motion of the run `name`, and the command that plots it.
 
     An oscillation that grows has another cause than the motion: `remedy` does not apply to it.
     """
+    causes = "current_delay_cycles in [controller]"
+    if name == EFFECTS:
+        causes = "delay and elasticity in [simulation]"
     columns = open_archive(path).columns
     error = columns["commanded_position"] - columns["position"]
     error = error[np.isfinite(error).all(axis=1)]
-    oscillation = growing_oscillation(error, cell.period)
+    oscillation = growing_oscillation(error, cell.period, _encoder_resolution(cell))
     if oscillation is not None:
         joint = oscillation.joint
         remedy = (
             f"{oscillation.sentence(cell.joint_names)}: the control of the simulated arm is "
-            "unstable, the motion is not at fault; correct rotor_inertia in [nominal] and "
-            "current_delay_cycles in [controller] of the cell file"
-            + (", or elasticity in [simulation]" if cell.file.simulation is not None else "")
+            f"unstable, the motion is not at fault; correct {causes} or rotor_inertia in [nominal] "
+            "of the cell file"
         )
     command = ["hil", "plot", str(path)]
     if joint is not None:

@@ -15,7 +15,7 @@ from hil.design.run import DESIGN_FILES
 from hil.errors import CampaignFolderError, OutputError
 from hil.files import make_folder, write_atomically
 from hil.motion_checks import MotionChecks
-from hil.reading import path_exists
+from hil.reading import path_exists, remedy_for_missing
 from identification.excitation import Excitation
 
 from .folder import CampaignFolder
@@ -98,7 +98,9 @@ class CampaignState:
         there = CampaignFolder(Path(folder))
         if not there.plan.exists():
             raise CampaignFolderError(
-                there.root, "is not a campaign folder", "name one that has plan.json"
+                there.root,
+                "is not a campaign folder",
+                remedy_for_missing(there.root, "name one that has plan.json"),
             )
         return cls(there, Cell.load(there.cell), CampaignPlan.load(there.plan))
 

@@ -32,6 +32,7 @@ ROS_RATE: Final = 100.0  # Rate of the points that a trajectory controller inter
 SCRIPT_RATE: Final = 125.0  # Rate of the set-points of a URScript program, Hz
 UR_JOINTS: Final = 6
 SLOW: Final = 0.2  # Speed of the slow variants, as a share of that of the motion
+SLOWEST: Final = 0.01  # Least speed of a URScript program, as a share of that of the motion
 README: Final = "README.txt"
 WARNING: Final = (
     "The arm will move. Checked by the model only: limits, torques, floor, walls, self-collision.",
@@ -133,13 +134,15 @@ def joint_trajectory(
 def urscript(motion: Trajectory, name: str, repetitions: int, header: Sequence[str]) -> str:
     """Return a URScript program that repeats a motion of six joints, at rest in between.
 
-    It divides the way between two set-points by the stretching of time, so that a slow motion has
-    as many set-points per second as a fast one.
+    A slow motion has as many set-points per second as a fast one: each is `speed` of the way
+    between two positions of the motion further than the one before.
     """
     cycle = 1.0 / SCRIPT_RATE
     positions = motion.sample(_times(motion, SCRIPT_RATE))[0]
     rows = [f"[{', '.join(f'{value:.9f}' for value in q)}]" for q in positions]
     between = ", ".join(f"start[{j}] + share * (goal[{j}] - start[{j}])" for j in range(UR_JOINTS))
+    at_start = [f"global start = {rows[0]}", "global share = speed"]
+    valid = f"speed is {SLOWEST:g} to 1"
     seconds = f"{motion.duration:.1f} s at full speed"
     question = f"{name}, {repetitions} times, {seconds}; speed and repetitions are set at the top"
     popup = f'"The arm will move: {question}. Continue?", "{name}", True, False, blocking=True'
@@ -147,18 +150,20 @@ def urscript(motion: Trajectory, name: str, repetitions: int, header: Sequence[s
         *(f"# {line}" for line in (*header, *WARNING)),
         "# speed scales time: 1.0 is the full speed of the motion. Raise it after a slow run.",
         f"def {name}():",
-        f"  speed = {SLOW:g}",
+        f"  global speed = {SLOW:g}",
         f"  repetitions = {repetitions}",
-        "  global stretch = ceil(1.0 / speed)",
+        f"  if speed < {SLOWEST:g} or speed > 1.0:",
+        f'    popup("{valid}", "{name}", False, True, blocking=True)',
+        "    halt",
+        "  end",
         f"  popup({popup})",
-        f"  global start = {rows[0]}",
+        *(f"  {line}" for line in at_start),
         "  def move_on(goal):",
-        "    step = 1",
-        "    while step <= stretch:",
-        "      share = step / stretch",
+        "    while share <= 1.000001:",
         f"      servoj([{between}], 0, 0, {cycle:g}, 0.03, 500)",
-        "      step = step + 1",
+        "      global share = share + speed",
         "    end",
+        "    global share = share - 1.0",
         "    global start = goal",
         "  end",
         f"  movej({rows[0]}, a=0.5, v=0.2)",
@@ -167,7 +172,7 @@ def urscript(motion: Trajectory, name: str, repetitions: int, header: Sequence[s
         *(f"    move_on({row})" for row in rows),
         "    stopj(5.0)",
         f"    movej({rows[0]}, a=0.5, v=0.2)",
-        f"    global start = {rows[0]}",
+        *(f"    {line}" for line in at_start),
         "    sleep(1.0)",
         "    repetition = repetition + 1",
         "  end",

@@ -119,7 +119,8 @@ def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
             )
         except ExecutionError as fault:
             if stop.requested:
-                raise OperatorStopError(f"{fault} Resume with --resume.") from fault
+                ended = str(fault).rstrip(".")
+                raise OperatorStopError(f"{ended}; resume with --resume") from fault
             raise
     took = time.perf_counter() - started
     seconds = link.cycles * cell.period

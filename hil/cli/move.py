@@ -78,7 +78,7 @@ def move(
         motion = None if campaign is None else campaign.plan.excitation.trajectory
         wanted = posture(cell, to, None if motion is None else motion.sample(np.array([0.0]))[0][0])
     with _reserved(campaign), cell_link(cell, only_axis=axis) as link:
-        link.connection.report = partial(say, err=True)
+        link.connection.report = partial(say, err=json)
         if yes and not link.only_simulated:
             most = 100.0 * cell.campaign.approach_speed
             if speed is not None and speed > most:

@@ -163,8 +163,8 @@ def _run(
         except (ExecutionError, OSError) as fault:
             failed = isinstance(fault, MotionFailedError) and fault.outcome != "stopped"
             if stop.requested and not failed:  # an OSError: of a terminal that was closed
-                again = f"Resume with `{campaign.folder.run_command}`."
-                raise OperatorStopError(f"{fault} {again}") from fault
+                again = f"resume with `{campaign.folder.run_command}`"
+                raise OperatorStopError(f"{str(fault).rstrip('.')}; {again}") from fault
             raise
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import json_digest, write_atomically
-from hil.reading import read_text
+from hil.reading import read_text, remedy_for_missing
 from hil.toml_text import Angles, from_text, to_text
 from hil.version import software
 from identification.excitation import (
@@ -177,7 +177,7 @@ class DesignResult:
             text = read_text(path)
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
-            remedy = "name a file that `hil design` wrote"
+            remedy = remedy_for_missing(path, "name a file that `hil design` wrote")
             raise InputError(path, f"cannot be read ({reason})", remedy=remedy) from error
         try:
             data = from_text(text)

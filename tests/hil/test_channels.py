@@ -9,6 +9,7 @@ import pytest
 
 from hil.importers.channels import channels_of, kind_of
 from hil.importers.column_map import ColumnMap, ready_maps
+from hil.importers.units import unit_of
 from tests.hil.test_bag_kinds import WHOLE
 from tests.hil.test_importers_rosbag2 import DEFINITION, STATE, bag, drives, mcap
 from tests.hil.test_log_kinds import COUNT, JOINTS, NAMES, POSITION, RATE, TIME, rows, text
@@ -28,6 +29,11 @@ NAMED = {
 def test_names_say_quantity_and_number(name: str) -> None:
     units = {"axis 3 (deg)": "deg", "axis 3 (A)": "A"}
     assert kind_of(name, units.get(name)) == NAMED[name]
+
+
+def test_units_of_torque_are_spelled_alike_with_every_prefix() -> None:
+    for spelled in ("N.m", "Nm", "N·m", "N m"):
+        assert [unit_of(prefix + spelled) for prefix in ("", "m", "k")] == ["N.m", "mN.m", "kN.m"]
 
 
 def test_columns_of_the_ready_maps_are_known_by_name() -> None:

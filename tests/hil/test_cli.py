@@ -274,6 +274,15 @@ class TestMistypedPaths:
         assert done.returncode == 2
         assert f"there is {folder / 'first.mcap'}" in done.stderr
 
+    @pytest.mark.parametrize(
+        "command",
+        ["status", "report", "rehearse", "run", "batch", "compare tests", "demo --excitation"],
+    )
+    def test_nearest_folder(self, folder: Path, command: str) -> None:
+        done = hil(*command.split(), f"{folder}n")
+        assert done.returncode == 2
+        assert f"; there is {folder}\n" in done.stderr
+
     def test_nothing_alike(self, tmp_path: Path) -> None:
         done = hil("archive", "check", tmp_path / "x.mcap")
         assert "check whether it was moved or removed" in done.stderr

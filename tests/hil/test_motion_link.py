@@ -48,6 +48,9 @@ class ScriptedPort:
         self.exchange_gone: str | None = None
         self.refuses: Exception | None = None
 
+    def prepare(self, stop: Stop) -> None:
+        pass
+
     def status(self) -> PortStatus:
         return PortStatus(self.state, 0, 1, 0, 0, 0, 0, self.ended_count, np.nan, np.nan)
 
@@ -132,6 +135,27 @@ def run(cell: Cell, port: ScriptedPort, stop: Stop | None = None) -> MotionEnded
     spec = ArchiveSpec(Path("a.mcap"), cell.joint_names, cell.period, {}, durable=False)
     link = MotionLink(cell, port)  # type: ignore[arg-type]
     return link.run(object(), spec, stop or Stop())  # type: ignore[arg-type]
+
+
+def test_what_a_connection_waits_for_is_reported_once(cell: Cell) -> None:
+    stop = Stop()
+    port = ScriptedPort(
+        (5.0, is_set("state", State.DRIVE_OFF)),
+        (8.0, is_set("state", State.DRIVING_ON)),
+        (9.0, lambda _: setattr(stop, "requested", True)),
+    )
+    port.state = State.SYNC
+    link = MotionLink(cell, port)  # type: ignore[arg-type]
+    lines: list[str] = []
+    link.connection.report = lines.append
+    with pytest.raises(ControllerError, match="ended by the operator"):
+        link.connect(stop)
+    nothing = "no packet from the controller (0 packets from other addresses)"
+    start = "waiting up to 60 s for the controller: "
+    assert lines == [
+        f"{start}{nothing}; start its Open program",
+        f"{start}its drive is off; switch it on",
+    ]
 
 
 def test_a_motion_ends_with_its_archive(cell: Cell) -> None:

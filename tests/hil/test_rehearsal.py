@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,10 +17,9 @@ from typer.testing import CliRunner
 from drivers.drive_train import DriveTrain
 from drivers.transports.simulated import Lose
 from hil.archive import open_archive
-from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop, rehearsal
+from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
-from hil.campaign.oscillation import Oscillation
 from hil.campaign.rehearsal import (
     CRITERIA,
     FASTEST,
@@ -27,11 +27,11 @@ from hil.campaign.rehearsal import (
     Rehearsal,
     Twin,
     link_faults,
-    of_currents,
     of_motions,
     too_far_without_a_packet,
 )
 from hil.cell import Cell
+from hil.cell.text import with_values
 from hil.cli import app
 from hil.errors import OperatorStopError
 from hil.identify import identify_campaign
@@ -185,19 +185,35 @@ def test_packets_are_lost_where_a_motion_survives_it(
         assert sentence in Twin.of(cell, seed=1, repetitions=3).assumed
 
 
-def test_a_growing_oscillation_is_named_with_plot_command(
-    tmp_path: Path, designed: Campaign, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("changes", "frequency"),
+    [
+        ({"simulation.delay": 0.008}, range(20, 31)),
+        ({"simulation.delay": 0.006, "simulation.elasticity": [2e-5, 2e-5]}, range(50, 71)),
+    ],
+)
+def test_an_unstable_servo_is_named_with_commands_that_work(
+    tmp_path: Path, designed: Campaign, changes: dict[str, object], frequency: range
 ) -> None:
-    oscillation = Oscillation(joint=1, frequency=110.0, growth=70.0, seconds=1.3)
-    monkeypatch.setattr(rehearsal, "growing_oscillation", lambda *_: oscillation)
-    plain = CampaignFolder(designed.folder.rehearsed / "plain")
-    sentence = of_currents(designed.cell, plain, "plain", 0.01).sentence
-    assert "elbow oscillates at 110 Hz, with an amplitude that grows 70 times" in sentence
-    assert "the motion is not at fault" in sentence
-    command = shlex.split(sentence.split("`")[-2])
-    assert command[:2] == ["hil", "plot"] and command[-2:] == ["--joint", "elbow"]
-    plotted = CliRunner().invoke(app, [*command[1:], "-o", str(tmp_path / "x.png")])
-    assert plotted.exit_code == 0
+    cell = designed.cell.with_values(changes)
+    unstable = Campaign.create(tmp_path / "unstable", cell, designed.plan)
+    failures = unstable.rehearse().failures
+    assert len(failures) == 2, "motion and current"
+    for sentence in failures:
+        match = re.search(r"oscillates at (\d+) Hz, with an amplitude that grows", sentence)
+        assert match is not None and int(match[1]) in frequency
+        assert (
+            "the motion is not at fault; correct delay and elasticity in [simulation]" in sentence
+        )
+        command = shlex.split(sentence.split("`")[-2])
+        assert command[:2] == ["hil", "plot"] and command[-2] == "--joint"
+        plotted = CliRunner().invoke(app, [*command[1:], "-o", str(tmp_path / "x.png")])
+        assert plotted.exit_code == 0
+
+    text = unstable.folder.cell.read_text()
+    corrected = {"simulation.delay": 0.0005, "simulation.elasticity": []}
+    unstable.folder.cell.write_text(with_values(text, corrected))
+    assert Campaign.open(unstable.folder.root).rehearse().passed
 
 
 def test_a_motion_beyond_a_speed_limit_is_no_completed_one(designed: Campaign) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -113,7 +112,7 @@ def test_each_file_is_the_motion_for_the_programs_that_read_it() -> None:
     sent = np.array([json.loads(row) for row in re.findall(r"^    move_on\((.*)\)", text, re.M)])
     time = np.minimum(np.arange(len(sent)) / SCRIPT_RATE, motion.duration)
     np.testing.assert_allclose(sent, motion.sample(time)[0], atol=1e-4)
-    opened = len(re.findall(r"^\s*(?:def|while)\b", text, re.MULTILINE))
+    opened = len(re.findall(r"^\s*(?:def|while|if)\b", text, re.MULTILINE))
     assert opened == len(re.findall(r"^\s*end$", text, re.MULTILINE))
 
     limits = JointLimits(*np.array([[-1.0], [1.0], [1.0], [5.0], [50.0]]))
@@ -144,21 +143,18 @@ def test_the_program_asks_first_and_its_speed_scales_time() -> None:
     text = files_of(cell, cell.joint_limits)["excitation.script"]
     assert text.index("popup(") < text.index("movej(")
     assert "blocking=True" in text
-    assert f"  speed = {SLOW:g}\n" in text
+    assert f"  global speed = {SLOW:g}\n" in text
 
     def commands(speed: float) -> list[tuple[str, Any]]:
         """Names and targets of the commands that the program gives at a speed."""
         kept = [line for line in text.splitlines() if line.strip() != "end"]
-        program = (
-            "\n".join(kept)
-            .replace("global ", "")
-            .replace("    start = goal", "    state['start'] = goal")
-        )
+        program = re.sub(r"speed = .*", f"speed = {speed}", "\n".join(kept), count=1)
         program = program.replace("while repetition < repetitions", "while repetition < 1")
-        program = re.sub(r"\bstart\b(?=\[|  *= \[)", "state['start']", program)
-        program = re.sub(r"speed = .*", f"speed = {speed}", program, count=1)
+        program = program.replace("  halt", "  return")
+        for name in {*re.findall(r"global (\w+)", program)}:
+            program = re.sub(rf"\b(?:global )?{name}\b(?!\w*=[^=])", f"state['{name}']", program)
         given: list[tuple[str, Any]] = []
-        names: dict[str, Any] = {"state": {}, "ceil": math.ceil, "True": True, "False": False}
+        names: dict[str, Any] = {"state": {}}
         for name in ("popup", "movej", "servoj", "stopj", "sleep"):
             names[name] = lambda *values, name=name, **_: given.append((name, values[0]))
         exec(program + "\nexcitation()", names)
@@ -171,6 +167,15 @@ def test_the_program_asks_first_and_its_speed_scales_time() -> None:
     np.testing.assert_allclose(paths[1][4::5], paths[0], atol=1e-12)
     largest = [np.abs(np.diff(path, axis=0)).max() for path in paths]
     assert largest[1] == pytest.approx(largest[0] / 5)
+
+    path = np.array([target for name, target in commands(0.8) if name == "servoj"])
+    assert len(path) == pytest.approx(len(paths[0]) / 0.8, abs=1.0)
+    goals = np.vstack([paths[0][:1], paths[0]])
+    places = 0.8 * np.arange(1.0, 1.0 + len(path))
+    expected = [np.interp(places, np.arange(len(goals)), column) for column in goals.T]
+    np.testing.assert_allclose(path, np.transpose(expected), atol=1e-9)
+    for speed in (0.0, -0.2, 1.5):
+        assert [name for name, _ in commands(speed)] == ["popup"]
 
 
 def test_a_short_search_leaves_the_files(tmp_path: Path) -> None:
