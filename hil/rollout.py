@@ -48,9 +48,9 @@ from identification.rollout.comparison import (
     variants,
 )
 from identification.rollout.polish import Driven
-from identification.rollout.servo import NoServoError, Servo, identify_servo
+from identification.rollout.servo import NoServoError, Servo, identify_servo, lead_of
 from identification.rollout.simulation import LARGEST_ERROR, Feedback
-from identification.rollout.windows import STEP, windows_of
+from identification.rollout.windows import STEP, Stretch, windows_of
 
 Array = NDArray[np.float64]
 
@@ -148,13 +148,13 @@ def _motion_of(
     arm = model.arm
     prepared = model.prepared
     sources = model.prepared.sources
-    recordings = with_commands(sources.held_out, prepared.held_out)
-    stretches, owners = recorded_stretches(arm.model, recordings, STEP)
     try:
         servo, drive = _servo_of(model, options)
+        stretches, owners = _stretches(model, sources.held_out, prepared.held_out, servo)
         if servo is not None and any(stretch.commanded is None for stretch in stretches):
             raise NoServoError("the held-out recordings have no commanded positions")
-        windows = windows_of(stretches, STEP, HORIZONS[-1], STRIDE).some(MOST_WINDOWS)
+        windows = windows_of(stretches, STEP, HORIZONS[-1], STRIDE, lead_of(servo))
+        windows = windows.some(MOST_WINDOWS)
     except NoServoError as error:
         remedy = "omit --servo: the recorded torque drives the arm then"
         raise InputError(model.paths[0], str(error), field="--servo", remedy=remedy) from error
@@ -192,6 +192,19 @@ def _servo_of(model: IdentifiedModel, options: RolloutOptions) -> tuple[Servo | 
         f"a servo identified from the fitted motion (gains {gains}; delay"
         f" {1e3 * servo.delay:.3g} ms)"
     )
+
+
+def _stretches(
+    model: IdentifiedModel,
+    sources: Sequence[Source],
+    samples: Sequence[Samples],
+    servo: Servo | None,
+) -> tuple[list[Stretch], list[Samples]]:
+    """Return stretches and their samples; on a servo those whose command is known."""
+    recordings: list[tuple[Samples, Array | None]] = [(part, None) for part in samples]
+    if servo is not None:
+        recordings = with_commands(sources, samples)
+    return recorded_stretches(model.arm.model, recordings, STEP)
 
 
 def with_commands(
@@ -282,12 +295,14 @@ def _polish(
 ) -> tuple[PolishResult, Arm]:
     """Fit to windows of the fitted motion, and judge on the held-out ones."""
     sources = model.prepared.sources
-    recordings = with_commands(sources.training, model.prepared.fitted)
-    stretches, owners = recorded_stretches(model.arm.model, recordings, STEP)
-    windows = windows_of(stretches, STEP, HORIZONS[-1], STRIDE).some(POLISHED_WINDOWS)
-    fitted = replace(driven.motion, windows=windows, samples=tuple(owners))
+    servo = driven.motion.servo
+    fitted = model.prepared.fitted
+    stretches, owners = _stretches(model, sources.training, fitted, servo)
+    windows = windows_of(stretches, STEP, HORIZONS[-1], STRIDE, lead_of(servo))
+    windows = windows.some(POLISHED_WINDOWS)
+    motion = replace(driven.motion, windows=windows, samples=tuple(owners))
     return polish(
-        replace(driven, motion=fitted), driven, identified, reporter, in_sample=sources.in_sample
+        replace(driven, motion=motion), driven, identified, reporter, in_sample=sources.in_sample
     )
 
 

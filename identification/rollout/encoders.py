@@ -38,7 +38,7 @@ from identification.rollout.servo import (
     command_of,
     without_means,
 )
-from identification.rollout.windows import STEP, Stretch
+from identification.rollout.windows import Stretch
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,6 @@ NAMES: Final = ("kp", "kd", "Im", "f0", "f1")
 _DELAYS: Final = 1e-3  # s between delays that are compared
 _LAGS: Final = (0.0, 0.01, 0.02, 0.03, 0.04)  # s of the commands that are instruments
 _DETERMINED: Final = 2.0  # standard deviations that a determined parameter is larger than
-_SMALLEST_PHASE: Final = 0.5  # rad of a joint's oscillation against its servo in a time step
 
 
 class ServoFit(NamedTuple):
@@ -112,12 +111,6 @@ def fit_servo(arm: Arm, stretches: Sequence[Stretch], step: float) -> ServoFit:
         deviations,
         sum(joint.delay_variance(delay) ** -1.0 for joint in joints) ** -0.5,
     )
-
-
-def step_of(servo: Servo, inertia: Array) -> float:
-    """Return a time step [s] in which no joint of an inertia (n,) moves far against its servo."""
-    rate = float(np.sqrt(np.max(servo.kp / inertia)))
-    return STEP / max(1, int(np.ceil(STEP * rate / _SMALLEST_PHASE)))
 
 
 class _Fit(NamedTuple):

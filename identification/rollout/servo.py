@@ -31,6 +31,11 @@ class Servo(NamedTuple):
     delay: float  # of the command [s]
 
 
+def lead_of(servo: Servo | None) -> float:
+    """Return how long before a window the command of a servo has to be known [s]."""
+    return 0.0 if servo is None else max(servo.delay, LONGEST_DELAY)
+
+
 def command_of(stretch: Stretch, delay: float) -> tuple[Array, Array]:
     """Return the delayed command, and its rate half a step after each instant (g, n).
 
