@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import write_files
-from hil.identified_model import IdentifiedModel, ensemble_of, remarks_of
+from hil.identified_model import (
+    IdentifiedModel,
+    ensemble_of,
+    impossible_bodies,
+    remarks_of,
+)
 from hil.identify.cell_context import nominal_of
 from hil.identify.prepared import Prepared
 from hil.identify.sources import Source
@@ -31,13 +36,13 @@ from identification import IdentificationError, Samples
 from identification.estimators.ensemble import Ensemble
 from identification.export.arm import Arm
 from identification.export.simulators import FORMATS, read_back
-from identification.model.pseudo_inertia import margin
 from identification.rollout.comparison import (
     HORIZONS,
     Errors,
     RecordedMotion,
     ResidualTorque,
     ToolFrame,
+    continued,
     coverage,
     errors_of,
     horizon_rows,
@@ -123,6 +128,7 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
         identified=ArmErrors.of(identified),
         nominal=nominal,
         no_nominal=reason,
+        continued=root_mean_squares(continued(windows) - measured),
         samples=len(ensemble),
         seed=options.seed,
         sample_errors=[
@@ -133,7 +139,7 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
         leading_joint=arm.model.joint_names[joint],
         leading_effect=leading_effect(arm, motion, feedback, positions, measured, joint),
         polish=None if polished is None else polished[0],
-        notes=[*notes, *_about(motion, prepared)],
+        notes=[*([] if model.good else [model.verdict]), *notes, *_about(motion, prepared)],
     )
     accepted = polished is not None and polished[0].accepted
     return Rollout(
@@ -207,6 +213,12 @@ def _stretches(
     return recorded_stretches(model.arm.model, recordings, STEP)
 
 
+def root_mean_squares(errors: Array) -> list[float]:
+    """Return those of errors (w, h, n) at each horizon, over all windows and joints."""
+    squares: list[float] = np.sqrt(np.mean(errors**2, axis=(0, 2))).tolist()
+    return squares
+
+
 def with_commands(
     sources: Sequence[Source], samples: Sequence[Samples]
 ) -> list[tuple[Samples, Array | None]]:
@@ -231,7 +243,7 @@ def _nominal(
         return None, "the URDF has no masses", []
     notes = []
     if described.balanced:
-        names = ", ".join(_impossible_bodies(described))
+        names = ", ".join(impossible_bodies(described.model, described.standard))
         notes.append(
             f"the nominal bodies of {names} are not physically consistent; MuJoCo balances their"
             " inertias"
@@ -253,15 +265,8 @@ def nominal_arm(cell: Cell, arm: Arm) -> Arm | None:
     if cell.file.nominal is not None and model.layout.rotor_inertia:
         standard[model.layout.rotors] = cell.nominal.rotor_inertia
     described = replace(arm, standard=standard, values=nominal.values, load=None)
-    return replace(described, balanced=bool(_impossible_bodies(described)))
-
-
-def _impossible_bodies(arm: Arm) -> list[str]:
-    """Return the joints whose bodies are not physically consistent."""
-    margins = margin(arm.standard[arm.model.layout.links])
-    return [
-        name for name, least in zip(arm.model.joint_names, margins, strict=True) if least <= 0.0
-    ]
+    impossible = impossible_bodies(model, described.standard)
+    return replace(described, balanced=bool(impossible))
 
 
 def _simulated_ensemble(

@@ -26,6 +26,7 @@ from hil.rollout import (
     Rollout,
     leading_effect,
     nominal_arm,
+    root_mean_squares,
     with_commands,
 )
 from hil.rollout_result import JUDGED, ArmErrors, RolloutResult, ServoParameter, ServoResult
@@ -36,6 +37,7 @@ from identification.rollout.comparison import (
     Errors,
     RecordedMotion,
     ToolFrame,
+    continued,
     errors_of,
     horizon_rows,
     leading_joint,
@@ -162,6 +164,7 @@ def _result(
         identified=ArmErrors.of(errors_of(positions, measured, tool)),
         nominal=ArmErrors.of(errors_of(alone, measured, tool)),
         no_nominal="",
+        continued=root_mean_squares(continued(windows) - measured),
         samples=0,
         seed=0,
         sample_errors=[],

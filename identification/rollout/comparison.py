@@ -118,6 +118,12 @@ def horizon_rows(windows: Windows) -> list[int]:
     return [round(horizon / windows.step) - 1 for horizon in HORIZONS]
 
 
+def continued(windows: Windows) -> Array:
+    """Return the positions at the horizons (w, h, n) of joints that keep their start velocity."""
+    moved = windows.start[:, None] * np.array(HORIZONS)[:, None]
+    return np.asarray(windows.position[:, :1] + moved)
+
+
 def _removed(stretch: Stretch, samples: Samples, arm: Arm) -> Array:
     """Return the part of an arm's torque (g, n) that the low-pass of the record removed."""
     if samples.torque_bandwidth is None:

@@ -118,7 +118,7 @@ def stretches_of(
     parts: Sequence[slice] = samples.segments
     with_command = np.zeros(len(samples.torque), np.bool_)
     if commanded is not None:
-        with_command = np.isfinite(commanded).all(axis=1)
+        with_command = np.asarray(np.isfinite(commanded).all(axis=1))
     if with_command.any():
         parts = [run for part in parts for run in _runs(with_command, part)]
     for part in parts:
@@ -144,8 +144,7 @@ def _runs(inside: NDArray[np.bool_], part: slice) -> list[slice]:
     """Return the runs of rows inside (m,) in a part of them."""
     edges = np.flatnonzero(np.diff(inside[part].astype(np.int8), prepend=0, append=0))
     return [
-        slice(part.start + int(first), part.start + int(end))
-        for first, end in edges.reshape(-1, 2)
+        slice(part.start + int(first), part.start + int(end)) for first, end in edges.reshape(-1, 2)
     ]
 
 

@@ -41,12 +41,13 @@ def on_its_servo(
     seed: int = 1,
     duration: float = 20.0,
     step: float = 0.001,
-    servo: Servo = Servo(KP, KD, DELAY),
+    servo: Servo | None = None,
 ):
     """Time, positions, velocities and command of an arm that MuJoCo moves, each `step` [s].
 
     A coloured disturbance [N·m] with a time constant of 20 ms acts beside the servo.
     """
+    servo = servo or Servo(KP, KD, DELAY)
     model = mujoco.MjModel.from_xml_string(mjcf(arm, "arm", step=step))
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
     data = mujoco.MjData(model)
