@@ -46,6 +46,7 @@ from identification.rollout.comparison import (
     HORIZONS,
     RecordedMotion,
     ToolFrame,
+    continued,
     errors_of,
     horizon_rows,
     light_feedback,
@@ -148,7 +149,7 @@ def _print_comparison(name: str, archives: Sequence[Path], iterations: int) -> N
         "the same, polished": (polished_arm.on(held_out).positions(), polished_seconds),
         "mujoco.sysid": (positions_of(rival, nominal, held_out, feedback), rival_seconds),
         "nominal": (simulate(nominal, held_out, feedback), None),
-        "start velocity": (_continued(held_out), None),
+        "start velocity": (continued(held_out.windows), None),
     }
     print(f"{'position error (rms) [mrad]':30}" + "".join(f"{f'{h:g} s':>10}" for h in HORIZONS))
     measured = held_out.windows.reached[:, horizon_rows(held_out.windows)]
@@ -159,13 +160,6 @@ def _print_comparison(name: str, archives: Sequence[Path], iterations: int) -> N
         print(
             f"{label:30}{figures}" + ("" if spent is None else f"   in {spent:.1f} s"), flush=True
         )
-
-
-def _continued(motion: RecordedMotion) -> Array:
-    """Return the positions at the horizons (w, h, n) of joints that keep their start velocity."""
-    windows = motion.windows
-    moved = windows.start[:, None] * np.array(HORIZONS)[:, None]
-    return np.asarray(windows.position[:, :1] + moved)
 
 
 def _windows_of(

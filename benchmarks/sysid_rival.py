@@ -104,6 +104,7 @@ def _parameters(spec: Any, arm: Arm, motion: RecordedMotion, feedback: Feedback)
     torque = np.sqrt(np.mean(windows.torque**2, axis=(0, 1)))
     speed = np.sqrt(np.mean(velocity**2, axis=0))
     inertia = model.dof_M0[[int(model.joint(name).dofadr[0]) for name in names]]
+    constants = {"damping": feedback.damping, "armature": feedback.inertia(windows.step)}
     for j, name in enumerate(names):
         body = arm.link(j)
         parameters.add(
@@ -117,7 +118,7 @@ def _parameters(spec: Any, arm: Arm, motion: RecordedMotion, feedback: Feedback)
             "armature": max(float(arm.rotors[j, j]), _SHARE * inertia[j]),
         }
         for field, start in starts.items():
-            constant = float(feedback.damping[j]) if field == "damping" else 0.0
+            constant = float(constants[field][j]) if field in constants else 0.0
             setter = _joint_setter(name, field, constant)
             parameters.add(
                 sysid.Parameter(f"{field} of {name}", start, 0.0, _MOST * start, modifier=setter)

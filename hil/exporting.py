@@ -16,7 +16,7 @@ from hil.files import make_folder, write_files
 from hil.identified_model import IdentifiedModel, ensemble_of, model_of, remarks_of
 from hil.identify import Identification
 from identification import Samples
-from identification.estimators.ensemble import Ensemble
+from identification.estimators.ensemble import FEWEST, Ensemble
 from identification.export.simulators import (
     FORMATS,
     MISSING,
@@ -32,6 +32,7 @@ from identification.model.motion import Motion
 Array = NDArray[np.float64]
 FormatName = Literal["mjcf", "urdf", "sdf", "pinocchio"]
 
+_SPREAD_TOLERANCE: Final = 0.05  # of drawn arms, from that of the stated intervals
 _ENSEMBLE_STATES: Final = 50  # random states at which each drawn arm is read back
 _MOST_ROWS: Final = 2000  # of the recorded motion, enough for root mean squares
 
@@ -139,6 +140,14 @@ class ExportedEnsemble:
             "spread of their torque on the fitted motion over that of the stated intervals:"
             f" {pooled:.2f} over all joints ({spread})",
         ]
+        if abs(pooled - 1.0) > _SPREAD_TOLERANCE:
+            lines.append(
+                f"the spread of fewer than {FEWEST} arms is that of chance: draw more, such as"
+                " --ensemble 20"
+                if len(arms) < FEWEST
+                else "warning: the nearest arms that can be built do not vary as the intervals say:"
+                " do not randomise between them"
+            )
         if isinstance(self.difference, str):
             lines.append(f"warning: not read back: {self.difference}")
         else:

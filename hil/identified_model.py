@@ -38,7 +38,9 @@ from identification.export.arm import Arm, Ranges
 from identification.export.friction import median_load
 from identification.export.parameters import estimate_in
 from identification.factor.factor import FINE_BLOCK, fine_blocks, total_factor
+from identification.model.pseudo_inertia import margin
 from identification.model.regressor import LINK_SYMBOLS
+from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import FOLDS
 
 Array = NDArray[np.float64]
@@ -260,7 +262,7 @@ def stored_model(folder: Path, reporter: Reporter, predict: Sequence[Path] = ())
         standard, values = _stored_values(cell, content)
         estimate = estimate_in(content)
     except (HilError, IdentificationError, ValueError, LookupError, TypeError) as error:
-        raise NotReusableError(f"{PARAMETERS_JSON} is not of this arm ({error})") from error
+        raise NotReusableError(f"{PARAMETERS_JSON} cannot be used ({error})") from error
     program = results.software.get("hil", "an unknown version of hil")
     return IdentifiedModel(
         cell,
@@ -333,6 +335,18 @@ def _stored_values(cell: Cell, content: Mapping[str, Any]) -> tuple[Array, Array
     ]
     elements = [stored["elements"][name] for name in model.elements.names]
     values = np.concatenate([model.base.grouping @ standard, friction, elements])
-    if not np.isfinite(values).all():
+    if not np.isfinite(values).all() or not np.isfinite(standard).all():
         raise ValueError("it has numbers that are not finite")
+    impossible = impossible_bodies(model, standard)
+    if impossible:
+        raise ValueError(f"the body of {', '.join(impossible)} cannot exist")
     return standard, values
+
+
+def impossible_bodies(model: RobotModel, standard: Array) -> list[str]:
+    """Return the joints whose bodies are not physically consistent, or rotors negative."""
+    layout = model.layout
+    possible = margin(standard[layout.links]) > 0.0
+    if layout.rotor_inertia:
+        possible &= standard[layout.rotors] >= 0.0
+    return [name for name, exists in zip(model.joint_names, possible, strict=True) if not exists]

@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import write_files
-from hil.identified_model import IdentifiedModel, ensemble_of, remarks_of
+from hil.identified_model import (
+    IdentifiedModel,
+    ensemble_of,
+    impossible_bodies,
+    remarks_of,
+)
 from hil.identify.cell_context import nominal_of
 from hil.identify.prepared import Prepared
 from hil.identify.sources import Source
@@ -31,13 +36,13 @@ from identification import IdentificationError, Samples
 from identification.estimators.ensemble import Ensemble
 from identification.export.arm import Arm
 from identification.export.simulators import FORMATS, read_back
-from identification.model.pseudo_inertia import margin
 from identification.rollout.comparison import (
     HORIZONS,
     Errors,
     RecordedMotion,
     ResidualTorque,
     ToolFrame,
+    continued,
     coverage,
     errors_of,
     horizon_rows,
@@ -48,9 +53,9 @@ from identification.rollout.comparison import (
     variants,
 )
 from identification.rollout.polish import Driven
-from identification.rollout.servo import NoServoError, Servo, identify_servo
+from identification.rollout.servo import NoServoError, Servo, identify_servo, lead_of
 from identification.rollout.simulation import LARGEST_ERROR, Feedback
-from identification.rollout.windows import STEP, windows_of
+from identification.rollout.windows import STEP, Stretch, windows_of
 
 Array = NDArray[np.float64]
 
@@ -123,6 +128,7 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
         identified=ArmErrors.of(identified),
         nominal=nominal,
         no_nominal=reason,
+        continued=root_mean_squares(continued(windows) - measured),
         samples=len(ensemble),
         seed=options.seed,
         sample_errors=[
@@ -133,7 +139,7 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
         leading_joint=arm.model.joint_names[joint],
         leading_effect=leading_effect(arm, motion, feedback, positions, measured, joint),
         polish=None if polished is None else polished[0],
-        notes=[*notes, *_about(motion, prepared)],
+        notes=[*([] if model.good else [model.verdict]), *notes, *_about(motion, prepared)],
     )
     accepted = polished is not None and polished[0].accepted
     return Rollout(
@@ -148,13 +154,13 @@ def _motion_of(
     arm = model.arm
     prepared = model.prepared
     sources = model.prepared.sources
-    recordings = with_commands(sources.held_out, prepared.held_out)
-    stretches, owners = recorded_stretches(arm.model, recordings, STEP)
     try:
         servo, drive = _servo_of(model, options)
+        stretches, owners = _stretches(model, sources.held_out, prepared.held_out, servo)
         if servo is not None and any(stretch.commanded is None for stretch in stretches):
             raise NoServoError("the held-out recordings have no commanded positions")
-        windows = windows_of(stretches, STEP, HORIZONS[-1], STRIDE).some(MOST_WINDOWS)
+        windows = windows_of(stretches, STEP, HORIZONS[-1], STRIDE, lead_of(servo))
+        windows = windows.some(MOST_WINDOWS)
     except NoServoError as error:
         remedy = "omit --servo: the recorded torque drives the arm then"
         raise InputError(model.paths[0], str(error), field="--servo", remedy=remedy) from error
@@ -194,6 +200,25 @@ def _servo_of(model: IdentifiedModel, options: RolloutOptions) -> tuple[Servo | 
     )
 
 
+def _stretches(
+    model: IdentifiedModel,
+    sources: Sequence[Source],
+    samples: Sequence[Samples],
+    servo: Servo | None,
+) -> tuple[list[Stretch], list[Samples]]:
+    """Return stretches and their samples; on a servo those whose command is known."""
+    recordings: list[tuple[Samples, Array | None]] = [(part, None) for part in samples]
+    if servo is not None:
+        recordings = with_commands(sources, samples)
+    return recorded_stretches(model.arm.model, recordings, STEP)
+
+
+def root_mean_squares(errors: Array) -> list[float]:
+    """Return those of errors (w, h, n) at each horizon, over all windows and joints."""
+    squares: list[float] = np.sqrt(np.mean(errors**2, axis=(0, 2))).tolist()
+    return squares
+
+
 def with_commands(
     sources: Sequence[Source], samples: Sequence[Samples]
 ) -> list[tuple[Samples, Array | None]]:
@@ -218,7 +243,7 @@ def _nominal(
         return None, "the URDF has no masses", []
     notes = []
     if described.balanced:
-        names = ", ".join(_impossible_bodies(described))
+        names = ", ".join(impossible_bodies(described.model, described.standard))
         notes.append(
             f"the nominal bodies of {names} are not physically consistent; MuJoCo balances their"
             " inertias"
@@ -240,15 +265,8 @@ def nominal_arm(cell: Cell, arm: Arm) -> Arm | None:
     if cell.file.nominal is not None and model.layout.rotor_inertia:
         standard[model.layout.rotors] = cell.nominal.rotor_inertia
     described = replace(arm, standard=standard, values=nominal.values, load=None)
-    return replace(described, balanced=bool(_impossible_bodies(described)))
-
-
-def _impossible_bodies(arm: Arm) -> list[str]:
-    """Return the joints whose bodies are not physically consistent."""
-    margins = margin(arm.standard[arm.model.layout.links])
-    return [
-        name for name, least in zip(arm.model.joint_names, margins, strict=True) if least <= 0.0
-    ]
+    impossible = impossible_bodies(model, described.standard)
+    return replace(described, balanced=bool(impossible))
 
 
 def _simulated_ensemble(
@@ -282,12 +300,14 @@ def _polish(
 ) -> tuple[PolishResult, Arm]:
     """Fit to windows of the fitted motion, and judge on the held-out ones."""
     sources = model.prepared.sources
-    recordings = with_commands(sources.training, model.prepared.fitted)
-    stretches, owners = recorded_stretches(model.arm.model, recordings, STEP)
-    windows = windows_of(stretches, STEP, HORIZONS[-1], STRIDE).some(POLISHED_WINDOWS)
-    fitted = replace(driven.motion, windows=windows, samples=tuple(owners))
+    servo = driven.motion.servo
+    fitted = model.prepared.fitted
+    stretches, owners = _stretches(model, sources.training, fitted, servo)
+    windows = windows_of(stretches, STEP, HORIZONS[-1], STRIDE, lead_of(servo))
+    windows = windows.some(POLISHED_WINDOWS)
+    motion = replace(driven.motion, windows=windows, samples=tuple(owners))
     return polish(
-        replace(driven, motion=fitted), driven, identified, reporter, in_sample=sources.in_sample
+        replace(driven, motion=motion), driven, identified, reporter, in_sample=sources.in_sample
     )
 
 

@@ -26,6 +26,7 @@ from hil.rollout import (
     Rollout,
     leading_effect,
     nominal_arm,
+    root_mean_squares,
     with_commands,
 )
 from hil.rollout_result import JUDGED, ArmErrors, RolloutResult, ServoParameter, ServoResult
@@ -36,15 +37,16 @@ from identification.rollout.comparison import (
     Errors,
     RecordedMotion,
     ToolFrame,
+    continued,
     errors_of,
     horizon_rows,
-    joint_inertia,
     leading_joint,
     recorded_stretches,
     simulate,
 )
-from identification.rollout.encoders import NAMES, ServoFit, fit_servo, step_of
+from identification.rollout.encoders import NAMES, ServoFit, fit_servo
 from identification.rollout.polish import Driven
+from identification.rollout.servo import lead_of
 from identification.rollout.simulation import Feedback
 from identification.rollout.windows import STEP, windows_of
 
@@ -91,9 +93,8 @@ def roll_out_servo(
     try:
         stretches, _ = recorded_stretches(cell.model, with_commands(sources.training, fitted), STEP)
         fit = fit_servo(bodies, stretches, STEP)
-        step = step_of(fit.servo, joint_inertia(fit.arm, STEP))
-        training = _driven(fit, sources.training, fitted, step, POLISHED_WINDOWS)
-        unseen = _driven(fit, sources.held_out, held_out, step, MOST_WINDOWS)
+        training = _driven(fit, sources.training, fitted, POLISHED_WINDOWS)
+        unseen = _driven(fit, sources.held_out, held_out, MOST_WINDOWS)
     except IdentificationError as error:
         remedy = "record the torque, or a longer motion with the commanded positions"
         raise InputError(paths[0], str(error), field="servo", remedy=remedy) from error
@@ -116,7 +117,7 @@ def _samples(sources: Sequence[Source], cell: Cell) -> list[Samples]:
 
 
 def _driven(
-    fit: ServoFit, sources: Sequence[Source], samples: Sequence[Samples], step: float, most: int
+    fit: ServoFit, sources: Sequence[Source], samples: Sequence[Samples], most: int
 ) -> Driven:
     """Return the arm on its servo, in windows of recordings whose torque is that of the model."""
     model = fit.arm.model
@@ -124,8 +125,8 @@ def _driven(
         replace(recording, torque=recording.predicted_torque(model, fit.arm.values))
         for recording in samples
     ]
-    stretches, owners = recorded_stretches(model, with_commands(sources, with_torque), step)
-    windows = windows_of(stretches, step, HORIZONS[-1], STRIDE).some(most)
+    stretches, owners = recorded_stretches(model, with_commands(sources, with_torque), STEP)
+    windows = windows_of(stretches, STEP, HORIZONS[-1], STRIDE, lead_of(fit.servo)).some(most)
     motion = RecordedMotion(windows, tuple(owners), fit.servo)
     return Driven(fit.arm, motion, Feedback(fit.servo.kp, fit.servo.kd))
 
@@ -163,6 +164,7 @@ def _result(
         identified=ArmErrors.of(errors_of(positions, measured, tool)),
         nominal=ArmErrors.of(errors_of(alone, measured, tool)),
         no_nominal="",
+        continued=root_mean_squares(continued(windows) - measured),
         samples=0,
         seed=0,
         sample_errors=[],

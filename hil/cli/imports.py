@@ -197,6 +197,15 @@ class Reading:
             rich_help_panel=CHANNELS,
         ),
     ] = None
+    command_topic: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TOPIC",
+            help="Topic of the commanded positions of a bag, or none. Default: the state of a "
+            "controller, else a topic of commands that the positions follow.",
+            rich_help_panel=CHANNELS,
+        ),
+    ] = None
     rename: Annotated[
         list[str] | None,
         typer.Option(
@@ -235,6 +244,7 @@ class Reading:
             _names(self.rename or []),
             self.outside_limits,
             self.drop_missing,
+            self.command_topic,
         )
 
     def refuse_without_robot(self) -> None:
@@ -244,6 +254,7 @@ class Reading:
             "--columns": self.channels,
             "--sample-rate": self.sample_rate,
             "--topic": self.topic,
+            "--command-topic": self.command_topic,
             "--rename": self.rename,
             "--outside-limits": self.outside_limits,
             "--drop-missing": self.drop_missing,
@@ -264,6 +275,7 @@ def rosbag2(
     topic: str | None = None,
     effort: Annotated[Effort, typer.Option(metavar="QUANTITY")] = "torque",
     clock: Annotated[Clock, typer.Option(metavar="STAMPS")] = "auto",
+    command_topic: Annotated[str | None, typer.Option(metavar="TOPIC")] = None,
     rename: Annotated[list[str] | None, typer.Option(metavar="RECORDED=URDF")] = None,
     held: Held = None,
     kind: Kind = "excitation",
@@ -284,6 +296,8 @@ def rosbag2(
         topic: Topic of the joint states; needed if the bag has several.
         effort: Content of the effort field: torque, motor_current or ignore.
         clock: Stamps to use: header (of the messages), bag (time of receipt) or auto.
+        command_topic: Topic of the commanded positions, or none; by default the state of a
+            controller, else a topic of commands that the positions follow.
         rename: Joint whose name in the bag differs from the URDF (repeatable).
     """
     names = _names(rename or [])
@@ -295,6 +309,7 @@ def rosbag2(
         effort=effort,
         clock=clock,
         joint_names=names,
+        command_topic=command_topic,
         held_joints=held or (),
         use=kind,
         force=force,

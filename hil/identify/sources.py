@@ -419,7 +419,7 @@ def useful_part(archive: Archive, recording: Recording) -> range | None:
     if archive.header.by_controller_program and "status" in archive.columns:
         usable = archive.columns["status"] == DRIVE_ON
         problem = "the drive is never on"
-    elif recording.commanded_position is not None:
+    elif recording.commanded_position is not None and archive.kind != "imported":
         usable = ~np.isnan(recording.commanded_position).any(axis=1)
         problem = "it has no commanded position"
     else:

@@ -26,6 +26,7 @@ class BagMap(BaseModel):
         topic: of the joint states; None where the bag has only one.
         clock: stamps that were used: ``header`` of the messages, or those of the ``bag``.
         effort: content of the effort field.
+        command_topic: of the commanded positions, ``none`` for none; None to find it.
         rename: joint in the URDF by name in the bag, where they differ.
     """
 
@@ -34,6 +35,7 @@ class BagMap(BaseModel):
     topic: str | None = None
     clock: Clock = "auto"
     effort: Effort = "torque"
+    command_topic: str | None = None
     rename: Mapping[str, str] = {}
 
     @property

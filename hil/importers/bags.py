@@ -6,7 +6,7 @@ import re
 import sqlite3
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import copyfile
@@ -21,7 +21,7 @@ from hil.archive.container import MOST_INFLATION
 from hil.errors import SourceError
 from hil.importers import mcap_messages
 from hil.importers.mcap_messages import Topic
-from hil.importers.ros_messages import MessageError, decoded, typestore_of
+from hil.importers.ros_messages import MessageError, decoded, definitions_of, typestore_of
 from hil.reading import open_file, read_text
 
 if TYPE_CHECKING:
@@ -165,12 +165,17 @@ class _Part(ABC):
     def decoded(self, topic: str, data: bytes) -> Any:
         """Return a message; MessageError if it cannot be decoded."""
         described = self.topics[topic]
-        definition = described.definition.decode(errors="replace")
-        return decoded(
-            typestore_of(described.kind, definition, described.schema_encoding),
-            described.kind,
-            data,
-        )
+        text = described.definition.decode(errors="replace")
+        *others, last = definitions_of(described.kind, text)
+        for definition in others:
+            with suppress(MessageError):
+                return _decoded(described, definition, data)
+        return _decoded(described, last, data)
+
+
+def _decoded(topic: Topic, definition: str, data: bytes) -> Any:
+    store = typestore_of(topic.kind, definition, topic.schema_encoding)
+    return decoded(store, topic.kind, data)
 
 
 class _McapPart(_Part):

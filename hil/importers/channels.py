@@ -19,6 +19,7 @@ from hil.errors import SourceError
 from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.bags import SUFFIXES, open_bag
 from hil.importers.column_map import Format
+from hil.importers.commands import as_joint_state, measured_topics
 from hil.importers.rosbag2 import joint_state_topics
 from hil.importers.stamps import concluded_unit
 from hil.importers.table import Table
@@ -168,11 +169,13 @@ def _of_bag(path: Path) -> tuple[Channel, ...]:
     """Return the quantities of the joint states in a bag; none where it has no such topic."""
     channels: list[Channel] = []
     with open_bag(path) as bag:
-        for topic in joint_state_topics(bag.topics):
+        measured = measured_topics(bag.topics)
+        others = [name for name in joint_state_topics(bag.topics) if name not in measured]
+        for topic in (*measured, *others):
             names: dict[str, None] = {}
             received = []
             present = dict.fromkeys(("position", "velocity", "effort"), 0)
-            for message in bag.messages(topic):
+            for message in map(as_joint_state, bag.messages(topic)):
                 names.update(dict.fromkeys(message.content.name))
                 received.append(message.received)
                 for quantity in present:
@@ -181,7 +184,7 @@ def _of_bag(path: Path) -> tuple[Channel, ...]:
             for quantity, samples in present.items():
                 if samples:
                     name = f"{topic}/{quantity}"
-                    kind, _ = kind_of(name)
+                    kind = kind_of(name)[0] if topic in measured else None
                     channels.append(
                         Channel(name, len(names), samples, None, "float64", rate_of(received), kind,
                                 None, tuple(names))

@@ -37,6 +37,7 @@ class ImportOptions:
         joint_names: in the URDF by name in the bag, where they differ.
         outside_limits: accept positions of which no row is within the limits of the URDF.
         drop_missing: leave out rows of a log in which a number is missing or is other text.
+        command_topic: of the commanded positions of a bag, ``none`` for none; None to find it.
     """
 
     columns: Path | None = None
@@ -46,6 +47,7 @@ class ImportOptions:
     joint_names: Mapping[str, str] = field(default_factory=dict)
     outside_limits: bool = False
     drop_missing: bool = False
+    command_topic: str | None = None
 
 
 @dataclass(frozen=True)
@@ -166,7 +168,7 @@ class _WithoutGripper:
         if not has_joint_states(self._source) or _read_as_log(self._source, options):
             return ()
         stated = None if options.columns is None else BagMap.load(options.columns)
-        bag = stated or BagMap(topic=options.topic, rename=options.joint_names)
+        bag = stated or _bag_map(options)
         return recorded_joints(self._source, bag.topic, bag.rename)
 
 
@@ -186,7 +188,7 @@ def _imported(
     if stated is not None:
         return _import_bag(source, output, robot_of, stated, options, held_joints, use, force=force)
     if options.columns is None and has_joint_states(source) and not _read_as_log(source, options):
-        bag = BagMap(topic=options.topic, rename=options.joint_names)
+        bag = _bag_map(options)
         return _import_bag(source, output, robot_of, bag, options, held_joints, use, force=force)
     lines: tuple[str, ...] = ()
     if options.columns is not None:
@@ -217,6 +219,12 @@ def _imported(
         outside_limits=options.outside_limits,
     )
     return ImportedRecording(output, text, lines)
+
+
+def _bag_map(options: ImportOptions) -> BagMap:
+    return BagMap(
+        topic=options.topic, command_topic=options.command_topic, rename=options.joint_names
+    )
 
 
 def _read_as_log(source: Path, options: ImportOptions) -> bool:
@@ -251,20 +259,26 @@ def _import_bag(
         effort=stated.effort,
         clock=stated.clock,
         joint_names=names,
+        command_topic=stated.command_topic,
         held_joints=held_joints,
         use=use,
         force=force,
         outside_limits=options.outside_limits,
     )
     entries = open_archive(output, fields=()).header.entries
-    read = {key: entries[key] for key in ("topic", "clock", "effort")}
+    read = {
+        key: entries[key] for key in ("topic", "clock", "effort", "command_topic") if key in entries
+    }
     bag = BagMap.model_validate({**read, "rename": dict(names)})
     lines = tuple(
         f"{channel.name}: {channel.kind}, {next(iter(UNITS[channel.kind]))}, by the field of the "
         "joint states; joints by their names"
         for channel in channels_of(source)
-        if channel.kind is not None and topic in (None, channel.name.rpartition("/")[0])
+        if channel.kind is not None and channel.name.rpartition("/")[0] == entries["topic"]
     )
+    if "command_topic" in entries:
+        line = f"{entries['command_topic']}: commanded_position, rad or m, {entries['command']}"
+        lines = (*lines, line)
     return ImportedRecording(output, None, lines, bag)
 
 

@@ -332,7 +332,10 @@ def _check(samples: Samples, source: Path, joints: Sequence[str]) -> None:
     for name, values in quantities.items():
         if values is None:
             continue
-        rows, columns = np.nonzero(~(np.abs(values) <= _MOST))
+        wrong = ~(np.abs(values) <= _MOST)
+        if values is samples.commanded_position:
+            wrong &= ~np.isnan(values)  # where nothing was commanded
+        rows, columns = np.nonzero(wrong)
         if rows.size:
             row = rows[0]
             column = columns[0]

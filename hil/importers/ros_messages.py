@@ -15,6 +15,18 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
+CONTROLLER_STATE: Final = "control_msgs/msg/JointTrajectoryControllerState"
+_HEAD: Final = "std_msgs/Header header\nstring[] joint_names\n"
+_CONTROLLER_STATES: Final = (
+    # Since Iron; Humble; before.
+    (("reference", "feedback", "error", "output"), ("reference", "feedback", "error", "output")),
+    (
+        ("reference", "feedback", "error", "output", "desired", "actual"),
+        ("reference", "feedback", "error", "output", "desired", "actual"),
+    ),
+    (("desired", "actual", "error"), ()),
+)
+"""Points of joints, and of joints with several axes, in the states of trajectory controllers."""
 _LONGEST: Final = 1 << 16  # elements of a sequence in a message
 _LARGEST: Final = 4096  # elements of a column; what is larger is an image or a cloud of points
 _ROS1_HEADER: Final = "seq"
@@ -49,6 +61,24 @@ def typestore_of(kind: str, definition: str, encoding: str) -> Typestore:
             f"its definition is invalid ({error or type(error).__name__})"
         ) from error
     return store
+
+
+def definitions_of(kind: str, definition: str) -> tuple[str, ...]:
+    """Return the definitions that messages may have: the given one, or those of releases of ROS 2.
+
+    Bags of Humble and before have none, and `rosbags` none of the messages of controllers.
+    """
+    if definition.strip() or kind not in (CONTROLLER_STATE, CONTROLLER_STATE.replace("/msg", "")):
+        return (definition,)
+    return tuple(
+        _HEAD
+        + "".join(f"trajectory_msgs/JointTrajectoryPoint {name}\n" for name in single)
+        + ("string[] multi_dof_joint_names\n" if several else "")
+        + "".join(
+            f"trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_{name}\n" for name in several
+        )
+        for single, several in _CONTROLLER_STATES
+    )
 
 
 def _of_msg(definition: str, kind: str) -> dict[str, Any]:

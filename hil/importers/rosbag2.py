@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import Final, Literal
@@ -14,16 +14,23 @@ from numpy.typing import NDArray
 from hil.archive import Samples
 from hil.errors import SourceError, UnrecordedJointError
 from hil.importers.bags import Bag, BagMessage, open_bag
+from hil.importers.commands import Clock as CommandClock
+from hil.importers.commands import (
+    Measured,
+    as_joint_state,
+    commanded_positions,
+    measured_topics,
+    topics_of_kind,
+)
 from hil.importers.mcap_messages import Topic
 from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
-from hil.importers.ros_messages import JOINT_STATE
+from hil.importers.ros_messages import CONTROLLER_STATE, JOINT_STATE
 from hil.importers.stamps import leading_zeros, swapped_messages
 
 Array = NDArray[np.float64]
 Effort = Literal["torque", "motor_current", "ignore"]
 Clock = Literal["auto", "header", "bag"]
 
-_JOINT_STATES: Final = (JOINT_STATE, "sensor_msgs/JointState")
 _QUANTITIES: Final = ("position", "velocity", "effort")
 _APART: Final = 0.1  # rad or m between samples of one stamp, 20 ms at 5 rad/s
 _STALLED: Final = 3  # messages with one stamp, of one publisher
@@ -42,6 +49,7 @@ def import_rosbag2(
     effort: Effort = "torque",
     clock: Clock = "auto",
     joint_names: Mapping[str, str] | None = None,
+    command_topic: str | None = None,
     held_joints: Sequence[str] = (),
     use: Use = "excitation",
     force: bool = False,
@@ -54,7 +62,9 @@ def import_rosbag2(
     the URDF by name in the bag, where they differ. Where joints come in messages of their own,
     those are merged by stamp. Messages with none of them (a gripper on the same topic) are ignored.
     Stamps are those in the messages' headers; where all are empty, or `clock` is ``bag``, the
-    bag's. The effort is a joint torque [N·m] or a motor current [A].
+    bag's. The effort is a joint torque [N·m] or a motor current [A]. Commanded positions are those
+    of `command_topic` (``none`` for none), by default of the topic that says most
+    (:mod:`hil.importers.commands`).
 
     With `force` an existing archive is replaced; `outside_limits` accepts positions of which no row
     is within the limits of the URDF.
@@ -67,10 +77,21 @@ def import_rosbag2(
         chosen = _choose(bag, topic)
         states = _States(bag.files[0], robot.joint_names, joint_names or {}, effort, clock)
         for message in bag.messages(chosen):
-            states.add(message)
+            states.add(as_joint_state(message))
         files = bag.files
-    samples = states.samples()
+        samples = states.samples()
+        measured = Measured(
+            robot.joint_names,
+            joint_names or {},
+            samples.stamp,
+            samples.position,
+            CommandClock(states.clock == "header", states.latency),
+        )
+        commands = commanded_positions(bag, chosen, measured, command_topic)
+    samples = replace(samples, commanded_position=commands.values)
     metadata = {"importer": "rosbag2", "topic": chosen, "effort": effort, "clock": states.clock}
+    if commands.values is not None:
+        metadata |= {"command_topic": commands.topic, "command": commands.reading}
     return write_imported(
         output,
         samples,
@@ -79,7 +100,7 @@ def import_rosbag2(
         metadata=metadata,
         held_joints=held_joints,
         use=use,
-        notes=states.notes,
+        notes=[*states.notes, *commands.notes],
         clock_remedy=_BAG_CLOCK if states.clock == "header" else "record again",
         force=force,
         outside_limits=outside_limits,
@@ -99,7 +120,9 @@ def recorded_joints(
     with open_bag(Path(source)) as bag:
         chosen = _choose(bag, topic)
         names = dict.fromkeys(
-            str(name) for message in bag.messages(chosen) for name in message.content.name
+            str(name)
+            for message in bag.messages(chosen)
+            for name in as_joint_state(message).content.name
         )
         if not names:
             raise SourceError(bag.files[0], "has no message with joints", field="joints")
@@ -108,10 +131,10 @@ def recorded_joints(
 
 def _choose(bag: Bag, topic: str | None) -> str:
     """Return the requested topic, or the only one that carries joint states."""
-    fitting = joint_state_topics(bag.topics)
+    fitting = measured_topics(bag.topics)
     if topic is None and len(fitting) == 1:
         (topic,) = fitting
-    if topic in fitting:
+    if topic is not None and topic in joint_state_topics(bag.topics):
         return topic
     problem = f"{len(fitting)} topics carry {JOINT_STATE}"
     if topic is not None:
@@ -127,8 +150,10 @@ def _choose(bag: Bag, topic: str | None) -> str:
 
 
 def joint_state_topics(topics: Mapping[str, Topic]) -> list[str]:
-    """Return the topics that carry joint states."""
-    return [name for name, kind in topics.items() if kind.is_ros and kind.kind in _JOINT_STATES]
+    """Return the topics that carry joint states, measured or commanded."""
+    return [
+        name for kind in (JOINT_STATE, CONTROLLER_STATE) for name in topics_of_kind(topics, kind)
+    ]
 
 
 @dataclass
@@ -227,6 +252,17 @@ class _States:
             torque=effort if self._effort == "torque" else None,
             motor_current=effort if self._effort == "motor_current" else None,
         )
+
+    @property
+    def latency(self) -> int:
+        """Median time between stamp and receipt of the messages with a stamp [ns]."""
+        late = [
+            received - stamp
+            for part in self._parts.values()
+            for stamp, received in zip(part.header, part.received, strict=True)
+            if stamp
+        ]
+        return int(np.median(late)) if late else 0
 
     def _chosen_parts(self) -> list[_Part]:
         """Return the parts that have each joint once: a whole one, or several."""

@@ -45,10 +45,21 @@ def require_torque(archive: Path, recording: Path) -> None:
     """Check that the archive of a recording has joint torques.
 
     Raises:
-        SourceError: it has motor currents only.
+        SourceError: it has motor currents only, or not even these.
     """
-    if "torque" in open_archive(archive, fields=("torque",)).columns:
+    fields = ("torque", "motor_current", "commanded_position")
+    columns = open_archive(archive, fields=fields).columns
+    if "torque" in columns:
         return
+    if "motor_current" not in columns:
+        problem = "has neither joint torques nor motor currents"
+        remedy = "record them"
+        if "commanded_position" in columns:
+            remedy += (
+                "; from its commanded positions `hil import log` and `hil rollout --polish`"
+                " identify servo and friction"
+            )
+        raise SourceError(recording, problem, field="torque", remedy=remedy)
     problem = "has motor currents and no joint torque"
     remedy = (
         "`hil import log` writes its column map: add [drive] torque_constant = [...] (N·m/A, "

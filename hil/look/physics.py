@@ -429,8 +429,13 @@ def _toml(value: Any) -> str:
     return f"{value:g}"
 
 
-def current_only() -> Row:
-    """Return the row of a log with motor currents and no torque."""
+def without_torque(recording: Recording) -> Row:
+    """Return the row of a log without torque."""
+    if recording.motor_current is None:
+        decide = "record it"
+        if recording.commanded_position is not None:
+            decide = "import it: `hil rollout --polish` identifies servo and friction"
+        return Row("torque", "none, and no motor current", "sure", "by the channels", decide)
     return Row("torque", "none; motor currents", "sure", "by name or unit",
                "[drive] torque_constant of a map (N·m/A), or `hil torque-constants`")  # fmt: skip
 

@@ -49,7 +49,7 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
         notes = opened.header.findings.lines
         cell = cell_of(opened)
         try:
-            recorded = source_of(opened, cell)
+            recorded = source_of(opened, cell, to_fit=False)
             recorded.recording.checked(cell.joint_names)
         except (RecordingError, SourceError) as error:
             raise SourceError(source, str(error)) from error
@@ -61,6 +61,8 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
 
 
 def _without_robot(recording: Recording) -> Row:
+    if recording.torque is None and recording.motor_current is None:
+        return physics.without_torque(recording)
     quantity = "torque" if recording.torque is not None else "motor current"
     return Row(
         quantity,
@@ -76,7 +78,7 @@ def _with_torque(
 ) -> Look:
     recording = recorded.recording
     if recording.torque is None:
-        rows.append(physics.current_only())
+        rows.append(physics.without_torque(recording))
         return Look(source.name, tuple(rows), (), (), imported.map_text)
     finding = _finding(source, imported, cell, recording)
     delay, low_pass = _channel(finding.axes.read(recording), finding.readings.model)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
+from hil.importers.commands import COMMANDED
 from hil.importers.findings import against_position, outside_limits
 from hil.look.result import Certainty, Row
 from identification.signals.clock import time_base
@@ -21,7 +22,6 @@ Array = NDArray[np.float64]
 
 _FOLLOWS: Final = 0.7  # correlation of a velocity with the slope of its position
 _CLOSE: Final = 0.1  # relative deviation of their ratio
-_COMMANDED: Final = re.compile(r"target|cmd|command|desired|_des\b|setpoint|ref(erence)?\b", re.I)
 _LONGEST_LAG: Final = 0.1  # s
 _CLEAR_LAG: Final = 1.5  # sampling steps
 _HIGHEST_CORRELATION: Final = 0.95
@@ -145,7 +145,7 @@ def _range(recording: Recording, cell: Cell) -> Row:
 def _measured(recording: Recording, lines: Sequence[str]) -> Row:
     """Return whether positions are measured, by their noise and the lag of the velocity."""
     names = [line.partition(": ")[0] for line in lines if ": position" in line]
-    if any(_COMMANDED.search(name) for name in names):
+    if any(COMMANDED.search(name) for name in names):
         return Row("positions", "commanded", "likely", "by the name",
                    "record the measured ones if the controller has them")  # fmt: skip
     quiet = noiseless_above(recording.time, recording.position, recording.segments())

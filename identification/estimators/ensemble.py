@@ -26,10 +26,11 @@ from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
 
+FEWEST = 10
+"""Arms of which a spread is estimated."""
 _FLAT = 1e3  # deviations of a quantity without prior, in the largest deviation of the others
 _SMALLEST = 1e-14  # eigenvalue of a correlation matrix
 _RANK = 1e-12  # smallest singular value that counts, relative to the largest
-_FEWEST = 10  # arms of which a spread is estimated
 _ROUNDS = 6  # of widening
 _SPREAD_TOLERANCE = 0.01
 _WIDEST = 5.0  # factor of the deviations
@@ -80,7 +81,7 @@ def draw_ensemble(
     ensemble = draws.consistent(factor, 1.0)
     for _ in range(_ROUNDS):
         ratio = float(np.sqrt(np.nanmean(ensemble.spread**2)))
-        if count < _FEWEST or abs(ratio - 1.0) < _SPREAD_TOLERANCE:
+        if count < FEWEST or abs(ratio - 1.0) < _SPREAD_TOLERANCE:
             break
         scale = min(scale / ratio, _WIDEST)
         ensemble = draws.consistent(factor, scale)
@@ -140,7 +141,7 @@ def _spread(factor: Factor, values: Array, covariance: Array) -> Array:
 
 def _balanced(normal: Array) -> Array:
     """Return standard normal draws (N, p) with the mean zero and each variance one."""
-    if len(normal) < _FEWEST:
+    if len(normal) < FEWEST:
         return normal
     return np.asarray((normal - normal.mean(axis=0)) / normal.std(axis=0, ddof=1))
 

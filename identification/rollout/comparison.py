@@ -118,6 +118,12 @@ def horizon_rows(windows: Windows) -> list[int]:
     return [round(horizon / windows.step) - 1 for horizon in HORIZONS]
 
 
+def continued(windows: Windows) -> Array:
+    """Return the positions at the horizons (w, h, n) of joints that keep their start velocity."""
+    moved = windows.start[:, None] * np.array(HORIZONS)[:, None]
+    return np.asarray(windows.position[:, :1] + moved)
+
+
 def _removed(stretch: Stretch, samples: Samples, arm: Arm) -> Array:
     """Return the part of an arm's torque (g, n) that the low-pass of the record removed."""
     if samples.torque_bandwidth is None:
@@ -279,6 +285,7 @@ class ResidualTorque:
 
 # What would lessen the error
 
+_DELAY_CHANGE: Final = 5e-3  # s
 Variant = tuple[str, Callable[[Arm, RecordedMotion], tuple[Arm, RecordedMotion]]]
 
 
@@ -299,9 +306,8 @@ def variants(joint: int) -> list[Variant]:
 
         return change
 
-    def delayed(instants: int) -> Callable[..., tuple[Arm, RecordedMotion]]:
+    def delayed(later: float) -> Callable[..., tuple[Arm, RecordedMotion]]:
         def change(arm: Arm, motion: RecordedMotion) -> tuple[Arm, RecordedMotion]:
-            later = instants * motion.windows.step
             if motion.servo is None:
                 return arm, replace(motion, delay=motion.delay + later)
             delay = max(0.0, motion.servo.delay + later)
@@ -312,5 +318,5 @@ def variants(joint: int) -> list[Variant]:
     return [
         *(("dry friction", scaled(("f0", "fl"), factor)) for factor in (0.7, 1.3)),
         *(("viscous friction", scaled(("f1", "f2"), factor)) for factor in (0.7, 1.3)),
-        *(("delay", delayed(instants)) for instants in (-1, 1)),
+        *(("delay", delayed(later)) for later in (-_DELAY_CHANGE, _DELAY_CHANGE)),
     ]

@@ -35,19 +35,18 @@ from identification.rollout.servo import (
     LONGEST_DELAY,
     NoServoError,
     Servo,
+    best_delay,
     command_of,
     without_means,
 )
-from identification.rollout.windows import STEP, Stretch
+from identification.rollout.windows import Stretch
 
 Array = NDArray[np.float64]
 
 NAMES: Final = ("kp", "kd", "Im", "f0", "f1")
 """Parameters of a joint: gains, rotor inertia, dry and viscous friction."""
-_DELAYS: Final = 1e-3  # s between delays that are compared
 _LAGS: Final = (0.0, 0.01, 0.02, 0.03, 0.04)  # s of the commands that are instruments
 _DETERMINED: Final = 2.0  # standard deviations that a determined parameter is larger than
-_SMALLEST_PHASE: Final = 0.5  # rad of a joint's oscillation against its servo in a time step
 
 
 class ServoFit(NamedTuple):
@@ -83,13 +82,7 @@ def fit_servo(arm: Arm, stretches: Sequence[Stretch], step: float) -> ServoFit:
     def error(delay: float) -> float:
         return sum(joint.at(delay).error for joint in joints)
 
-    delays = np.arange(0.0, LONGEST_DELAY + 0.5 * _DELAYS, _DELAYS)
-    coarse = delays[int(np.argmin([error(float(delay)) for delay in delays]))]
-    ends = np.clip([coarse - _DELAYS, coarse + _DELAYS], 0.0, LONGEST_DELAY)
-    fine = scipy.optimize.minimize_scalar(
-        error, bounds=ends, method="bounded", options={"xatol": 0.05 * _DELAYS}
-    )
-    delay = float(fine.x)
+    delay = best_delay(error)
     fits = [joint.at(delay) for joint in joints]
     values = np.array([fit.values for fit in fits])
     deviations = np.array(
@@ -112,12 +105,6 @@ def fit_servo(arm: Arm, stretches: Sequence[Stretch], step: float) -> ServoFit:
         deviations,
         sum(joint.delay_variance(delay) ** -1.0 for joint in joints) ** -0.5,
     )
-
-
-def step_of(servo: Servo, inertia: Array) -> float:
-    """Return a time step [s] in which no joint of an inertia (n,) moves far against its servo."""
-    rate = float(np.sqrt(np.max(servo.kp / inertia)))
-    return STEP / max(1, int(np.ceil(STEP * rate / _SMALLEST_PHASE)))
 
 
 class _Fit(NamedTuple):

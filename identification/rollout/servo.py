@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
@@ -17,6 +18,7 @@ BLOCK: Final = 0.5
 """Time over which the sum of gravity, friction and integral action counts as constant [s]."""
 LONGEST_DELAY: Final = 0.04
 """Largest delay of the command that is tried [s]."""
+_DELAYS: Final = 1e-3  # s between delays that are compared
 
 
 class NoServoError(IdentificationError):
@@ -29,6 +31,11 @@ class Servo(NamedTuple):
     kp: Array  # (n,) [N·m/rad or N/m]
     kd: Array  # (n,) [N·m·s/rad or N·s/m]
     delay: float  # of the command [s]
+
+
+def lead_of(servo: Servo | None) -> float:
+    """Return how long before a window the command of a servo has to be known [s]."""
+    return 0.0 if servo is None else max(servo.delay, LONGEST_DELAY)
 
 
 def command_of(stretch: Stretch, delay: float) -> tuple[Array, Array]:
@@ -51,18 +58,13 @@ def command_of(stretch: Stretch, delay: float) -> tuple[Array, Array]:
 
 
 def identify_servo(stretches: Sequence[Stretch], step: float, joint_names: Sequence[str]) -> Servo:
-    """Return the servo of some stretches, by least squares for each delay on a grid of `step` [s].
+    """Return the servo of some stretches, by least squares for each delay; `step` is theirs [s].
 
     Raises:
         NoServoError: there are no commanded positions, or the torque does not follow the error.
     """
-    best: tuple[float, Servo] | None = None
-    for delay in step * np.arange(int(LONGEST_DELAY / step + 1e-9) + 1):
-        candidate = _gains_at(stretches, float(delay), step)
-        if best is None or candidate[0] < best[0]:
-            best = candidate
-    assert best is not None
-    servo = best[1]
+    delay = best_delay(lambda delay: _gains_at(stretches, delay, step)[0])
+    _, servo = _gains_at(stretches, delay, step)
     if not (servo.kp > 0.0).all():
         joint = int(np.argmin(servo.kp))
         raise NoServoError(
@@ -70,6 +72,17 @@ def identify_servo(stretches: Sequence[Stretch], step: float, joint_names: Seque
             " kd and delay"
         )
     return servo
+
+
+def best_delay(error: Callable[[float], float]) -> float:
+    """Return the delay [s] of least error, of those up to `LONGEST_DELAY`."""
+    delays = np.arange(0.0, LONGEST_DELAY + 0.5 * _DELAYS, _DELAYS)
+    coarse = delays[int(np.argmin([error(float(delay)) for delay in delays]))]
+    ends = np.clip([coarse - _DELAYS, coarse + _DELAYS], 0.0, LONGEST_DELAY)
+    fine = scipy.optimize.minimize_scalar(
+        error, bounds=ends, method="bounded", options={"xatol": 0.05 * _DELAYS}
+    )
+    return float(fine.x)
 
 
 def _gains_at(stretches: Sequence[Stretch], delay: float, step: float) -> tuple[float, Servo]:

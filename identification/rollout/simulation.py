@@ -33,10 +33,20 @@ class Feedback(NamedTuple):
     stiffness: Array  # N·m/rad or N/m
     damping: Array  # N·m·s/rad or N·s/m
 
+    def inertia(self, step: float) -> Array:
+        """Return what the stiffness adds to the inertia of the joints in a time step (n,)."""
+        return np.asarray(0.5 * step**2 * self.stiffness)
+
 
 @dataclass(frozen=True, eq=False)
 class SimulatedArm:
-    """An arm in MuJoCo without limits, contacts and motors; torques act on its joints."""
+    r"""An arm in MuJoCo without limits, contacts and motors; torques act on its joints.
+
+    The stiffness k of the feedback acts on the mean of the positions before and after a step,
+    :math:`(q_{i-1} + q_{i+1}) / 2 = q_i + h^2 \ddot q_i / 2`: this is of second order, and no
+    gain makes it unstable or lets an oscillation grow. To a step it is an inertia
+    :math:`k h^2 / 2`, of which the reference has its share.
+    """
 
     model: Any  #: `mujoco.MjModel`
     order: NDArray[np.intp]  #: MuJoCo's coordinate of each joint (n,)
@@ -77,6 +87,7 @@ class SimulatedArm:
         viscous = model.dof_damping[places].copy()
         model.jnt_stiffness[places] += feedback.stiffness
         model.dof_damping[places] += feedback.damping
+        model.dof_armature[places] += feedback.inertia(step)
         return cls(model, places, model.qpos_spring[places].copy(), viscous, step, feedback)
 
     def force(self, torque: Array, position: Array, velocity: Array, change: Array) -> Array:
@@ -87,7 +98,9 @@ class SimulatedArm:
         """
         # The viscous friction of a step is that of the velocity after it, half a step late.
         force = torque + self.feedback.damping * velocity + self.viscous * change
-        return np.asarray(force + self.feedback.stiffness * (position - self.rest))
+        earlier = np.concatenate([2.0 * velocity[:1] - velocity[1:2], velocity[:-1]])
+        mean = position + 0.5 * self.step * (velocity - earlier)
+        return np.asarray(force + self.feedback.stiffness * (mean - self.rest))
 
     def simulate(self, start: Array, velocity: Array, force: Array, reference: Array) -> Array:
         """Return the positions after each step (w, K, n), not finite where they are unstable.

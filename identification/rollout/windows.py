@@ -18,7 +18,7 @@ from identification.signals.samples import Samples
 Array = NDArray[np.float64]
 
 STEP: Final = 5e-3
-"""Longest time step of a simulation [s]."""
+"""Time step of a simulation [s]."""
 _FEWEST_SAMPLES: Final = 4  # of a stretch that is interpolated
 
 
@@ -111,10 +111,17 @@ def stretches_of(
     """Return the stretches of a recording without gap.
 
     `load` torque (m, n), which was subtracted from that of the samples, is added. The positions
-    are interpolated by a cubic spline, of which the velocity is the derivative.
+    are interpolated by a cubic spline, of which the velocity is the derivative. Where some samples
+    have a commanded position (m, n), those without (NaN) are gaps.
     """
     stretches = []
-    for part in samples.segments:
+    parts: Sequence[slice] = samples.segments
+    with_command = np.zeros(len(samples.torque), np.bool_)
+    if commanded is not None:
+        with_command = np.asarray(np.isfinite(commanded).all(axis=1))
+    if with_command.any():
+        parts = [run for part in parts for run in _runs(with_command, part)]
+    for part in parts:
         motion = samples.motion.rows(part)
         time = motion.time
         if len(time) < _FEWEST_SAMPLES or time[-1] - time[0] < 2.0 * step:
@@ -125,12 +132,20 @@ def stretches_of(
         on_grid = Motion(grid, spline(grid), spline(grid, 1), spline(grid, 2))
         before, after = (spline(grid + shift, 1) for shift in (-0.5 * step, 0.5 * step))
         command = None
-        if commanded is not None and np.isfinite(commanded[part]).all():
+        if commanded is not None and with_command.any():
             columns = commanded[part].T
             command = np.column_stack([np.interp(grid, time, column) for column in columns])
         torque = mean_about(time, (samples.torque + load)[part], grid)
         stretches.append(Stretch(on_grid, before, after, torque, time, part, command))
     return stretches
+
+
+def _runs(inside: NDArray[np.bool_], part: slice) -> list[slice]:
+    """Return the runs of rows inside (m,) in a part of them."""
+    edges = np.flatnonzero(np.diff(inside[part].astype(np.int8), prepend=0, append=0))
+    return [
+        slice(part.start + int(first), part.start + int(end)) for first, end in edges.reshape(-1, 2)
+    ]
 
 
 def mean_about(time: Array, values: Array, grid: Array) -> Array:
@@ -150,22 +165,28 @@ def mean_about(time: Array, values: Array, grid: Array) -> Array:
     return np.asarray(np.diff(at, axis=0) / step)
 
 
-def windows_of(stretches: Sequence[Stretch], step: float, horizon: float, stride: float) -> Windows:
+def windows_of(
+    stretches: Sequence[Stretch], step: float, horizon: float, stride: float, lead: float = 0.0
+) -> Windows:
     """Return windows of a horizon [s] that start every `stride` seconds.
+
+    The first starts `lead` seconds after the start of its stretch: what acts on an arm so much
+    later, such as a delayed command, is not known before.
 
     Raises:
         NoWindowError: no stretch is as long.
     """
     steps = round(horizon / step)
     between = max(1, round(stride / step))
+    before = int(np.ceil(lead / step - 1e-9))
     starts = [
-        np.arange(0, len(stretch.motion.time) - steps, between, dtype=np.intp)
+        np.arange(before, len(stretch.motion.time) - steps, between, dtype=np.intp)
         for stretch in stretches
     ]
     if not sum(len(first) for first in starts):
         longest = max((np.ptp(stretch.motion.time) for stretch in stretches), default=0.0)
         raise NoWindowError(
-            f"no part of the motion without gap lasts {horizon:g} s; the longest lasts"
+            f"no part of the motion without gap lasts {horizon + lead:g} s; the longest lasts"
             f" {longest:.3g} s"
         )
     stretch = np.repeat(np.arange(len(starts)), [len(first) for first in starts])

@@ -5,8 +5,9 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -190,6 +191,49 @@ def test_parameters_of_no_possible_arm_are_named(folder: Path) -> None:
     done = run("rollout", folder, "--samples", "3")
     assert "identified again" in done.output
     assert "it has no physically consistent parameters" in done.output
+
+
+def with_links(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change each link of the physically consistent parameters in a folder."""
+    path = folder / PARAMETERS_JSON
+    content = json.loads(path.read_text())
+    for link in content["standard"]["links"]:
+        change(link)
+    path.write_text(json.dumps(content))
+
+
+def test_bodies_that_cannot_exist_are_named(folder: Path, tmp_path: Path) -> None:
+    """They are no arm to simulate, to export or to draw around: it is identified again."""
+    with_links(folder, lambda link: link.update(Izz=-0.5) if link["joint"] == "joint_5" else None)
+    reason = "parameters.json cannot be used (the body of joint_5 cannot exist)"
+    commands = {
+        "rollout": ("--samples", "3", "-o", tmp_path / "out"),
+        "export": ("--to", "urdf", "-o", tmp_path / "arm.urdf"),
+        "export ": ("--to", "mjcf", "--ensemble", "3", "-o", tmp_path / "arms"),
+    }
+    for command, options in commands.items():
+        done = run(command.strip(), folder, *options)
+        assert done.exit_code in (0, 5), done.exception
+        assert f"identified again: {reason}" in " ".join(done.output.split())
+
+
+def test_an_arm_that_explodes_is_counted(folder: Path) -> None:
+    """Bodies and rotors that can exist, too light for the recorded torque."""
+    quantities = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
+
+    def lighten(link: dict[str, Any]) -> None:
+        for name in (*quantities, "rotor_inertia"):
+            link[name] *= 1e-6
+
+    with_links(folder, lighten)
+    done = run("rollout", folder, "--samples", "3")
+    assert done.exit_code in (0, 5), done.exception
+    result = RolloutResult.load(folder / ROLLOUT)
+    assert result.identified.unstable == result.windows
+    assert f"identified: unstable in {result.windows} of {result.windows} windows" in done.output
+    section = (folder / REPORT).read_text().split('<section id="rollout">')[1]
+    for text in (done.output, (folder / ROLLOUT).read_text(), section.split("</section>")[0]):
+        assert not re.search(r"\b(nan|inf)\b", text, re.IGNORECASE)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import scipy
 from identification.export.arm import Arm, Ranges
 from identification.export.simulators import mjcf
 from identification.model.motion import Motion
-from identification.rollout.encoders import NAMES, fit_servo, step_of
+from identification.rollout.encoders import NAMES, fit_servo
 from identification.rollout.servo import NoServoError, Servo
 from identification.rollout.windows import Stretch, stretches_of
 from tests.identification.two_link import MODEL, URDF, as_samples, four_sines
@@ -35,12 +35,19 @@ def an_arm(rotors=ROTORS, dry=DRY, factor: float = 1.0) -> Arm:
     return Arm(URDF, MODEL, standard, values, NO_LIMITS)
 
 
-def on_its_servo(arm: Arm, disturbance: float = 0.0, seed: int = 1, duration: float = 20.0):
-    """Time, positions, velocities and command of an arm that MuJoCo moves, each millisecond.
+def on_its_servo(
+    arm: Arm,
+    disturbance: float = 0.0,
+    seed: int = 1,
+    duration: float = 20.0,
+    step: float = 0.001,
+    servo: Servo | None = None,
+):
+    """Time, positions, velocities and command of an arm that MuJoCo moves, each `step` [s].
 
     A coloured disturbance [N·m] with a time constant of 20 ms acts beside the servo.
     """
-    step = 0.001
+    servo = servo or Servo(KP, KD, DELAY)
     model = mujoco.MjModel.from_xml_string(mjcf(arm, "arm", step=step))
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
     data = mujoco.MjData(model)
@@ -48,7 +55,7 @@ def on_its_servo(arm: Arm, disturbance: float = 0.0, seed: int = 1, duration: fl
     time = np.arange(0.0, duration, step)
     command = four_sines(time, 0.5)
     late = [
-        np.column_stack([np.interp(time - DELAY, time, column) for column in values.T])
+        np.column_stack([np.interp(time - servo.delay, time, column) for column in values.T])
         for values in (command.position, command.velocity)
     ]
     white = np.random.default_rng(seed).standard_normal(command.position.shape)
@@ -59,9 +66,9 @@ def on_its_servo(arm: Arm, disturbance: float = 0.0, seed: int = 1, duration: fl
     for k in range(len(time)):
         position[k], velocity[k] = data.qpos[order], data.qvel[order]
         error, slip = late[0][k] - position[k], late[1][k] - velocity[k]
-        data.qfrc_applied[order] = KP * error + KD * slip + torque[k]
+        data.qfrc_applied[order] = servo.kp * error + servo.kd * slip + torque[k]
         mujoco.mj_step(model, data)
-    settled = slice(500, None)
+    settled = slice(round(0.5 / step), None)
     return time[settled], position[settled], velocity[settled], command.position[settled]
 
 
@@ -132,9 +139,3 @@ def test_no_command_is_no_servo(disturbed: list[Stretch]) -> None:
     parts = [replace(stretch, commanded=None) for stretch in disturbed]
     with pytest.raises(NoServoError, match="no commanded positions"):
         fit_servo(an_arm(), parts, STEP)
-
-
-def test_a_stiff_servo_has_a_short_time_step() -> None:
-    inertia = np.ones(N)
-    assert step_of(Servo(np.array([9000.0, 500.0]), KD, 0.0), inertia) == pytest.approx(0.005)
-    assert step_of(Servo(np.array([90000.0, 500.0]), KD, 0.0), inertia) == pytest.approx(0.005 / 3)

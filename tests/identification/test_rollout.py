@@ -9,6 +9,7 @@ import pytest
 from identification.export.arm import Arm, Ranges
 from identification.export.simulators import FORMATS, compare, mjcf
 from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.rollout.comparison import (
     HORIZONS,
@@ -24,7 +25,7 @@ from identification.rollout.comparison import (
     simulate,
 )
 from identification.rollout.polish import Driven, polished
-from identification.rollout.servo import NoServoError, identify_servo
+from identification.rollout.servo import NoServoError, Servo, identify_servo, lead_of
 from identification.rollout.simulation import LARGEST_ERROR, Feedback, SimulatedArm
 from identification.rollout.windows import (
     NoWindowError,
@@ -32,7 +33,8 @@ from identification.rollout.windows import (
     stretches_of,
     windows_of,
 )
-from tests.identification.two_link import MODEL, URDF, four_sines, simulated
+from tests.identification.test_encoders import on_its_servo
+from tests.identification.two_link import MODEL, URDF, as_samples, four_sines, simulated
 
 mujoco = pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 
@@ -218,7 +220,7 @@ class TestServo:
     def test_is_found_from_commanded_and_measured_positions(self) -> None:
         kp, kd = np.array([2000.0, 500.0]), np.array([40.0, 10.0])
         servo = identify_servo(self.stretches(kp, kd, 0.010), 0.005, ("a", "b"))
-        assert servo.delay == pytest.approx(0.010)
+        assert servo.delay == pytest.approx(0.010, abs=2e-4)
         assert servo.kp == pytest.approx(kp, rel=0.05)
         assert servo.kd == pytest.approx(kd, rel=0.2)
 
@@ -231,3 +233,57 @@ class TestServo:
         stretches = [replace(stretch, commanded=None) for stretch in self.stretches(1.0, 1.0, 0.0)]
         with pytest.raises(NoServoError, match="no commanded positions"):
             identify_servo(stretches, 0.005, ("a", "b"))
+
+
+class TestStepOnServo:
+    """At 5 ms arms on servos of any stiffness move as at 0.2 ms."""
+
+    def errors(self, arm: Arm, servo: Servo, moved, step: float):
+        """Errors of an arm on a servo, in windows of a motion on it."""
+        time, position, velocity, command = moved
+        motion = Motion(time, position, velocity, np.gradient(velocity, time, axis=0))
+        samples = as_samples(MODEL, motion, np.zeros_like(position))
+        torque = samples.predicted_torque(MODEL, an_arm(coulomb=1.0).values)
+        samples = replace(samples, torque=torque)
+        stretches, owners = recorded_stretches(MODEL, [(samples, command)], step)
+        windows = windows_of(stretches, step, 1.0, 0.2, lead_of(servo))
+        motion_on_servo = RecordedMotion(windows, tuple(owners), servo)
+        return final_errors(arm, motion_on_servo, Feedback(servo.kp, servo.kd))
+
+    @pytest.mark.parametrize("phase", [0.2, 1.0, 2.5])
+    def test_is_small_enough(self, phase: float) -> None:
+        """`phase` is that of an oscillation against the servo in a step of 5 ms [rad].
+
+        Above 2 the spring alone would be unstable.
+        """
+        arm = an_arm(coulomb=1.0)
+        inertia = joint_inertia(arm, 0.005)
+        rate = phase / 0.005
+        servo = Servo(rate**2 * inertia, 0.4 * rate * inertia, 0.012)
+        moved = on_its_servo(arm, duration=3.5, step=2e-4, servo=servo)
+        errors = self.errors(arm, servo, moved, 0.005)
+        assert errors.unstable == 0
+        assert errors.joints.max() < 1e-4  # rad, of a motion of one
+
+    def test_a_stiff_servo_makes_no_light_arm_unstable(self) -> None:
+        """Such as a nominal arm without rotor inertias, on the servo of the real one."""
+        arm = an_arm(coulomb=1.0)
+        servo = Servo(np.array([2e6, 5e5]), np.array([0.0, 0.0]), 0.012)
+        moved = on_its_servo(arm, duration=3.5, step=1e-4, servo=servo)
+        light = replace(arm, standard=1e-3 * arm.standard, values=1e-3 * arm.values)
+        errors = self.errors(light, servo, moved, 0.005)
+        assert errors.unstable == 0
+        assert errors.joints.max() < 1e-3
+
+
+def test_windows_start_where_the_delayed_command_is_known() -> None:
+    motion = four_sines(np.arange(0.0, 3.0, 0.001), 0.5)
+    command = motion.position.copy()
+    command[:500] = np.nan
+    command[2600:2610] = np.nan
+    parts, _ = recorded_stretches(MODEL, [(simulated(MODEL, an_arm().values, motion), command)],
+                                  0.005)  # fmt: skip
+    assert [part.part for part in parts] == [slice(500, 2600), slice(2610, 3000)]
+    assert all(np.isfinite(part.commanded).all() for part in parts)
+    windows = windows_of(parts, 0.005, 1.0, 0.2, lead=0.04)
+    assert windows.first[0] == 8
