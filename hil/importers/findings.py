@@ -115,6 +115,22 @@ def _fits(position: Array, limits: UrdfLimits) -> NDArray[np.bool_]:
     return np.asarray(above & (position.max(axis=0) <= limits.upper[:, None] + _TOLERANCE))
 
 
+def in_turns(position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]) -> Array:
+    """Return positions (m, n) of which a joint within its limits but for whole turns is within.
+
+    Angles of 0 to 360 degrees and of +-180 are two conventions of one posture. A joint that no turn
+    brings within its limits is as recorded.
+    """
+    continued = position.copy()
+    continued[:, turning] = unwrap(position[:, turning])
+    result = position.copy()
+    for turns in (1.0, -1.0, 0.0):
+        turned = continued + 2.0 * np.pi * turns * turning
+        fits = np.diag(_fits(turned, limits)) & turning
+        result[:, fits] = turned[:, fits]
+    return result
+
+
 class _Outside(NamedTuple):
     """Positions that leave the limits of the URDF."""
 
@@ -127,6 +143,8 @@ def _outside(
     position: Array, names: Sequence[str], limits: UrdfLimits, turning: NDArray[np.bool_]
 ) -> _Outside | None:
     """Return which positions leave the limits of the URDF, and which reading would not."""
+    radians = in_turns(np.where(turning, np.radians(position), position), limits, turning)
+    position = in_turns(position, limits, turning)
     fits = _fits(position, limits)
     joints = range(len(names))
     beyond = [joint for joint in joints if not fits[joint, joint]]
@@ -141,7 +159,6 @@ def _outside(
         "every row leaves" if rows.all() else f"{_percent(float(rows.mean()))} of the rows leave"
     )
     problem = f"as mapped, {share} the limits of the URDF ({ranges})"
-    radians = np.where(turning, np.radians(position), position)
     farthest = 3.0 * np.maximum(-limits.lower, limits.upper)
     far = (np.maximum(-low, high) > farthest)[beyond].any()
     columns = scipy.optimize.linear_sum_assignment(~fits + 1e-6 * (1.0 - np.eye(len(names))))[1]
@@ -195,9 +212,11 @@ def are_degrees(position: Array, converted: Array, names: Sequence[str], urdf: s
     finite = np.isfinite(position).all() and np.isfinite(converted).all()
     beyond = ~np.diag(_fits(position, limits))
     far = np.abs(position).max(axis=0) > 3.0 * np.maximum(-limits.lower, limits.upper)
-    fits = np.diag(_fits(converted, limits))
+    if not finite or not (far & beyond).any():
+        return False
+    fits = np.diag(_fits(in_turns(converted, limits, turning), limits))
     moves = np.ptp(converted, axis=0).max() >= _LEAST_TRAVEL
-    return bool(finite and (far & beyond).any() and fits.all() and moves)
+    return bool(fits.all() and moves)
 
 
 def has_degrees_per_second(time: Array, position: Array, velocity: Array) -> bool:
@@ -258,7 +277,8 @@ def _of_one_stamp(time: Array, position: Array) -> str:
         return ""
     return (
         f"samples with the same time stamp are up to {apart.max():.3g} rad or m apart ({count} such"
-        " stamps): two sources write this log, or its clock is much coarser than its samples"
+        " stamps): two sources write this log, or its clock stood still or is much coarser than its"
+        " samples"
     )
 
 

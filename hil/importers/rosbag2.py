@@ -17,7 +17,7 @@ from hil.importers.bags import Bag, BagMessage, open_bag
 from hil.importers.mcap_messages import Topic
 from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
 from hil.importers.ros_messages import JOINT_STATE
-from hil.importers.stamps import leading_zeros, swapped_messages
+from hil.importers.stamps import leading_zeros, sorted_neighbours
 
 Array = NDArray[np.float64]
 Effort = Literal["torque", "motor_current", "ignore"]
@@ -279,7 +279,7 @@ class _States:
                 "positions between others that do not: those of a second publisher, left out"
             )
         order = np.flatnonzero(keep)
-        swapped = swapped_messages(stamp[order])
+        swapped = sorted_neighbours(stamp[order], "message")
         if swapped.note is not None:
             self.notes.append(swapped.note)
         order = order[swapped.order]
