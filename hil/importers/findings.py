@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hil.archive import Findings, Samples
 from hil.cell.text import UrdfLimits, urdf_limits
 from hil.errors import SourceError
+from hil.importers.publishers import APART, alternating_samples
 from hil.importers.stamps import FASTEST, SLOWEST
 from identification.model.urdf_text import urdf_tree
 from identification.signals.clock import time_base
@@ -25,7 +26,6 @@ from identification.signals.recording import STUCK_MOVEMENT, unwrap
 Array = NDArray[np.float64]
 
 _TOLERANCE: Final = 0.05  # rad or m beyond a limit, for calibration and overshoot
-_APART: Final = 0.1  # rad or m between samples of one stamp, 20 ms at 5 rad/s
 _LEAST_TRAVEL: Final = 0.1  # rad or m
 _SCALE_TOLERANCE: Final = 0.1  # of velocity over slope of the position, for filters
 _CORRELATED: Final = 0.7
@@ -68,9 +68,11 @@ def examine(
     warnings = []
     if not SLOWEST <= base.rate <= FASTEST:
         warnings += [f"{base.rate:.3g} samples per second are unusual: check the unit of the time"]
-    warnings += _positions(time, position, joint_names, limits, turning)
+    several = _of_one_stamp(time, position) or alternating_samples(position)
+    warnings += [several] if several else []
+    warnings += _positions(time, position, joint_names, limits, turning, has_speed=not several)
     is_plausible = not warnings  # torques are compared with those of a plausible motion only
-    if samples.velocity is not None:
+    if samples.velocity is not None and not several:
         warnings += _velocities(time, position, samples.velocity, joint_names)
     warnings += _torques(samples, joint_names, limits.effort)
     if is_plausible:
@@ -236,8 +238,13 @@ def _positions(
     names: Sequence[str],
     limits: UrdfLimits,
     turning: NDArray[np.bool_],
+    *,
+    has_speed: bool,
 ) -> Iterator[str]:
-    """Yield warnings where positions or speeds are outside the limits of the URDF."""
+    """Yield warnings where positions or speeds are outside the limits of the URDF.
+
+    Positions of several sources have no speed of the arm.
+    """
     outside = _outside(position, names, limits, turning)
     if outside is not None:
         yield f"{outside.problem}; {outside.remedy}"
@@ -252,11 +259,8 @@ def _positions(
     stride = max(1, len(time) // 2000)  # longer steps, in which noise is negligible
     steps = np.diff(time[::stride])[:, None]
     moved = np.abs(np.diff(position[::stride], axis=0))[steps[:, 0] > 0.0]
-    if not len(moved):
+    if not len(moved) or not has_speed:
         return
-    if apart := _of_one_stamp(time, position):
-        yield apart
-        return  # its speeds are none of the arm
     usual = np.quantile(moved / steps[steps[:, 0] > 0.0], 0.9, axis=0)
     for name, speed, limit in zip(names, usual, limits.velocity, strict=True):
         if speed > _TOO_FAST * limit:
@@ -272,7 +276,7 @@ def _of_one_stamp(time: Array, position: Array) -> str:
     highest = np.maximum.reduceat(position, starts)
     lowest = np.minimum.reduceat(position, starts)
     apart = (highest - lowest).max(axis=1)
-    count = np.count_nonzero(apart > _APART)
+    count = np.count_nonzero(apart > APART)
     if not count:
         return ""
     return (

@@ -18,6 +18,7 @@ from hil.errors import SourceError, UnrecordedJointError
 from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.column_map import HOLE, KINEMATIC, ColumnMap, Quantity, TimeColumn
 from hil.importers.findings import are_degrees, has_degrees_per_second
+from hil.importers.publishers import second_publisher
 from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
 from hil.importers.stamps import YEAR, concluded_unit, sorted_neighbours, without_wraps
 from hil.importers.table import Table
@@ -81,6 +82,11 @@ def import_log(
         each = np.broadcast_to(uncertainty, len(log.joints))[log.order]
         metadata["torque_uncertainty"] = json.dumps(each.tolist())
     joint_side = log.in_concluded_units(stamp, values, robot)
+    silent = second_publisher(joint_side["position"], "row")
+    if silent.note is not None:
+        log.notes.append(silent.note)
+        stamp = stamp[~silent.rows]
+        joint_side = {name: array[~silent.rows] for name, array in joint_side.items()}
     return write_imported(
         output,
         Samples(stamp, **joint_side),

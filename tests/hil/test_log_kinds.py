@@ -258,6 +258,15 @@ class TestRead:
         )
         assert archive.columns["velocity"] == pytest.approx(SLOPE, abs=1e-12)
 
+    def test_rows_of_a_second_publisher_are_left_out(self, tmp_path: Path, urdf: Path) -> None:
+        """As a bag that was exported to text has them."""
+        other = [f"{t + 0.5 / RATE:.6f},0.3,-0.4,1.5,0,0,0" for t in TIME.tolist()]
+        lines = [line for pair in zip(text().splitlines()[1:], other, strict=True) for line in pair]
+        archive = imported(tmp_path / "log.csv", "\n".join([HEAD, *lines]) + "\n", urdf)
+        assert_right(archive)
+        said = f"{COUNT} of {2 * COUNT} rows have 0.3, -0.4, 1.5 for all positions between others"
+        assert any(said in line for line in archive.header.findings.lines)
+
     def test_a_stated_unit_is_not_overruled(self, tmp_path: Path, urdf: Path) -> None:
         content, _ = READ["degrees that nothing states"]
         position = {"columns": "q{}", "unit": "rad"}
