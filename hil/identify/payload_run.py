@@ -327,13 +327,14 @@ class NoPayloadError(InputError):
 
 def _no_payload(estimate: PayloadEstimate, mounting: str | None) -> NoPayloadError:
     low, high = estimate.intervals[0]
-    return NoPayloadError(
-        None,
-        f"the loaded archives show no payload: its mass is between {low:.3g} and {high:.3g} kg",
-        field="--loaded",
-        remedy="give recordings that were made with the payload"
-        + ("" if mounting is None else f"; or the mounting is another: {mounting}"),
+    problem = (
+        f"the loaded archives show no payload: its mass is between {low:.3g} and {high:.3g} kg"
     )
+    remedy = "give recordings that were made with the payload"
+    if mounting is not None:
+        problem += ", as the arm is stated to be mounted"
+        remedy = f"the mounting is doubtful: {mounting}; then {remedy}"
+    return NoPayloadError(None, problem, field="--loaded", remedy=remedy)
 
 
 def _sides(bare: Sequence[Path], loaded: Sequence[Path]) -> dict[bool, list[Path]]:
