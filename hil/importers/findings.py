@@ -118,17 +118,20 @@ def _fits(position: Array, limits: UrdfLimits) -> NDArray[np.bool_]:
 
 
 def in_turns(position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]) -> Array:
-    """Return positions (m, n) of which a joint within its limits but for whole turns is within.
+    """Return positions (m, n) of which a joint within its limits but for a whole turn is within.
 
-    Angles of 0 to 360 degrees and of +-180 are two conventions of one posture. A joint that no turn
-    brings within its limits is as recorded.
+    Angles of 0 to 360 degrees and of +-180 are two conventions of one posture; others are as
+    recorded, and so is a joint that no turn brings within its limits.
     """
+    low = position.min(axis=0) + _TOLERANCE
+    high = position.max(axis=0) - _TOLERANCE
+    usual = ((low > 0.0) & (high < 2.0 * np.pi)) | ((low > -np.pi) & (high < np.pi))
     continued = position.copy()
     continued[:, turning] = unwrap(position[:, turning])
     result = position.copy()
     for turns in (1.0, -1.0, 0.0):
         turned = continued + 2.0 * np.pi * turns * turning
-        fits = np.diag(_fits(turned, limits)) & turning
+        fits = np.diag(_fits(turned, limits)) & turning & usual
         result[:, fits] = turned[:, fits]
     return result
 

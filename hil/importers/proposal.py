@@ -344,13 +344,12 @@ class _Search:
         """Return the joints without a channel by the numbers of the others, else the last ones."""
         numbers = [_NUMBER.search(name) for name in group.names]
         places = {int(match[0]) for match in numbers if match is not None}
-        for first in (1, 0):
-            expected = range(first, first + len(self._joints))
-            if len(places) == group.size and places < set(expected):
-                absent = [place for place in expected if place not in places]
-                if absent[0] < max(places):
-                    names = [self._joints[place - first] for place in absent]
-                    return names, "by the numbers of the channels"
+        first = 0 if 0 in places else 1
+        expected = range(first, first + len(self._joints))
+        absent = [place for place in expected if place not in places]
+        if len(places) == group.size and places < set(expected) and absent[0] < max(places):
+            names = [self._joints[place - first] for place in absent]
+            return names, "by the numbers of the channels"
         return self._joints[group.size :], "for the last ones"
 
     def _refuse_missing(self, missing: Sequence[str]) -> NoReturn:
