@@ -46,6 +46,7 @@ _EXPECTED: Final = {
     "signs": "as the URDF's axes",
     "angle unit": "unit as read",
     "zero": "as the URDF",
+    "coupling": "no angle contains another's",
     "gravity": "torque with gravity",
     "mounting": "as stated, else upright",
     "side": "joint side",
@@ -148,6 +149,13 @@ def plants(arm: Arm) -> Iterator[Planted]:
     smooth = _shifted(t, _low_passed(t, q, both=True), _AHEAD)
     yield of("commanded", "positions", "commanded", position=smooth)
     yield of("wrapped", "wraps", "wrapped", position=_wrapped(q))
+    third = 2 if n == 6 else 3  # the next parallel axis
+    relative = np.eye(n)
+    relative[third, 1] = 1.0
+    yield of(
+        "coupled", "coupling", f"{names[third]} is recorded plus that of {names[1]}",
+        position=q @ relative.T, velocity=None if v is None else v @ relative.T,
+    )  # fmt: skip
     for joint, angle in ((1, 0.6), (2, -0.6), (3, np.pi / 2.0)):
         zero = np.zeros(n)
         zero[joint] = angle

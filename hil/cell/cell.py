@@ -18,6 +18,7 @@ from drivers.errors import DriverError
 from drivers.guard import GuardLimits
 from drivers.transports.base import TransportSpec
 from hil.reading import parse_toml, read_text, remedy_for_missing
+from hil.terminal_text import typed
 from identification.excitation import Box, Workspace
 from identification.model.robot import RobotModel
 from planner import JointLimits
@@ -417,8 +418,21 @@ def _read(file: Path, path: Path, field: str, value: object, remedy: str) -> str
 
 def _required(cell: Cell, table: T | None, name: str) -> T:
     if table is None:
-        raise CellError(cell.path, name, None, "is missing", f"add a table [{name}]")
+        remedy = f"add a table [{name}]"
+        if sliding := _sliding(cell):
+            urdf = typed(cell.path.parent / cell.file.cell.urdf)
+            remedy = (
+                f"{sliding} is prismatic, and motions are planned for other joints: write a cell "
+                f"of those, `hil new --urdf {urdf} --fix {typed(sliding)}`"
+            )
+        raise CellError(cell.path, name, None, "is missing", remedy)
     return table
+
+
+def _sliding(cell: Cell) -> str:
+    """Return the first prismatic joint, "" if there is none."""
+    kinds = zip(cell.joint_names, cell.model.chain.revolute, strict=True)
+    return next((name for name, turns in kinds if not turns), "")
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ def look(
     Names and units say a part, the slope of the positions another, and with --urdf the torque:
     side, sign, order and zero of the joints, gravity, mounting, delay and low-pass. Where two
     readings fit alike, both are shown with their errors; on a terminal one is asked for, else the
-    lines to choose from are printed and the exit status is 2.
+    lines to choose from are printed, to be added to the map, and the exit status is 2.
 
     **Example:** `hil look log.csv --urdf arm.urdf`
 
@@ -60,10 +60,10 @@ def look(
             text = with_entries(text, dict(chosen.entries))
     if output is not None and text is None:
         say(f"note: {output} is not written: a bag has no columns to map", err=True)
-    if output is not None and text is not None and not is_open:
+    if output is not None and text is not None:
         write_output(output, text)
         if not json:
-            say(f"wrote {output}")
+            say(f"wrote {output}{', without what is open: add a line' if is_open else ''}")
     if is_open:
         raise typer.Exit(IN_DOUBT)
 

@@ -28,6 +28,7 @@ from identification.model.pseudo_inertia import Body
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.evidence import find_gravity
+from identification.validation.facts.faults import MOUNTING_STEP
 from identification.validation.finding import Thresholds
 
 from .cell_context import TorqueScale, torque_scale
@@ -326,13 +327,14 @@ class NoPayloadError(InputError):
 
 def _no_payload(estimate: PayloadEstimate, mounting: str | None) -> NoPayloadError:
     low, high = estimate.intervals[0]
-    return NoPayloadError(
-        None,
-        f"the loaded archives show no payload: its mass is between {low:.3g} and {high:.3g} kg",
-        field="--loaded",
-        remedy="give recordings that were made with the payload"
-        + ("" if mounting is None else f"; or the mounting is another: {mounting}"),
+    problem = (
+        f"the loaded archives show no payload: its mass is between {low:.3g} and {high:.3g} kg"
     )
+    remedy = "give recordings that were made with the payload"
+    if mounting is not None:
+        problem += ", as the arm is stated to be mounted"
+        remedy = f"the mounting is doubtful: {mounting}; then {remedy}"
+    return NoPayloadError(None, problem, field="--loaded", remedy=remedy)
 
 
 def _sides(bare: Sequence[Path], loaded: Sequence[Path]) -> dict[bool, list[Path]]:
@@ -438,8 +440,8 @@ def doubtful_mounting(model: RobotModel, bare: Sequence[Samples]) -> str | None:
         f"with gravity ({best}) m/s² in base axes, {angle:.0f}° from the declared ({declared})"
         f" m/s², the bare recordings are predicted with {np.sqrt(gravity.ratio):.2f} times the "
         f"error;"
-        " set gravity of [robot] in the cell file to the mounting of the arm and import the"
-        " recordings with that cell; if it is right, check the zero positions of the joints"
+        f" {MOUNTING_STEP}, and import the recordings again; if it is right, check the zero"
+        " positions of the joints"
     )
 
 

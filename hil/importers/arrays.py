@@ -302,13 +302,23 @@ def _parquet(path: Path) -> dict[str, Stored]:
         values = table[name].to_numpy()
         if values.dtype == object and len(values) and isinstance(values[0], np.ndarray):
             values = np.stack(values)
-        arrays[name] = values
+        arrays[name] = _as_numbers(values)
     episodes = np.unique(arrays.get("episode_index", np.zeros(1)))
     if len(episodes) > 1:
         problem = f"has {len(episodes)} episodes, each with a clock that starts at zero"
         remedy = "save one of them as a file of its own"
         raise SourceError(path, problem, field="episode_index", remedy=remedy)
     return _in_memory(arrays)
+
+
+def _as_numbers(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a column of text as numbers, NaN where it is none, if most of it is numbers."""
+    if values.dtype != object:
+        return values
+    import pandas as pd  # 0.4 s
+
+    numbers = np.asarray(pd.to_numeric(pd.Series(values), errors="coerce"), np.float64)
+    return numbers if np.isfinite(numbers).mean() > 0.5 else values
 
 
 def _in_memory(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Stored]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from shutil import copyfile
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Final
+from typing import IO, TYPE_CHECKING, Any, Final
 
 import zstandard
 from rosbags.interfaces import MessageDefinitionFormat
@@ -32,6 +32,7 @@ _PACKED: Final = (".zstd", ".zst")
 _LONGEST_MESSAGE: Final = 1 << 24  # bytes
 _LONGEST_ROW: Final = 1 << 28  # bytes
 _SLACK: Final = 1 << 20  # bytes
+_SQLITE: Final = b"SQLite format 3\0"
 _ZSTD: Final = b"\x28\xb5\x2f\xfd"  # begins no CDR message
 
 
@@ -256,9 +257,18 @@ def _not_a_bag(file: Path, error: Exception) -> SourceError:
     kind = "a bag of ROS 1" if _storage(file) == ".bag" else "a rosbag2 in sqlite3 storage"
     reason = re.sub(r"\S*part_\d+\.\w+'?", file.name, str(error)) or type(error).__name__
     problem = f"is not {kind}, or damaged ({reason})"
-    return SourceError(
-        file, problem, remedy="name the .db3, .mcap or .bag file, or the bag's folder"
-    )
+    remedy = "name the .db3, .mcap or .bag file, or the bag's folder"
+    if _is_database(file):
+        remedy = "copy it again, with the file that ends in -wal beside it, if there is one"
+    return SourceError(file, problem, remedy=remedy)
+
+
+def _is_database(file: Path) -> bool:
+    try:
+        with file.open("rb") as stream:
+            return stream.read(len(_SQLITE)) == _SQLITE
+    except OSError:
+        return False
 
 
 @contextmanager
@@ -298,12 +308,27 @@ def _unpack(file: Path, target: Path) -> None:
     try:
         most = _SLACK + MOST_INFLATION * file.stat().st_size
         with file.open("rb") as packed, target.open("wb") as output:
-            for block in zstandard.ZstdDecompressor().read_to_iter(packed):
+            for block in _unpacked_blocks(packed, file):
                 output.write(block)
                 if output.tell() > most:
                     raise SourceError(file, f"becomes more than {MOST_INFLATION} times as large")
     except (OSError, zstandard.ZstdError) as error:
         raise SourceError(file, f"cannot be decompressed ({error})") from error
+
+
+def _unpacked_blocks(packed: IO[bytes], file: Path) -> Iterator[bytes]:
+    """Yield blocks of a compressed file; SourceError if its end is missing."""
+    frame = None
+    while data := packed.read(_SLACK):
+        while data:
+            frame = frame or zstandard.ZstdDecompressor().decompressobj()
+            yield frame.decompress(data)
+            data = frame.unused_data
+            if frame.eof:
+                frame = None
+    if frame is not None:
+        problem = "ends within its compressed data"
+        raise SourceError(file, problem, remedy="copy it again")
 
 
 def _decompressed(data: bytes, file: Path) -> bytes:

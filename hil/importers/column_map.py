@@ -18,6 +18,8 @@ from hil.errors import SourceError
 from hil.importers.units import PER_CENT, UNITS, names_of_units
 from hil.reading import parse_toml, path_exists, read_text, remedy_for_missing
 
+KINEMATIC: Final = ("position", "velocity", "commanded_position")
+"""Quantities of the motion."""
 Vector = tuple[FiniteFloat, ...]
 Column = Annotated[int, Field(ge=0)] | str
 _Number = Annotated[int, Field(ge=1)]
@@ -48,6 +50,8 @@ class Quantity(_Table):
         offset: added to the recorded numbers, one for all joints or one each.
         scale: factor after that, one for all joints or one each.
         side: ``motor`` if it was measured before the gears.
+        coupled: angles or velocities that contain those of other joints, as terms ``[joint, other,
+            factor]``, numbered from 1: with ``[3, 2, 1.0]`` axis 3 is stated relative to the base.
     """
 
     columns: Annotated[tuple[Column, ...], Field(min_length=1)] | str | None = Field(
@@ -65,6 +69,10 @@ class Quantity(_Table):
     offset: FiniteFloat | Vector = Field(default=0.0, description=_ONE_OR_EACH)
     scale: FiniteFloat | Vector = Field(default=1.0, description=_ONE_OR_EACH)
     side: Literal["joint", "motor"] = "joint"
+    coupled: tuple[tuple[_Number, _Number, FiniteFloat], ...] = Field(
+        default=(),
+        description="a list of [joint, other joint, factor], numbered from 1",
+    )
 
 
 class TimeColumn(_Table):
@@ -193,6 +201,10 @@ class ColumnMap(_Table):
                     f"{name}.files has no {{}} for the joint's number; "
                     'write it there, as in "q_{}.txt"'
                 )
+            if quantity.coupled and name not in KINEMATIC:
+                raise ValueError(f"{name} has no coupled angles; give {KINEMATIC[0]}.coupled")
+            if any(joint == other for joint, other, _ in quantity.coupled):
+                raise ValueError(f"{name}.coupled is of two joints each; use {name}.scale")
             if 0.0 in np.atleast_1d(quantity.scale):
                 raise ValueError(f"{name}.scale is 0, which removes the recorded values")
         if any(motor == joint for motor, joint, _ in self.drive.coupling):

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hil.archive import Findings, Samples
 from hil.cell.text import UrdfLimits, urdf_limits
 from hil.errors import SourceError
+from hil.importers.publishers import APART, alternating_samples
 from hil.importers.stamps import FASTEST, SLOWEST
 from identification.model.urdf_text import urdf_tree
 from identification.signals.clock import time_base
@@ -25,7 +26,6 @@ from identification.signals.recording import STUCK_MOVEMENT, unwrap
 Array = NDArray[np.float64]
 
 _TOLERANCE: Final = 0.05  # rad or m beyond a limit, for calibration and overshoot
-_APART: Final = 0.1  # rad or m between samples of one stamp, 20 ms at 5 rad/s
 _LEAST_TRAVEL: Final = 0.1  # rad or m
 _SCALE_TOLERANCE: Final = 0.1  # of velocity over slope of the position, for filters
 _CORRELATED: Final = 0.7
@@ -68,9 +68,11 @@ def examine(
     warnings = []
     if not SLOWEST <= base.rate <= FASTEST:
         warnings += [f"{base.rate:.3g} samples per second are unusual: check the unit of the time"]
-    warnings += _positions(time, position, joint_names, limits, turning)
+    several = _of_one_stamp(time, position) or alternating_samples(position)
+    warnings += [several] if several else []
+    warnings += _positions(time, position, joint_names, limits, turning, has_speed=not several)
     is_plausible = not warnings  # torques are compared with those of a plausible motion only
-    if samples.velocity is not None:
+    if samples.velocity is not None and not several:
         warnings += _velocities(time, position, samples.velocity, joint_names)
     warnings += _torques(samples, joint_names, limits.effort)
     if is_plausible:
@@ -115,6 +117,25 @@ def _fits(position: Array, limits: UrdfLimits) -> NDArray[np.bool_]:
     return np.asarray(above & (position.max(axis=0) <= limits.upper[:, None] + _TOLERANCE))
 
 
+def in_turns(position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]) -> Array:
+    """Return positions (m, n) of which a joint within its limits but for a whole turn is within.
+
+    Angles of 0 to 360 degrees and of +-180 are two conventions of one posture; others are as
+    recorded, and so is a joint that no turn brings within its limits.
+    """
+    low = position.min(axis=0) + _TOLERANCE
+    high = position.max(axis=0) - _TOLERANCE
+    usual = ((low > 0.0) & (high < 2.0 * np.pi)) | ((low > -np.pi) & (high < np.pi))
+    continued = position.copy()
+    continued[:, turning] = unwrap(position[:, turning])
+    result = position.copy()
+    for turns in (1.0, -1.0, 0.0):
+        turned = continued + 2.0 * np.pi * turns * turning
+        fits = np.diag(_fits(turned, limits)) & turning & usual
+        result[:, fits] = turned[:, fits]
+    return result
+
+
 class _Outside(NamedTuple):
     """Positions that leave the limits of the URDF."""
 
@@ -127,6 +148,8 @@ def _outside(
     position: Array, names: Sequence[str], limits: UrdfLimits, turning: NDArray[np.bool_]
 ) -> _Outside | None:
     """Return which positions leave the limits of the URDF, and which reading would not."""
+    radians = in_turns(np.where(turning, np.radians(position), position), limits, turning)
+    position = in_turns(position, limits, turning)
     fits = _fits(position, limits)
     joints = range(len(names))
     beyond = [joint for joint in joints if not fits[joint, joint]]
@@ -141,7 +164,6 @@ def _outside(
         "every row leaves" if rows.all() else f"{_percent(float(rows.mean()))} of the rows leave"
     )
     problem = f"as mapped, {share} the limits of the URDF ({ranges})"
-    radians = np.where(turning, np.radians(position), position)
     farthest = 3.0 * np.maximum(-limits.lower, limits.upper)
     far = (np.maximum(-low, high) > farthest)[beyond].any()
     columns = scipy.optimize.linear_sum_assignment(~fits + 1e-6 * (1.0 - np.eye(len(names))))[1]
@@ -195,9 +217,11 @@ def are_degrees(position: Array, converted: Array, names: Sequence[str], urdf: s
     finite = np.isfinite(position).all() and np.isfinite(converted).all()
     beyond = ~np.diag(_fits(position, limits))
     far = np.abs(position).max(axis=0) > 3.0 * np.maximum(-limits.lower, limits.upper)
-    fits = np.diag(_fits(converted, limits))
+    if not finite or not (far & beyond).any():
+        return False
+    fits = np.diag(_fits(in_turns(converted, limits, turning), limits))
     moves = np.ptp(converted, axis=0).max() >= _LEAST_TRAVEL
-    return bool(finite and (far & beyond).any() and fits.all() and moves)
+    return bool(fits.all() and moves)
 
 
 def has_degrees_per_second(time: Array, position: Array, velocity: Array) -> bool:
@@ -217,8 +241,13 @@ def _positions(
     names: Sequence[str],
     limits: UrdfLimits,
     turning: NDArray[np.bool_],
+    *,
+    has_speed: bool,
 ) -> Iterator[str]:
-    """Yield warnings where positions or speeds are outside the limits of the URDF."""
+    """Yield warnings where positions or speeds are outside the limits of the URDF.
+
+    Positions of several sources have no speed of the arm.
+    """
     outside = _outside(position, names, limits, turning)
     if outside is not None:
         yield f"{outside.problem}; {outside.remedy}"
@@ -233,11 +262,8 @@ def _positions(
     stride = max(1, len(time) // 2000)  # longer steps, in which noise is negligible
     steps = np.diff(time[::stride])[:, None]
     moved = np.abs(np.diff(position[::stride], axis=0))[steps[:, 0] > 0.0]
-    if not len(moved):
+    if not len(moved) or not has_speed:
         return
-    if apart := _of_one_stamp(time, position):
-        yield apart
-        return  # its speeds are none of the arm
     usual = np.quantile(moved / steps[steps[:, 0] > 0.0], 0.9, axis=0)
     for name, speed, limit in zip(names, usual, limits.velocity, strict=True):
         if speed > _TOO_FAST * limit:
@@ -253,12 +279,13 @@ def _of_one_stamp(time: Array, position: Array) -> str:
     highest = np.maximum.reduceat(position, starts)
     lowest = np.minimum.reduceat(position, starts)
     apart = (highest - lowest).max(axis=1)
-    count = np.count_nonzero(apart > _APART)
+    count = np.count_nonzero(apart > APART)
     if not count:
         return ""
     return (
         f"samples with the same time stamp are up to {apart.max():.3g} rad or m apart ({count} such"
-        " stamps): two sources write this log, or its clock is much coarser than its samples"
+        " stamps): two sources write this log, or its clock stood still or is much coarser than its"
+        " samples"
     )
 
 

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from hil.archive import Samples
 from hil.errors import SourceError, UnrecordedJointError
 from hil.importers.arrays import READERS, ArrayFile
-from hil.importers.column_map import HOLE, ColumnMap, Quantity, TimeColumn
+from hil.importers.column_map import HOLE, KINEMATIC, ColumnMap, Quantity, TimeColumn
 from hil.importers.findings import are_degrees, has_degrees_per_second
+from hil.importers.publishers import second_publisher
 from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
-from hil.importers.stamps import YEAR, concluded_unit, without_wraps
+from hil.importers.stamps import YEAR, concluded_unit, sorted_neighbours, without_wraps
 from hil.importers.table import Table
 from hil.importers.units import PER_CENT, TIMES, UNITS, unit_of
 
@@ -65,8 +66,13 @@ def import_log(
     complete = log.complete_rows(clock, values)
     if columns.format.missing == "drop":
         metadata["dropped_rows"] = str(np.count_nonzero(~complete))
-    stamp = clock.stamp[complete]
-    values = {name: array[complete] for name, array in values.items()}
+    rows = np.flatnonzero(complete)
+    swapped = sorted_neighbours(clock.stamp[rows], "row")
+    if swapped.note is not None:
+        log.notes.append(f"time: {swapped.note}")
+    rows = rows[swapped.order]
+    stamp = clock.stamp[rows]
+    values = {name: array[rows] for name, array in values.items()}
     if columns.drive.geared:
         matrix = log.matrix[np.ix_(log.order, log.order)]
         metadata["motor_from_joint"] = json.dumps(matrix.tolist())
@@ -76,6 +82,11 @@ def import_log(
         each = np.broadcast_to(uncertainty, len(log.joints))[log.order]
         metadata["torque_uncertainty"] = json.dumps(each.tolist())
     joint_side = log.in_concluded_units(stamp, values, robot)
+    silent = second_publisher(joint_side["position"], "row")
+    if silent.note is not None:
+        log.notes.append(silent.note)
+        stamp = stamp[~silent.rows]
+        joint_side = {name: array[~silent.rows] for name, array in joint_side.items()}
     return write_imported(
         output,
         Samples(stamp, **joint_side),
@@ -464,15 +475,37 @@ class _Log:
             self._check_count(row, "drive.motor_from_joint")
         diagonal = np.diag(drive.gear_ratio or np.ones(n))
         matrix = np.array(drive.motor_from_joint or diagonal.tolist(), np.float64)
-        for motor, joint, ratio in drive.coupling:
-            if max(motor, joint) > n:
-                problem = f"there are {n} joints, not {max(motor, joint)}"
-                raise SourceError(self.path, problem, field="drive.coupling")
-            matrix[motor - 1, joint - 1] = ratio
+        self._set_terms(matrix, drive.coupling, "drive.coupling")
         if np.linalg.matrix_rank(matrix) < n:
             problem = "no motor would move one of the joints"
-            raise SourceError(self.path, problem, field="drive.gear_ratio")
+            remedy = "give each joint a ratio that is not zero, by which one motor turns it"
+            raise SourceError(self.path, problem, field="drive.gear_ratio", remedy=remedy)
         return matrix
+
+    def coupling_of(self, name: str) -> Array:
+        """Return recorded angles per joint angle (k, k) of a quantity, in the log's order."""
+        field = f"{name}.coupled"
+        matrix = np.eye(len(self.joints))
+        self._set_terms(matrix, self._map.quantities()[name].coupled, field)
+        if np.linalg.matrix_rank(matrix) < len(matrix):
+            problem = "with these factors the angles do not determine the joints"
+            remedy = "state which angle contains that of which other joint, not both ways"
+            raise SourceError(self.path, problem, field=field, remedy=remedy)
+        return matrix
+
+    def _set_terms(
+        self, matrix: Array, terms: Sequence[tuple[int, int, float]], field: str
+    ) -> None:
+        """Set entries of a matrix (k, k), by row and column from 1."""
+        n = len(matrix)
+        for row, column, factor in terms:
+            if max(row, column) > n:
+                problem = f"there are {n} joints, not {max(row, column)}"
+                remedy = (
+                    f"number them from 1, in the order of the columns: {', '.join(self.joints)}"
+                )
+                raise SourceError(self.path, problem, field=field, remedy=remedy)
+            matrix[row - 1, column - 1] = factor
 
     def _check_count(self, values: Sequence[object] | Array, field: str) -> None:
         if len(values) != len(self.joints):
@@ -493,14 +526,19 @@ def _check_lengths(
 def _joint_side(values: dict[str, Array], columns: ColumnMap, log: _Log) -> dict[str, Array]:
     """Convert the quantities to the joint side and the robot's order, conserving power.
 
-    With motor angles M q, joint torques are M^T times the motors'.
+    With motor angles M q, joint torques are M^T times the motors'. Angles that contain those of
+    other joints are of the motion alone.
     """
     matrix = log.matrix
     sides = {name: quantity.side for name, quantity in columns.quantities().items()}
     joint = dict(values)
-    for name in ("position", "velocity", "commanded_position"):
+    quantities = columns.quantities()
+    for name in KINEMATIC:
         if sides.get(name) == "motor":
             joint[name] = np.asarray(np.linalg.solve(matrix, values[name].T).T, np.float64)
+        if name in quantities and quantities[name].coupled:
+            own = np.linalg.solve(log.coupling_of(name), joint[name].T).T
+            joint[name] = np.asarray(own, np.float64)
     if sides.get("torque") == "motor":
         joint["torque"] = values["torque"] @ matrix
     drive = columns.drive

@@ -143,11 +143,12 @@ def _groups(channels: Iterable[Channel], joints: Sequence[str]) -> list[_Group]:
         if match is not None:
             pattern = f"{bare[: match.start()]}{{}}{bare[match.end() :]}"
             place = int(match[0])
-        joint = _joint_in(bare, joints) if kind is None else None
+        joint = _joint_in(bare, joints)
         if joint is not None:
             quantity = bare.replace(joint, "").strip(" _.-/")
-            kind = kind_of(quantity, channel.unit)[0]
-            if kind is not None:
+            of_joint = kind_of(quantity, channel.unit)[0]
+            if of_joint is not None and kind in (None, of_joint):
+                kind = of_joint
                 by_joint = True
                 pattern = bare.replace(joint, "{}")
                 place = list(joints).index(joint)
@@ -327,8 +328,9 @@ class _Search:
         )
         otherwise = "or name the URDF's joint of each channel in joints of a map (--map map.toml)"
         if count < len(self._joints):
-            last = " ".join(f"--locked {name}" for name in self._joints[count:])
-            remedy = f"fix the joints that were not recorded, for the last ones with {last}"
+            absent, which = self._absent(group)
+            options = " ".join(f"--locked {name}" for name in absent)
+            remedy = f"fix the joints that were not recorded, {which} with {options}"
             raise UnrecordedJointError(
                 self._log, problem, field=kind, remedy=f"{remedy}; {otherwise}"
             )
@@ -337,6 +339,18 @@ class _Search:
         if len(group.names) == count:
             remedy += f", or the channels of its joints, such as --columns '{kind}={some}'"
         raise SourceError(self._log, problem, field=kind, remedy=f"{remedy}; {otherwise}")
+
+    def _absent(self, group: _Group) -> tuple[Sequence[str], str]:
+        """Return the joints without a channel by the numbers of the others, else the last ones."""
+        numbers = [_NUMBER.search(name) for name in group.names]
+        places = {int(match[0]) for match in numbers if match is not None}
+        first = 0 if 0 in places else 1
+        expected = range(first, first + len(self._joints))
+        absent = [place for place in expected if place not in places]
+        if len(places) == group.size and places < set(expected) and absent[0] < max(places):
+            names = [self._joints[place - first] for place in absent]
+            return names, "by the numbers of the channels"
+        return self._joints[group.size :], "for the last ones"
 
     def _refuse_missing(self, missing: Sequence[str]) -> NoReturn:
         """Raise SourceError with the quantities without a channel, and what would name them."""

@@ -23,17 +23,16 @@ from hil.importers.commands import (
     topics_of_kind,
 )
 from hil.importers.mcap_messages import Topic
+from hil.importers.publishers import APART, STALLED, second_publisher
 from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
 from hil.importers.ros_messages import CONTROLLER_STATE, JOINT_STATE
-from hil.importers.stamps import leading_zeros, swapped_messages
+from hil.importers.stamps import leading_zeros, sorted_neighbours
 
 Array = NDArray[np.float64]
 Effort = Literal["torque", "motor_current", "ignore"]
 Clock = Literal["auto", "header", "bag"]
 
 _QUANTITIES: Final = ("position", "velocity", "effort")
-_APART: Final = 0.1  # rad or m between samples of one stamp, 20 ms at 5 rad/s
-_STALLED: Final = 3  # messages with one stamp, of one publisher
 _MOST_APART: Final = 2.0  # periods between a sample and the one that it is interpolated to
 _STATIC: Final = 1e-3  # rad or m; a joint that moves less is at rest
 _AT_REST: Final = "lock joints that did not move: --locked NAME=POSITION"
@@ -305,17 +304,12 @@ class _States:
         if zeros:
             keep[:zeros] = False
             self.notes.append(f"left out: messages at the start without a stamp ({zeros})")
-        silent = self._second_publisher(values["position"])
-        if silent.any():
-            keep &= ~silent
-            pose = values["position"][np.argmax(silent)]
-            where = ", ".join(f"{angle:.3g}" for angle in pose) if pose.any() else "0"
-            self.notes.append(
-                f"{np.count_nonzero(silent)} of {len(stamp)} messages have {where} for all "
-                "positions between others that do not: those of a second publisher, left out"
-            )
+        silent = second_publisher(values["position"], "message")
+        if silent.note is not None:
+            keep &= ~silent.rows
+            self.notes.append(silent.note)
         order = np.flatnonzero(keep)
-        swapped = swapped_messages(stamp[order])
+        swapped = sorted_neighbours(stamp[order], "message")
         if swapped.note is not None:
             self.notes.append(swapped.note)
         order = order[swapped.order]
@@ -352,25 +346,6 @@ class _States:
             raise SourceError(self._source, "the messages have no positions", field="position")
         return values
 
-    @staticmethod
-    def _second_publisher(position: Array) -> NDArray[np.bool_]:
-        """Return which messages have one and the same pose between others that move (m,)."""
-        none = np.zeros(len(position), np.bool_)
-        jumps = np.abs(np.diff(position, axis=0)).max(axis=1) > _APART
-        if np.count_nonzero(jumps) <= 2 * _STALLED:
-            return none
-        poses, counts = np.unique(position, axis=0, return_counts=True)
-        pose = poses[np.argmax(counts)]
-        silent = (position == pose).all(axis=1)
-        others = position[~silent]
-        alternating = np.count_nonzero(np.diff(silent.astype(np.int8))) > 2 * _STALLED
-        if not alternating or not len(others):
-            return none
-        moved = np.diff(others, axis=0).any(axis=1)
-        if pose.any() and 2 * np.count_nonzero(moved) < len(moved):
-            return none  # an arm that goes to and fro between two poses
-        return none if np.abs(others - pose).max(axis=1).min() < _APART else np.asarray(silent)
-
     def _check_repeats(
         self,
         stamp: NDArray[np.int64],
@@ -388,13 +363,13 @@ class _States:
         highest = np.maximum.reduceat(position, starts)
         lowest = np.minimum.reduceat(position, starts)
         apart = (highest - lowest).max(axis=1)
-        worst = np.flatnonzero(apart > _APART)
+        worst = np.flatnonzero(apart > APART)
         if not worst.size:
             return
         first = int(starts[worst[0]])
         run = np.flatnonzero(stamp == stamp[first])
         steps = np.abs(np.diff(position[run], axis=0)).max()
-        if len(run) >= _STALLED and steps < 0.5 * apart[worst[0]]:
+        if len(run) >= STALLED and steps < 0.5 * apart[worst[0]]:
             elapsed = 1e-9 * float(received[run[-1]] - received[run[0]])
             problem = (
                 f"{len(run)} messages from message {numbers[first]} have the same stamp, and were "

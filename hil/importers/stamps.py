@@ -19,7 +19,7 @@ FASTEST: Final = 20_000.0  # Hz
 _LARGEST: Final = 10**40  # ns; more is no time in any unit
 _NO_MOTION: Final = 10.0  # Hz; 5 kHz in ms, read as s, are 5 Hz
 _MOST_STEPS: Final = 10  # median steps that a counter may pass where it wraps
-_SWAPPED: Final = 0.02  # share of the messages of a recording that may have changed places
+_SWAPPED: Final = 0.02  # share of the samples of a recording that may have changed places
 YEAR: Final = 365 * 86_400 * 10**9
 """[ns]"""
 _WRAPS: Final[dict[str, int]] = {
@@ -88,17 +88,17 @@ def leading_zeros(stamp: Stamps) -> int:
 
 
 class Sorted(NamedTuple):
-    """The order of messages by stamp."""
+    """The order of samples by stamp."""
 
     order: NDArray[np.intp]
     note: str | None  #: how many had changed places, None if none had
 
 
-def swapped_messages(stamp: Stamps) -> Sorted:
-    """Return the order of messages by stamp (m,) [ns] where a few neighbours changed places.
+def sorted_neighbours(stamp: Stamps, sample: str) -> Sorted:
+    """Return the order of samples by stamp (m,) [ns] where a few neighbours changed places.
 
-    A clock that was set back stays as it is, to be refused: there a message is older than many
-    before it.
+    A clock that was set back stays as it is, to be refused: there a sample is older than many
+    before it. In words it is a `sample`, such as "message".
     """
     unchanged = np.arange(len(stamp))
     backward = int(np.count_nonzero(np.diff(stamp) < 0))
@@ -108,8 +108,8 @@ def swapped_messages(stamp: Stamps) -> Sorted:
     farthest = int(np.abs(order - unchanged).max())
     if farthest > 2 or backward > max(1.0, _SWAPPED * len(stamp)):
         return Sorted(unchanged, None)
-    messages = f"{backward} messages that came" if backward > 1 else "one message that came"
-    return Sorted(order, f"{messages} before an older one: sorted by stamp")
+    count = f"{backward} {sample}s" if backward > 1 else f"one {sample}"
+    return Sorted(order, f"{count} that came before an older one: sorted by stamp")
 
 
 def check_clock(stamp: Stamps, path: Path, remedy: str | None = None) -> None:

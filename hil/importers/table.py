@@ -51,6 +51,13 @@ _DAY: Final = r"\d{1,4}([-./])(?:\d{1,2}|[A-Za-z]{3})\1\d{1,4}"
 _CLOCK: Final = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d+)?)?(?:\s*[AaPp][Mm])?\s*(?:Z|[+-]\d{2}:?\d{2})?"
 _DATE: Final = re.compile(rf"(?:{_DAY}(?:[ T]+{_CLOCK})?|{_CLOCK})")
 _QUOTES: Final = "\"'"
+# Cells in apostrophes, or as spreadsheets protect text: ="0.5".
+_OTHER_QUOTES: Final = re.compile(r"""(?<![^\s,;|])(?:'([^'"\n]*)'|="([^"\n]*)")(?![^\s,;|])""")
+# Of columns, as PLCs and programs write them below the names.
+_TYPE: Final = re.compile(
+    r"l?real|float(32|64)?|double|single|numeric|number|[usld]{0,2}int(8|16|32|64)?|integer|bool"
+    r"(ean)?|l?time|date|datetime|string|text|d?word|byte|[<>]?[fiu][248]"
+)
 _MARKUP: Final = re.compile(r"\ufeff?\s*<[?!A-Za-z]")
 
 
@@ -301,7 +308,8 @@ def _text(path: Path, form: Format) -> str:
         if isinstance(error, FileNotFoundError):
             remedy = remedy_for_missing(path, remedy)
         raise SourceError(path, problem, remedy=remedy) from error
-    return text.removeprefix("%") if text.startswith(_ROSTOPIC) else text  # a header there
+    text = text.removeprefix("%") if text.startswith(_ROSTOPIC) else text  # a header there
+    return _OTHER_QUOTES.sub(r'"\1\2"', text) if "'" in text or '="' in text else text
 
 
 def _dialect(lines: Sequence[str], form: Format) -> Dialect:
@@ -343,8 +351,13 @@ def _layout(numbered: list[tuple[int, str]], dialect: Dialect, path: Path, form:
         raise SourceError(path, "has no row of numbers", remedy=_EMPTY)
     head = [dialect.cells(line) for _, line in filled[:begin]]
     units: list[str] = []
-    if len(head) > 1 and _are_units(head[-1]):
-        units = head.pop()
+    while len(head) > 1:
+        if _are_units(head[-1]):
+            units = head.pop()
+        elif _are_types(head[-1]) and len(head[-1]) == len(head[-2]):
+            head.pop()
+        else:
+            break
     names = [cell.strip(_QUOTES).strip() for cell in head[-1]] if head else []
     last = filled[-1][0]
     rows = [entry for entry in numbered if filled[begin][0] <= entry[0] <= last]
@@ -390,6 +403,11 @@ def _are_units(cells: Sequence[str]) -> bool:
     """Return whether the cells of a line are units, of which some may be missing."""
     filled = [cell.strip("[]() ") for cell in cells if cell.strip("[]() -")]
     return bool(filled) and all(without_unit(f"x [{cell}]")[1] for cell in filled)
+
+
+def _are_types(cells: Sequence[str]) -> bool:
+    """Return whether the cells of a line are types of columns."""
+    return all(_TYPE.fullmatch(cell.strip(_QUOTES).lower()) for cell in cells)
 
 
 def _width(names: Sequence[str], first: Sequence[str], path: Path) -> int:

@@ -16,21 +16,23 @@ from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, i
 from hil.importers.robot import Robot, Use
 from hil.look.other_arm import Contradictions
 from hil.look.result import Choice, Look, Row
-from hil.look.run import SETTINGS, look_at_joints
+from hil.look.run import SETTINGS, look_at_joints, mountings
 from hil.terminal_text import typed
 from identification.errors import IdentificationError
 from identification.signals.samples import Samples, prepare
 from identification.text import percentage
-from identification.validation.readings import Score, score_of
+from identification.validation.readings import SURE, Score, compare, score_of
 
 _SUSPECT: Final = 0.15
 """Error of the torque, predicted from other parts, above which a log is looked at closely. Right
 logs of four real arms have 0.04 to 0.11, with URDFs of other arms 0.09 to 1.1."""
+_MUCH_BETTER: Final = 0.85  # error ratio of another mounting that chance alone does not make
 _OTHER_ARM: Final = 0.5
 """The same, above which no masses of this arm explain the torque."""
 _DRIVES: Final = -4.0  # standard errors of a friction that drives a joint
 _ROWS: Final = 700
 _WARNED: Final = 2  # contradictions: a wrong limit of a right URDF explains one, more are refused
+_OF_AXES: Final = ("order", "signs", "zero", "coupling")
 _REMEDY: Final = (
     "give the URDF of this arm; to identify in spite of that, give the column map "
     "(`hil look LOG --urdf ARM.urdf -o map.toml`, --map map.toml)"
@@ -58,7 +60,8 @@ def concluded(
     if few is None:
         return imported
     cell, samples, score = few
-    if score.overall <= _SUSPECT and not np.any(score.friction < _DRIVES):
+    suspect = score.overall > _SUSPECT or bool(np.any(score.friction < _DRIVES))
+    if not suspect and not _hangs_otherwise(cell, samples, score):
         contradictions = Contradictions.of(cell, cell.model, samples, score.overall)
         return _of_this_arm(imported, source, contradictions)
     look = look_at_joints(source, imported)
@@ -70,12 +73,12 @@ def concluded(
         contradictions = Contradictions.of(cell, cell.model, samples, error)
         imported = _of_this_arm(imported, source, contradictions)
     if look.questions:
-        raise _undecided(source, look.questions[0])
+        raise undecided(source, look.questions[0])
     if look.map_text != imported.map_text or look.options:
         again = _again(imported, source, robot_of, look, use)
         if (few := _few_rows(again.archive)) is not None:
             cell, samples, _ = few
-            axes = [row.aspect for row in changed if row.aspect in ("order", "signs", "zero")]
+            axes = [row.aspect for row in changed if row.aspect in _OF_AXES]
             contradictions = Contradictions.of(cell, cell.model, samples, error, axes)
             return _of_this_arm(again, source, contradictions)
         return again
@@ -93,6 +96,17 @@ def _few_rows(archive: Path) -> tuple[Cell, Samples, Score] | None:
         return cell, few, score_of(cell.model, few)
     except (IdentificationError, ValueError):
         return None  # the identification says what is wrong
+
+
+def _hangs_otherwise(cell: Cell, samples: Samples, score: Score) -> bool:
+    """Return whether another mounting predicts much better; a short log fits any to some %."""
+    for model in mountings(cell).values():
+        if np.array_equal(model.gravity, np.zeros(3)):
+            continue  # less torque to explain
+        against = compare(score_of(model, samples), score, cell.model)
+        if against.ratio < _MUCH_BETTER and against.sigmas < -SURE:
+            return True
+    return False
 
 
 def _of_this_arm(
@@ -115,7 +129,7 @@ def _of_this_arm(
 
 def _changed(look: Look) -> list[Row]:
     """Return the rows of what is sure to be other than recorded."""
-    aspects = ("order", "signs", "angle unit", "zero", "gravity", "mounting")
+    aspects = ("order", "signs", "angle unit", "zero", "coupling", "gravity", "mounting")
     return [
         row
         for row in look.rows
@@ -152,22 +166,26 @@ def _gravity(look: Look) -> tuple[float, ...] | None:
     return tuple(float(word) for word in option_words[1:4]) if option_words else None
 
 
-def _undecided(source: Path, choices: tuple[Choice, ...]) -> SourceError:
+def undecided(source: Path, choices: tuple[Choice, ...]) -> SourceError:
+    """Return the error of readings of which the recording does not choose one."""
     errors = [
         f" (error {percentage(choice.error, 1)})" if choice.error else "" for choice in choices
     ]
     readings = " or ".join(
         choice.reading + error for choice, error in zip(choices, errors, strict=True)
     )
-    remedy = "name the joint, unit and sign of each column in a map (--map map.toml)"
-    if all(choice.entries for choice in choices):
-        lines = " or ".join(choice.line for choice in choices)
-        remedy = (
+    options = [choice.line for choice in choices if choice.line.startswith("--")]
+    lines = [choice.line for choice in choices if choice.line and choice.line not in options]
+    steps = []
+    if options:
+        steps.append(f"state {' or '.join(options)}")
+    if lines:
+        steps.append(
             f"write the map with `hil look {typed(source.name)} --urdf ARM.urdf -o map.toml`, "
-            f"add one of the lines {lines}, and give it with --map"
+            f"add {'one of the lines ' if len(lines) > 1 else ''}{' or '.join(lines)}, and give it "
+            "with --map"
         )
-    elif any(choice.line.startswith("--") for choice in choices):
-        remedy = f"state {' or '.join(choice.line for choice in choices if choice.line)}"
+    remedy = "; or ".join(steps) or "name joint, unit and sign of each column in a map (--map)"
     problem = f"two readings fit alike: {readings}"
     return SourceError(source, problem, field=choices[0].aspect, remedy=remedy)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.importers.channels import channels_of
 from hil.reading import parse_toml
@@ -31,7 +32,7 @@ def with_entries(text: str, entries: Mapping[str, Any]) -> str:
 def entries_of(axes: Axes, text: str, source: Path, joints: Sequence[str]) -> dict[str, Any]:
     """Return the entries of a map that make an import read what `axes` say.
 
-    Angles of `zero` are in the unit of the map, before its scale.
+    Angles of `zero` are in the unit of the map, before its scale and coupling.
     """
     table = parse_toml(text)
     same = bool(np.array_equal(axes.position_order, axes.torque_order))
@@ -56,6 +57,8 @@ def entries_of(axes: Axes, text: str, source: Path, joints: Sequence[str]) -> di
         by_column = sign[place] if same else sign
         if np.any(sign < 0.0):
             entries[f"{name}.scale"] = by_column.tolist()
+        if name in ("position", "velocity") and (terms := _terms(axes, place if same else count)):
+            entries[f"{name}.coupled"] = terms
     if axes.factor < 1.0:
         entries["position.unit"] = "deg"
     if axes.factor > 1.0:
@@ -65,6 +68,16 @@ def entries_of(axes: Axes, text: str, source: Path, joints: Sequence[str]) -> di
         offset = axes.zero / (axes.position_sign * factor)
         entries["position.offset"] = np.round(offset[place] if same else offset, 4).tolist()
     return entries
+
+
+def _terms(axes: Axes, columns: NDArray[np.intp]) -> list[list[float]]:
+    """Return the angles that contain others: column and joint, from 1, and the factor.
+
+    `columns` are the joints of the log's columns.
+    """
+    coupling = axes.coupling[np.ix_(columns, columns)]
+    others = np.argwhere(coupling - np.diag(np.diag(coupling)))
+    return [[int(j) + 1, int(k) + 1, float(coupling[j, k])] for j, k in others]
 
 
 def _names(columns: Any, source: Path, joints: Sequence[str]) -> list[Any] | None:

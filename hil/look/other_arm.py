@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.cell.text import urdf_limits
+from hil.importers.findings import in_turns
 from hil.look.physics import Size
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -54,7 +55,8 @@ class Contradictions:
         """
         limits = urdf_limits(cell.urdf, cell.joint_names)
         names = cell.joint_names
-        position = samples.motion.position
+        turning = np.array(model.chain.revolute)
+        position = in_turns(samples.motion.position, limits, turning)
         low, high = np.quantile(position, (1.0 - _MOST, _MOST), axis=0)
         beyond = np.maximum(limits.lower - low, high - limits.upper)
         speed = _largest(samples.motion.velocity) / limits.velocity

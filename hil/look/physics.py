@@ -25,6 +25,7 @@ from identification.signals.samples import Preprocessing, Samples
 from identification.text import percentage
 from identification.validation.plausibility import nominal_scale
 from identification.validation.readings import (
+    COUPLED,
     EXPLAINED,
     SEPARATE,
     Axes,
@@ -56,6 +57,8 @@ _ASPECTS: Final[Mapping[Meaning, str]] = {
     "degrees": "angle unit",
     "radians": "angle unit",
     "zero": "zero",
+    "angle sum": "coupling",
+    "angle difference": "coupling",
     "no gravity": "gravity",
     "mounting": "mounting",
 }
@@ -85,8 +88,11 @@ class Size:
 
     @classmethod
     def of(cls, cell: Cell, model: RobotModel, samples: Samples) -> Size:
-        """Compare samples with the nominal arm, or with the weight of arms of its reach."""
-        nominal = nominal_of(cell)
+        """Compare samples with the nominal arm, or with the weight of arms of its reach.
+
+        The model is that of the cell, or of another gravity, which has other base parameters.
+        """
+        nominal = nominal_of(mounted(cell, tuple(model.gravity)))
         if nominal is None:
             return cls(_by_reach(model, samples), by_masses=False)
         scale = nominal_scale(model, nominal.values, [samples]).scale
@@ -115,6 +121,12 @@ class Size:
         if self.factor is None:
             return False
         return bool(abs(abs(np.log(self.factor)) - np.log(_THOUSAND)) < np.log(2.0))
+
+
+def mounted(cell: Cell, gravity: tuple[float, ...]) -> Cell:
+    """Return a cell with another gravity in the base frame [m/s²]."""
+    robot = cell.file.robot.model_copy(update={"gravity": gravity})
+    return replace(cell, file=cell.file.model_copy(update={"robot": robot}))
 
 
 def _by_reach(model: RobotModel, samples: Samples) -> float | None:
@@ -160,6 +172,7 @@ class Finding:
             self._signs(),
             self._unit(),
             self._zero(),
+            self._coupling(),
             self._gravity(),
             self._mounting(),
             self._size(),
@@ -225,8 +238,13 @@ class Finding:
             "radians": "radians",
             "no gravity": "without gravity",
             "mounting": f"mounted {change.name}",
+            "angle sum": "plus",
+            "angle difference": "less",
             "zero": f"zero moved by {np.degrees(change.size):.0f} deg",
         }
+        if change.meaning in COUPLED:
+            joint, other = (self.cell.joint_names[place] for place in change.joints)
+            return f"the angle of {joint} is recorded {texts[change.meaning]} that of {other}"
         text = texts[change.meaning]
         if len(change.joints) > 2 and change.order:
             names = self.cell.joint_names
@@ -293,6 +311,14 @@ class Finding:
         change, against = self.readings.nearest["zero"]
         reason = f"{self.described(change)}: error {against.ratio:.2f} times"
         return Row("zero", text, "open", reason, decide)
+
+    def _coupling(self) -> Row:
+        steps = self.steps(*COUPLED)
+        decide = "turn one joint alone and see which angles change"
+        if steps:
+            text = "; ".join(self.described(step.change) for step in steps)
+            return self._found("coupling", steps, text, decide)
+        return self._unchanged("coupling", "no angle contains another's", *COUPLED, decide=decide)
 
     def _gravity(self) -> Row:
         steps = self.steps("no gravity")

@@ -125,22 +125,21 @@ def _look_of(finding: physics.Finding, rows: Sequence[Row], groups: tuple[Group,
 def _readings(cell: Cell, recording: Recording, imported: ImportedRecording) -> Readings:
     samples = prepare(recording, cell.model, options=SETTINGS)
     stated = any("position" in line and "no unit stated" not in line for line in imported.lines)
-    mountings = {
-        name: _mounted(cell, gravity)
-        for name, gravity in physics.MOUNTINGS.items()
-        if not np.allclose(gravity, cell.model.gravity)
-    }
     return find_readings(
         cell.model,
         samples,
-        mountings=mountings,
+        mountings=mountings(cell),
         unit_is_open=not stated,
     )
 
 
-def _mounted(cell: Cell, gravity: tuple[float, float, float]) -> RobotModel:
-    robot = cell.file.robot.model_copy(update={"gravity": gravity})
-    return replace(cell, file=cell.file.model_copy(update={"robot": robot})).model
+def mountings(cell: Cell) -> dict[str, RobotModel]:
+    """Return models of a cell with another gravity, by the mounting."""
+    return {
+        name: physics.mounted(cell, gravity).model
+        for name, gravity in physics.MOUNTINGS.items()
+        if not np.allclose(gravity, cell.model.gravity)
+    }
 
 
 def _channel(

@@ -36,6 +36,8 @@ Kind = Literal[
     "axis sign",
     "position order",
     "joint order",
+    "angle sum",
+    "angle difference",
     "payload",
     "load friction",
     "changed gain",
@@ -73,11 +75,14 @@ _BLOCKS: Final = 10
 _FOLDS: Final = 5
 _FEWEST_ROWS: Final = 10
 _FEWEST_BLOCKS: Final = 2
+_JOINTS_BEFORE: Final = 2  # an angle contains that of one of them; parallel axes are neighbours, or
+# have one across them in between
 # Ridge as a share of each column's information, for columns that the motion hardly determines.
 _RIDGE: Final = 1e-6
 _LOAD: Final = len(LINK_SYMBOLS)
 _MASS: Final = LINK_SYMBOLS.index("m")
-_OF_MOTION: Final[tuple[Kind, ...]] = ("axis sign", "position order", "joint order")
+_COUPLED: Final[tuple[Kind, ...]] = ("angle sum", "angle difference")
+_OF_MOTION: Final[tuple[Kind, ...]] = ("axis sign", "position order", "joint order", *_COUPLED)
 _OF_TORQUE: Final = ("torque sign", "torque order")
 
 
@@ -92,7 +97,8 @@ class Fault(NamedTuple):
     """Possible fault of recordings."""
 
     kind: Kind  # of fault
-    joints: tuple[int, ...] = ()  # affected joints; all if empty
+    # affected joints; all if empty. Of a coupled angle: its own, and the one that it contains
+    joints: tuple[int, ...] = ()
     part: Part | None = None  # affected part of the recordings; None for all
 
     @property
@@ -274,7 +280,7 @@ class _Search:
         if np.all(usual.fitted <= _LITTLE_MORE**2 * noise):
             return _OF_MOTION
         in_order = np.all(usual.shares(usual.fitted) < _SMALL_ERROR**2)
-        return ("position order", "joint order") if in_order else ()
+        return ("position order", "joint order", *_COUPLED) if in_order else ()
 
     def resized(self, trial: _Trial) -> Cause:
         """Return the cause of a trial; the load of friction is that of the parameters beside it."""
@@ -297,6 +303,8 @@ class _Search:
         changes = [Fault("payload"), Fault("changed arm")]
         # What a joint that stands still does says nothing about its order, sign or gain.
         moved = self._moved.tolist()
+        for pair in coupled_pairs(self._model, moved):
+            yield from (Fault(kind, pair) for kind in _COUPLED)
         for j in moved:
             yield from (Fault(kind, (j,)) for kind in kinds)
             yield from (Fault(kind, (k, j)) for k in moved if k < j for kind in orders)
@@ -703,12 +711,24 @@ def _columns_of(tables: _Tables, model: RobotModel, values: Array, fault: Fault)
     return np.asarray(mask[:, None, None, None] * columns)
 
 
+def coupled_pairs(model: RobotModel, moved: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """Yield the joints whose angle a controller may state relative to one of the two before it.
+
+    Such as the forearm's to the horizontal: the angle of axis 3 then contains that of axis 2.
+    """
+    turning = [joint for joint in moved if model.chain.revolute[joint]]
+    yield from ((j, k) for j in turning for k in turning if 0 < j - k <= _JOINTS_BEFORE)
+
+
 def corrected(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
-    """Return samples with a wrong sign or order corrected."""
+    """Return samples with a wrong sign or order, or a coupled angle, corrected."""
     n = model.n_joints
     sign = np.ones(n)
     order = np.arange(n)
-    if fault.kind.endswith("sign"):
+    own_angle = np.eye(n)
+    if fault.kind in _COUPLED:
+        own_angle[fault.joints] = -1.0 if fault.kind == "angle sum" else 1.0
+    elif fault.kind.endswith("sign"):
         sign[list(fault.joints)] = -1.0
     else:
         order[list(fault.joints)] = fault.joints[::-1]
@@ -717,10 +737,11 @@ def corrected(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
     usable = samples.usable
     if fault.kind in _OF_MOTION:
         load = None if motion.load is None else motion.load[:, order]
-        motion = Motion(motion.time, *(part[:, order] * sign for part in motion[1:4]))
+        read = (own_angle @ (np.eye(n)[order] * sign[:, None])).T
+        motion = Motion(motion.time, *(part @ read for part in motion[1:4]))
         motion = motion._replace(load=load)
         usable = usable[:, order]
-    if fault.kind != "position order":
+    if fault.kind not in ("position order", *_COUPLED):
         torque = torque[:, order] * sign
     result = replace(samples, motion=motion, torque=torque, usable=usable, mask=None)
     if samples.parent is not None:

@@ -24,7 +24,7 @@ from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples
-from identification.validation.causes import Fault, corrected
+from identification.validation.causes import Fault, corrected, coupled_pairs
 from identification.validation.finding import little_torque
 
 Array = NDArray[np.float64]
@@ -35,6 +35,8 @@ Meaning = Literal[
     "torque order",
     "position order",
     "joint order",
+    "angle sum",
+    "angle difference",
     "degrees",
     "radians",
     "zero",
@@ -76,6 +78,8 @@ _NEARER: Final = (-0.5, -0.25, 0.25, 0.5)  # of a zero, tried about it
 _DEGREE: Final = np.pi / 180.0
 _SIGNS: Final[tuple[Meaning, ...]] = ("torque sign", "position sign", "axis sign")
 _IN_ORDER: Final[tuple[Meaning, ...]] = ("torque order", "position order", "joint order")
+COUPLED: Final[tuple[Meaning, ...]] = ("angle sum", "angle difference")
+"""The recorded angle of the first joint contains that of the second, added or taken off."""
 _GRAVITIES: Final[tuple[Meaning, ...]] = ("mounting", "no gravity")
 
 
@@ -433,6 +437,8 @@ class _Search:
                 yield from (Change(kind, (joint,)) for kind in _SIGNS)
             if self.model.chain.revolute[joint]:
                 yield from (Change("zero", (joint,), angle * _DEGREE) for angle in _ZEROS)
+        for pair in coupled_pairs(self.model, moved):
+            yield from (Change(kind, pair) for kind in COUPLED)
         for pair in combinations(moved, 2):
             yield from (Change(kind, pair) for kind in _IN_ORDER)
 
@@ -499,7 +505,7 @@ def _moved(model: RobotModel, samples: Samples, change: Change) -> Samples:
         return samples
     if meaning.endswith("order"):
         return _reordered(model, samples, change)
-    if meaning in ("torque sign", "axis sign"):
+    if meaning in ("torque sign", "axis sign", "angle sum", "angle difference"):
         return corrected(model, samples, Fault(meaning, joints))
     if meaning == "position sign":
         turned = corrected(model, samples, Fault("axis sign", joints))
@@ -714,7 +720,7 @@ class Axes(NamedTuple):
     """Where the joints of a recording are in what was recorded, and how to convert them.
 
     A quantity as read is ``sign * recorded[:, order]``; positions are multiplied by `factor`, and
-    `zero` [rad] is added.
+    `zero` [rad] is added: angles that may each contain that of other joints, ``coupling @ own``.
     """
 
     position_order: NDArray[np.intp]
@@ -723,13 +729,14 @@ class Axes(NamedTuple):
     torque_sign: Array
     factor: float
     zero: Array
+    coupling: Array  # (n, n)
 
     @classmethod
     def of(cls, changes: Iterable[Change], joints: int) -> Axes:
         """Return the axes after changes, one after the other."""
         axes = cls(
             np.arange(joints), np.ones(joints), np.arange(joints), np.ones(joints), 1.0,
-            np.zeros(joints),
+            np.zeros(joints), np.eye(joints),
         )  # fmt: skip
         for change in changes:
             axes = axes._after(change)
@@ -750,6 +757,7 @@ class Axes(NamedTuple):
                 position_order=axes.position_order[order],
                 position_sign=axes.position_sign[order] * sign,
                 zero=axes.zero[order] * sign,
+                coupling=axes.coupling[np.ix_(order, order)] * np.outer(sign, sign),
             )
         if meaning in ("torque order", "joint order", "torque sign", "axis sign"):
             axes = axes._replace(
@@ -759,19 +767,24 @@ class Axes(NamedTuple):
             factor = _DEGREE if meaning == "degrees" else 1.0 / _DEGREE
             axes = axes._replace(factor=axes.factor * factor, zero=axes.zero * factor)
         if meaning == "zero":
-            zero = axes.zero.copy()
-            zero[joints] += change.size
-            axes = axes._replace(zero=zero)
+            zero = np.zeros(len(self.zero))
+            zero[joints] = change.size
+            axes = axes._replace(zero=axes.zero + axes.coupling @ zero)
+        if meaning in COUPLED:
+            with_other = np.eye(len(self.zero))
+            with_other[change.joints] = 1.0 if meaning == "angle sum" else -1.0
+            axes = axes._replace(coupling=axes.coupling @ with_other)
         return axes
 
     def read(self, recording: Recording) -> Recording:
         """Return a recording as read."""
         scale = self.factor * self.position_sign
+        own = np.linalg.inv(self.coupling).T
         velocity = recording.velocity
         torque = recording.torque
         return replace(
             recording,
-            position=recording.position[:, self.position_order] * scale + self.zero,
-            velocity=None if velocity is None else velocity[:, self.position_order] * scale,
+            position=(recording.position[:, self.position_order] * scale + self.zero) @ own,
+            velocity=None if velocity is None else velocity[:, self.position_order] * scale @ own,
             torque=None if torque is None else torque[:, self.torque_order] * self.torque_sign,
         )

@@ -171,6 +171,22 @@ class TestPublishers:
         assert_right(typed.archive)
         assert "messages have 0.3, -0.4, 1.5 for all positions between others" in typed.message
 
+    def test_samples_of_an_older_publisher_are_named(self, urdf) -> None:
+        """And no unit, sign or gear for their velocities."""
+        old = np.roll(POSITION, 40, axis=0)
+        both = [
+            sent
+            for k in range(40, COUNT)
+            for sent in (
+                message(k),
+                message(k, stamp=STAMPS[k] + PERIOD // 2, position=old, late=PERIOD // 2),
+            )
+        ]
+        typed = Typed(urdf, both)
+        (warning,) = typed.archive.header.findings.warnings
+        assert "samples go to and fro between two sequences up to 0.2" in warning
+        assert "two sources write these joints" in warning
+
     def test_a_pose_to_which_the_arm_returns_is_none(self, urdf) -> None:
         """It moves between two poses within a sample, as in a log of steps."""
         steps = POSITION * 0.0 + np.where(np.arange(COUNT) // 20 % 2, 0.5, -0.5)[:, None]
@@ -287,6 +303,15 @@ class TestFiles:
         assert_right(self.read(folder, urdf))
         (folder / "bag_2.db3").unlink()
         assert_right(self.read(folder, urdf))
+
+    def test_the_end_of_a_compressed_file_is_missing(self, urdf) -> None:
+        path = urdf.with_name("mine.db3.zstd")
+        whole = bag(urdf.with_name("whole.db3"), {"/joint_states": (STATE, WHOLE)}).read_bytes()
+        path.write_bytes(zstandard.compress(whole[:5000]) + zstandard.compress(whole[5000:]))
+        assert_right(self.read(path, urdf))
+        path.write_bytes(path.read_bytes()[:-9])
+        with pytest.raises(SourceError, match="ends within its compressed data; copy it again"):
+            self.read(path, urdf)
 
     @pytest.mark.parametrize("suffix", ["db3", "mcap"])
     def test_errors_name_the_file_of_the_user(self, urdf, suffix: str) -> None:

@@ -53,6 +53,14 @@ def test_lists_in_parquet_are_joints(tmp_path: Path, robot: Robot) -> None:
     assert np.allclose(columns["torque"], TORQUE, rtol=1e-6, atol=1e-6)
 
 
+def test_numbers_as_text_in_parquet_are_numbers(tmp_path: Path, robot: Robot) -> None:
+    table = {"t": TIME, **{f"q{k + 1}": column for k, column in enumerate(POSITION.T)}}
+    table["q2"] = [f"{value:.12f}" for value in table["q2"]]
+    table |= {f"tau{k + 1}": column for k, column in enumerate(TORQUE.T)}
+    parquet.write_table(pyarrow.table(table), tmp_path / "log.parquet")
+    assert read(tmp_path / "log.parquet", robot)["position"] == pytest.approx(POSITION, abs=1e-9)
+
+
 def test_several_episodes_in_one_file_are_refused(tmp_path: Path, robot: Robot) -> None:
     path = lerobot(tmp_path / "all.parquet", episode_index=np.arange(len(TIME)) // 300)
     with pytest.raises(SourceError, match="episodes, each with a clock that starts at zero"):

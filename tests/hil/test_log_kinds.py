@@ -157,6 +157,14 @@ READ: dict[str, tuple[str | bytes, dict[str, Any]]] = {
     "quoted with decimal commas": (
         text([[f'"{cell.replace(".", ",")}"' for cell in row] for row in rows()]), {},
     ),
+    "in apostrophes": (text([[f"'{cell}'" for cell in row] for row in rows()]), {}),
+    "as text of a spreadsheet": (text([[f'="{cell}"' for cell in row] for row in rows()]), {}),
+    "types below the units": (
+        text(IN_DEGREES, head=[*DEGREES_BELOW, ["LTIME", *["LREAL"] * 6]]), {},
+    ),
+    "rows that changed places": (
+        text([*rows()[:50], *reversed(rows()[50:52]), *rows()[52:]]), {},
+    ),
     "a preamble, an empty line and decimal commas": (
         PREAMBLE + text(rows(time=[comma(t) for t in TIME], cell=comma), delimiter=";"), {},
     ),
@@ -233,6 +241,7 @@ class TestRead:
             "milliseconds that nothing states": "time: no unit is stated; read as ms",
             "32 bits of microseconds": "a 32-bit counter of us wrapped once and was continued",
             "the head once more": "left out: lines that repeat the header (1)",
+            "rows that changed places": "time: one row that came before an older one: sorted by s",
             "a first stamp of zero": "left out: rows at the start with the time 0 (1)",
             "units in the second line that are not those of the SI": "position: in deg, as the fi",
         }.items():
@@ -249,6 +258,15 @@ class TestRead:
         )
         assert archive.columns["velocity"] == pytest.approx(SLOPE, abs=1e-12)
 
+    def test_rows_of_a_second_publisher_are_left_out(self, tmp_path: Path, urdf: Path) -> None:
+        """As a bag that was exported to text has them."""
+        other = [f"{t + 0.5 / RATE:.6f},0.3,-0.4,1.5,0,0,0" for t in TIME.tolist()]
+        lines = [line for pair in zip(text().splitlines()[1:], other, strict=True) for line in pair]
+        archive = imported(tmp_path / "log.csv", "\n".join([HEAD, *lines]) + "\n", urdf)
+        assert_right(archive)
+        said = f"{COUNT} of {2 * COUNT} rows have 0.3, -0.4, 1.5 for all positions between others"
+        assert any(said in line for line in archive.header.findings.lines)
+
     def test_a_stated_unit_is_not_overruled(self, tmp_path: Path, urdf: Path) -> None:
         content, _ = READ["degrees that nothing states"]
         position = {"columns": "q{}", "unit": "rad"}
@@ -258,6 +276,33 @@ class TestRead:
         assert unit is not None
         position["unit"] = unit[1]
         assert_right(imported(tmp_path / "log.csv", content, urdf, position=position))
+
+    def test_degrees_from_0_to_360_are_within_the_limits(self, tmp_path: Path, urdf: Path) -> None:
+        """Whether a joint passes 0 or stays beyond 180 throughout."""
+        degrees = np.degrees(POSITION - np.array([0.0, 0.0, 1.5])) % 360.0
+        content = text(rows(position=degrees, cell=lambda value: f"{value:.9f}"))
+        archive = imported(tmp_path / "log.csv", content, urdf)
+        assert archive.columns["position"] == pytest.approx(np.radians(degrees), abs=1e-9)
+        findings = archive.header.findings
+        assert any(
+            "position: no unit is stated; read as degrees" in line for line in findings.lines
+        )
+        assert not any("limits" in warning for warning in findings.warnings)
+
+    def test_angles_that_contain_others_are_their_own(self, tmp_path: Path, urdf: Path) -> None:
+        """The ankle is stated to the ground, and less half the hip."""
+        recorded = POSITION.copy()
+        recorded[:, 2] += POSITION[:, 1] - 0.5 * POSITION[:, 0]
+        position = {"columns": "q{}", "coupled": [[3, 2, 1.0], [3, 1, -0.5]]}
+        content = text(rows(position=recorded, cell=lambda value: f"{value:.9f}"))
+        assert_right(imported(tmp_path / "log.csv", content, urdf, position=position))
+        for terms, sentence in (
+            ([[4, 1, 1.0]], "there are 3 joints, not 4; number them from 1"),
+            ([[2, 1, 1.0], [1, 2, 1.0]], "the angles do not determine the joints"),
+        ):
+            position = {"columns": "q{}", "coupled": terms}
+            with pytest.raises(SourceError, match=sentence):
+                imported(tmp_path / "log.csv", content, urdf, position=position)
 
     def test_a_urdf_in_another_encoding(self, tmp_path: Path, urdf: Path) -> None:
         content = '<?xml version="1.0" encoding="{}"?><!-- Größe -->' + URDF

@@ -25,10 +25,11 @@ from hil.identify.sources import cell_of, source_of
 from hil.importers import ColumnMap, Robot
 from hil.importers.recording import ImportOptions
 from hil.look import Look, look_at
-from hil.look.conclusions import concluded
+from hil.look.conclusions import concluded, undecided
 from hil.look.maps import entries_of
 from hil.look.other_arm import Contradictions
 from hil.look.physics import channel_rows
+from hil.look.result import Choice
 from hil.look.run import SETTINGS
 from identification.estimators.delay import DelayEstimate
 from identification.signals.samples import prepare
@@ -90,6 +91,13 @@ def of_motors(table: Mapping[str, Floats]) -> dict[str, Floats]:
     return {"tau": table["tau"] / 100.0}
 
 
+def to_the_ground(table: Mapping[str, Floats]) -> dict[str, Floats]:
+    """The angle of the second joint contains that of the first."""
+    matrix = np.eye(3)
+    matrix[1, 0] = 1.0
+    return {"q": table["q"] @ matrix.T, "v": table["v"] @ matrix.T}
+
+
 def late(table: Mapping[str, Floats]) -> dict[str, Floats]:
     time = table["t"]
     shifted = [np.interp(time - 0.04, time, column) for column in table["tau"].T]
@@ -103,6 +111,7 @@ def late(table: Mapping[str, Floats]) -> dict[str, Floats]:
         (exchanged, "order", f"torque columns are of {JOINTS[1]}, {JOINTS[0]}, {JOINTS[2]}"),
         (of_motors, "side", "motor side (before the gears), or a current"),
         (late, "delay", "torque 4"),
+        (to_the_ground, "coupling", f"angle of {JOINTS[1]} is recorded plus that of {JOINTS[0]}"),
     ],
 )
 def test_a_planted_meaning_is_named(
@@ -186,6 +195,70 @@ class TestConclusions:
         assert "signs: torque negated: all joints, concluded" in result.output
         text = (tmp_path / "a" / "map.toml").read_text()
         assert "scale = [-1.0, -1.0, -1.0]" in text
+
+    def test_a_coupled_angle_is_its_own_in_the_archive(
+        self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
+    ) -> None:
+        """Also by the map that a look writes."""
+        path, target = tmp_path / "a.csv", tmp_path / "map.toml"
+        planted = {**table, **to_the_ground(table)}
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *planted.values())
+        result = hil("identify", path, "--urdf", urdf, "--output", tmp_path / "o")
+        sentence = f"coupling: the angle of {JOINTS[1]} is recorded plus that of {JOINTS[0]}, conc"
+        assert sentence in result.output
+        assert hil("look", path, "--urdf", urdf, "-o", target).exit_code == 0
+        archive = tmp_path / "a.mcap"
+        done = hil("import", "log", path, "--urdf", urdf, "--map", target, "-o", archive)
+        assert done.exit_code == 0, done.exception
+        columns = open_archive(archive).columns
+        assert columns["position"] == pytest.approx(table["q"], abs=1e-7)
+        assert columns["velocity"] == pytest.approx(table["v"], abs=1e-7)
+
+    def test_the_lines_that_decide_it_work_when_added(
+        self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
+    ) -> None:
+        """Torques of motors or currents: the map is written without what is open."""
+        path, target = tmp_path / "a.csv", tmp_path / "map.toml"
+        planted = {**table, **of_motors(table)}
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *planted.values())
+        looked = hil("look", path, "--urdf", urdf, "-o", target)
+        assert looked.exit_code == 2
+        assert "map.toml, without what is open: add a line" in looked.output
+        line = r'\[torque\] (side = "motor"); \[drive\] (gear_ratio = \[.*?\])'
+        side = re.search(line, looked.output)
+        assert side is not None
+        lines = target.read_text().replace("[torque]\n", f"[torque]\n{side[1]}\n")
+        target.write_text(f"{lines}\n[drive]\n{side[2]}\n")
+        archive = tmp_path / "a.mcap"
+        done = hil("import", "log", path, "--urdf", urdf, "--map", target, "-o", archive)
+        assert done.exit_code == 0, done.exception
+        torque = open_archive(archive).columns["torque"]
+        assert torque == pytest.approx(table["tau"], rel=0.2, abs=0.2)
+
+    def test_a_refusal_names_options_and_lines_of_a_map(self) -> None:
+        choices = (
+            Choice("mounting", "upright", 0.07, "--gravity 0 0 -9.81"),
+            Choice("zero", "zero moved", 0.07, "[position] offset = [0, 3]", (("a", 1),)),
+        )
+        message = str(undecided(Path("my log.csv"), choices))
+        assert "state --gravity 0 0 -9.81; or write the map with `hil look 'my log.csv'" in message
+        assert "-o map.toml`, add [position] offset = [0, 3], and give it with --map" in message
+
+    @pytest.mark.parametrize("mounted", [(0.0, 9.81, 0.0), (0.0, 0.0, 0.0)])
+    def test_another_gravity_is_stated_wrongly(
+        self,
+        tmp_path: Path,
+        urdf: Path,
+        table: Mapping[str, Floats],
+        mounted: tuple[float, float, float],
+    ) -> None:
+        """The arm stands; the size of the torque is by its masses under that gravity."""
+        path = write_log(tmp_path / "a.csv", ["t", "q{}", "v{}", "tau{}"], *table.values())
+        gravity = ("--gravity", *map(str, mounted))
+        result = hil("identify", path, "--urdf", urdf, *gravity, "--output", tmp_path / "o")
+        assert "mounting: upright, concluded" in result.output
+        columns = open_archive(tmp_path / "o" / "a.mcap").columns
+        assert columns["torque"] == pytest.approx(table["tau"], abs=1e-6)
 
     def test_the_urdf_of_another_arm_is_refused(
         self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]

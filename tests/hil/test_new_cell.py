@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -337,6 +339,13 @@ def test_a_prismatic_joint_along_gravity_is_identified(tmp_path: Path) -> None:
     assert "--fix lift" in summary["notes"][0]
     cell = Cell.load(tmp_path / "cell.toml")
     assert cell.joint_names == ("shoulder", "elbow", "lift") and cell.file.limits is None
+    refused = CliRunner().invoke(app, ["design", str(tmp_path / "cell.toml"), "--quick"])
+    command = re.search("`hil (new --urdf .* --fix lift)`", str(refused.exception))
+    assert command is not None
+    arguments = [*shlex.split(command[1]), "-o", str(tmp_path / "others.toml"), "--json"]
+    written = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert json.loads(written.stdout)["joints"] == ["shoulder", "elbow"]
+    assert "[campaign]" in (tmp_path / "others.toml").read_text()
 
 
 @pytest.mark.parametrize("option", [("--fix", "lift=0.1"), ("--design-only",)])

@@ -82,13 +82,18 @@ class TestProposedMap:
         columns = open_archive(imported.archive).columns
         assert np.allclose(columns["position"], POSITION, rtol=0.0, atol=1e-8)
 
-    def test_joints_in_names_put_columns_in_order(self, tmp_path: Path, urdf: Path) -> None:
+    @pytest.mark.parametrize("pattern", ["{kind}_{joint}", "{joint}/{kind}"])
+    def test_joints_in_names_put_columns_in_order(
+        self, tmp_path: Path, urdf: Path, pattern: str
+    ) -> None:
         order = [2, 0, 1]
-        names = [f"{kind}_{JOINTS[k]}" for kind in ("pos", "effort") for k in order]
+        names = [
+            pattern.format(kind=kind, joint=JOINTS[k]) for kind in ("pos", "effort") for k in order
+        ]
         values = [quantity[:, k] for quantity in (POSITION, TORQUE) for k in order]
         path = log(tmp_path / "a.csv", ["time", *names], TIME, *values)
         proposal = proposed_map(path, Robot.from_urdf(urdf))
-        assert proposal.columns.position.columns == "pos_{}"
+        assert proposal.columns.position.columns == pattern.format(kind="pos", joint="{}")
         assert any("by the URDF's joint in the name" in line for line in proposal.lines)
         import_recording(path, tmp_path / "a.mcap", lambda _: Robot.from_urdf(urdf))
         columns = open_archive(tmp_path / "a.mcap").columns
@@ -162,6 +167,12 @@ REFUSED: Mapping[str, tuple[list[str], list[Floats], str, str]] = {
         [TIME, POSITION[:, :2], TORQUE[:, :2]],
         "2 channels are named as position (q1 .. q2), and the URDF has 3 joints",
         "--locked ankle",
+    ),
+    "a column that is missing between others": (
+        ["t", "q1", "q3", "tau1", "tau3"],
+        [TIME, *POSITION.T[[0, 2]], *TORQUE.T[[0, 2]]],
+        "2 channels are named as position (q1 .. q3), and the URDF has 3 joints",
+        "by the numbers of the channels with --locked knee",
     ),
     "more columns than joints": (
         ["t", "q{}", "tau{}"],

@@ -332,7 +332,7 @@ class TestMounting:
         status, text = run(tmp_path, "empty.mcap", "--loaded", "full.mcap", "--json")
         document = json.loads(text)
         assert status == 5
-        assert "set gravity of [robot]" in document["mounting"]
+        assert "--gravity X Y Z" in document["mounting"]
         assert document["controllers"] == {}
 
     def test_a_right_one_is_not_doubted(self, printed: dict[str, object]) -> None:

@@ -67,6 +67,8 @@ CASES: dict[str, tuple[Change, ...]] = {
     "joints permuted": (Change("joint order", (0, 1, 2), order=(2, 0, 1)),),
     "zero of the knee": (Change("zero", (1,), -ANGLE),),
     "gravity removed": (Change("no gravity"),),
+    "knee to the ground": (Change("angle sum", (1, 0)),),
+    "ankle less the knee": (Change("angle difference", (2, 1)),),
 }
 
 
@@ -82,6 +84,8 @@ def planted(case: str) -> tuple[Floats, Floats]:
         "joints permuted": (q[:, ROTATED], torque[:, ROTATED]),
         "zero of the knee": (q + ANGLE * KNEE, torque),
         "gravity removed": (q, torque - weight),
+        "knee to the ground": (q + np.roll(q, 1, axis=1) * KNEE, torque),
+        "ankle less the knee": (q - np.roll(q, 1, axis=1) * [0.0, 0.0, 1.0], torque),
     }[case]
 
 

@@ -619,6 +619,11 @@ def moved(samples, change, *, torque=True):
     return replace(samples, motion=motion, torque=change(samples.torque), usable=usable)
 
 
+def with_axis_2(values):
+    """Axis 3 relative to the base."""
+    return values + np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]) * values[:, [1]]
+
+
 GAIN = np.array([1.0, 1.15, 1.0, 1.0, 1.0, 1.0])
 FAULTS = {
     "delay": ((), late),
@@ -628,6 +633,7 @@ FAULTS = {
     "axis sign": ((2,), lambda samples: moved(samples, turned)),
     "position order": ((1, 2), lambda samples: moved(samples, swapped, torque=False)),
     "joint order": ((1, 2), lambda samples: moved(samples, swapped)),
+    "angle sum": ((2, 1), lambda samples: moved(samples, with_axis_2, torque=False)),
 }
 SIZES = {"delay": DELAY, "gain": 0.15}
 

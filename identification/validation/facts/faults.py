@@ -17,6 +17,10 @@ from identification.validation.finding import Finding, Mask, Naming, Thresholds
 
 Array = NDArray[np.float64]
 
+MOUNTING_STEP: Final = (
+    "state how the arm is mounted: `--gravity X Y Z` where a log is read with its URDF, or gravity"
+    " of [robot] in the cell file"
+)
 _SIGN_OR_SCALE: Final[tuple[Kind, ...]] = ("torque sign", "axis sign", "gain")
 
 
@@ -98,8 +102,7 @@ class GravityFacts:
                 f"with gravity ({self.best}) m/s² in base axes, {self.angle:.0f}° from the declared"
                 f" ({self.declared}) m/s², {naming.motion} is predicted with {self.error:.2f} times"
                 " the error",
-                "set gravity of [robot] in the cell file to the mounting of the arm; if it is"
-                " right, check the zero positions of the joints",
+                f"{MOUNTING_STEP}; if it is right, check the zero positions of the joints",
                 "cause",
             )
 
@@ -148,7 +151,7 @@ class FaultFacts:
         """Yield each fault."""
         for cause in self.causes:
             joints = [naming.joints[joint] for joint in cause.fault.joints] or ["all axes"]
-            text = _text(cause, " and ".join(joints))
+            text = _text(cause, " and ".join(joints), naming)
             certain = cause.fault.discrete or cause.ratio < self.certain_below
             yield Finding(
                 text.check,
@@ -166,7 +169,7 @@ class _Text(NamedTuple):
     step: str
 
 
-def _text(cause: Cause, joints: str) -> _Text:
+def _text(cause: Cause, joints: str, naming: Naming) -> _Text:
     """Return the words on a cause of each kind."""
     match cause.fault.kind:
         case "delay":
@@ -185,6 +188,10 @@ def _text(cause: Cause, joints: str) -> _Text:
             return _order("positions", joints)
         case "joint order":
             return _order("positions and torques", joints)
+        case "angle sum":
+            return _coupled_angle(cause, naming, "plus", 1)
+        case "angle difference":
+            return _coupled_angle(cause, naming, "less", -1)
         case "payload":
             return _payload(cause)
         case "changed gain":
@@ -260,6 +267,18 @@ def _order(quantity: str, joints: str) -> _Text:
         "order of joints",
         f"the {quantity} of {joints} are probably interchanged",
         "check the order of the columns in the column map against the joints of the URDF",
+    )
+
+
+def _coupled_angle(cause: Cause, naming: Naming, sign: str, factor: int) -> _Text:
+    joint, other = cause.fault.joints
+    return _Text(
+        "coupled angles",
+        f"the recorded angle of {naming.joints[joint]} is probably its own {sign} that of"
+        f" {naming.joints[other]}",
+        "turn one joint alone and see which angles change; if so, state it in the column map of"
+        f" the log: coupled = [[{joint + 1}, {other + 1}, {factor}]] in [position] and [velocity]"
+        " (joints by their columns, from 1)",
     )
 
 

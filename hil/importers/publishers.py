@@ -1,0 +1,74 @@
+"""Samples of a second publisher among those of a recording."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+APART: Final = 0.1
+"""rad or m between samples of one stamp, 20 ms at 5 rad/s."""
+STALLED: Final = 3
+"""Messages with one stamp, of one publisher."""
+_RETURNS: Final = 0.25  # of a step to another sequence, which the step back leaves
+_LEAST_SHARE: Final = 0.02  # of the samples, beyond single spikes
+
+
+class SecondPublisher(NamedTuple):
+    """Samples with one and the same pose between others that move."""
+
+    rows: NDArray[np.bool_]  #: (m,)
+    note: str | None  #: what was left out, None if there are none
+
+
+def second_publisher(position: Array, sample: str) -> SecondPublisher:
+    """Find those of positions (m, n) [rad or m]; in words each is a `sample`, such as "message"."""
+    rows = _of_one_pose(position)
+    if not rows.any():
+        return SecondPublisher(rows, None)
+    pose = position[np.argmax(rows)]
+    where = ", ".join(f"{angle:.3g}" for angle in pose) if pose.any() else "0"
+    note = (
+        f"{np.count_nonzero(rows)} of {len(position)} {sample}s have {where} for all positions "
+        "between others that do not: those of a second publisher, left out"
+    )
+    return SecondPublisher(rows, note)
+
+
+def _of_one_pose(position: Array) -> NDArray[np.bool_]:
+    none = np.zeros(len(position), np.bool_)
+    jumps = np.abs(np.diff(position, axis=0)).max(axis=1) > APART
+    if np.count_nonzero(jumps) <= 2 * STALLED:
+        return none
+    poses, counts = np.unique(position, axis=0, return_counts=True)
+    pose = poses[np.argmax(counts)]
+    silent = (position == pose).all(axis=1)
+    others = position[~silent]
+    alternating = np.count_nonzero(np.diff(silent.astype(np.int8))) > 2 * STALLED
+    if not alternating or not len(others):
+        return none
+    moved = np.diff(others, axis=0).any(axis=1)
+    if pose.any() and 2 * np.count_nonzero(moved) < len(moved):
+        return none  # an arm that goes to and fro between two poses
+    return none if np.abs(others - pose).max(axis=1).min() < APART else np.asarray(silent)
+
+
+def alternating_samples(position: Array) -> str:
+    """Return how far apart two sequences are that positions (m, n) go to and fro between, or ""."""
+    steps = np.abs(np.diff(position, axis=0)).max(axis=1)
+    if len(steps) < 2:
+        return ""
+    there_and_back = np.minimum(steps[:-1], steps[1:])
+    left = np.abs(position[2:] - position[:-2]).max(axis=1)
+    alternate = (there_and_back > APART) & (left < _RETURNS * there_and_back)
+    count = np.count_nonzero(alternate)
+    if count <= max(2 * STALLED, _LEAST_SHARE * len(position)):
+        return ""
+    return (
+        f"samples go to and fro between two sequences up to {there_and_back[alternate].max():.3g} "
+        f"rad or m apart ({count} samples): two sources write these joints, one of them other or "
+        "older samples; record one of them"
+    )
