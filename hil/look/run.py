@@ -124,7 +124,7 @@ def _readings(cell: Cell, recording: Recording, imported: ImportedRecording) -> 
     samples = prepare(recording, cell.model, options=SETTINGS)
     stated = any("position" in line and "no unit stated" not in line for line in imported.lines)
     mountings = {
-        name: _mounted(cell, gravity)
+        name: mounted(cell, gravity).model
         for name, gravity in physics.MOUNTINGS.items()
         if not np.allclose(gravity, cell.model.gravity)
     }
@@ -136,9 +136,10 @@ def _readings(cell: Cell, recording: Recording, imported: ImportedRecording) -> 
     )
 
 
-def _mounted(cell: Cell, gravity: tuple[float, float, float]) -> RobotModel:
+def mounted(cell: Cell, gravity: tuple[float, float, float]) -> Cell:
+    """Return a cell whose arm is under another gravity [m/s²]."""
     robot = cell.file.robot.model_copy(update={"gravity": gravity})
-    return replace(cell, file=cell.file.model_copy(update={"robot": robot})).model
+    return replace(cell, file=cell.file.model_copy(update={"robot": robot}))
 
 
 def _channel(
