@@ -30,7 +30,7 @@ HilError                   exit status 1
 from __future__ import annotations
 
 import errno
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -119,7 +119,24 @@ class SourceError(InputError):
 
 
 class UnrecordedJointError(SourceError):
-    """A foreign recording without a joint of its robot."""
+    """A foreign recording without a joint of its robot.
+
+    Attributes:
+        count: how many joints were recorded.
+        joints: those that the recording names, as in the URDF.
+        channels: names of the channels, which may say a side of the robot.
+    """
+
+    count = 0
+    joints: tuple[str, ...] = ()
+    channels: tuple[str, ...] = ()
+
+    def of(
+        self, count: int, joints: Iterable[str] = (), channels: Iterable[str] = ()
+    ) -> UnrecordedJointError:
+        """Return this error with what was recorded."""
+        self.count, self.joints, self.channels = count, tuple(joints), tuple(channels)
+        return self
 
 
 class OutputError(HilError):

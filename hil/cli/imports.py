@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from hil.archive import open_archive
+from hil.cell.arms import Links
 from hil.cli.arguments import (
     ARM,
     CHANNELS,
@@ -33,12 +34,11 @@ from hil.importers import (
     Robot,
     Use,
     convention_of,
-    import_rosbag2,
-    recorded_joints,
 )
+from hil.importers.bag_map import BagMap
 from hil.importers.channels import CHANNEL_NAMES
 from hil.importers.column_map import ready_map, ready_maps
-from hil.importers.recording import ImportOptions, import_recording
+from hil.importers.recording import ImportOptions, import_bag, import_recording
 from hil.progress import say
 from hil.terminal_text import printable
 from identification import FrictionLaw
@@ -127,6 +127,20 @@ class Described:
         ),
     ] = False
 
+    base: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LINK",
+            help="Link from which the recorded arm starts, of a robot with several arms; joints "
+            "outside it are fixed. Default: by names and number of those recorded.",
+            rich_help_panel=ARM,
+        ),
+    ] = None
+    tip: Annotated[
+        str | None,
+        typer.Option(metavar="LINK", help="Last link of the recorded arm.", rich_help_panel=ARM),
+    ] = None
+
     @property
     def is_given(self) -> bool:
         """Whether an option names a description of the robot."""
@@ -145,8 +159,11 @@ class Described:
         )
         at = figures(self.locked or [], "--locked", "--locked joint_7=0.3 (rad or m)")
         joints = recorded() if self.lock_others else None
+        links = Links(base=self.base, tip=self.tip)
         if self.cell is not None:
-            return Robot.from_cell(self.cell, gravity=self.gravity, locked=at, recorded=joints)
+            return Robot.from_cell(
+                self.cell, gravity=self.gravity, locked=at, recorded=joints, links=links
+            )
         path = self.urdf or self.dh
         assert path is not None
         return Robot.from_urdf(
@@ -156,6 +173,7 @@ class Described:
             gravity=self.gravity or STANDARD_GRAVITY,
             locked=at,
             recorded=joints,
+            links=links,
         )
 
 
@@ -287,8 +305,8 @@ def rosbag2(
 
     The source is a bag folder or its .db3, .mcap or .bag file, compressed or not. Joints are
     matched by name. For MCAP files with other message types use `hil import log` with a column map.
-    If the URDF has more joints than were recorded, --locked or --lock-others removes them from the
-    model.
+    Joints of the URDF that were not recorded are fixed if they are of a gripper or of another arm;
+    others with --locked or --lock-others.
 
     **Example:** `hil import rosbag2 bag --urdf arm.urdf --lock-others --gravity 0 0 9.81 -o a.mcap`
 
@@ -301,21 +319,17 @@ def rosbag2(
         rename: Joint whose name in the bag differs from the URDF (repeatable).
     """
     names = _names(rename or [])
-    path = import_rosbag2(
+    recording = import_bag(
         source,
         output,
-        robot=arm.robot(lambda: recorded_joints(source, topic, names)),
-        topic=topic,
-        effort=effort,
-        clock=clock,
-        joint_names=names,
-        command_topic=command_topic,
+        arm.robot,
+        BagMap(topic=topic, effort=effort, clock=clock, command_topic=command_topic, rename=names),
+        ImportOptions(outside_limits=outside_limits),
         held_joints=held or (),
         use=kind,
         force=force,
-        outside_limits=outside_limits,
     )
-    _print(path, json=json)
+    _print(recording.archive, recording.lines, json=json)
 
 
 @with_options(Described, "arm")

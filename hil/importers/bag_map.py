@@ -8,6 +8,7 @@ from typing import Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from hil.cell.arms import Links
 from hil.cell.errors import first_error
 from hil.errors import SourceError
 from hil.importers.column_map import map_text
@@ -28,6 +29,7 @@ class BagMap(BaseModel):
         effort: content of the effort field.
         command_topic: of the commanded positions, ``none`` for none; None to find it.
         rename: joint in the URDF by name in the bag, where they differ.
+        arm: links between which the recorded arm lies; a table of its own, as of a column map.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
@@ -37,11 +39,14 @@ class BagMap(BaseModel):
     effort: Effort = "torque"
     command_topic: str | None = None
     rename: Mapping[str, str] = {}
+    arm: Links = Links()
 
     @property
     def text(self) -> str:
         """The map, TOML."""
-        return to_text({"bag": self.model_dump(exclude_defaults=True)}, {"": _COMMENT})
+        bag = self.model_dump(exclude_defaults=True, exclude={"arm"})
+        arm = self.arm.model_dump(exclude_none=True)
+        return to_text({"bag": bag, **({"arm": arm} if arm else {})}, {"": _COMMENT})
 
     @classmethod
     def load(cls, path: Path) -> BagMap | None:
@@ -51,8 +56,10 @@ class BagMap(BaseModel):
             SourceError: it is not valid.
         """
         try:
-            table = parse_toml(map_text(path)).get("bag")
-            return None if table is None else cls.model_validate(table)
+            tables = parse_toml(map_text(path))
+            if "bag" not in tables:
+                return None
+            return cls.model_validate({**tables["bag"], "arm": tables.get("arm", {})})
         except ValidationError as error:
             wrong = first_error(path, error, cls, documentation=_DOCUMENTATION)
             field = f"bag.{wrong.field}"

@@ -43,7 +43,8 @@ CHANNEL_NAMES: Final[Mapping[Kind, tuple[str, ...]]] = {
         "dtheta", "field.velocity", "observation.velocity",
     ),
     "torque": (
-        "tau", "torque", "torques", "effort", "efforts", "m", "moment", "tau_j", "state.tau_j",
+        "tau", "torque", "torques", "effort", "efforts", "eff", "m", "moment", "tau_j",
+        "state.tau_j",
         "tau_meas", "tau_actual", "joint_torque", "joint_torques", "jointtorque", "geartorque.a",
         "drehmoment", "field.effort", "observation.effort", "observation.torque",
     ),

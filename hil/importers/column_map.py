@@ -13,6 +13,7 @@ from typing import Annotated, Final, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
+from hil.cell.arms import Links
 from hil.cell.errors import first_error
 from hil.errors import SourceError
 from hil.importers.units import PER_CENT, UNITS, names_of_units
@@ -166,7 +167,8 @@ class ColumnMap(_Table):
     """The column map, with either a time column or a `sample_rate` [Hz].
 
     `joints` are the URDF's joint of each column, where the order differs from that of the URDF, or
-    where the log has joints that the URDF does not have: their columns are not used.
+    where the log has joints that the URDF does not have: their columns are not used. `arm` are the
+    links between which the recorded arm of a robot with several lies.
     """
 
     position: Quantity
@@ -179,6 +181,7 @@ class ColumnMap(_Table):
         default=None, description="a number above 0, in Hz"
     )
     joints: tuple[str, ...] | None = Field(default=None, description="a list of names")
+    arm: Links = Links()
     drive: Drive = Drive()
     format: Format = Format()
 

@@ -396,13 +396,15 @@ class _Log:
         missing = [name for name in chosen if not has(name)]
         if missing:
             joint = chosen.index(missing[0])
-            raise UnrecordedJointError(
+            refusal = UnrecordedJointError(
                 self.path,
                 f"there is no {what[:-1]} {missing[0]!r} for {self.joints[joint]}, joint "
                 f"{joint + 1} of {count}; there are {', '.join(available) or 'none'}",
                 field=field,
                 remedy=f"{NOT_RECORDED}, name the joints of the log in joints, or list its {what}",
             )
+            named = [joint for joint, name in zip(self.joints, by_joint, strict=True) if has(name)]
+            raise refusal.of(len(named) or sum(map(has, names)), named, filter(has, names))
         present = [name for name in names if has(name)]
         if len(present) > count:
             raise SourceError(
@@ -426,8 +428,8 @@ class _Log:
             along = "rows" if matrix.shape[0] < matrix.shape[1] else "columns"
         upright = matrix.T if along == "rows" else matrix
         if upright.shape[1] != count:
-            kind = UnrecordedJointError if upright.shape[1] < count else SourceError
-            raise kind(
+            is_fewer = upright.shape[1] < count
+            refusal = (UnrecordedJointError if is_fewer else SourceError)(
                 path,
                 f"{name} has the shape {matrix.shape}, joints along its {along}, and there are "
                 f"{count} joints: {', '.join(self.joints)}",
@@ -435,6 +437,9 @@ class _Log:
                 remedy=f"{NOT_RECORDED}, name the joints of the log in joints, or give the columns "
                 "of the joints",
             )
+            if isinstance(refusal, UnrecordedJointError):
+                refusal.of(upright.shape[1])
+            raise refusal
         return upright
 
     def _file(self, name: str | None, field: str) -> Table | ArrayFile:
@@ -453,13 +458,16 @@ class _Log:
         """Return the column of the log of each joint of the robot."""
         missing = [name for name in robot.joint_names if name not in self.joints]
         if missing or len(set(self.joints)) < len(self.joints):
-            raise (UnrecordedJointError if missing else SourceError)(
+            refusal = (UnrecordedJointError if missing else SourceError)(
                 self.path,
                 f"the map names the joints {', '.join(self.joints)}",
                 field="joints",
                 remedy=f"the robot's joints are {', '.join(robot.joint_names)}; name each once, or "
                 f"{NOT_RECORDED}",
             )
+            if isinstance(refusal, UnrecordedJointError):
+                refusal.of(len(self.joints), self.joints)
+            raise refusal
         return [self.joints.index(name) for name in robot.joint_names]
 
     def _motor_from_joint(self) -> Array:

@@ -78,6 +78,12 @@ class _Group:
         last = self.names[-1]
         return first if first == last else f"{first} .. {last}"
 
+    def joints(self, joints: Sequence[str]) -> tuple[str, ...]:
+        """Return the joints of the URDF that the names are of."""
+        if not self.by_joint:
+            return ()
+        return tuple(joint for joint in joints if self.pattern.replace("{}", joint) in self.names)
+
     def columns(self, joints: Sequence[str]) -> str | list[str]:
         """Return `columns` of the map: the pattern where it gives these names, else the list."""
         numbers = range(len(joints) + 1)
@@ -331,9 +337,10 @@ class _Search:
             absent, which = self._absent(group)
             options = " ".join(f"--locked {name}" for name in absent)
             remedy = f"fix the joints that were not recorded, {which} with {options}"
-            raise UnrecordedJointError(
+            refusal = UnrecordedJointError(
                 self._log, problem, field=kind, remedy=f"{remedy}; {otherwise}"
             )
+            raise refusal.of(count, group.joints(self._joints), group.names)
         some = ",".join(group.names[: len(self._joints)])
         remedy = "give the URDF of this arm"
         if len(group.names) == count:

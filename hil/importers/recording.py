@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from hil.archive import open_archive
+from hil.cell.arms import Arm, Links, arms_of, recorded_arms
 from hil.errors import ArchiveError, NotAnArchiveError, SourceError, UnrecordedJointError
 from hil.importers.bag_map import BagMap
 from hil.importers.bags import open_bag
@@ -17,8 +18,10 @@ from hil.importers.column_map import ColumnMap, map_text
 from hil.importers.log import import_log
 from hil.importers.proposal import proposed_map
 from hil.importers.robot import Robot, Use
-from hil.importers.rosbag2 import import_rosbag2, joint_state_topics, recorded_joints
-from hil.importers.units import UNITS
+from hil.importers.rosbag2 import Effort, import_rosbag2, joint_state_topics, recorded_joints
+from hil.importers.units import UNITS, Kind
+from hil.reading import parse_toml
+from hil.toml_text import to_text
 
 _BAGS: Final = (".db3", ".bag", ".mcap", ".zstd", ".zst")
 RobotOf = Callable[[Callable[[], tuple[str, ...] | None]], Robot]
@@ -113,8 +116,9 @@ def import_recording(
 ) -> ImportedRecording:
     """Import a log or a bag; what no column map states is concluded from names and units.
 
-    Joints of a gripper that were not recorded are fixed. `held_joints` and the following are those
-    of :func:`hil.importers.import_log`.
+    Joints of a gripper that were not recorded are fixed, and of a robot with several arms all
+    joints but those of the recorded one. `held_joints` and the following are those of
+    :func:`hil.importers.import_log`.
 
     Raises:
         SourceError: it cannot be read, or its channels leave a quantity open.
@@ -130,46 +134,136 @@ def import_recording(
         coupled=coupled,
         force=force,
     )
+    return _of_recorded_joints(read, robot_of, source)
+
+
+def import_bag(
+    source: Path,
+    output: Path,
+    robot_of: RobotOf,
+    bag: BagMap,
+    options: ImportOptions = ImportOptions(),
+    *,
+    held_joints: Sequence[str] = (),
+    use: Use = "excitation",
+    force: bool = False,
+) -> ImportedRecording:
+    """Import the joint states of a bag that `bag` describes; see :func:`import_recording`."""
+
+    def read(robots: RobotOf) -> ImportedRecording:
+        return _import_bag(source, output, robots, bag, options, held_joints, use, force=force)
+
+    return _of_recorded_joints(read, robot_of, source)
+
+
+def _of_recorded_joints(
+    read: Callable[[RobotOf], ImportedRecording], robot_of: RobotOf, source: Path
+) -> ImportedRecording:
+    """Import with joints fixed that were not recorded, where the URDF says which those are."""
+    robots = _OfRecordedJoints(robot_of, source)
     try:
-        return read(robot_of)
-    except UnrecordedJointError:
-        robots = _WithoutGripper(robot_of, source, options)
+        return read(robots)
+    except UnrecordedJointError as error:
+        imported = _of_fewer_joints(read, robots, error)
+    return replace(imported, lines=(*imported.lines, *robots.lines))
+
+
+def _of_fewer_joints(
+    read: Callable[[RobotOf], ImportedRecording],
+    robots: _OfRecordedJoints,
+    refusal: UnrecordedJointError,
+) -> ImportedRecording:
+    """Import with fewer joints; raise the refusal where that is no help."""
+    error = refusal
+    while robots.fix(error):
         try:
-            imported = read(robots)
-        except SourceError:
-            imported = None  # of the arm with its gripper the remedy is right
-        if imported is None or robots.line is None:
-            raise
-    return replace(imported, lines=(*imported.lines, robots.line))
+            return read(robots)
+        except UnrecordedJointError as further:
+            error = further
+    raise refusal
 
 
-class _WithoutGripper:
-    """Robots whose gripper's joints are fixed, but those that a bag has."""
+class _OfRecordedJoints:
+    """Robots of which joints that were not recorded are fixed, after a refused import.
 
-    def __init__(self, robot_of: RobotOf, source: Path, options: ImportOptions) -> None:
+    Attributes:
+        lines: what was fixed.
+    """
+
+    def __init__(self, robot_of: RobotOf, source: Path) -> None:
         self._robot_of = robot_of
         self._source = source
-        self._options = options
-        self.line: str | None = None  #: what was fixed
+        self._steps: list[Callable[[Robot], Robot]] = []
+        self._robot: Robot | None = None
+        self.lines: tuple[str, ...] = ()
 
     def __call__(self, recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
         robot = self._robot_of(recorded)
-        arm = robot.without_gripper(self._recorded())
-        fixed = [name for name in robot.joint_names if name not in arm.joint_names]
-        if fixed:
-            names = ", ".join(fixed)
-            places = ", ".join(f"{arm.locked[name]:.3g}" for name in fixed)
-            self.line = f"{names}: fixed, at {places} (rad or m), as of an unrecorded gripper"
-        return arm
+        for step in self._steps:
+            robot = step(robot)
+        self._robot = robot
+        return robot
 
-    def _recorded(self) -> tuple[str, ...]:
-        """Return the joints of a bag; none of a log, which has too few channels for them."""
-        options = self._options
-        if not has_joint_states(self._source) or _read_as_log(self._source, options):
-            return ()
-        stated = None if options.columns is None else BagMap.load(options.columns)
-        bag = stated or _bag_map(options)
-        return recorded_joints(self._source, bag.topic, bag.rename)
+    def fix(self, error: UnrecordedJointError) -> bool:
+        """Fix joints of a gripper, then those outside the recorded arm; False if there are none.
+
+        Raises:
+            SourceError: several arms have as many joints as were recorded.
+        """
+        robot = self._robot
+        if robot is None:
+            return False
+        gripping = robot.without_gripper(error.joints)
+        fixed = [name for name in robot.joint_names if name not in gripping.joint_names]
+        if fixed and error.count <= len(gripping.joint_names):
+            self._steps.append(lambda robot: robot.without_gripper(error.joints))
+            names = ", ".join(fixed)
+            places = ", ".join(f"{gripping.locked[name]:.3g}" for name in fixed)
+            line = f"{names}: fixed, at {places} (rad or m), as of an unrecorded gripper"
+            self.lines = (*self.lines, line)
+            return True
+        arm = self._arm(robot, error)
+        if arm is None:
+            return False
+        self._steps.append(lambda robot: robot.between(arm.links))
+        reason = "names" if error.joints else "number"
+        line = (
+            f"arm: {arm}, between {arm.links}, by the {reason} of the recorded joints; all others "
+            "are fixed"
+        )
+        self.lines = (*self.lines, line)
+        return True
+
+    def _arm(self, robot: Robot, error: UnrecordedJointError) -> Arm | None:
+        """Return the only arm that the recording may be of, None without one."""
+        arms = arms_of(robot.urdf, robot.joint_names)
+        fitting = recorded_arms(arms, error.count, error.joints, error.channels)
+        if len(fitting) > 1:
+            names = " or ".join(map(str, fitting))
+            problem = f"{error.count} joints were recorded, which may be {names}"
+            remedy = f"choose the arm: {' or '.join(arm.links.options for arm in fitting)}"
+            raise SourceError(self._source, problem, field="--base, --tip", remedy=remedy)
+        (arm,) = fitting or (None,)
+        return None if arm is None or arm.joints == robot.joint_names else arm
+
+
+def with_arm(text: str, links: Links) -> str:
+    """Return a map with the links of the recorded arm, unless it has them."""
+    if not links or ColumnMap.model_validate(parse_toml(text)).arm:
+        return text
+    table = to_text({"arm": links.model_dump(exclude_none=True)})
+    return f"{text.rstrip()}\n\n{table}"
+
+
+def _arm_of_map(robot: Robot, links: Links, path: Path | None) -> Robot:
+    """Return the arm of a map; SourceError where options name another one."""
+    if not links or robot.links == links:
+        return robot
+    if robot.links:
+        problem = f"names the arm between {links}, the options that between {robot.links}"
+        remedy = "omit --base and --tip, or correct [arm] of the map"
+        raise SourceError(path or Path(), problem, field="arm", remedy=remedy)
+    return robot.between(links, path)
 
 
 def _imported(
@@ -192,8 +286,9 @@ def _imported(
         return _import_bag(source, output, robot_of, bag, options, held_joints, use, force=force)
     lines: tuple[str, ...] = ()
     if options.columns is not None:
-        robot = robot_of(partial(_joints_of_map, options.columns))
         columns = ColumnMap.load(options.columns)
+        robot = robot_of(partial(_joints_of_map, options.columns))
+        robot = _arm_of_map(robot, columns.arm, options.columns)
         text = map_text(options.columns)
     else:
         robot = robot_of(partial(_no_joints, source))
@@ -218,7 +313,7 @@ def _imported(
         force=force,
         outside_limits=options.outside_limits,
     )
-    return ImportedRecording(output, text, lines)
+    return ImportedRecording(output, with_arm(text, robot.links), lines)
 
 
 def _bag_map(options: ImportOptions) -> BagMap:
@@ -251,10 +346,12 @@ def _import_bag(
 ) -> ImportedRecording:
     topic = stated.topic
     names = stated.rename
+    robot = robot_of(lambda: recorded_joints(source, topic, names))
+    robot = _arm_of_map(robot, stated.arm, options.columns)
     import_rosbag2(
         source,
         output,
-        robot=robot_of(lambda: recorded_joints(source, topic, names)),
+        robot=robot,
         topic=topic,
         effort=stated.effort,
         clock=stated.clock,
@@ -266,20 +363,27 @@ def _import_bag(
         outside_limits=options.outside_limits,
     )
     entries = open_archive(output, fields=()).header.entries
-    read = {
-        key: entries[key] for key in ("topic", "clock", "effort", "command_topic") if key in entries
-    }
-    bag = BagMap.model_validate({**read, "rename": dict(names)})
+    keys = ("topic", "clock", "effort", "command_topic")
+    read = {key: entries[key] for key in keys if key in entries}
+    bag = BagMap.model_validate({**read, "rename": dict(names), "arm": robot.links})
     lines = tuple(
-        f"{channel.name}: {channel.kind}, {next(iter(UNITS[channel.kind]))}, by the field of the "
-        "joint states; joints by their names"
+        f"{channel.name}: {kind}, {next(iter(UNITS[kind]))}, by the field of the joint states; "
+        "joints by their names"
         for channel in channels_of(source)
-        if channel.kind is not None and channel.name.rpartition("/")[0] == entries["topic"]
+        if channel.name.rpartition("/")[0] == entries["topic"]
+        and (kind := _content(channel.kind, stated.effort)) is not None
     )
     if "command_topic" in entries:
         line = f"{entries['command_topic']}: commanded_position, rad or m, {entries['command']}"
         lines = (*lines, line)
     return ImportedRecording(output, None, lines, bag)
+
+
+def _content(kind: Kind | None, effort: Effort) -> Kind | None:
+    """Return the quantity of a field of joint states; None of an effort that is not used."""
+    if kind != "torque" or effort == "torque":
+        return kind
+    return "motor_current" if effort == "motor_current" else None
 
 
 def _joints_of_map(columns: Path) -> tuple[str, ...]:

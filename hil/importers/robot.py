@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hil.archive import Findings, Samples, write_samples
 from hil.cell import Cell
+from hil.cell.arms import Links, joints_outside
 from hil.cell.gripper import gripper_joints
 from hil.cell.text import urdf_limits, with_values
 from hil.errors import ArchiveWriteError, SourceError
@@ -54,6 +55,7 @@ class Robot:
     urdf: str  #: text of the robot description
     joint_names: tuple[str, ...]  #: that move and are not locked, in the order of the model
     locked: Mapping[str, float] = field(default_factory=dict)  #: positions [rad or m] by joint
+    links: Links = field(default_factory=Links)  #: between which its joints lie, of several arms
 
     @classmethod
     def from_urdf(
@@ -65,6 +67,7 @@ class Robot:
         gravity: Sequence[float] = STANDARD_GRAVITY,
         locked: Mapping[str, float] | None = None,
         recorded: Collection[str] | None = None,
+        links: Links = Links(),  # noqa: B008 - frozen
     ) -> Robot:
         """Return a robot by its URDF and the settings of its model.
 
@@ -76,6 +79,8 @@ class Robot:
             locked: position [rad or m] of joints that are not in the model, such as a gripper's.
             recorded: recorded joints; all others are locked at zero, or at the middle of their
                 range if that excludes zero. None: only those in `locked` are.
+            links: of a robot with several arms, those between which the recorded one lies; all
+                other joints are locked like those that were not recorded.
 
         Raises:
             InputError: the file cannot be read, is not a valid URDF, or has no such joint.
@@ -87,9 +92,9 @@ class Robot:
             pinocchio_model(urdf)
         except ModelError as error:  # an error of this file, not of a cell file
             raise SourceError(path, str(error), remedy=otherwise) from error
-        held = _held(urdf, locked or {}, recorded, path)
+        held = _held(urdf, locked or {}, recorded, path, links)
         text = _cell_text(path.stem, friction or IMPORTED_LAW, gravity, held)
-        return cls._checked(text, urdf, path)
+        return cls._checked(text, urdf, path, links)
 
     @classmethod
     def from_cell(
@@ -99,6 +104,7 @@ class Robot:
         gravity: Sequence[float] | None = None,
         locked: Mapping[str, float] | None = None,
         recorded: Collection[str] | None = None,
+        links: Links = Links(),  # noqa: B008 - frozen
     ) -> Robot:
         """Return a robot by a cell file; see `from_urdf` for the arguments.
 
@@ -110,12 +116,13 @@ class Robot:
         path = Path(path)
         cell = Cell.load(path)
         text = cell.text
-        held = _held(cell.urdf, {**cell.file.robot.locked, **(locked or {})}, recorded, path)
+        stated = {**cell.file.robot.locked, **(locked or {})}
+        held = _held(cell.urdf, stated, recorded, path, links)
         if held != cell.file.robot.locked:
             text = with_values(text, {"robot.locked": _writable_names(held)})
         if gravity is not None:
             text = with_values(text, {"robot.gravity": [float(value) for value in gravity]})
-        return cls._checked(text, cell.urdf, path)
+        return cls._checked(text, cell.urdf, path, links)
 
     def with_coupling(self, motor_from_joint: NDArray[np.float64]) -> Robot:
         """Return this robot with coupled motors, unless its cell states a coupling.
@@ -128,28 +135,40 @@ class Robot:
         text = with_values(
             self.cell, {"robot.coupling.motor_from_joint": motor_from_joint.tolist()}
         )
-        return self._checked(text, self.urdf, path)
+        return self._checked(text, self.urdf, path, self.links)
 
     def with_gravity(self, gravity: Sequence[float]) -> Robot:
         """Return this robot under another gravity in the base frame [m/s²]."""
         values = {"robot.gravity": [float(value) for value in gravity]}
-        return self._checked(with_values(self.cell, values), self.urdf, Path("cell.toml"))
+        text = with_values(self.cell, values)
+        return self._checked(text, self.urdf, Path("cell.toml"), self.links)
 
     def without_gripper(self, recorded: Collection[str] = ()) -> Robot:
         """Return this robot with the joints of a gripper fixed, but those that were recorded."""
         fingers = [
             name for name in gripper_joints(self.urdf, self.joint_names) if name not in recorded
         ]
-        if not fingers:
+        if len(fingers) in (0, len(self.joint_names)):
             return self
         held = {**self.locked, **_places(self.urdf, fingers)}
         text = with_values(self.cell, {"robot.locked": _writable_names(held)})
-        return self._checked(text, self.urdf, Path("cell.toml"))
+        return self._checked(text, self.urdf, Path("cell.toml"), self.links)
+
+    def between(self, links: Links, path: Path | None = None) -> Robot:
+        """Return this robot with all joints fixed that do not lie between two links.
+
+        Raises:
+            InputError: of the file `path`: there are no such links, or no joint between them.
+        """
+        outside = joints_outside(path, self.urdf, links, self.joint_names)
+        held = {**self.locked, **_places(self.urdf, outside)}
+        text = with_values(self.cell, {"robot.locked": _writable_names(held)})
+        return self._checked(text, self.urdf, Path("cell.toml"), links)
 
     @classmethod
-    def _checked(cls, text: str, urdf: str, path: Path) -> Robot:
+    def _checked(cls, text: str, urdf: str, path: Path, links: Links) -> Robot:
         cell = Cell.from_texts(text, urdf, path)
-        return cls(text, urdf, cell.joint_names, cell.file.robot.locked)
+        return cls(text, urdf, cell.joint_names, cell.file.robot.locked, links)
 
     def nominal_torque(self) -> NominalTorque | None:
         """Return the torque of the nominal inertias; None if the URDF has no masses."""
@@ -180,9 +199,20 @@ def _cell_text(
 
 
 def _held(
-    urdf: str, locked: Mapping[str, float], recorded: Collection[str] | None, path: Path
+    urdf: str,
+    locked: Mapping[str, float],
+    recorded: Collection[str] | None,
+    path: Path,
+    links: Links,
 ) -> dict[str, float]:
-    """Return the positions of locked joints: those given, and all that were not recorded."""
+    """Return the positions of locked joints: those given, and all that were not recorded.
+
+    With `links` also those that do not lie between them.
+    """
+    if links:
+        names = tuple(pinocchio_model(urdf).names)[1:]
+        places = _places(urdf, joints_outside(path, urdf, links, names))
+        locked = {**places, **locked}
     if recorded is None:
         return dict(locked)
     names = tuple(pinocchio_model(urdf).names)[1:]

@@ -62,7 +62,7 @@ def concluded(
     cell, samples, score = few
     suspect = score.overall > _SUSPECT or bool(np.any(score.friction < _DRIVES))
     if not suspect and not _hangs_otherwise(cell, samples, score):
-        contradictions = Contradictions.of(cell, cell.model, samples, score.overall)
+        contradictions = Contradictions.of(cell, cell.model, samples, score, score.overall)
         return _of_this_arm(imported, source, contradictions)
     look = look_at_joints(source, imported)
     error = score.overall if look.error is None else look.error
@@ -70,16 +70,16 @@ def concluded(
         raise _other_arm(source, error)
     changed = _changed(look)
     if not changed:
-        contradictions = Contradictions.of(cell, cell.model, samples, error)
+        contradictions = Contradictions.of(cell, cell.model, samples, score, error)
         imported = _of_this_arm(imported, source, contradictions)
     if look.questions:
         raise undecided(source, look.questions[0])
     if look.map_text != imported.map_text or look.options:
         again = _again(imported, source, robot_of, look, use)
         if (few := _few_rows(again.archive)) is not None:
-            cell, samples, _ = few
+            cell, samples, score = few
             axes = [row.aspect for row in changed if row.aspect in _OF_AXES]
-            contradictions = Contradictions.of(cell, cell.model, samples, error, axes)
+            contradictions = Contradictions.of(cell, cell.model, samples, score, error, axes)
             return _of_this_arm(again, source, contradictions)
         return again
     return imported
@@ -112,13 +112,13 @@ def _hangs_otherwise(cell: Cell, samples: Samples, score: Score) -> bool:
 def _of_this_arm(
     imported: ImportedRecording, source: Path, contradictions: Contradictions
 ) -> ImportedRecording:
-    """Return a recording, with a warning if two independent findings contradict the URDF.
+    """Return a recording, with a warning if the URDF may be that of another arm.
 
     Raises:
-        SourceError: more of them do.
+        SourceError: more than two independent findings contradict it.
     """
     sentences = contradictions.sentences
-    if len(sentences) < _WARNED:
+    if not contradictions.is_doubtful:
         return imported
     if len(sentences) > _WARNED:
         problem = f"is not of the arm of the URDF: {'; '.join(sentences)}"

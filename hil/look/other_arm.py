@@ -1,4 +1,9 @@
-"""What contradicts the arm of a URDF in a recording: its range and speed, its size, its torque."""
+"""What contradicts the arm of a URDF in a recording: range and speed, size, lengths, torque.
+
+Gravity acts on first moments, and the coupling of the joints is that of first moments and lengths.
+A torque whose masses are free says thereby how long the links are, if the motion is fast enough:
+lengths that are s times as long, with masses that fit, are gravity that is s times weaker.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +15,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.cell.text import urdf_limits
-from hil.importers.findings import in_turns
-from hil.look.physics import Size
+from hil.cell.text import UrdfLimits, urdf_limits
+from hil.look.physics import Size, mounted
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.text import percentage
+from identification.validation.readings import (
+    EXPLAINED,
+    SEPARATE,
+    SURE,
+    Comparison,
+    Score,
+    compare,
+    score_of,
+)
 
 Array = NDArray[np.float64]
 
 _MOST: Final = 0.99  # quantile of the rows, so that single spikes are no evidence
 _BEYOND: Final = 0.17  # rad or m beyond a range; zeros of the same arm differ by less
+_FAR: Final = np.pi / 4.0  # the same, of one finding that is enough
+_TURNS: Final = 3  # by which the count of an encoder may be off
 _OVER: Final = 3.0  # of a speed or torque; right logs of real arms reach 1.7 of a stated torque
 _UNEXPLAINED: Final = 0.15  # of the torque; right logs of short motions have up to 0.29 as well
+_LENGTHS: Final = (0.5, 0.63, 0.8, 1.25, 1.6, 2.0)  # times those of the URDF
+_NEARER: Final = 1.12  # further factors about the best of them
+# Delay, low-pass and noise take torque from inertia, as if the links were shorter.
+_SHORTER: Final = 0.5  # error ratio that such a channel does not have
 
 
 @dataclass(frozen=True)
@@ -36,8 +55,12 @@ class Contradictions:
 
     motion: str
     size: str
+    lengths: str
     torque: str
     axes: str
+    #: whether a joint is farther beyond its range than zeros are off, or masses explain no torque
+    #: of this size
+    is_far: bool = False
 
     @classmethod
     def of(
@@ -45,27 +68,27 @@ class Contradictions:
         cell: Cell,
         model: RobotModel,
         samples: Samples,
+        score: Score,
         error: float,
         changed: Sequence[str] = (),
     ) -> Contradictions:
         """Compare samples of a recording, as read, with the URDF.
 
-        `error` is the share of the torque that stays unexplained, `changed` names what of the axes
-        (order, signs, zero) had to be changed for that.
+        `score` is that of the samples, `error` is the share of the torque that stays unexplained,
+        `changed` names what of the axes (order, signs, zero) had to be changed for that.
         """
         limits = urdf_limits(cell.urdf, cell.joint_names)
         names = cell.joint_names
-        turning = np.array(model.chain.revolute)
-        position = in_turns(samples.motion.position, limits, turning)
+        position = samples.motion.position
         low, high = np.quantile(position, (1.0 - _MOST, _MOST), axis=0)
-        beyond = np.maximum(limits.lower - low, high - limits.upper)
+        turns = model.chain.revolute
+        beyond = _beyond(low, high, limits, turns)
         speed = _largest(samples.motion.velocity) / limits.velocity
         effort = _largest(samples.torque) / limits.effort
         motion = size = torque = ""
         if beyond.max() > _BEYOND:
             joint = int(beyond.argmax())
-            turns = model.chain.revolute[joint]
-            far = f"{np.degrees(beyond[joint]):.0f}°" if turns else f"{beyond[joint]:.2g} m"
+            far = f"{np.degrees(beyond[joint]):.0f}°" if turns[joint] else f"{beyond[joint]:.2g} m"
             motion = f"{names[joint]} moves {far} beyond its range"
         elif speed.max() > _OVER:
             joint = int(speed.argmax())
@@ -78,16 +101,67 @@ class Contradictions:
             size = f"the torque of {names[joint]} reaches {effort[joint]:.3g} times its limit"
         elif expected.is_off and factor > 1.0 and not expected.is_thousand:
             size = f"the torque is {factor:.2g} times that of {expected.basis}"
-        if error > _UNEXPLAINED:
+        lengths = _other_lengths(cell, samples, score, expected)
+        if error > _UNEXPLAINED and not lengths:
             torque = f"{percentage(error)} of the torque stays unexplained, whatever the masses"
         several = len(changed) > 1
         axes = f"the torque follows it with other {' and '.join(changed)} only" if several else ""
-        return cls(motion, size, torque, axes)
+        is_larger = expected.by_masses and size.endswith(expected.basis)
+        is_far = is_larger or bool(np.any(beyond > np.where(turns, _FAR, np.inf)))
+        return cls(motion, size, lengths, torque, axes, is_far=is_far)
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """The contradictions there are."""
-        return tuple(filter(None, (self.motion, self.size, self.torque, self.axes)))
+        parts = (self.motion, self.size, self.lengths, self.torque, self.axes)
+        return tuple(filter(None, parts))
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the arm may be another one, by a finding that is enough or by two."""
+        return self.is_far or bool(self.lengths) or len(self.sentences) > 1
+
+
+def _other_lengths(cell: Cell, samples: Samples, score: Score, size: Size) -> str:
+    """Return which lengths of the links the torque fits better than those of the URDF.
+
+    Longer links have more weight: that a torque by masses is larger as well is evidence of them.
+    """
+    if not np.any(cell.model.gravity):
+        return ""
+    trials = {factor: _with_lengths(cell, samples, score, factor) for factor in _LENGTHS}
+    best = min(trials, key=lambda factor: trials[factor][1].ratio)
+    for factor in (best / _NEARER, best * _NEARER):
+        trials[factor] = _with_lengths(cell, samples, score, factor)
+    best = min(trials, key=lambda factor: trials[factor][1].ratio)
+    error, against = trials[best]
+    least = 1.0 if best > 1.0 else _SHORTER
+    agrees = size.by_masses and 1.0 < best < (size.factor or 0.0)
+    if error > EXPLAINED or against.sigmas > -(SEPARATE if agrees else SURE):
+        return ""
+    if against.ratio > least:
+        return ""
+    return (
+        f"the torque fits links {best:.2g} times as long (error {percentage(error)}, with those "
+        f"of the URDF {percentage(score.overall)})"
+    )
+
+
+def _with_lengths(
+    cell: Cell, samples: Samples, score: Score, factor: float
+) -> tuple[float, Comparison]:
+    """Return the error of samples with other lengths of all links, and its comparison."""
+    x, y, z = (float(part) / factor for part in cell.model.gravity)
+    model = mounted(cell, (x, y, z)).model
+    other = score_of(model, samples)
+    return other.overall, compare(other, score, model)
+
+
+def _beyond(low: Array, high: Array, limits: UrdfLimits, turns: NDArray[np.bool_]) -> Array:
+    """Return how far positions leave the range of each joint (n,), whole turns aside."""
+    places = 2.0 * np.pi * np.arange(-_TURNS, _TURNS + 1)[:, None] * turns
+    excess = np.maximum(limits.lower - (low + places), high + places - limits.upper)
+    return np.asarray(excess.min(axis=0))
 
 
 def _largest(values: Array) -> Array:

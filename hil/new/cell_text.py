@@ -10,7 +10,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Final, get_origin
 
@@ -22,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from tomlkit.items import Table
 
 from drivers.drive_train import WRIST_AXES
+from hil.cell.arms import Links, joints_outside
 from hil.cell.errors import UNKNOWN, WHERE, models_of
 from hil.cell.gripper import gripper_joints, links_of
 from hil.cell.schema import CellFile
@@ -314,62 +314,23 @@ def cell_of_urdf(
     """
     text = read_input(path, "name a URDF")
     names = _moving_joints(path, text)
-    if base is None and tip is None:
+    links = Links(base=base, tip=tip)
+    if not links:
         if len(names) > MOST_JOINTS:
             problem = f"has {len(names)} moving joints; at most {MOST_JOINTS} can be identified"
             remedy = "choose one arm with --base LINK --tip LINK"
             raise InputError(path, problem, remedy=remedy)
         return _cell_of(path, text, fixed, moved=moved)
-    between = set(_joints_between(path, text, base, tip))
-    others = [name for name in names if name not in between and name not in fixed]
-    if len(others) == len(names):
-        problem = f"no joint moves between {base or 'the root'} and {tip or 'the tip'}"
-        raise InputError(path, problem, field="--base, --tip", remedy=_LINKS_REMEDY)
+    outside = joints_outside(path, text, links, names)
+    others = [name for name in outside if name not in fixed]
     if not others:
         return _cell_of(path, text, fixed, moved=moved)
     limits = urdf_limits(text, others)
     nearest = np.clip(0.0, limits.lower, limits.upper).tolist()
     arm = with_fixed(text, dict(zip(others, nearest, strict=True)))
     made = _cell_of(path, arm, fixed, moved=moved)
-    note = (
-        f"fixed, as they do not lie between {base or 'the root'} and {tip or 'the tip'}: "
-        f"{', '.join(others)}"
-    )
+    note = f"fixed, as they do not lie between {links}: {', '.join(others)}"
     return replace(made, urdf=made.urdf or arm, known=made.known | Known(notes=(note,)))
-
-
-_LINKS_REMEDY: Final = "name links of the URDF, the tip farther from the root than the base"
-
-
-def _joints_between(path: Path, text: str, base: str | None, tip: str | None) -> list[str]:
-    """Return the joints of the URDF on the way from a link to another, either end open."""
-    to_link = {
-        child.get("link", ""): (joint.get("name", ""), parent.get("link", ""))
-        for joint in urdf_tree(text).findall("joint")
-        for child in joint.findall("child")
-        for parent in joint.findall("parent")
-    }
-    links = sorted({*to_link, *(parent for _, parent in to_link.values())})
-    for option, link in (("--base", base), ("--tip", tip)):
-        if link is not None and link not in links:
-            matches = get_close_matches(link, links, n=3)
-            heading = "the nearest are" if matches else "its links are"
-            remedy = f"{heading} {', '.join((matches or links)[:_MOST_NAMES])}"
-            raise InputError(path, f"has no link {link!r}", field=option, remedy=remedy)
-    ends = [tip] if tip is not None else list(to_link)
-    joints: dict[str, None] = {}
-    for end in ends:
-        way = list[str]()
-        link = end
-        while link != base and link in to_link:
-            name, link = to_link[link]
-            way.append(name)
-        if base is None or link == base:
-            joints |= dict.fromkeys(way)
-        elif tip is not None:
-            problem = f"link {tip!r} does not hang on link {base!r}"
-            raise InputError(path, problem, field="--tip", remedy=_LINKS_REMEDY)
-    return list(joints)
 
 
 _MOST_NAMES: Final = 12

@@ -290,6 +290,7 @@ class Evidence:
     residuals: ResidualChecks | None = None  #: patterns of the residual
     context: CellContext = CellContext()  #: data on the cell
     prismatic: tuple[int, ...] = ()  #: indices of the joints that slide
+    moved: Array | None = None  #: time in which each joint moved in unseen motion (n,) [s]
     #: whether nothing was held out, so that all errors are those of the fit
     in_sample: bool = False
 
@@ -385,7 +386,15 @@ def gather(
         context=context,
         in_sample=in_sample,
         prismatic=tuple(np.flatnonzero(~model.chain.revolute).tolist()),
+        moved=np.sum([_time_moved(run) for run in held_out], axis=0),
     )
+
+
+def _time_moved(run: Samples) -> Array:
+    """Return the time in which each joint moves in a recording (n,) [s]."""
+    steps = np.diff(run.motion.time)
+    step = float(np.median(steps)) if steps.size else 0.0
+    return np.asarray(step * np.count_nonzero(run.usable, axis=0))
 
 
 def _error(model: RobotModel, values: Array, recordings: Sequence[Samples]) -> PredictionError:

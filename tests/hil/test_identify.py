@@ -235,7 +235,7 @@ class TestSources:
         """At the end of a recording the arm rests for 0.2 s."""
         identification = identified(paths(campaign)[0], split=0.985)
         assert not identification.verdict.good
-        assert "moved in fewer than" in identification.verdict.line
+        assert "moved for less than" in identification.verdict.line
 
     @pytest.mark.parametrize(
         ("spoilt", "sentence"),

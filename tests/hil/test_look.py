@@ -33,7 +33,7 @@ from hil.look.result import Choice
 from hil.look.run import SETTINGS
 from identification.estimators.delay import DelayEstimate
 from identification.signals.samples import prepare
-from identification.validation.readings import Axes, Change
+from identification.validation.readings import Axes, Change, score_of
 from tests.hil.simulated_logs import write_log, write_moving_log
 from tests.hil.test_importers_rosbag2 import STATE, bag, states
 from tests.hil.test_log_kinds import JOINTS, URDF
@@ -273,7 +273,7 @@ class TestConclusions:
 
 
 class TestOtherArm:
-    """Two independent findings against the URDF are a warning, three refuse it."""
+    """Two independent findings against the URDF, or a clear one, are a warning; three refuse it."""
 
     @staticmethod
     def described(path: Path, text: str) -> Path:
@@ -323,9 +323,40 @@ class TestOtherArm:
         samples = prepare(source_of(archive, cell).recording, cell.model, options=SETTINGS)
         motor = samples.motion._replace(position=100.0 * samples.motion.position)
         before_gears = replace(samples, motion=motor, torque=samples.torque / 100.0)
-        assert not Contradictions.of(cell, cell.model, samples, 0.0).sentences
-        (sentence,) = Contradictions.of(cell, cell.model, before_gears, 0.0).sentences
+        score = score_of(cell.model, samples)
+        assert not Contradictions.of(cell, cell.model, samples, score, 0.0).sentences
+        (sentence,) = Contradictions.of(cell, cell.model, before_gears, score, 0.0).sentences
         assert "beyond its range" in sentence
+
+    @pytest.mark.parametrize(("length", "said"), [(0.25, "1.6"), (0.4, ""), (0.8, "0.5")])
+    def test_links_of_another_length(
+        self, tmp_path: Path, table: Mapping[str, Floats], length: float, said: str
+    ) -> None:
+        """Masses are free: gravity and the coupling of the joints say how long the links are."""
+        path = tmp_path / "a.csv"
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *table.values())
+        text = URDF.replace("<origin xyz='0 0 0.4'/>", f"<origin xyz='0 0 {length}'/>")
+        contradictions = self.contradictions(path, self.described(tmp_path / "x.urdf", text))
+        assert contradictions.is_doubtful == bool(said)
+        assert contradictions.lengths.startswith(f"the torque fits links {said}" if said else "")
+
+    @staticmethod
+    def contradictions(log: Path, urdf: Path) -> Contradictions:
+        imported = hil("import", "log", log, "--urdf", urdf, "--outside-limits")
+        assert imported.exit_code == 0
+        archive = open_archive(log.with_suffix(".mcap"))
+        cell = cell_of(archive)
+        samples = prepare(source_of(archive, cell).recording, cell.model, options=SETTINGS)
+        score = score_of(cell.model, samples)
+        return Contradictions.of(cell, cell.model, samples, score, score.overall)
+
+    def test_whole_turns_are_not_beyond_a_range(
+        self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
+    ) -> None:
+        path = tmp_path / "a.csv"
+        turned = {**table, "q": table["q"] + 2.0 * np.pi * np.array([0.0, 0.0, 1.0])}
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *turned.values())
+        assert not self.contradictions(path, urdf).sentences
 
     @pytest.mark.parametrize("change", ["narrow", "weak"])
     def test_one_of_them_alone_may_be_a_limit_that_is_wrong(

@@ -25,17 +25,17 @@ class TestedFacts:
     in_sample: bool  # whether nothing was held out
     still: Mask  # joints that hardly moved (n,)
     silent: Mask  # joints without a torque (n,)
-    least_rows: int  # in which a joint must have moved
+    least: float  # time in which a joint must have moved [s]
 
     @classmethod
     def of(cls, evidence: Evidence, limits: Thresholds) -> TestedFacts:
-        """Compare the rows of each joint with the limit."""
+        """Compare the time in which each joint moved with the limit."""
         error = evidence.held_out
         return cls(
             in_sample=evidence.in_sample,
-            still=error.rows < limits.rows,
+            still=error.rows == 0 if evidence.moved is None else evidence.moved < limits.moved,
             silent=(error.rows > 0) & (error.torque_squared == 0.0),
-            least_rows=limits.rows,
+            least=limits.moved,
         )
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
@@ -52,7 +52,7 @@ class TestedFacts:
             yield Finding(
                 "tested",
                 "wrong",
-                f"{joints} moved in fewer than {self.least_rows} samples of {naming.motion}",
+                f"{joints} moved for less than {self.least:g} s of {naming.motion}",
                 f"record a validation motion that moves {joints}; a joint that must not move is"
                 " locked (`locked` under [robot] in the cell file, or `hil import log --held"
                 " JOINT`)",
