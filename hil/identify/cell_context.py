@@ -37,7 +37,7 @@ from identification.validation.prediction import PredictionError, pooled_error
 from planner.arrays import numbers
 
 from .prepared import Prepared
-from .sources import Source
+from .sources import Source, Sources
 
 Array = NDArray[np.float64]
 
@@ -145,6 +145,7 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
             *_resolution(prepared),
         ),
         added_friction=_added_friction(prepared),
+        scale_std=torque_scale_of(sources).std,
     )
 
 
@@ -323,6 +324,12 @@ class TorqueScale:
         if not self.std.any():
             return f"assuming exact torques ({self.source})"
         return f"assuming {described(self.std, self.of)} (standard deviation; {self.source})"
+
+
+def torque_scale_of(sources: Sources) -> TorqueScale:
+    """Return the uncertainty of the torques of the fitted recordings."""
+    recordings = [source.recording for source in sources.training]
+    return torque_scale(sources.cell, recordings, simulated=sources.header.only_simulated)
 
 
 def torque_scale(cell: Cell, recordings: Sequence[Recording], *, simulated: bool) -> TorqueScale:
