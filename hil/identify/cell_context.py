@@ -18,8 +18,8 @@ from identification.estimators.prior import without_masses
 from identification.estimators.torque_channel import torque_noiseless_above
 from identification.estimators.torque_scale import DATA_SHEET, described
 from identification.factor.factor import Estimate
-from identification.model.friction import TERMS
-from identification.selection.inner_prediction import LOW_PASS
+from identification.model.friction import TERMS, FrictionLaw
+from identification.selection.inner_prediction import LOAD, LOW_PASS
 from identification.signals.masks import SATURATED
 from identification.signals.recording import UNWRAPPED, Recording
 from identification.signals.samples import Samples
@@ -37,7 +37,7 @@ from identification.validation.prediction import PredictionError, pooled_error
 from planner.arrays import numbers
 
 from .prepared import Prepared
-from .sources import Source
+from .sources import Source, Sources
 
 Array = NDArray[np.float64]
 
@@ -142,9 +142,11 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
             *_log([jump for source_steps in steps for jump in source_steps.logged]),
             *_wrapped(recorded),
             *_torque_channel(prepared),
+            *_friction_law(prepared),
             *_resolution(prepared),
         ),
         added_friction=_added_friction(prepared),
+        scale_std=torque_scale_of(sources).std,
     )
 
 
@@ -196,6 +198,38 @@ def _added_friction(prepared: Prepared) -> tuple[str, ...]:
         and getattr(stated, option) in (None, "none", 0.0, False)
     ]
     return tuple(dict.fromkeys(added))
+
+
+def _friction_law(prepared: Prepared) -> Iterator[Finding]:
+    """Yield a finding if inner prediction chose another friction law than the archives state."""
+    names = (_FRICTION_AT_SPEED, LOAD)
+    if not any(choice.chosen for choice in prepared.settings.choices if choice.name in names):
+        return
+    cell = prepared.sources.cell
+    law = cell.model.friction.laws[0]
+    table = cell.stated.robot.friction
+    stated = law.changed({term.option: getattr(table, term.option) for term in TERMS})
+    text = (
+        f"the friction law is {law.summary()[0]}, chosen by inner prediction; the recordings state"
+        f" {stated.summary()[0]}"
+    )
+    removed = [term.label.lower() for term in stated.terms if term not in law.terms]
+    if removed:
+        yield _condition(
+            "friction law",
+            f"{text}, which predicts parts of the fitted motion worse",
+            f"keep it with `hil identify --friction {_option(stated)}` if it is known",
+        )
+    else:
+        yield Finding("friction law", "information", text, "", "condition")
+
+
+def _option(law: FrictionLaw) -> str:
+    """Return the terms of a law as an entry of `--friction`."""
+    return ",".join(
+        f"{term.label.lower()}={term.speed:g}" if term.speed_symbol else term.label.lower()
+        for term in law.terms
+    )
 
 
 def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
@@ -323,6 +357,12 @@ class TorqueScale:
         if not self.std.any():
             return f"assuming exact torques ({self.source})"
         return f"assuming {described(self.std, self.of)} (standard deviation; {self.source})"
+
+
+def torque_scale_of(sources: Sources) -> TorqueScale:
+    """Return the uncertainty of the torques of the fitted recordings."""
+    recordings = [source.recording for source in sources.training]
+    return torque_scale(sources.cell, recordings, simulated=sources.header.only_simulated)
 
 
 def torque_scale(cell: Cell, recordings: Sequence[Recording], *, simulated: bool) -> TorqueScale:

@@ -58,11 +58,10 @@ from identification.text import percentage
 from identification.validation.calibration import Refit
 from identification.validation.finding import joined
 
-from .cell_context import TorqueScale, torque_scale
+from .cell_context import TorqueScale, torque_scale_of
 from .estimators import OF_PRIOR, Estimator, fit_of, values_of
 from .options import Options
 from .prepared import Prepared, known_parameters, samples_of
-from .sources import Sources
 
 # Hz. A narrower smoother removes part of the motion from the regressor, a bias that instruments
 # cannot correct. On simulated NS 16 logs with 100 to 1000 times the encoder noise, instrumental
@@ -146,7 +145,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
     with reporter.task("estimating", 4) as task:
         fitted = smoothed_for_instruments(model, prepared) if name == "iv" else prepared.fitted
         task.advance(1, name)
-        scale = _scale_of(prepared.sources)
+        scale = torque_scale_of(prepared.sources)
         factors = [Factor.by_time(model, samples) for samples in fitted]
         total = sum(factors, Factor.zero(model))
         posterior = Posterior.of(cell, total, name, prepared.settings.strength)
@@ -223,11 +222,6 @@ def _require_usable_rows(prepared: Prepared) -> None:
             raise ArchiveError(
                 Path(source.name), f"{no_rows_message(model)} ({lasts})", remedy="leave it out"
             )
-
-
-def _scale_of(sources: Sources) -> TorqueScale:
-    recordings = [source.recording for source in sources.training]
-    return torque_scale(sources.cell, recordings, simulated=sources.header.only_simulated)
 
 
 def with_uncertain_scale(

@@ -29,7 +29,8 @@ from identification.selection.inner_prediction import (
 )
 from identification.selection.settings import Settings
 from identification.signals.clock import time_base
-from identification.signals.recording import Recording
+from identification.signals.masks import SHORTEST_STRETCH
+from identification.signals.recording import Recording, in_succession
 from identification.signals.samples import (
     RIGID_BANDWIDTH,
     Preprocessing,
@@ -125,8 +126,9 @@ def _array(figures: tuple[float, ...] | None) -> Array | None:
 
 MAX_RECORDINGS: Final = 32
 """Recordings that settings are chosen from."""
-_DELAY_SAMPLES: Final = 8000  # A stated delay is checked on the first samples of a recording
 _DELAY_RATE: Final = 250.0  # Hz, to which it is averaged; both positions and torques, without bias
+_SAME_STEP: Final = 0.1  # of sampling intervals of recordings that are estimated together
+_DELAY_TIME: Final = 64.0  # s, in which a delay that nobody asked for is looked for
 RIPPLE: Final = ((1,), (2,), (1, 2))
 """Periods of a torque ripple per motor turn: rotor eccentricity, wave generator, both."""
 
@@ -140,7 +142,7 @@ class Decided(NamedTuple):
     """Chosen settings."""
 
     settings: Settings
-    delays: DelayEstimate | None  #: in the longest recording; None if it cannot be determined
+    delays: DelayEstimate | None  #: None if it cannot be determined
     notes: tuple[str, ...]  #: about delays, one sentence each
 
 
@@ -377,21 +379,20 @@ def _spring_joints(cell: Cell) -> tuple[str, ...]:
 def _delays(
     sources: Sources, stated: Settings, options: Options, reporter: Reporter
 ) -> DelayEstimate | None:
-    """Estimate the delays in the longest fitted recording, or in its beginning if not requested."""
+    """Estimate the delay in all fitted recordings, or in some time of them if not requested."""
     if options.delay == "stated":
         return None
-    source = max(sources.training, key=lambda source: source.recording.n_samples)
     wanted = options.delay == "auto"
-    if not wanted:
-        some = min(source.recording.n_samples, _DELAY_SAMPLES)
-        source = replace(source, recording=source.recording.between(0, some))
-    mean = averaged_source(source, _DELAY_RATE)
+    in_order = sorted(sources.training, key=lambda source: -source.recording.n_samples)
+    averages = _averaged_for(np.inf if wanted else _DELAY_TIME, in_order)
+    longest = in_order[0]
+    mean = replace(longest, recording=averages[0], context=None)
     with reporter.task("estimating the delay", 1) as task:
         try:
             estimate = estimate_delay(
-                mean.recording,
+                in_succession(averages),
                 sources.cell.model,
-                noise_variance=_array(averaged_noise(stated, source, mean).noise_variance),
+                noise_variance=_array(averaged_noise(stated, longest, mean).noise_variance),
                 options=replace(stated.preprocessing, smooth_torque=False),
             )
         except IdentificationError:
@@ -399,7 +400,26 @@ def _delays(
                 raise
             return None
         task.advance(1)
-    return replace(estimate, cycle=float(np.median(np.diff(source.recording.time))))
+    return replace(estimate, cycle=_step(longest.recording))
+
+
+def _averaged_for(duration: float, sources: Sequence[Source]) -> list[Recording]:
+    """Return averages of recordings of one sampling rate, the first one's, for a time [s]."""
+    averages: list[Recording] = []
+    for recording in (source.recording for source in sources):
+        if averages and (duration <= 0.0 or recording.n_samples < SHORTEST_STRETCH):
+            break
+        if duration < np.inf:
+            recording = recording.between(0, max(2, math.ceil(duration / _step(recording))))
+            duration -= recording.n_samples * _step(recording)
+        average = recording.averaged(_DELAY_RATE)
+        if not averages or np.isclose(_step(average), _step(averages[0]), rtol=_SAME_STEP):
+            averages.append(average)
+    return averages
+
+
+def _step(recording: Recording) -> float:
+    return float(np.median(np.diff(recording.time)))
 
 
 def _described(estimate: DelayEstimate) -> tuple[str, ...]:
@@ -418,7 +438,7 @@ class Prepared:
     training: tuple[Samples, ...]  #: the same recordings for the verdict: torques as recorded
     held_out: tuple[Samples, ...]  #: for the verdict; `training` if nothing was held out
     settings: Settings  #: of `fitted`
-    #: delay of the torque in the longest fitted recording; None if it cannot be determined
+    #: delay of the torque in the fitted recordings; None if it cannot be determined
     delays: DelayEstimate | None
     masked: Mapping[str, NDArray[np.intp]]  #: excluded rows of each joint (n,), by reason
     rows: int  #: time samples of `fitted`

@@ -5,7 +5,8 @@ The torque of all axes is recorded with a delay d, as by one logger:
 .. math:: \tau(t) = W\bigl(q, \dot q, \ddot q\bigr)(t - d)\,\pi + e(t)
 
 The minimum of a residual profile is refined by Gauss-Newton steps on parameters and delay together,
-with the column :math:`-d\tau/dt`.
+with the column :math:`-d\tau/dt`, and on the scale of each joint's torque, known to `DATA_SHEET`:
+the error of a scale common to all rows of a joint is as large as the noise, but follows the motion.
 
 The motion is interpolated at other times, not the torque, whose noise that would smooth. Rows near
 a velocity reversal are left out: presliding friction is similar to a delay.
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from identification.distributions import student_limit
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread
+from identification.estimators.torque_scale import DATA_SHEET
 from identification.factor.factor import (
     Estimate,
     Factor,
@@ -205,17 +207,19 @@ def estimate_delay(
     p = model.n_parameters
     assumed = options.torque_delay
     narrow = min(options.rigid_bandwidth, DELAY_BANDWIDTH)
-    options = replace(options, smooth_torque=False, rigid_bandwidth=narrow)
+    # Reversals are left out below, less widely than beside a smoother of this bandwidth.
+    options = replace(options, smooth_torque=False, rigid_bandwidth=narrow, left_out="halts")
     samples = prepare(recording, model, noise_variance=noise_variance, options=options)
     reader = _Reader.of(model, samples)
     ends = (-LONGEST_DELAY - assumed, LONGEST_DELAY - assumed)
     grid = np.linspace(*ends, 1 + 2 * int(np.ceil(LONGEST_DELAY / _PROFILE_STEP)))
     heights, values = reader.profile(grid)
+    values = np.concatenate([values, np.zeros(model.n_joints)])
     shift = float(grid[np.argmin(heights)])
     for _ in range(_ITERATIONS):
         blocks = reader.linearised(shift, values)
         solution = blocks.solution()
-        values = solution.values[:p]
+        values = np.delete(solution.values, p)
         step = np.clip(solution.values[p], -_PROFILE_STEP, _PROFILE_STEP)
         before = shift
         shift = float(np.clip(shift + step, *ends))
@@ -225,7 +229,7 @@ def estimate_delay(
     std, count = blocks.delay_std(solution)
     factor, by_chance = (float(student_limit(share, count - 1)) for share in (0.025, _CHANCE))
     at_limit = shift <= ends[0] or shift >= ends[1]
-    unshifted = reader.linearised(0.0, solution.values[:p], blocks.weights)
+    unshifted = reader.linearised(0.0, values, blocks.weights)
     return DelayEstimate(
         delay=shift + assumed,
         std=std,
@@ -268,39 +272,51 @@ def _undetermined_reason(half_interval: float, at_limit: bool, other: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Weighted normal equations of p parameters and a delay step, by B blocks of time."""
+    """Weighted normal equations by B blocks of time.
 
-    gram: Array  # (B, p + 2, p + 2)
+    Columns: p parameters, a delay step, the scale of each joint's torque, and the torque.
+    """
+
+    gram: Array  # (B, p + n + 2, p + n + 2)
+    delay: int  # index p of its column
     weights: Array  # (n,)
     rows: int
 
     def solution(self) -> Solution:
         """Solve by least squares."""
-        return _solved(self.gram.sum(axis=0))
+        return self._solved(self.gram.sum(axis=0), self.delay)
+
+    @staticmethod
+    def _solved(gram: Array, delay: int) -> Solution:
+        """Solve normal equations whose scales, after column `delay`, have unit variance."""
+        information = gram[:-1, :-1].copy()
+        scales = np.arange(len(information)) > delay
+        information[scales, scales] += 1.0
+        return solve(NormalEquations(information, gram[:-1, -1]))
 
     def delay_std(self, solution: Solution) -> tuple[float, int]:
         """Return the standard deviation of the delay, infinite if undetermined, and the blocks."""
         gram = self.gram[self.gram[:, -1, -1] > 0.0]
         augmented = np.append(-solution.values, 1.0)
         gram = merged(gram, block_length(gram[:, :-1] @ augmented))
-        moved = spread(gram[:, :-1, :-1], gram[:, :-1] @ augmented, solution.root)[:, -1]
-        std = float(np.linalg.norm(moved)) if solution.determined[-1] else np.inf
+        moved = spread(gram[:, :-1, :-1], gram[:, :-1] @ augmented, solution.root)[:, self.delay]
+        std = float(np.linalg.norm(moved)) if solution.determined[self.delay] else np.inf
         return std, max(2, len(gram))
 
     def predicted(self, *, with_delay: bool = True) -> float:
         """Return the mean weighted squared error of each fifth predicted from the others."""
-        used = np.arange(self.gram.shape[1]) != (-1 if with_delay else self.gram.shape[1] - 2)
-        parts = np.array_split(self.gram[:, used][:, :, used], _FOLDS)
+        gram = self.gram.copy()
+        if not with_delay:
+            gram[:, self.delay] = 0.0
+            gram[:, :, self.delay] = 0.0
+        parts = np.array_split(gram, _FOLDS)
         folds = np.array([part.sum(axis=0) for part in parts])
         error = 0.0
         for fold in folds:
-            augmented = np.append(-_solved(folds.sum(axis=0) - fold).values, 1.0)
+            values = self._solved(folds.sum(axis=0) - fold, self.delay).values
+            augmented = np.append(-values, 1.0)
             error += float(augmented @ fold @ augmented)
         return error / self.rows
-
-
-def _solved(gram: Array) -> Solution:
-    return solve(NormalEquations(gram[:-1, :-1], gram[:-1, -1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -387,26 +403,27 @@ class _Reader:
         return heights, best
 
     def linearised(self, shift: float, values: Array, weights: Array | None = None) -> _Blocks:
-        """Return normal equations of p parameters and a delay step at a shift, by blocks."""
-        p = self.model.n_parameters
+        """Return normal equations at a shift, linear near p parameters and n scales (p + n,)."""
         model = self.model
+        p = model.n_parameters
         samples = self.at(shift)
         blocks, columns = samples.regressor(model)
         load = samples.known_torque(model)
         tables = []
         for j, (block, used) in enumerate(zip(blocks, columns, strict=True)):
-            rate = predicted_rate(samples, load[:, j] + block @ values[used])
-            table = np.column_stack([block, -rate, samples.torque[:, j]])
+            torque = load[:, j] + block @ values[used]
+            rate = predicted_rate(samples, torque)
+            table = np.column_stack([block, -rate, DATA_SHEET * torque, samples.torque[:, j]])
             tables.append(np.where(samples.usable[:, j], table.T, 0.0))
         index = np.arange(len(samples.usable)) * _BLOCKS // max(1, len(samples.usable))
-        columns_with_delay = tuple(np.append(used, p) for used in columns)
-        names = (*model.parameter_names, "delay")
+        places = tuple(np.append(used, [p, p + 1 + joint]) for joint, used in enumerate(columns))
+        names = (*model.parameter_names, "delay", *(f"scale {name}" for name in model.joint_names))
         counts = count_by_block(index, samples.usable)
-        factor = Factor.of_rows([(index, tables)], counts, columns_with_delay, names)
+        factor = Factor.of_rows([(index, tables)], counts, places, names)
         if weights is None:
-            nothing = np.zeros((p + 1, 0))
-            variance = residual_variance(
-                factor, np.append(values, 0.0), nothing, np.ones(model.n_joints)
-            )
+            unmoved = np.insert(values, p, 0.0)
+            nothing = np.zeros((len(unmoved), 0))
+            variance = residual_variance(factor, unmoved, nothing, np.ones(model.n_joints))
             weights = inverse_variance(variance)
-        return _Blocks(factor.by_block(weights), weights, max(1, int(factor.samples.sum())))
+        rows = max(1, int(factor.samples.sum()))
+        return _Blocks(factor.by_block(weights), p, weights, rows)

@@ -447,16 +447,24 @@ def _compare_low_passes(
     if not possible:
         return now, choices
     candidates = [replace(start, preprocessing=how) for how in possible]
-    likely = trial.decide(
-        LOW_PASS, [start, trial.best(candidates)], LOW_PASS_WORTHWHILE, by_joint=True
-    )
+    # A lag and a low-pass differ beside reversals, where friction is not quite as any law: one that
+    # replaces a delay is the best of many.
+    delayed = now.preprocessing.torque_delay != now.stated_delay
+    certainty = CERTAIN if delayed else 1.0
+
+    def compare(first: Settings, other: Settings) -> _Decision:
+        return trial.decide(
+            LOW_PASS, [first, other], LOW_PASS_WORTHWHILE, by_joint=True, certainty=certainty
+        )
+
+    likely = compare(start, trial.best(candidates))
     if not likely.choice.chosen:
         return now, [*choices, likely.choice]
     filtered, behind = _sweep(trial, likely.settings, questions)
     # Refined by prediction, as the residual's minimum is flat.
     filtered = trial.decide("", _nearby_bandwidths(filtered), share=0.0).settings
     # Compared by joint, as the channel is common to all.
-    decision = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
+    decision = compare(now, filtered)
     if decision.choice.chosen and filtered.preprocessing.torque_shape.causal:
         # A lag that predicts as well is called a delay.
         late = trial.decide("", _nearby_lags(now, filtered), share=0.0).settings

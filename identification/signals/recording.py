@@ -50,7 +50,7 @@ class Recording:
         shape = (len(self.time), len(self.joint_names))
         if self.time.ndim != 1:
             raise ShapeError("time", self.time.shape, "(m,)")
-        for name, array in self._channels():
+        for name, array in self.channels():
             if array.shape != shape:
                 raise ShapeError(name, array.shape, f"{shape} (samples, joints)")
         if self.gap_before is not None and self.gap_before.shape != self.time.shape:
@@ -152,7 +152,7 @@ class Recording:
         edges = [0, *(np.flatnonzero(breaks) + 1).tolist(), self.n_samples]
         return [slice(a, b) for a, b in pairwise(edges)]
 
-    def _channels(self) -> list[tuple[str, Array]]:
+    def channels(self) -> list[tuple[str, Array]]:
         """Return the channels present, each (m, n), by attribute name."""
         channels = {
             "position": self.position,
@@ -165,14 +165,14 @@ class Recording:
 
     def each_channel(self, select: Callable[[Array], Array]) -> dict[str, Any]:
         """Apply a function to every channel present."""
-        return {name: select(array) for name, array in self._channels()}
+        return {name: select(array) for name, array in self.channels()}
 
     def check_finite(self) -> None:
         """Raise RecordingError for NaN or infinity; commands may be NaN."""
         bad = np.flatnonzero(~np.isfinite(self.time))
         if bad.size:
             raise RecordingError(f"time is {self.time[bad[0]]} at sample {bad[0]}")
-        for name, array in self._channels():
+        for name, array in self.channels():
             # NaN: packet without set-point.
             wrong = np.isinf(array) if name == "commanded_position" else ~np.isfinite(array)
             for sample, joint in np.argwhere(wrong)[:1].tolist():
@@ -212,6 +212,30 @@ class Recording:
                     f" {self.position[standstill[0], j]:.6g} from sample {standstill[0]} on "
                     f"while its command moves by {standstill[1]:.3g}"
                 )
+
+
+def in_succession(recordings: Sequence[Recording]) -> Recording:
+    """Return recordings of the same joints as segments of one, of the channels that all have."""
+    if len(recordings) == 1:
+        return recordings[0]
+    first = recordings[0]
+    times: list[Array] = []
+    gaps = []
+    for recording in recordings:
+        steps = np.diff(recording.time)
+        start = times[-1][-1] + float(np.median(steps)) if times else recording.time[0]
+        times.append(recording.time - recording.time[0] + start)
+        gap = np.zeros(len(recording.time), dtype=np.bool_)
+        gap[[segment.start for segment in recording.segments()]] = True
+        gaps.append(gap)
+    parts = [dict(recording.channels()) for recording in recordings]
+    channels: dict[str, Any] = {
+        name: np.concatenate([part[name] for part in parts])
+        if all(name in part for part in parts)
+        else None
+        for name in parts[0]
+    }
+    return replace(first, time=np.concatenate(times), gap_before=np.concatenate(gaps), **channels)
 
 
 def without_repeats(recording: Recording) -> Recording:

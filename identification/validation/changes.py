@@ -28,8 +28,13 @@ _SIGMAS: Final = 3.0  # standard deviations of a significant change
 # Smallest change that is named; a torque constant drifts by some per cent with the temperature of
 # its magnets.
 _LEAST: Final = 0.03
-# Error on unseen over fitted motion of a joint that may have changed; with the change, it is less.
-_GROWN: Final = 2.0
+# Error on unseen over fitted motion of a joint that may have changed: half of its square again, so
+# that there is an additional error to explain. A change that other axes contradict is an error of
+# the fit as well, and grows it by little.
+_GROWN: Final = 1.25
+# Error that remains with the change, of a joint that is then predicted as well as usual: twice that
+# of the fitted motion, or that of published fits.
+_USUAL: Final = (2.0, 0.1)
 # Share of the additional squared error that the change has to explain. Planted changes: at least
 # 0.95; another motion that the fitted one does not cover: below 0.6.
 _EXPLAINED: Final = 0.8
@@ -109,7 +114,7 @@ def find_changes(
             left = float(_relative(error, unseen.torque[joint]))
             explains = unseen.relative[joint] ** 2 - left**2 > _EXPLAINED * beyond
             # A factor near zero removes a prediction that is wrong, and explains nothing.
-            explains &= left < _GROWN * usual[joint]
+            explains &= left < max(_USUAL[0] * usual[joint], _USUAL[1])
             size = abs(ratio - 1.0)
             # A factor below zero is no change of one quantity.
             if ratio > 0.0 and explains and size > max(_LEAST, _SIGMAS * deviation):

@@ -254,6 +254,7 @@ class CellContext:
     controller_inertia: InertiaRatio | None = None  # its diagonal inertia over the identified one
     corrections: tuple[Finding, ...] = ()  # faults of recordings that were corrected
     added_friction: tuple[str, ...] = ()  # symbols of friction terms that nobody stated
+    scale_std: Array | None = None  # relative uncertainty of each joint's torque scale (n,)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
@@ -9,11 +11,12 @@ from hypothesis import strategies as st
 
 from drivers import SimulatedTransport
 from drivers.events import RepliesLost
+from planner import PiecewiseCubic, TrajectoryPlayer, plan
 from sim_fixtures.faults import parse_fault, split_faults
 from tests.drivers.rig import limits, running
 from tests.drivers.test_session_losses import FAR, lose, planned
 from tests.fault_matrix import faulty_runs, small_cell
-from tests.laws.motions import slows_down
+from tests.laws.motions import Array, slows_down
 
 
 class Stopped:
@@ -24,9 +27,17 @@ class Stopped:
         lost: replies lost in a row.
         share: of full speed.
         again: cycles after which two more replies are lost; 0 for never.
+        motion: the motion, by default along a straight path.
     """
 
-    def __init__(self, first: int, lost: int, share: float, again: int) -> None:
+    def __init__(
+        self,
+        first: int,
+        lost: int,
+        share: float,
+        again: int,
+        motion: TrajectoryPlayer | None = None,
+    ) -> None:
         losses = [f"lose@{first}x{lost}:to_controller"]
         if again:
             losses.append(f"lose@{first + lost + again}x2:to_controller")
@@ -35,16 +46,21 @@ class Stopped:
         self.run = faulty_runs.Run(cell, True, speed=share)
         self.run._over = first
         self.run.transport = SimulatedTransport(cell, faults)
-        self.motion = faulty_runs.motion(np.array(small_cell.HOME), faulty_runs.WAY, share)
+        straight = faulty_runs.motion(np.array(small_cell.HOME), faulty_runs.WAY, share)
+        self.motion = motion or straight
         self.run.session.request(self.motion)
         self.rates: list[float] = []
         self.along: list[float] = []
-        self.run._exchange(self._ended, 1500)
+        self.times: list[float] = []
+        self.sent: list[Array] = []
+        self.run._exchange(self._ended, 4000)
 
     def _ended(self) -> bool:
         if self.run.session.stop_reason is not None:
             sent = self.run.session._ring.last(1)["commanded_position"][0]
             self.rates.append(self.motion.rate)
+            self.times.append(self.motion.motion_time)
+            self.sent.append(sent)
             self.along.append(float((sent - small_cell.HOME) @ faulty_runs.WAY))
         return self.run.transport.cycle > 100 and not self.run.session.requested
 
@@ -62,6 +78,39 @@ def test_it_does_not_speed_up_before_it_stops(late, lost, share, again):
     stopped = Stopped(first, lost, share, again)
     assert stopped.run.outcome == "" and not stopped.run.session.broken
     assert list(slows_down(stopped.rates, stopped.along)) == []
+
+
+def curved(share: float) -> PiecewiseCubic:
+    """A path round several corners, on which the joints speed up and turn at other times."""
+    way = np.array([[0, 0], [0.15, -0.1], [0.3, 0.05], [0.25, 0.3], [0, 0.3], [-0.1, 0.1]])
+    limits = replace(faulty_runs.LIMITS, velocity=share * faulty_runs.LIMITS.velocity)
+    return plan(small_cell.HOME + way, limits, fly=1.0)
+
+
+@pytest.mark.safety
+@settings(max_examples=15, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@given(
+    at=st.floats(0.02, 0.98),
+    lost=st.integers(3, 60),
+    share=st.sampled_from((0.3, 1.0)),
+    again=st.sampled_from((0, 1, 4, 30)),
+)
+def test_nor_on_a_path_that_turns_and_speeds_up(at, lost, share, again):
+    """On its path, each joint at most as fast as planned there times the rate it began with."""
+    path = curved(share)
+    motion = TrajectoryPlayer(path, faulty_runs.PERIOD, faulty_runs.LIMITS, start_tolerance=5e-3)
+    begun = faulty_runs.cycles_without_a_fault(True)["under way"]
+    first = begun + round(at * path.duration / faulty_runs.PERIOD)
+    stopped = Stopped(first, lost, share, again, motion)
+    # "completed": the replies were lost where the motion ended.
+    assert stopped.run._fate() in ("stopped", "completed") and not stopped.run.session.broken
+    assert list(slows_down(stopped.rates, stopped.times)) == []
+    steps = np.diff(stopped.times)
+    assert (np.diff(steps[steps > 0.0]) <= 1e-12).all(), "zero where a set-point is sent again"
+    sent = np.array(stopped.sent).reshape(-1, faulty_runs.N)
+    planned = path.sample(np.minimum(stopped.times, path.duration))[0]
+    apart = (sent - planned)[np.isfinite(sent).all(axis=1)]
+    assert not apart.size or np.ptp(apart, axis=0).max() < 1e-9
 
 
 def lose_slowing(lost: int, others: float = 0.95):

@@ -1,9 +1,14 @@
-"""Clock, wrapped angles and resolution of recordings, as the facts of a verdict."""
+"""Clock, wrapped angles, friction law and resolution of recordings, as facts of a verdict."""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from hil.identify.cell_context import grid_step
+from hil.identify.cell_context import _friction_law, grid_step
+from identification.model.friction import FrictionLaw
+from identification.selection.inner_prediction import LOAD
+from identification.selection.settings import Choice
 from identification.signals.recording import UNWRAPPED, Recording, unwrap, unwrapped
 
 TIME = np.arange(0.0, 20.0, 0.01)
@@ -43,6 +48,40 @@ class TestWrappedAngles:
         moved = ANGLES.copy()
         moved[1000:, 1] += 2.0 * np.pi
         assert unwrap(moved, np.arange(len(TIME)) == 1000) is moved
+
+
+def friction_findings(stated, law, chosen=1):
+    """Findings about the friction of recordings that state a law, fitted with another."""
+    table = SimpleNamespace(**stated.table())
+    cell = SimpleNamespace(
+        model=SimpleNamespace(friction=SimpleNamespace(laws=(law,))),
+        stated=SimpleNamespace(robot=SimpleNamespace(friction=table)),
+    )
+    choices = (Choice(LOAD, ("first", "second"), (0.2, 0.1), chosen),)
+    prepared = SimpleNamespace(
+        settings=SimpleNamespace(choices=choices), sources=SimpleNamespace(cell=cell)
+    )
+    return [*_friction_law(prepared)]
+
+
+class TestFrictionLaw:
+    BASIC = FrictionLaw(third=None, offset=True)
+
+    def test_a_term_that_nobody_stated_is_said(self):
+        (finding,) = friction_findings(self.BASIC, self.BASIC.changed({"load": True}))
+        assert finding.level == "information"
+        assert "Coulomb, viscous, load, offset" in finding.words
+
+    @pytest.mark.parametrize("stated", [{"third": "quadratic"}, {"stribeck": 0.1}, {"load": True}])
+    def test_a_stated_term_that_goes_is_a_warning(self, stated):
+        (finding,) = friction_findings(self.BASIC.changed(stated), self.BASIC)
+        assert finding.level == "doubtful"
+        terms = {"quadratic": "quadratic", 0.1: "stribeck=0.1", True: "load"}
+        (term,) = stated.values()
+        assert f"{terms[term]},offset`" in finding.next_step
+
+    def test_the_stated_law_is_not_mentioned(self):
+        assert friction_findings(self.BASIC, self.BASIC, chosen=0) == []
 
 
 class TestResolution:

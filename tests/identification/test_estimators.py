@@ -59,6 +59,7 @@ from identification.factor.factor import (
     total_factor,
 )
 from identification.model.pseudo_inertia import pseudo_inertia
+from identification.signals.recording import in_succession
 from identification.signals.smoothing import low_pass
 from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.ns16 import CELL_PATH, urdf_text
@@ -1154,6 +1155,25 @@ class TestDelay:
         # The standard deviation of 12 samples has an error of 21 %.
         assert abs(np.log(claimed / scatter)) < 3 * 0.21
         assert all(estimate.significant for estimate in estimates)
+
+    def test_the_scale_of_torques_does_not_bias_it(self):
+        """An error of some per cent for one joint follows the motion, as the delay does."""
+        errors = []
+        for seed in range(6):
+            recording = delayed(1.6e-3, seed=seed, torque_noise=0.3)
+            scaled = replace(recording, torque=recording.torque * [1.05, 0.95])
+            estimate = estimate_delay(scaled, MODEL)
+            errors.append((estimate.delay - 1.6e-3) / estimate.half_interval)
+            exact = estimate_delay(recording, MODEL)
+            assert estimate.half_interval < 1.2 * exact.half_interval
+        assert np.abs(errors).max() < 1.5
+
+    def test_recordings_in_succession_determine_it_better(self):
+        recordings = [delayed(1.6e-3, seed=seed) for seed in range(4)]
+        single = estimate_delay(recordings[0], MODEL)
+        every = estimate_delay(in_succession(recordings), MODEL)
+        assert every.delay == pytest.approx(1.6e-3, abs=1.5 * every.half_interval)
+        assert every.half_interval < 0.7 * single.half_interval
 
     def test_a_delay_beyond_the_range_is_undetermined(self):
         estimate = estimate_delay(delayed(0.06), MODEL)

@@ -29,6 +29,7 @@ from identification.signals.masks import (
 from identification.signals.recording import (
     Recording,
     RecordingError,
+    in_succession,
     offsets_of_repetitions,
     without_repeats,
 )
@@ -224,6 +225,23 @@ class TestAveraged:
         starts = np.concatenate([8 * np.arange(7), 64 + 8 * np.arange(10), 150 + 8 * np.arange(6)])
         expected = recording.position[starts[:, None] + np.arange(8)].mean(axis=1)
         np.testing.assert_allclose(averaged.position, expected, rtol=1e-12)
+
+
+class TestInSuccession:
+    def test_recordings_are_segments_of_one(self):
+        """With one step between them, and the channels that all have."""
+        first, second = a_recording(150), replace(a_recording(90), commanded_position=None)
+        both = in_succession([first, second])
+        assert [part.stop - part.start for part in both.segments()] == [150, 90]
+        for name in ("position", "torque"):
+            expected = np.concatenate([getattr(first, name), getattr(second, name)])
+            np.testing.assert_array_equal(getattr(both, name), expected)
+        assert both.commanded_position is None
+        assert both.checked(first.joint_names) is both
+
+    def test_one_recording_is_itself(self):
+        recording = a_recording()
+        assert in_succession([recording]) is recording
 
 
 class TestTrueTimes:

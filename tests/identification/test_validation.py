@@ -747,6 +747,31 @@ class TestChangesToUnseenMotion:
         assert [(change.kind, change.joint) for change in changes] == [("friction", 1)]
         assert changes[0].ratio == pytest.approx(factor, abs=0.05)
 
+    def test_a_torque_beside_an_error_of_the_fit(self):
+        """The error on unseen motion is not twice that of the fitted one."""
+
+        def waved(factor):
+            def measured(motion, torque):
+                wave = 0.1 * torque.std(axis=0) * np.sin(3.0 * motion.time)[:, None]
+                return torque * [1.0, factor] + wave * [0.0, 1.0]
+
+            return measured
+
+        (change,) = changes_between(waved(0.9), waved(1.0))
+        assert (change.kind, change.joint) == ("gain", 1)
+        assert change.ratio == pytest.approx(1.0 / 0.9, abs=0.02)
+
+    def test_a_torque_beside_an_error_of_unseen_motion(self):
+        """What is left may be more than twice the error of a good fit."""
+
+        def waved(motion, torque):
+            wave = 0.05 * torque.std(axis=0) * np.sin(7.0 * motion.time)[:, None]
+            return torque * [1.0, 1.1] + wave
+
+        (change,) = changes_between(as_it_is, waved)
+        assert (change.kind, change.joint) == ("gain", 1)
+        assert change.ratio == pytest.approx(1.1, abs=0.02)
+
     def test_another_error_is_no_change(self):
         def waved(motion, torque):
             return torque + 3.0 * np.sin(40.0 * motion.time)[:, None]

@@ -386,6 +386,8 @@ class TestJudgement:
             (Change("gain", 1, 0.91, 0.001, 0.01), 0.1, "wrong", "two 0.91 ± 0.002"),
             (Change("gain", 1, 0.95, 0.001, 0.01), 0.05, "doubtful", "two 0.95 ± 0.002"),
             (Change("friction", 0, 1.3, 0.01, 0.01), 0.1, "wrong", "one +30 %"),
+            (Change("friction", 0, 1.3, 0.01, 0.01), 0.03, "wrong", "one +30 %"),
+            (Change("friction", 0, 1.3, 0.01, 0.01), 0.01, "doubtful", "one +30 %"),
             (Change("friction", 0, 0.92, 0.01, 0.01), 0.1, "doubtful", "one -8 %"),
         ],
     )
@@ -401,6 +403,15 @@ class TestJudgement:
         causes = caused("gain", 1, ratio=0.86)
         findings = judged(causes=causes, changes=changes, held_out=an_error(0.1)).findings
         assert named == any(finding.check == "torque constant" for finding in findings)
+
+    @pytest.mark.parametrize(("size", "level"), [(0.1, "information"), (0.2, "doubtful")])
+    def test_a_constant_within_the_assumed_scale_is_no_cause(self, size, level):
+        """Three standard deviations of the ratio of two torques known to 3 % are 13 %."""
+        causes = (Cause(Fault("gain", (1,)), 0.8, size, 0.001),)
+        verdict = judged(causes=causes, scale_std=np.full(2, 0.03))
+        (finding,) = (each for each in verdict.findings if each.check == "torque constant")
+        assert finding.level == level
+        assert ("assumed uncertainty" in finding.words) == (level == "information")
 
     def test_a_body_that_explains_the_error_is_not_unexplained(self):
         changes = {"held_out": an_error(0.1), "noise_floor": np.full(2, 0.1), "causes": ()}

@@ -21,6 +21,7 @@ MOUNTING_STEP: Final = (
     "state how the arm is mounted: `--gravity X Y Z` where a log is read with its URDF, or gravity"
     " of [robot] in the cell file"
 )
+_SIGMAS: Final = 3.0  # standard deviations of a scale that is not as assumed
 _SIGN_OR_SCALE: Final[tuple[Kind, ...]] = ("torque sign", "axis sign", "gain")
 
 
@@ -118,6 +119,8 @@ class FaultFacts:
 
     causes: tuple[Cause, ...]
     certain_below: float  # ratio of the errors
+    # of the scale of one joint's torque over those of the others, as it is assumed (n,)
+    scale_std: Array
 
     @classmethod
     def of(
@@ -145,7 +148,10 @@ class FaultFacts:
             or cause.ratio < limits.cause
             or changed <= {*cause.fault.joints}
         )
-        return cls(causes, limits.cause)
+        std = evidence.context.scale_std
+        std = np.zeros(len(evidence.held_out.rows)) if std is None else std
+        others = np.sqrt(np.maximum((std**2).sum() - std**2, 0.0) / max(len(std) - 1, 1))
+        return cls(causes, limits.cause, np.hypot(std, others))
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
         """Yield each fault."""
@@ -153,6 +159,15 @@ class FaultFacts:
             joints = [naming.joints[joint] for joint in cause.fault.joints] or ["all axes"]
             text = _text(cause, " and ".join(joints), naming)
             certain = cause.fault.discrete or cause.ratio < self.certain_below
+            if self._is_assumed(cause):
+                std = percentage(self._scale_std_of(cause), 1)
+                yield Finding(
+                    text.check,
+                    "information",
+                    f"{text.words}, which the assumed uncertainty of the torques includes"
+                    f" (standard deviation of the ratio {std})",
+                )
+                continue
             yield Finding(
                 text.check,
                 "wrong" if certain else "doubtful",
@@ -161,6 +176,16 @@ class FaultFacts:
                 text.step,
                 "cause",
             )
+
+    def _is_assumed(self, cause: Cause) -> bool:
+        """Return whether a torque is off by no more than the scale of torques may be."""
+        if cause.fault.kind != "gain" or cause.fault.part is not None:
+            return False
+        std = float(np.hypot(self._scale_std_of(cause), cause.std))
+        return abs(cause.size or 0.0) <= _SIGMAS * std
+
+    def _scale_std_of(self, cause: Cause) -> float:
+        return float(self.scale_std[[*cause.fault.joints]].max())
 
 
 class _Text(NamedTuple):

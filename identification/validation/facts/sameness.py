@@ -69,6 +69,7 @@ class ChangeFacts:
     gain: Mask  # joints of another torque (n,)
     friction: Mask  # joints of other friction (n,)
     matters: Mask  # joints with an error that has to be explained (n,)
+    noticed: Mask  # joints with an error beyond that of a right model (n,)
 
     @classmethod
     def of(
@@ -96,6 +97,7 @@ class ChangeFacts:
             gain=_joints_of(evidence, "gain"),
             friction=_joints_of(evidence, "friction"),
             matters=error.relative > limits.unexplained,
+            noticed=error.relative > limits.noticeable,
         )
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
@@ -163,7 +165,7 @@ class FrictionFacts:
     def _of_changes(cls, changes: ChangeFacts, limits: Thresholds) -> FrictionFacts:
         change = changes.ratio - 1.0
         joints = changes.friction
-        far = joints & changes.matters & (np.abs(change) > FRICTION_CHANGE)
+        far = joints & changes.noticed & (np.abs(change) > FRICTION_CHANGE)
         return cls(change, joints, axes=joints, wrong=bool(far.any()), limit=limits.friction)
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
