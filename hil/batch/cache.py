@@ -125,7 +125,7 @@ class CacheLocation:
                 checksum, _, text = file.read().partition(b"\n")
             if checksum != _checksum(key, text):
                 return None
-            value: T = _adapter(kind).validate_python(json.loads(text))
+            value: T = _adapter(kind).validate_python(json.loads(text))  # type: ignore[arg-type]
         except (OSError, MemoryError, ValueError, RecursionError):
             return None
         return value

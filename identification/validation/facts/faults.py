@@ -153,7 +153,7 @@ class FaultFacts:
             yield Finding(
                 text.check,
                 "wrong" if certain else "doubtful",
-                f"{text.words}; correcting this multiplies the error of predicted parts of the"
+                f"{text.message}; correcting this multiplies the error of predicted parts of the"
                 f" fitted motion by {cause.ratio:.2f}",
                 text.step,
                 "cause",
@@ -162,12 +162,12 @@ class FaultFacts:
 
 class _Text(NamedTuple):
     check: str
-    words: str
+    message: str
     step: str
 
 
 def _text(cause: Cause, joints: str) -> _Text:
-    """Return the words on a cause of each kind."""
+    """Return the message on a cause of each kind."""
     match cause.fault.kind:
         case "delay":
             return _delay(cause, joints)
