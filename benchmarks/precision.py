@@ -302,9 +302,9 @@ def weighings(count: int, required: str) -> dict[str, Any]:
         load = Body(share * heavy.mass, heavy.centre, share * heavy.inertia)
         weighed = _weighed(cell.with_campaign(simulation_seed=seed), plan, load, requirements)
         truth = figures_of(load)
-        intervals = weighed.found.estimate.intervals
+        intervals = weighed.payload.estimate.intervals
         inside.append((intervals[:, 0] <= truth) & (truth <= intervals[:, 1]))
-        errors.append(weighed.found.body.mass / load.mass - 1.0)
+        errors.append(weighed.payload.body.mass / load.mass - 1.0)
         halves.append((intervals[0, 1] - intervals[0, 0]) / 2.0 / load.mass)
         pairs.append(weighed.pairs)
         figures = {"seed": seed, "pairs": pairs[-1], "error": errors[-1], "half": halves[-1]}

@@ -125,12 +125,12 @@ class Weighed:
     """A payload that was weighed.
 
     Attributes:
-        found: as by `hil payload`.
+        payload: as by `hil payload`.
         pairs: of recordings without and with it.
         precision: of the mass, if one was required.
     """
 
-    found: PayloadFound
+    payload: PayloadFound
     pairs: int
     precision: PrecisionRecord | None
 
@@ -138,12 +138,12 @@ class Weighed:
     def lines(self) -> list[str]:
         """What `hil payload` prints, and the precision."""
         reached = [] if self.precision is None else ["", self.precision.message]
-        return [*self.found.lines(), *reached]
+        return [*self.payload.lines(), *reached]
 
     def as_json(self) -> dict[str, Any]:
         """Return all values as JSON data."""
         precision = None if self.precision is None else self.precision.message
-        return self.found.as_json() | {"pairs": self.pairs, "precision": precision}
+        return self.payload.as_json() | {"pairs": self.pairs, "precision": precision}
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,7 +272,7 @@ class PayloadCampaign:
                 reporter.say(record.message)
             if pairs >= FEWEST and (record is None or (record.ended and record.measured == pairs)):
                 break
-        result = result or self._found(pairs, reporter)
+        result = result or self._weighed(pairs, reporter)
         sides = ((self.bare.folder.root,), (self.loaded.folder.root,))
         weighed = Weighed(replace(result, typed=sides), pairs, record)
         text = json.dumps(weighed.as_json(), indent=1, ensure_ascii=False)
@@ -342,7 +342,7 @@ class PayloadCampaign:
     def _weighed_so_far(self, pairs: int, reporter: Reporter) -> PayloadFound | None:
         """Weigh the payload as `_found`; None if too few pairs leave it undetermined."""
         try:
-            return self._found(pairs, reporter)
+            return self._weighed(pairs, reporter)
         except (NoPayloadError, IdentificationError) as error:
             if pairs >= FEWEST:
                 raise
@@ -350,7 +350,7 @@ class PayloadCampaign:
             reporter.say(f"precision after {pair}: the mass is not determined yet: {error}")
             return None
 
-    def _found(self, pairs: int, reporter: Reporter) -> PayloadFound:
+    def _weighed(self, pairs: int, reporter: Reporter) -> PayloadFound:
         """Weigh the payload by the first pairs of recordings."""
         bare, loaded = (
             [*side.folder.completed("excitation")[:pairs], *side.folder.completed("standstill")]

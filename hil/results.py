@@ -365,7 +365,7 @@ class FittedResult(Frozen):
     smoothed_overall_relative_error: float | None = None
 
     @property
-    def words(self) -> str:
+    def message(self) -> str:
         """Summary, without full stop."""
         smoothed = self.smoothed_overall_relative_error
         text = (
@@ -389,7 +389,7 @@ class CalibrationResult(Frozen):
     half_width: list[Known]  #: Median half width of the intervals, N·m or N
 
     @property
-    def words(self) -> str:
+    def message(self) -> str:
         """Summary, without full stop."""
         return (
             f"{percentage(self.inside, 1)} of {self.means} held-out means of torque "

@@ -350,7 +350,7 @@ class Layout:
     """Axis blocks of this arm and of others, and the packets with them.
 
     `tail` are random bytes that fill long packets; `axes` (n_slots,) the axis blocks of the next
-    packet; `slots` (and `own`, as an array) the slot of each axis of this arm.
+    packet; `slots` (and `slot_array`) the slot of each axis of this arm.
     """
 
     def __init__(
@@ -359,7 +359,7 @@ class Layout:
         self.n_slots = n = n_axes + settings.foreign_axes
         slots = settings.slots if settings.slots is not None else tuple(range(n_axes))
         self.slots = tuple(slots)
-        self.own = np.array(slots, np.intp)
+        self.slot_array = np.array(slots, np.intp)
         self._foreign = np.array([s for s in range(n) if s not in slots], np.intp)
         self._settings = settings
         self._tail = tail
@@ -378,7 +378,7 @@ class Layout:
     def fill(self, values: NDArray[np.float64]) -> None:
         """Set D1..D5, extra1..3 of this arm's axes, (8, n_axes); infinite beyond float32."""
         with np.errstate(over="ignore"):
-            self._values[:, self.own] = values
+            self._values[:, self.slot_array] = values
 
     def set_modes(self, common: int | None, open_axes: Sequence[bool]) -> None:
         """Set all modes to `common`, or if None each axis to the open mode or to closed."""
@@ -390,7 +390,7 @@ class Layout:
             self.axes["mode"] = common
             return
         mode = self._settings.open_mode
-        self.axes["mode"][self.own] = [mode if is_open else 0 for is_open in open_axes]
+        self.axes["mode"][self.slot_array] = [mode if is_open else 0 for is_open in open_axes]
         opens = self._settings.foreign_open and any(open_axes)
         self.axes["mode"][self._foreign] = mode if opens else 0
 
@@ -426,7 +426,7 @@ class Layout:
             slots[at], modes[at] = slot, Mode.CLOSED
             for name, value in _FOREIGN.items():
                 tables[name][at] = value
-        slots[axes], modes[axes] = self.own, Mode.CLOSED
+        slots[axes], modes[axes] = self.slot_array, Mode.CLOSED
         for name in _FOREIGN:
             tables[name][axes] = getattr(drive, name)
         tables["kinematic_influence"][row, 3:6] = (drive.k54, drive.k64, drive.k65)
@@ -559,7 +559,7 @@ _ADDS_CURRENT = (1, 2, 9)
 class Targets:
     """Computes the demand of each cycle from the own program and the replies.
 
-    `own` and `own_delta` are the targets that the controller reports, (n,) [motor rev], and their
+    `target` and `delta` are the targets that the controller reports, (n,) [motor rev], and their
     speed [motor rev per cycle].
     """
 
@@ -574,8 +574,8 @@ class Targets:
         self._broken_off = False
         self._offset = [0.0] * n
         self._ramp = [0.0] * n
-        self.own = [0.0] * n
-        self.own_delta = [0.0] * n
+        self.target = [0.0] * n
+        self.delta = [0.0] * n
 
     @property
     def own_motion_done(self) -> bool:
@@ -584,8 +584,8 @@ class Targets:
 
     def release(self, servo: CycleServo) -> None:
         """With the drive off, set targets to the motor positions and abort the own motion."""
-        self.own, self.own_delta = list(servo.target), list(servo.delta)
-        self._offset = [0.0] * len(self.own)
+        self.target, self.delta = list(servo.target), list(servo.delta)
+        self._offset = [0.0] * len(self.target)
         self._break_off()
 
     def _break_off(self) -> None:
@@ -602,14 +602,14 @@ class Targets:
         """Return the demand of the cycle that begins, with the PC's reply `wanted` (n,)."""
         demand = self._own_demand(servo, program)
         if self._settings.corrected and program.listening:
-            self.own, self.own_delta = list(demand.target), list(demand.delta)
+            self.target, self.delta = list(demand.target), list(demand.delta)
             self._correct(demand, wanted)
         else:
             if not self._settings.corrected:
                 self._follow(demand, wanted)
-            self.own = demand.target
-            self.own_delta = demand.delta
-            self._offset = [0.0] * len(self.own)
+            self.target = demand.target
+            self.delta = demand.delta
+            self._offset = [0.0] * len(self.target)
         return demand
 
     def _own_demand(self, servo: CycleServo, program: LoopProgram) -> CycleDemand:
@@ -623,7 +623,7 @@ class Targets:
             self._break_off()
         self._moving = False
         if corrected:
-            return CycleDemand(list(self.own), list(zero), zero, list(zero))
+            return CycleDemand(list(self.target), list(zero), zero, list(zero))
         continues = self._settings.while_silent == "continue"
         target = list(servo.target)
         delta = [0.0] * n
@@ -654,7 +654,7 @@ class Targets:
         assert self._motion is not None
         if not self._moving:
             self._moving = True
-            self._motion.begin(self._drive.joint_angles(self.own))
+            self._motion.begin(self._drive.joint_angles(self.target))
         position, velocity = self._motion.advance()
         period = self._settings.period
         target = self._drive.motor_revolutions(position.tolist())
@@ -919,7 +919,7 @@ class SimulatedController:
         if requests.drive_off or requests.following_error or not program.listening:
             return requests, self._nothing
         layout.move_foreign(packet)
-        replied = packet.axes["d"][layout.own].tolist()
+        replied = packet.axes["d"][layout.slot_array].tolist()
         open_mode = self.settings.open_mode
         return requests, [
             fields if is_open and modes[slot] == open_mode else None
@@ -935,7 +935,7 @@ class SimulatedController:
         layout.set_modes(common, program.open_axes)
         zero = [0.0] * self._drive.n_axes
         has_target = program.powered or phase is Phase.TRIPPED
-        demanded = (self._targets.own, self._targets.own_delta) if has_target else (zero, zero)
+        demanded = (self._targets.target, self._targets.delta) if has_target else (zero, zero)
         measured: Sequence[float] = servo.measured
         slip = self._arm.disturbances.slip
         if slip is not None:

@@ -1,7 +1,8 @@
-"""Cache of a batch between runs: `.npz` files with a JSON header, replaced atomically.
+"""Cache of a batch between runs: `.npz` files with a JSON header, and JSON files without arrays.
 
 A file is named by its key, a digest of everything that the content depends on, so that no entry is
-ever out of date. The container has a checksum of each array; a damaged entry is ignored.
+ever out of date. Files are replaced atomically. An `.npz` has a checksum of each array, a JSON file
+one of its text in the line above; a damaged entry is ignored.
 """
 
 from __future__ import annotations
@@ -10,18 +11,19 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, is_dataclass
 from functools import cache
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, BinaryIO, Final, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from hil.errors import InputError
 from hil.files import digest, json_digest, replace_file, user_cache
@@ -35,6 +37,7 @@ Arrays = dict[str, NDArray[Any]]
 
 BESIDE: Final = ".hil-cache"  # folder beside the archives
 HEADER: Final = "header"  # array with the JSON text, as bytes
+NPZ, JSON = ".npz", ".json"  # suffixes of entries with and without arrays
 
 LIBRARIES: Final = ("numpy", "scipy", "pin")  # that determine the numbers
 
@@ -73,13 +76,13 @@ class CacheLocation:
         root = user_cache() if self.root is None else Path(self.root)
         return root / digest(folder)[:16]
 
-    def path(self, location: str, key: str) -> Path:
-        """Return the file of an entry."""
-        return self.folder(location) / key[:2] / f"{key}.npz"
+    def path(self, location: str, key: str, suffix: str = NPZ) -> Path:
+        """Return the file of an entry, by default of one with arrays."""
+        return self.folder(location) / key[:2] / f"{key}{suffix}"
 
-    def has(self, location: str, key: str) -> bool:
+    def has(self, location: str, key: str, suffix: str = NPZ) -> bool:
         """Return whether there is a file for the key, intact or not."""
-        return self.keep and self.path(location, key).is_file()
+        return self.keep and self.path(location, key, suffix).is_file()
 
     def read(self, location: str, key: str) -> tuple[Any, Arrays] | None:
         """Return the header and the arrays of an entry; None if there is no intact one."""
@@ -108,25 +111,22 @@ class CacheLocation:
         """
         if not self.keep:
             return
-        path = self.path(location, key)
         text = json.dumps({"key": key, "content": content, "arrays": [*arrays]}).encode()
         header = {HEADER: np.frombuffer(text, np.uint8)}
-        # No fsync: an entry damaged by a power cut fails its checksum and is computed again.
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with replace_file(path) as temporary, temporary.open("xb") as file:
-                np.savez(file, allow_pickle=False, **header, **arrays)
-        except OSError as error:
-            problem = f"cannot be written ({error.strerror})"
-            remedy = "make room, or name another folder with --cache, or none"
-            raise CacheError(path, problem, remedy=remedy) from error
+        with _new_file(self.path(location, key)) as file:
+            np.savez(file, allow_pickle=False, **header, **arrays)
 
     def get(self, location: str, key: str, kind: type[T]) -> T | None:
         """Return the JSON data of a key as this type; None if there is no intact entry of it."""
-        entry = self.read(location, key)
+        if not self.keep:
+            return None
         try:
-            value: T | None = None if entry is None else _adapter(kind).validate_python(entry[0])  # type: ignore[arg-type]
-        except ValidationError:
+            with open_file(self.path(location, key, JSON)) as file:
+                checksum, _, text = file.read().partition(b"\n")
+            if checksum != _checksum(key, text):
+                return None
+            value: T = _adapter(kind).validate_python(json.loads(text))  # type: ignore[arg-type]
+        except (OSError, MemoryError, ValueError, RecursionError):
             return None
         return value
 
@@ -136,8 +136,35 @@ class CacheLocation:
         Raises:
             CacheError: the file cannot be written.
         """
+        if not self.keep:
+            return
         is_object = is_dataclass(content) and not isinstance(content, type)
-        self.write(location, key, asdict(content) if is_object else content, {})
+        text = json.dumps(asdict(content) if is_object else content).encode()
+        with _new_file(self.path(location, key, JSON)) as file:
+            file.write(_checksum(key, text) + b"\n" + text)
+
+
+def _checksum(key: str, text: bytes) -> bytes:
+    return digest(key.encode() + text).encode()
+
+
+@contextmanager
+def _new_file(path: Path) -> Iterator[BinaryIO]:
+    """Provide the new file of an entry, which replaces another when it is complete.
+
+    Without fsync: an entry damaged by a power cut fails its checksum and is computed again.
+
+    Raises:
+        CacheError: the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replace_file(path) as temporary, temporary.open("xb") as file:
+            yield file
+    except OSError as error:
+        problem = f"cannot be written ({error.strerror})"
+        remedy = "make room, or name another folder with --cache, or none"
+        raise CacheError(path, problem, remedy=remedy) from error
 
 
 @cache

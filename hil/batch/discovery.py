@@ -26,7 +26,7 @@ from hil.recorded_campaign import Entry, RecordedCampaign
 from hil.terminal_text import typed
 from identification.selection.settings import Settings
 
-from .cache import BESIDE, CacheError, CacheLocation, code_digest
+from .cache import BESIDE, JSON, CacheError, CacheLocation, code_digest
 from .cluster import Cluster, SkippedArchive, Task, reason_of
 from .places import (
     SUFFIX,
@@ -416,7 +416,7 @@ def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
         cell = cell_in(archive)
         drives = archive.attachments.get("drive_train.json")
         key = json_digest([cell.text, cell.urdf])
-        if not cache.has(place, key):
+        if not cache.has(place, key, JSON):
             cache.put(place, key, CellTexts(cell.text, cell.urdf))
         arm = arm_digest(cell, drives, simulated=ref.simulated)
         ref = replace(ref, arm=arm, cell=key, setup=describe_setup(cell))

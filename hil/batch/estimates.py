@@ -255,7 +255,7 @@ class Estimator:
             result.estimate,
             covariance=scatter.covariance(solution.root, precision, result.design_effect),
             interval_factor=scatter.interval_factor,
-            method=f"{result.estimate.method.partition('; ')[0]}; {scatter.words}",
+            method=f"{result.estimate.method.partition('; ')[0]}; {scatter.description}",
         )
 
     def of_group(self, group: Group, posterior: Posterior | None) -> Estimate:

@@ -260,7 +260,7 @@ def _entry(summary: Summary) -> dict[str, Any]:
         entry["scatter"] = {
             "rows": len(scatter.rows),
             "interval_factor": scatter.interval_factor,
-            "words": scatter.words,
+            "description": scatter.description,
         }
     return entry
 

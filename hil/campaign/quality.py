@@ -326,37 +326,52 @@ class ArchiveReview:
         """Return the problem of a repetition, None for none.
 
         Where enough later attempts agree with each other and not with the only accepted one, that
-        one is rejected instead: once in a run, since a second time shows that they scatter.
+        one is rejected instead: once in a run, since a second time shows that they scatter. So are
+        several accepted ones with missed packets, during which the controller moved the arm
+        without a set-point, if as many attempts without a missed packet agree.
         """
         problem = self._check.problem(executed)
-        good = self._folder.completed("excitation")
-        if problem is None or not problem.differs or len(good) != 1 or self.notes:
+        accepted = [path.name for path in self._folder.completed("excitation")]
+        if problem is None or not problem.differs or not accepted or self.notes:
             return problem
-        alike, with_accepted = self._alike(executed)
-        enough = max(_FEWEST_ALIKE, self._cell.campaign.bad_repetitions)
+        several = len(accepted) > 1
+        if several and (executed.missed or not all(map(self._has_missed, accepted))):
+            return problem
+        alike, with_accepted = self._alike(executed, without_missed=several)
+        enough = max(_FEWEST_ALIKE, self._cell.campaign.bad_repetitions, len(accepted))
         if len(alike) + 1 < max(enough, with_accepted + 2):
             return problem
-        name = good[0].name
-        reason = f"{', '.join(alike)} and the next repetition agree with each other, not with this"
-        self._reject(name, reason)
+        attempts = ", ".join(alike)
+        reason = f"{attempts} and the next repetition agree with each other, not with this"
+        if several:
+            reason += ": packets were missed in it, and none in those"
+        for name in accepted:
+            self._reject(name, reason)
+        later = f"{len(alike) + 1} later ones agree with each other and not with"
         self.notes.append(
-            f"{name} was the only repetition that counted, and was rejected because "
-            f"{len(alike) + 1} later ones agree with each other and not with it: it was "
-            "disturbed, or the arm was changed after it"
+            f"packets were missed in {', '.join(accepted)}, all that counted; they were rejected"
+            f" because {later} them, in which none was missed: they were disturbed alike, or the"
+            " arm was changed after them"
+            if several
+            else f"{accepted[0]} was the only repetition that counted, and was rejected because"
+            f" {later} it: it was disturbed, or the arm was changed after it"
         )
         self._check = RepetitionCheck(self._cell, self._motion)
         return None
+
+    def _has_missed(self, name: str) -> bool:
+        return self._executed(name).missed > 0
 
     def _reject(self, name: str, reason: str) -> None:
         amend_outcome(self._folder.archives / name, REJECTED, reason)
         self._folder.add(name, REJECTED, reason)
         self.rejected.append(Rejected(name, reason))
 
-    def _alike(self, executed: Executed) -> tuple[list[str], int]:
+    def _alike(self, executed: Executed, *, without_missed: bool = False) -> tuple[list[str], int]:
         """Return attempts that agree with this one and each other, and how many with the accepted.
 
-        Only valid attempts that were rejected since the last accepted one are compared; where
-        attempts scatter, they agree with either.
+        Only valid attempts that were rejected since the last accepted one are compared, and on
+        request only those without a missed packet; where attempts scatter, they agree with either.
         """
         rejected = list[str]()
         for entry in self._folder.manifest():
@@ -369,6 +384,8 @@ class ArchiveReview:
         for attempt in rejected:
             with suppress(ArchiveError):
                 other = self._executed(attempt)
+                if without_missed and other.missed:
+                    continue
                 if problem_of(other, self._motion, self._cell) is None:
                     with_accepted += self._check.problem(other) is None
                     if check.problem(other) is None:

@@ -113,7 +113,7 @@ class _CampaignRun:
             # Refused before anything moves if the dry run could not be accepted afterwards.
             require_dry_run(
                 campaign.folder,
-                self._dry_run.found(),
+                self._dry_run.record(),
                 options,
                 simulated=simulated,
                 can_answer=watch.operator.can_answer,
@@ -221,7 +221,7 @@ class _CampaignRun:
     def _result(self) -> RunResult:
         campaign = self._campaign
         archives = self._archives
-        dry_run = self._dry_run.found()
+        dry_run = self._dry_run.record()
         precision = campaign.precision
         return RunResult(
             campaign=str(campaign.folder.root),

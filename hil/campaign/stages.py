@@ -44,9 +44,9 @@ class DryRunStage:
         self.motions = [replace(motion, kind="dryrun", index=k) for k, motion in enumerate(motions)]
         # Only what an earlier run measured can be accepted, not what this one is going to.
         named = options.accept_torque
-        self._known = named if named and self.found() else ()
+        self._known = named if named and self.record() else ()
 
-    def found(self) -> DryRunRecord | None:
+    def record(self) -> DryRunRecord | None:
         """Return the dry run of this plan and kind of arm; None without a valid one."""
         archives = self._archives
         if self._options.unrehearsed:
@@ -80,7 +80,7 @@ class DryRunStage:
             OperatorStopError: the operator stopped instead of answering.
         """
         archives = self._archives
-        record = self.found()
+        record = self.record()
         if self._options.unrehearsed:
             return
         if record is None:
@@ -146,13 +146,13 @@ class WarmUpStage:
     @property
     def outcome(self) -> str:
         """State of the warm-up: "none", "going on", "warm" or "not warm"."""
-        record = self._found()
+        record = self._stored()
         return "none" if record is None else record.outcome
 
     @property
     def notes(self) -> list[str]:
         """What a reader of the results must know."""
-        record = self._found()
+        record = self._stored()
         if record is None or record.outcome != "not warm":
             return self._pauses
         cold = f"the arm was not warm when the repetitions began ({record.sentence})"
@@ -204,21 +204,21 @@ class WarmUpStage:
 
     def motion_ended(self) -> None:
         """Record that a motion that warms the joints has ended."""
-        record = self._found()
+        record = self._stored()
         if record is not None:
             replace(record, moved_at=time.time()).save(self._path)
 
-    def _found(self) -> WarmUpRecord | None:
+    def _stored(self) -> WarmUpRecord | None:
         return WarmUpRecord.load(self._path, self._archives.plan_hash)
 
     def _state(self) -> WarmUpRecord:
         """Return the warm-up from its file, or a new one."""
         new = WarmUpRecord(self._archives.plan_hash, self._cell.joint_names, self._threshold)
-        return replace(self._found() or new, threshold=self._threshold)
+        return replace(self._stored() or new, threshold=self._threshold)
 
     def _cold(self, when: float) -> WarmUpRecord | None:
         """Return a warm-up after which the arm has cooled down by `when` [s since 1970]."""
-        record = self._found() if self._threshold else None
+        record = self._stored() if self._threshold else None
         return record if record is not None and record.motions and record.cold(when) else None
 
     def _motion_of(self, state: WarmUpRecord) -> CampaignMotion:

@@ -23,7 +23,7 @@ from hil.errors import InputError
 from hil.files import convert_write_errors, write_atomically
 from hil.importers import convention_of
 from hil.new import (
-    Known,
+    CellValues,
     cell_of_dh,
     cell_of_urdf,
     from_archive,
@@ -106,16 +106,14 @@ def new(
         made = cell_of_dh(dh, convention_of(convention), fixed)
     if made.urdf is not None:
         _require_free(made.urdf_beside(output), force=force, urdf_read=made.urdf_path)
-    known_values = made.known
+    values = made.values
     if from_controller is not None:
-        known_values |= _asked(from_controller, bind, len(made.joint_names), arm, wait, quiet=json)
+        values |= _asked(from_controller, bind, len(made.joint_names), arm, wait, quiet=json)
     if from_archive_file is not None:
         stated = from_archive(from_archive_file, made.joint_names)
         # Limits belong together, with their frame.
-        known_values = (
-            known_values.without("limits") if "limits.frame" in stated.values else known_values
-        ) | stated
-    made = replace(made, known=known_values)
+        values = (values.without("limits") if "limits.frame" in stated.values else values) | stated
+    made = replace(made, values=values)
     made = made.for_design() if design_only else made
     text, unknown = made.text(output)
     with convert_write_errors(output):
@@ -124,10 +122,10 @@ def new(
             write_atomically(made.urdf_beside(output), made.urdf)
         write_atomically(output, text)
     if json:
-        summary = {"joints": made.joint_names, "unknown": unknown, "notes": made.known.notes}
+        summary = {"joints": made.joint_names, "unknown": unknown, "notes": made.values.notes}
         print_json({"cell": str(output), **summary})
         return
-    for note in made.known.notes:
+    for note in made.values.notes:
         say(f"note: {note}")
     say(f"{output}: {len(made.joint_names)} joints ({', '.join(made.joint_names)})")
     if unknown:
@@ -140,7 +138,9 @@ def new(
         say(f"check the assumed values in it, then `hil design {typed(output)}`")
 
 
-def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, quiet: bool) -> Known:
+def _asked(
+    address: str, bind: str, n_joints: int, arm: int, wait: float, *, quiet: bool
+) -> CellValues:
     """Read the init packet of the controller at HOST[:PORT]."""
     from drivers.transports.udp import UdpSpec
 
@@ -159,7 +159,7 @@ def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, qui
     link = {"controller.transport": "udp", "controller.host": host, "controller.port": port}
     if bind != "0.0.0.0":
         link["controller.bind"] = bind
-    return from_init(init, n_joints, arm) | Known.of_origin("as given to hil new", link)
+    return from_init(init, n_joints, arm) | CellValues.of_origin("as given to hil new", link)
 
 
 def _require_free(path: Path, *, force: bool, urdf_read: Path | None = None) -> None:

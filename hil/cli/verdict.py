@@ -38,8 +38,8 @@ def finish(
         lines = sentences(results, quiet=quiet)
         if not quiet:
             if results.calibration is not None:
-                lines.insert(0, results.calibration.words)
-            lines.insert(0, results.fitted.words)
+                lines.insert(0, results.calibration.message)
+            lines.insert(0, results.fitted.message)
             for line in table(results):
                 typer.echo(line)
         for line in lines:

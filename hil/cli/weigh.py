@@ -137,6 +137,6 @@ def weigh(
         print_json(result.as_json())
     else:
         typer.echo("\n".join(result.lines))
-    if result.found.mounting is not None:
+    if result.payload.mounting is not None:
         raise typer.Exit(NOT_GOOD)
     return None

@@ -34,7 +34,7 @@ class DoctorCheck:
 
     name: str
     status: Status
-    found: str
+    facts: str
     remedy: tuple[str, ...] = ()
 
 

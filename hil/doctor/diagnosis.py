@@ -259,7 +259,7 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
         table.add_column(title, overflow="fold")
     for check in diagnosis.checks:
         status = Text(check.status, style=_COLOUR[check.status])
-        table.add_row(Text(check.name), status, Text(printable(check.found)))
+        table.add_row(Text(check.name), status, Text(printable(check.facts)))
     console.print(table)
     lines = [
         f"{latency.name} [µs]: "

@@ -98,7 +98,7 @@ def _estimator(estimation: Estimation) -> results.EstimatorResult:
     return results.EstimatorResult(
         name=name,
         words=pooled.method if name == "auto" else ESTIMATORS[name],
-        prior=estimation.with_prior.words,
+        prior=estimation.with_prior.origin,
         condition=pooled.condition,
         grouping=estimation.posterior.model.base.explanation(),
     )

@@ -545,8 +545,8 @@ def _joint_side(values: dict[str, Array], columns: ColumnMap, log: _Log) -> dict
         if sides.get(name) == "motor":
             joint[name] = np.asarray(np.linalg.solve(matrix, values[name].T).T, np.float64)
         if name in quantities and quantities[name].coupled:
-            own = np.linalg.solve(log.coupling_of(name), joint[name].T).T
-            joint[name] = np.asarray(own, np.float64)
+            angles = np.linalg.solve(log.coupling_of(name), joint[name].T).T
+            joint[name] = np.asarray(angles, np.float64)
     if sides.get("torque") == "motor":
         joint["torque"] = values["torque"] @ matrix
     drive = columns.drive

@@ -197,7 +197,7 @@ class Finding:
             return "all joints"
         return ", ".join(self.cell.joint_names[joint] for joint in change.joints)
 
-    def _found(self, aspect: str, steps: list[Step], text: str, decide: str) -> Row:
+    def _row_of(self, aspect: str, steps: list[Step], text: str, decide: str) -> Row:
         ratio = float(np.prod([step.ratio for step in steps]))
         sigmas = min(step.sigmas for step in steps)
         certainty: Certainty = "sure" if all(step.sure for step in steps) else "open"
@@ -268,13 +268,13 @@ class Finding:
         if "position order" in kinds or "joint order" in kinds:
             listing = ", ".join(names[np.argsort(self.axes.position_order)])
             texts.append(f"position columns are of {listing}")
-        return self._found("order", steps, "; ".join(texts), "name the joint of each column")
+        return self._row_of("order", steps, "; ".join(texts), "name the joint of each column")
 
     def _signs(self) -> Row:
         steps = self.steps("torque sign", "position sign", "axis sign")
         if steps:
             text = "; ".join(self.described(step.change) for step in steps)
-            return self._found("signs", steps, text, "push one joint by hand and see its torque")
+            return self._row_of("signs", steps, text, "push one joint by hand and see its torque")
         friction = self.readings.score.friction
         share = self.readings.score.share
         dissipates = (friction > SEPARATE) & (share > 0.0)
@@ -294,7 +294,7 @@ class Finding:
         steps = self.steps("degrees", "radians")
         if steps:
             unit = "deg" if self.axes.factor < 1.0 else "rad"
-            return self._found("angle unit", steps, f"in {unit}", f'[position] unit = "{unit}"')
+            return self._row_of("angle unit", steps, f"in {unit}", f'[position] unit = "{unit}"')
         return self._unchanged("angle unit", "unit as read", "degrees", "radians")
 
     def _zero(self) -> Row:
@@ -303,7 +303,7 @@ class Finding:
         unseen = [self.cell.joint_names[joint] for joint in self.readings.unseen_zeros]
         if steps:
             text = "; ".join(self.described(step.change) for step in steps)
-            return self._found("zero", steps, text, decide)
+            return self._row_of("zero", steps, text, decide)
         row = self._unchanged("zero", "as the URDF", "zero", decide=decide)
         if not unseen:
             return row
@@ -317,20 +317,20 @@ class Finding:
         decide = "turn one joint alone and see which angles change"
         if steps:
             text = "; ".join(self.described(step.change) for step in steps)
-            return self._found("coupling", steps, text, decide)
+            return self._row_of("coupling", steps, text, decide)
         return self._unchanged("coupling", "no angle contains another's", *COUPLED, decide=decide)
 
     def _gravity(self) -> Row:
         steps = self.steps("no gravity")
         if steps:
-            return self._found("gravity", steps, "torque without gravity", "--gravity 0 0 0")
+            return self._row_of("gravity", steps, "torque without gravity", "--gravity 0 0 0")
         decide = "hold the arm still, stretched out, and see the torque"
         return self._unchanged("gravity", "torque with gravity", "no gravity", decide=decide)
 
     def _mounting(self) -> Row:
         steps = self.steps("mounting")
         if steps:
-            return self._found("mounting", steps, steps[-1].change.name, "state --gravity X Y Z")
+            return self._row_of("mounting", steps, steps[-1].change.name, "state --gravity X Y Z")
         return self._unchanged("mounting", "as stated, else upright", "mounting",
                           decide="state --gravity X Y Z")  # fmt: skip
 

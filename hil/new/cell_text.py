@@ -34,7 +34,7 @@ from identification.errors import ModelError
 from identification.model.kinematics import MOST_JOINTS, Chain, chain_from_urdf, pinocchio_model
 from identification.model.urdf_text import urdf_tree
 
-from .known import ASSUMED, Known, assumed_for_design, clear_home, from_urdf
+from .cell_values import ASSUMED, CellValues, assumed_for_design, clear_home, from_urdf
 
 Array = NDArray[np.float64]
 
@@ -149,7 +149,7 @@ class NewCell:
     urdf: str | None  #: changed URDF text, None if the given file is used
     urdf_path: Path  #: URDF or table of DH parameters that was read
     meshes: tuple[str, ...]  #: `package://` mesh paths of the collision shapes
-    known: Known
+    values: CellValues
     design_only: bool = False
     #: prismatic joints along gravity that are identified; from recordings only, as no controller
     #: moves them
@@ -168,7 +168,7 @@ class NewCell:
             "cell.urdf": os.path.relpath(urdf, path.parent),
             "cell.assumed": self._assumed(),
             **({} if folders is None else {"cell.mesh_folders": folders}),
-            **self.known.values,
+            **self.values.values,
         }
         document = self._head()
         unknown = list[str]()
@@ -178,21 +178,21 @@ class NewCell:
         tables = [*CellFile.model_fields, *(name.partition(".")[0] for name in values)]
         for name in dict.fromkeys(tables):
             if name not in without:
-                table, not_known = self._table(name, values)
-                unknown += not_known
+                table, unknown_fields = self._table(name, values)
+                unknown += unknown_fields
                 if table:
                     document.append(name, table)
         return tomlkit.dumps(document), tuple(unknown)
 
     def _head(self) -> tomlkit.TOMLDocument:
         """Return a document with the comments at the top of the file."""
-        origins = ", ".join(dict.fromkeys(self.known.origin.values()))
+        origins = ", ".join(dict.fromkeys(self.values.origin.values()))
         head = _HEAD.format(
             name=self.name,
             sources=f"Its values are {origins}." if origins else "",
             joints=", ".join(f"{k} {name}" for k, name in enumerate(self.joint_names, 1)),
         )
-        notes = [_wrapped(f"Note: {note}") for note in self.known.notes]
+        notes = [_wrapped(f"Note: {note}") for note in self.values.notes]
         document = tomlkit.document()
         for line in comment_lines("\n".join([head, *notes])):
             document.add(line)
@@ -219,7 +219,7 @@ class NewCell:
             for line in comment_lines(comments):
                 written.add(line)
             item = inline(value)
-            origin = self.known.origin.get(name)
+            origin = self.values.origin.get(name)
             if origin:
                 item.comment(origin)
             written.append(name.partition(".")[2], item)
@@ -227,12 +227,12 @@ class NewCell:
 
     def _assumed(self) -> list[str]:
         """Return the names of assumed fields."""
-        names = [name for name in _ASSUMED if name not in self.known.values]
+        names = [name for name in _ASSUMED if name not in self.values.values]
         if self.lifting:
             return []
         if self.design_only:
             names = [name for name in names if not name.startswith("controller.")]
-        assumed = [name for name, origin in self.known.origin.items() if origin == ASSUMED]
+        assumed = [name for name, origin in self.values.origin.items() if origin == ASSUMED]
         return [*names, *(name for name in assumed if not name.startswith("campaign."))]
 
     def _mesh_folders(self, folder: Path) -> list[str] | None:
@@ -251,12 +251,12 @@ class NewCell:
 
     def for_design(self) -> NewCell:
         """Return the cell for design only, with assumed values and a clear home posture."""
-        cell_values = self.known | assumed_for_design(self.known, len(self.joint_names))
+        cell_values = self.values | assumed_for_design(self.values, len(self.joint_names))
         urdf = self.urdf if self.urdf is not None else read_text(self.urdf_path)
         beside = self.urdf_path.resolve().parent
         meshes = [str(beside / folder) for folder in self._mesh_folders(beside) or []]
         return replace(
-            self, known=cell_values | clear_home(urdf, cell_values, meshes), design_only=True
+            self, values=cell_values | clear_home(urdf, cell_values, meshes), design_only=True
         )
 
     def urdf_beside(self, path: Path) -> Path:
@@ -294,7 +294,7 @@ def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -
     text = urdf_of_dh(path, convention)
     note = "the URDF contains the geometry of the DH parameters only: no masses, no limits"
     made = _cell_of(path, text, fixed, moved=True)
-    return replace(made, urdf=made.urdf or text, known=Known(notes=(note,)) | made.known)
+    return replace(made, urdf=made.urdf or text, values=CellValues(notes=(note,)) | made.values)
 
 
 def cell_of_urdf(
@@ -330,7 +330,7 @@ def cell_of_urdf(
     arm = with_fixed(text, dict(zip(others, nearest, strict=True)))
     made = _cell_of(path, arm, fixed, moved=moved)
     note = f"fixed, as they do not lie between {links}: {', '.join(others)}"
-    return replace(made, urdf=made.urdf or arm, known=made.known | Known(notes=(note,)))
+    return replace(made, urdf=made.urdf or arm, values=made.values | CellValues(notes=(note,)))
 
 
 _MOST_NAMES: Final = 12
@@ -451,7 +451,7 @@ def _cell_of(path: Path, text: str, fixed: Mapping[str, float], *, moved: bool) 
         urdf=used if positions else None,
         urdf_path=path,
         meshes=tuple(sorted({mesh for shape in shapes for mesh in _MESH.findall(shape)})),
-        known=from_urdf(used, moving) | Known(notes=tuple(notes)),
+        values=from_urdf(used, moving) | CellValues(notes=tuple(notes)),
         lifting=() if moved else tuple(lifting),
     )
 

@@ -140,7 +140,7 @@ def view_of(
         quantities=tuple(quantities),
         events=tuple(event for event in events if begin <= event[0] <= end),
         gaps=time[columns["gap"] > 0] if "gap" in columns else None,
-        frame=scales.words,
+        frame=scales.frame_description,
     )
 
 
@@ -190,7 +190,7 @@ class _Scales:
         return cls(frame, _slides(archive, n), motors, limits)
 
     @property
-    def words(self) -> str:
+    def frame_description(self) -> str:
         """Description of the frame."""
         pendant = self.frame.name == "controller"
         whose = "as on the teach pendant" if pendant else "of the URDF"

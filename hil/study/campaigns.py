@@ -58,7 +58,7 @@ class Search:
     """One search."""
 
     key: str  #: name of its folder
-    words: str  #: description
+    description: str
     settings: DesignSettings
     excitation: Excitation | None = None  #: None before the search, or if nothing was found
 
@@ -96,7 +96,7 @@ def run_searches(
         place = DesignFolder(folder.design(search.key))
         result = DesignResult.load(place.result) if place.result.exists() else None
         if result is None or not result.complete or result.settings != search.settings:
-            reporter.step(f"search {number} of {len(wanted)}: {search.words}")
+            reporter.step(f"search {number} of {len(wanted)}: {search.description}")
             resume = place.settings.exists()
             try:
                 result = run_design(
@@ -124,7 +124,7 @@ def chosen(searches: Sequence[Search]) -> dict[str, Search]:
     for search in best.values():
         if search.excitation is None:
             raise NoExcitationError(
-                f"{search.words} found no motion that satisfies all constraints of the cell;"
+                f"{search.description} found no motion that satisfies all constraints of the cell;"
                 " search longer (without --quick), or with another --seed"
             )
     return best

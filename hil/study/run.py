@@ -109,7 +109,7 @@ def _rows(
     for search in searches:
         excitation = search.excitation
         method = executed.get(search.key)
-        row = MotionRow(key=search.key, words=search.words, executed=method is not None)
+        row = MotionRow(key=search.key, words=search.description, executed=method is not None)
         if excitation is not None:
             row = MotionRow.of(
                 excitation.criteria,

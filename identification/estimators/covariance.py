@@ -70,7 +70,7 @@ class Clustered:
     determined: NDArray[np.bool_]  # (p,)
     design_effect: float  # mean ratio of the variance to that of white residuals
     interval_factor: float  # standard deviations in half a 95 % interval
-    words: str  # description
+    description: str
     blocks: int  # number of blocks
 
 
@@ -164,7 +164,7 @@ def _sandwich(
         determined=solution.determined,
         design_effect=effect,
         interval_factor=float(student_limit(0.025, max(1, count - 1))),
-        words=f"cluster-robust covariance over {count} blocks of {duration:g} s",
+        description=f"cluster-robust covariance over {count} blocks of {duration:g} s",
         blocks=count,
     )
 
@@ -178,7 +178,7 @@ def with_block_covariance(
         estimate,
         covariance=clustered.covariance,
         interval_factor=clustered.interval_factor,
-        method=f"{name}, {clustered.words}",
+        method=f"{name}, {clustered.description}",
     )
 
 

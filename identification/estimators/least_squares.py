@@ -49,7 +49,7 @@ def fit_least_squares(
     precise = reduced(model, recordings, factor)
     weights = np.ones(model.n_joints) if weighting == "ordinary" else joint_weights(precise)
     solution, clustered = clustered_fit(model, precise, recordings, factor, weights)
-    method = f"{weighting} least squares{precise.words}, {clustered.words}"
+    method = f"{weighting} least squares{precise.method_suffix}, {clustered.description}"
     return estimate_of(
         model.units,
         precise,

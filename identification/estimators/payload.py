@@ -199,7 +199,7 @@ def identify_payload(
     if low <= 0.0:
         undetermined = NAMES[1:]
         return PayloadEstimate(
-            estimate.values, None, intervals, estimate.moment, undetermined, (), estimate.words
+            estimate.values, None, intervals, estimate.moment, undetermined, (), estimate.method
         )
     total, by_scale = (
         estimate.variance_of_mass(part) for part in (estimate.spread, estimate.by_scale)
@@ -231,7 +231,7 @@ def identify_payload(
         moment=estimate.moment,
         undetermined=tuple(np.array(NAMES)[open_ended].tolist()),
         impossible=tuple(np.array(NAMES)[negative].tolist()),
-        method=estimate.words,
+        method=estimate.method,
         scale_share=by_scale / total,
     )
 
@@ -518,7 +518,7 @@ class _BodyEstimate(NamedTuple):
     spread: Array  # covariance of those (r, r)
     by_scale: Array  # part of it that the torque scale makes (r, r)
     factor: float  # standard deviations in half a 95 % interval
-    words: str  # how
+    method: str
 
     def variance_of_mass(self, spread: Array) -> float:
         """Return the variance of the mass [kg²] by a part of `spread`."""
@@ -594,7 +594,7 @@ def _body_estimate(
         spread=fit.covariance + by_scale,
         by_scale=by_scale,
         factor=factor,
-        words=fit.clustered.words,
+        method=fit.clustered.description,
     )
 
 

@@ -89,7 +89,7 @@ class GaussianPrior:
 
     mean: Array  #: (p,)
     root: Array  #: (k, p); flat in directions without information
-    words: str  #: origin
+    origin: str
 
     @classmethod
     def of_combinations(
@@ -132,14 +132,14 @@ class BodyPrior:
     mean: Array  #: of the standard parameters (s,), then of friction and elements (k,)
     std: Array  #: likewise; infinite where nothing is known
     combinations: Array  #: ``pi = combinations @ [standard; others]``, (p, s + k)
-    words: str  #: origin
+    origin: str
     #: whether the description has no masses, or masses without relation to the torque
     placeholder: bool = False
 
     @cached_property
     def gaussian(self) -> GaussianPrior:
         """The prior of the parameters (p,)."""
-        return GaussianPrior.of_combinations(self.combinations, self.mean, self.std, self.words)
+        return GaussianPrior.of_combinations(self.combinations, self.mean, self.std, self.origin)
 
     def most_probable(self, values: Array) -> Array:
         """Return the most probable standard and other parameters (s + k,) of parameters (p,)."""
@@ -158,7 +158,7 @@ class PosteriorEstimate:
     estimate: Estimate  #: its covariance is the posterior's
     prior_mean: Array  #: (p,)
     prior_std: Array  #: (p,), infinite where unknown
-    words: str  #: origin of the prior
+    origin: str  #: of the prior
     design_effect: float  #: rows of data that count as one
 
     @property
@@ -253,11 +253,11 @@ def with_prior(
         values=prior.mean + posterior.values,
         condition=solve_rows(rows, target).condition if len(rows) else np.inf,
     )
-    method = f"weighted least squares with a Gaussian prior ({prior.words}), posterior covariance"
+    method = f"weighted least squares with a Gaussian prior ({prior.origin}), posterior covariance"
     if design_effect > 1.0:
         method += f", design effect {design_effect:.3g}"
     estimate = estimate_of(model.units, factor, solution, weights / design_effect, method)
-    return PosteriorEstimate(estimate, prior.mean, prior.std, prior.words, design_effect)
+    return PosteriorEstimate(estimate, prior.mean, prior.std, prior.origin, design_effect)
 
 
 def fit_posterior(
@@ -278,12 +278,12 @@ def fit_posterior(
     spread = block_covariance(factor, weights, values, prior.information, design_effect)
     alone = factor.solve(weights)
     solution = Solution(values, spread.root, alone.condition, alone.determined)
-    method = f"posterior of the prior ({prior.words}), {design_effect:.3g} rows count as one; "
-    estimate = estimate_of(model.units, factor, solution, weights, method + spread.words)
+    method = f"posterior of the prior ({prior.origin}), {design_effect:.3g} rows count as one; "
+    estimate = estimate_of(model.units, factor, solution, weights, method + spread.description)
     estimate = replace(
         estimate, covariance=spread.covariance, interval_factor=spread.interval_factor
     )
-    return PosteriorEstimate(estimate, prior.mean, prior.std, prior.words, design_effect)
+    return PosteriorEstimate(estimate, prior.mean, prior.std, prior.origin, design_effect)
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,7 +292,7 @@ class ScoreScatter:
 
     rows: Array  #: (k, p), ``rows' rows`` is the covariance of the sum of the scores
     interval_factor: float  #: standard deviations in half a 95 % interval
-    words: str  #: description of the covariance
+    description: str  #: of the covariance
 
     @classmethod
     def of(cls, factor: Factor, prior: GaussianPrior) -> ScoreScatter:
@@ -303,7 +303,7 @@ class ScoreScatter:
         of_parameters = np.linalg.pinv(spread.root / size[:, None]) / size
         # Not all blocks, of which there may be very many, but rows of the same products.
         triangle = np.linalg.qr(spread.scores, mode="r")
-        return cls(triangle @ of_parameters, spread.interval_factor, spread.words)
+        return cls(triangle @ of_parameters, spread.interval_factor, spread.description)
 
     def covariance(self, root: Array, precision: Array, design_effect: float) -> Array:
         """Return the covariance of a posterior (p, p).

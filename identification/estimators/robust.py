@@ -103,8 +103,8 @@ def robust_estimate(
         state.factor,
         state.solution._replace(determined=clustered.determined),
         weights,
-        f"iteratively reweighted least squares{factor.words}, {loss.name}, {state.passes}"
-        f" passes{ended}, {clustered.words}",
+        f"iteratively reweighted least squares{factor.method_suffix}, {loss.name}, {state.passes}"
+        f" passes{ended}, {clustered.description}",
         clustered.covariance,
         clustered.interval_factor,
     )

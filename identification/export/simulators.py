@@ -273,7 +273,7 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[Part]:
     yield "friction of coupled motors", lambda: _friction(arm, motion, motors), form.drives
     yield (
         "the payload",
-        lambda: model.load_torque(*motion[1:4]) - model.elements.known(q),
+        lambda: model.load_torque(*motion[1:4]) - model.elements.known_torque(q),
         form.drives,
     )
     for placed in model.elements.placed:
@@ -302,7 +302,7 @@ def _element_torque(arm: Arm, motion: Motion, placed: PlacedElement) -> Array:
     """Return the torque (m, n) of a passive element."""
     torque = np.zeros(motion.position.shape)
     values = arm.values[arm.model.element_part][placed.part]
-    torque[:, placed.joint] = placed.columns(motion.position) @ values + placed.known(
+    torque[:, placed.joint] = placed.columns(motion.position) @ values + placed.known_torque(
         motion.position
     )
     return torque

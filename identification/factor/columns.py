@@ -86,7 +86,7 @@ def gain_factor(
     m = len(samples.motion.time)
     turns = np.eye(n) if transmission is None else np.asarray(transmission, dtype=np.float64)
     blocks, columns = samples.regressor(model)
-    load = model.elements.known(samples.motion.position)
+    load = model.elements.known_torque(samples.motion.position)
     if payload is not None:
         load = load + Load(model.chain, model.gravity, payload).torque(*samples.motion[1:4])
     since = samples.motion.time - samples.origin

@@ -201,7 +201,7 @@ class Factor:
         return tuple(np.einsum("bki,bkj->ij", triangles, triangles) for triangles in self.matrices)
 
     @property
-    def words(self) -> str:
+    def method_suffix(self) -> str:
         """Suffix of estimator names."""
         return " by QR" if self.storage == "qr" else ""
 
@@ -660,7 +660,7 @@ def estimate(model: RobotModel, factor: Factor, weights: Array | None = None) ->
     require_rows(model, factor)
     if weights is None:
         weights = joint_weights(factor)
-    method = f"weighted least squares{factor.words}, classical covariance (white residuals)"
+    method = f"weighted least squares{factor.method_suffix}, classical covariance (white residuals)"
     return estimate_of(model.units, factor, factor.solve(weights), weights, method)
 
 

@@ -65,7 +65,7 @@ class Element(ABC):
         """Return the torque per unit of each identified parameter, at angles (m,): (m, c)."""
         return self.shapes(q)[:, [coefficient.identified for coefficient in self.coefficients]]
 
-    def known(self, q: Array) -> Array:
+    def known_torque(self, q: Array) -> Array:
         """Return the known part of the torque [N·m] (m,)."""
         values = [
             0.0 if coefficient.identified else coefficient.value or 0.0
@@ -250,9 +250,9 @@ class PlacedElement(NamedTuple):
         """Return the columns (m, c) at joint positions (m, n)."""
         return self.element.columns(np.asarray(q @ np.array(self.turns)))
 
-    def known(self, q: Array) -> Array:
+    def known_torque(self, q: Array) -> Array:
         """Return the known torque [N·m] (m,) at joint positions (m, n)."""
-        return self.element.known(np.asarray(q @ np.array(self.turns)))
+        return self.element.known_torque(np.asarray(q @ np.array(self.turns)))
 
 
 @dataclass(frozen=True)
@@ -328,11 +328,11 @@ class JointElements:
             [coefficient.value or 0.0 for coefficient in self._coefficients], dtype=np.float64
         )
 
-    def known(self, q: Array) -> Array:
+    def known_torque(self, q: Array) -> Array:
         """Return the known part of the torque (m, n) [N·m] at positions (m, n)."""
         torque = np.zeros(q.shape)
         for placed in self.placed:
-            torque[:, placed.joint] += placed.known(q)
+            torque[:, placed.joint] += placed.known_torque(q)
         return torque
 
 

@@ -399,7 +399,7 @@ class RobotModel:
             ShapeError: an array has another shape.
         """
         (q,) = joint_arrays(self.n_joints, q=q)
-        torque = self.elements.known(q)
+        torque = self.elements.known_torque(q)
         return torque if self._load is None else torque + self._load.torque(q, qd, qdd)
 
     def moving(self, qd: Array) -> NDArray[np.bool_]:

@@ -725,9 +725,9 @@ def corrected(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
     n = model.n_joints
     sign = np.ones(n)
     order = np.arange(n)
-    own_angle = np.eye(n)
+    relative = np.eye(n)
     if fault.kind in _COUPLED:
-        own_angle[fault.joints] = -1.0 if fault.kind == "angle sum" else 1.0
+        relative[fault.joints] = -1.0 if fault.kind == "angle sum" else 1.0
     elif fault.kind.endswith("sign"):
         sign[list(fault.joints)] = -1.0
     else:
@@ -737,7 +737,7 @@ def corrected(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
     usable = samples.usable
     if fault.kind in _OF_MOTION:
         load = None if motion.load is None else motion.load[:, order]
-        read = (own_angle @ (np.eye(n)[order] * sign[:, None])).T
+        read = (relative @ (np.eye(n)[order] * sign[:, None])).T
         motion = Motion(motion.time, *(part @ read for part in motion[1:4]))
         motion = motion._replace(load=load)
         usable = usable[:, order]

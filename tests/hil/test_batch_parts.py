@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pyarrow import parquet
 
-from hil.batch.cache import HEADER, CacheError, CacheLocation, code_digest
+from hil.batch.cache import HEADER, JSON, NPZ, CacheError, CacheLocation, code_digest
 from hil.batch.cluster import SkippedArchive
 from hil.batch.discovery import ArchiveRef, arm_digest
 from hil.batch.estimates import Arm
@@ -84,13 +84,31 @@ class TestCache:
         path.write_bytes(intact[: data.draw(st.integers(0, len(intact) - 1))])
         assert cache.read(place, KEY) is None
 
-    def test_entries_of_another_key_are_ignored(self, tmp_path):
+    @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(st.data())
+    def test_texts_with_a_wrong_bit_or_cut_short_are_ignored(self, tmp_path, data):
+        cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
+        cache.put(place, KEY, self.CONTENT)
+        path = cache.path(place, KEY, JSON)
+        intact = path.read_bytes()
+        assert cache.get(place, KEY, dict) == self.CONTENT
+        damaged = bytearray(intact)
+        bit = data.draw(st.integers(0, 8 * len(intact) - 1))
+        damaged[bit // 8] ^= 1 << bit % 8
+        for content in (bytes(damaged), intact[: data.draw(st.integers(0, len(intact) - 1))]):
+            path.write_bytes(content)
+            assert cache.get(place, KEY, dict) is None
+
+    @pytest.mark.parametrize("suffix", [NPZ, JSON])
+    def test_entries_of_another_key_are_ignored(self, tmp_path, suffix):
         cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
         cache.write(place, KEY, self.CONTENT, {})
-        other = cache.path(place, KEY[::-1])
+        cache.put(place, KEY, self.CONTENT)
+        other = cache.path(place, KEY[::-1], suffix)
         other.parent.mkdir(parents=True)
-        cache.path(place, KEY).rename(other)
+        cache.path(place, KEY, suffix).rename(other)
         assert cache.read(place, KEY[::-1]) is None
+        assert cache.get(place, KEY[::-1], dict) is None
 
     @pytest.mark.parametrize(
         ("content", "arrays"),
@@ -158,7 +176,7 @@ class TestCache:
         monkeypatch.setattr(np, "savez", full)
         cache = CacheLocation(str(tmp_path))
         with pytest.raises(CacheError, match=r"No space left.*make room, or name another folder"):
-            cache.put("/data/a.mcap", KEY, {})
+            cache.write("/data/a.mcap", KEY, {}, {})
         assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
     def test_urls_are_cached_in_the_home(self, tmp_path, monkeypatch):

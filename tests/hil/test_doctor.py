@@ -380,7 +380,7 @@ def test_what_is_found_is_judged(
 ) -> None:
     check = judge(MadeUp(tmp_path, files, commands))
     assert check.status is status
-    assert word in "\n".join([check.found, *check.remedy])
+    assert word in "\n".join([check.facts, *check.remedy])
 
 
 @pytest.mark.parametrize(

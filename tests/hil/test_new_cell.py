@@ -32,7 +32,7 @@ from hil.importers import Robot
 from hil.motion_checks import collision_checker
 from hil.new import cell_of_urdf, from_archive
 from hil.new.cell_text import with_fixed
-from hil.new.known import _nothing_moves
+from hil.new.cell_values import _nothing_moves
 from hil.progress import Silent
 from hil.simulation import simulated_link
 from hil.testing import shortened
@@ -404,12 +404,12 @@ class TestOneArmOfARobot:
         assert made.joint_names == (
             "left_s0", "left_s1", "left_e0", "left_e1", "left_w0", "left_w1", "left_w2"
         )  # fmt: skip
-        note = next(note for note in made.known.notes if note.startswith("fixed, as they do not"))
+        note = next(note for note in made.values.notes if note.startswith("fixed, as they do not"))
         assert "right_w2" in note
-        assert not any("branches" in note for note in made.known.notes)
+        assert not any("branches" in note for note in made.values.notes)
 
     def test_branches_are_named(self) -> None:
-        notes = cell_of_urdf(urdf_path("baxter.urdf"), {}).known.notes
+        notes = cell_of_urdf(urdf_path("baxter.urdf"), {}).values.notes
         assert any(
             "3 branches, with the last moving links head, left_wrist, right_wrist" in note
             for note in notes
@@ -421,18 +421,18 @@ class TestOneArmOfARobot:
         made = cell_of_urdf(path, {})
         assert any(
             "left_finger looks like a joint of a gripper" in note and "--tip arm" in note
-            for note in made.known.notes
+            for note in made.values.notes
         )
         made = cell_of_urdf(path, {}, tip="tool")
         assert made.joint_names == ("shoulder",)
-        assert not any("gripper" in note for note in made.known.notes)
+        assert not any("gripper" in note for note in made.values.notes)
 
     def test_a_wrist_that_carries_a_gripper_is_of_the_arm(self) -> None:
-        notes = cell_of_urdf(urdf_path("so101.urdf"), {}).known.notes
+        notes = cell_of_urdf(urdf_path("so101.urdf"), {}).values.notes
         assert any(note.startswith("gripper looks like a joint of a gripper") for note in notes)
 
     def test_arms_with_hands_are_branches_too(self) -> None:
-        notes = cell_of_urdf(urdf_path("talos_reduced.urdf"), {}).known.notes
+        notes = cell_of_urdf(urdf_path("talos_reduced.urdf"), {}).values.notes
         assert any("5 branches" in note and "arm_left_7_link" in note for note in notes)
 
     def test_one_arm_of_a_robot_with_too_many_joints(self) -> None:

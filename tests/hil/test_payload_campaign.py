@@ -128,7 +128,7 @@ class TestRecording:
 
     def test_the_carried_mass_is_found_and_not_the_assumed_one(self, done) -> None:
         _, payload, _ = done
-        low, high = payload.found.estimate.intervals[0]
+        low, high = payload.payload.estimate.intervals[0]
         assert low < MASS < high < ASSUMED
         assert high - low < 0.05 * MASS
 
@@ -141,7 +141,7 @@ class TestRecording:
     def test_the_result_is_stored_as_hil_payload_prints_it(self, done) -> None:
         weighed, payload, _ = done
         stored = json.loads((weighed.root / "payload.json").read_text())
-        assert stored["figures"]["mass"]["value"] == pytest.approx(payload.found.body.mass)
+        assert stored["figures"]["mass"]["value"] == pytest.approx(payload.payload.body.mass)
         text = (weighed.root / "payload.txt").read_text()
         assert text == "\n".join(payload.lines) + "\n"
         assert "$TOOL_MASS := 1." in text or "$TOOL_MASS := 2." in text
@@ -158,7 +158,7 @@ class TestRecording:
             pytest.fail("nothing was missing")
 
         again = PayloadCampaign.of(designed, "weight", None)
-        assert run(again, never).found.body.mass == payload.found.body.mass
+        assert run(again, never).payload.body.mass == payload.payload.body.mass
 
     def test_an_identification_of_the_loaded_side_warns(self, done) -> None:
         """What the assumed payload is wrong by is in the last link."""
@@ -198,7 +198,7 @@ class TestInterrupted:
         assert complete == sorted(ORDER[:stage])
         payload = run(PayloadCampaign.of(Campaign.open(campaign.folder.root), "weight", None))
         assert recorded(weighed) == sorted(ORDER)
-        assert payload.found.body.mass == pytest.approx(MASS, rel=0.03)
+        assert payload.payload.body.mass == pytest.approx(MASS, rel=0.03)
         attempts = [path.name for path in weighed.root.glob("*/archives/excitation*")]
         assert sum("_a2" in name for name in attempts) == 1
 

@@ -736,14 +736,14 @@ class TestPlaceholders:
     def test_equal_or_missing_masses_are_some(self, model, origin):
         prior, _ = self.prior(model)
         assert prior.placeholder
-        assert origin in prior.words
+        assert origin in prior.origin
         assert not prior.mean[: model.layout.size].any()
 
     def test_masses_with_another_torque_are_some(self):
         for size in (20.0, 0.05, -1.0):
             prior, _ = self.prior(MODEL, size)
             assert prior.placeholder
-            assert "times that of the bodies of the description" in prior.words
+            assert "times that of the bodies of the description" in prior.origin
             assert not prior.mean[: MODEL.layout.size].any()
 
     @pytest.mark.parametrize("size", [0.7, 1.0, 1.5])

@@ -708,15 +708,15 @@ class TestElementTorque:
         """The torque of the drive is the derivative of the stored energy."""
         h = 1e-5
         slope = (energy(POSITIONS + h) - energy(POSITIONS - h)) / (2.0 * h)
-        np.testing.assert_allclose(element.known(POSITIONS), slope, rtol=1e-6, atol=1e-5)
+        np.testing.assert_allclose(element.known_torque(POSITIONS), slope, rtol=1e-6, atol=1e-5)
 
     @pytest.mark.parametrize("element", [TORSION, BALANCER, GAS_SPRING])
     def test_is_columns_times_nominal_values(self, element):
         """An identified element with its nominal values has the torque of the known one."""
         free = replace(element, identified=True)
         nominal = JointElements.of([free], ["joint2"], [True]).nominal
-        torque = free.columns(POSITIONS) @ nominal + free.known(POSITIONS)
-        np.testing.assert_allclose(torque, element.known(POSITIONS), rtol=1e-12)
+        torque = free.columns(POSITIONS) @ nominal + free.known_torque(POSITIONS)
+        np.testing.assert_allclose(torque, element.known_torque(POSITIONS), rtol=1e-12)
 
     def test_a_given_preload_stays_known(self):
         """The preload of an identified spring is a parameter unless it is given."""
@@ -724,10 +724,11 @@ class TestElementTorque:
         with_preload = replace(EXTENSION, identified=True)
         assert (both.symbols, with_preload.symbols) == (("spring", "preload"), ("spring",))
         assert JointElements.of([both], ["joint2"], [True]).units == ("N/m", "N")
-        whole = EXTENSION.known(POSITIONS)
+        whole = EXTENSION.known_torque(POSITIONS)
         np.testing.assert_allclose(both.columns(POSITIONS) @ [900.0, 60.0], whole)
         np.testing.assert_allclose(
-            with_preload.columns(POSITIONS)[:, 0] * 900 + with_preload.known(POSITIONS), whole
+            with_preload.columns(POSITIONS)[:, 0] * 900 + with_preload.known_torque(POSITIONS),
+            whole,
         )
 
 
@@ -745,7 +746,9 @@ class TestPublishedRecordings:
             np.genfromtxt(DATA / "kr300" / name, delimiter=",", names=True)
             for name in ("A.csv", "Abal.csv")
         )
-        np.testing.assert_allclose(BALANCER.known(raw["q2"]), raw["tau2"] - off["tau2"], atol=1e-6)
+        np.testing.assert_allclose(
+            BALANCER.known_torque(raw["q2"]), raw["tau2"] - off["tau2"], atol=1e-6
+        )
 
     def fitted(self, coupling):
         """Return the least-squares estimate of the TX40, and its error."""
@@ -824,7 +827,7 @@ class TestElementModel:
         values = np.concatenate([two_link.truth(), [35.0, 0.8]])
         expected = two_link.MODEL.torque(two_link.truth(), *motion[1:])
         expected[:, 0] += 35.0 * (motion.position[:, 0] - 0.3)
-        expected[:, 1] += 0.8 * replace(GAS, identified=False).known(motion.position[:, 1])
+        expected[:, 1] += 0.8 * replace(GAS, identified=False).known_torque(motion.position[:, 1])
         np.testing.assert_allclose(model.torque(values, *motion[1:]), expected, atol=1e-9)
         dense = model.regressor(*motion[1:]).dense(model.n_parameters) @ values
         np.testing.assert_allclose(dense, expected, atol=1e-9)

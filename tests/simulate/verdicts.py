@@ -16,8 +16,6 @@ import numpy as np
 from drivers.events import Event, GapSeen, InitReceived, LinkLost, MotionEnded, RepliesLost
 from tests.drivers import oracle
 from tests.faults import DISTURBS_THE_ARM, kind_of, parse_script
-from tests.laws.manifests import completed, manifest_of
-from tests.laws.second_reader import read
 from tests.simulate.draws import DRAWS
 from tests.simulate.laws import LAWS as OTHERS
 from tests.simulate.laws.conversation import heard
@@ -76,8 +74,7 @@ _NEEDS_OPERATOR: Final = frozenset({"RepetitionsRejectedError"})
 def completion(seen: Observed) -> Iterator[str]:
     """Without further faults the campaign completes and is identified.
 
-    If the arm was disturbed, or `missed_alike`, its repetitions may differ, and the run may request
-    an inspection.
+    If the arm was disturbed, its repetitions may differ, and the run may request an inspection.
     """
     if seen.complete:
         if seen.found is None:
@@ -85,25 +82,8 @@ def completion(seen: Observed) -> Iterator[str]:
         return
     disturbed = any(kind_of(line) in {*DISTURBS_THE_ARM, "corrupt"} for line in seen.struck)
     excused = type(seen.runs[-1].error).__name__ in _NEEDS_OPERATOR
-    if not (excused and (disturbed or missed_alike(seen))):
+    if not (excused and disturbed):
         yield f"after {len(seen.runs)} runs it ended {seen.ended}"
-
-
-def missed_alike(seen: Observed) -> bool:
-    """Whether packets were missed in at least two of the repetitions that count, and in half.
-
-    While a packet is missed the controller moves the arm without a target of the PC. Two
-    repetitions that are so disturbed at the same set-point agree with each other; once they count,
-    each sound one is rejected, and the run says to check the arm or to begin a new campaign.
-    """
-    entries = completed(manifest_of(seen.folder)[1])
-    repetitions = [entry.name for entry in entries if entry.motion[0] == "excitation"]
-    cycles = [read(seen.folder / "archives" / name).cycles for name in repetitions]
-    missed = [
-        bool(rows["gap"][np.isfinite(rows["commanded_position"]).all(axis=1)].any())
-        for rows in cycles
-    ]
-    return sum(missed) >= max(2, len(missed) / 2)
 
 
 LAWS: Final[dict[str, Law]] = {"completion": completion, "gaps": gaps, "piles": piles, **OTHERS}

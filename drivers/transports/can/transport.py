@@ -140,7 +140,7 @@ class CanLink:
         self._waiting: deque[can.Message] = deque()
         # python-can's multicast bus returns every frame to its sender.
         echoes = isinstance(bus, UdpMulticastBus)
-        self._own: deque[Frame] | None = deque(maxlen=_MAX_ECHOES) if echoes else None
+        self._echoes: deque[Frame] | None = deque(maxlen=_MAX_ECHOES) if echoes else None
 
     def receive(self, timeout: float) -> bytes | None:
         """Return the next packet, or None after `timeout` s without one.
@@ -185,8 +185,8 @@ class CanLink:
             self.discarded["foreign"] += 1
             return None
         frame = Frame(message.arbitration_id, bytes(message.data))
-        if self._own is not None and frame in self._own:
-            self._own.remove(frame)
+        if self._echoes is not None and frame in self._echoes:
+            self._echoes.remove(frame)
             return None
         # The time on the bus matters, not that of reading.
         return self._frames.receive(frame, message.timestamp or self._clock())
@@ -221,8 +221,8 @@ class CanLink:
                     raise
                 self.discarded["unsent"] += 1
                 return
-            if self._own is not None:
-                self._own.append(frame)
+            if self._echoes is not None:
+                self._echoes.append(frame)
                 self._fetch()
 
     def close(self) -> None:

@@ -321,7 +321,7 @@ class SystematicFacts:
             yield Finding(
                 "systematic error",
                 "wrong",
-                self._words(naming, self.large, self.limits.systematic),
+                self._message(naming, self.large, self.limits.systematic),
                 f"check sign, gear ratio, coupling and torque constant of {naming.of(self.large)}",
                 "symptom",
             )
@@ -329,13 +329,13 @@ class SystematicFacts:
             yield Finding(
                 "systematic error",
                 "doubtful",
-                self._words(naming, self.noticeable, self.limits.noticeable),
+                self._message(naming, self.noticeable, self.limits.noticeable),
                 f"check the torque constant of {naming.of(self.noticeable)} with a known payload"
                 " (`hil torque-constants`), or without gravity load against the drive's data sheet",
                 "symptom",
             )
 
-    def _words(self, naming: Naming, joints: Mask, limit: float) -> str:
+    def _message(self, naming: Naming, joints: Mask, limit: float) -> str:
         shares = naming.each(joints, lambda joint: percentage(self.share[joint], 1))
         return (
             f"the torque error on {naming.motion} beyond noise exceeds {percentage(limit, 1)}:"

@@ -164,14 +164,14 @@ class FaultFacts:
                 yield Finding(
                     text.check,
                     "information",
-                    f"{text.words}, which the assumed uncertainty of the torques includes"
+                    f"{text.message}, which the assumed uncertainty of the torques includes"
                     f" (standard deviation of the ratio {std})",
                 )
                 continue
             yield Finding(
                 text.check,
                 "wrong" if certain else "doubtful",
-                f"{text.words}; correcting this multiplies the error of predicted parts of the"
+                f"{text.message}; correcting this multiplies the error of predicted parts of the"
                 f" fitted motion by {cause.ratio:.2f}",
                 text.step,
                 "cause",
@@ -190,12 +190,12 @@ class FaultFacts:
 
 class _Text(NamedTuple):
     check: str
-    words: str
+    message: str
     step: str
 
 
 def _text(cause: Cause, joints: str, naming: Naming) -> _Text:
-    """Return the words on a cause of each kind."""
+    """Return the message on a cause of each kind."""
     match cause.fault.kind:
         case "delay":
             return _delay(cause, joints)

@@ -113,7 +113,7 @@ def new_cell(path: Path, archive: Archive) -> None:
         assert error.remedy
         return
     if archive.joint_names == JOINTS:
-        cell = replace(cell_of_urdf(_urdf(), {}), known=values)
+        cell = replace(cell_of_urdf(_urdf(), {}), values=values)
         cell.text(path.with_name("cell.toml"))
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from hil.campaign.errors import (
 )
 from hil.campaign.operator import OperatorRequest
 from hil.campaign.quality import FIELDS, Executed, RepetitionCheck
+from hil.campaign.run import RunResult
 from hil.identify.sources import gather_sources
 from hil.simulation import (
     controller_settings,
@@ -179,3 +182,57 @@ def test_a_truncated_stuck_or_saturated_motion_is_named(undisturbed: Campaign) -
     ):
         problem = check.problem(replace(good, **changes))
         assert problem is None if message is None else message in str(problem)
+
+
+class TestMissedPackets:
+    """Repetitions 1 and 2 of three are disturbed alike, and a packet may be missed in each."""
+
+    @pytest.fixture
+    def begins(self, undisturbed: Campaign) -> list[int]:
+        """Cycles in which repetitions begin, where a missed packet disturbs none."""
+        cycles = [cycles_of(undisturbed, f"excitation_{k:03d}_a1.mcap") for k in range(2)]
+        first, second = (int(of_repetition[0]) + _AT_REST for of_repetition in cycles)
+        return [first + k * (second - first) for k in range(9)]
+
+    def run(self, campaign: Campaign, begins: Sequence[int], missed: Collection[int]) -> RunResult:
+        # Each missed packet delays what follows by a cycle.
+        cycles = [
+            begin + sum(k in missed for k in range(number)) for number, begin in enumerate(begins)
+        ]
+        lost, _ = split_faults([parse_fault(f"lose@{cycles[k]}") for k in sorted(missed)])
+        settings = replace(controller_settings(campaign.cell), missed_replies=5)
+        controller = simulated_controller(
+            campaign.cell,
+            settings=settings,
+            faults=[Push(cycles[k] + 100 + (k in missed)) for k in range(2)],  # type: ignore[misc]
+        )
+        link = VirtualLink.over(
+            SimulatedTransport(controller, lost), campaign.cell, controller.finish
+        )
+        return campaign.run(link, unrehearsed=True, durable=False)
+
+    def test_sound_ones_replace_as_many(self, make: Make, begins: list[int]) -> None:
+        campaign = make(repetitions=3)
+        result = self.run(campaign, begins, {0, 1})
+        assert result.complete
+        assert [rejection.archive[11:-5] for rejection in result.rejected] == [
+            *("002_a1", "002_a2", "000_a1", "001_a1"),
+        ]
+        assert "packets were missed in it, and none in those" in result.rejected[-1].reason
+        assert any("disturbed alike, or the arm was changed" in note for note in result.notes)
+        good = [path.name[11:-5] for path in campaign.folder.completed("excitation")]
+        assert good == ["000_a2", "001_a2", "002_a3"]
+
+    @pytest.mark.parametrize("missed", [{0}, {1}, set(), {*range(9)}])
+    def test_others_need_an_operator(
+        self, make: Make, begins: list[int], missed: Collection[int]
+    ) -> None:
+        """Of those that count one missed none, or the later ones missed some, too."""
+        campaign = make(repetitions=3)
+        with pytest.raises(RepetitionsRejectedError):
+            self.run(campaign, begins, missed)
+        good = [path.name[11:-5] for path in campaign.folder.completed("excitation")]
+        assert good == ["000_a1", "001_a1"]
+
+
+_AT_REST: Final = 32  # cycles after the first of an archive, when the first set-point is sent

@@ -42,7 +42,7 @@ ASSUMED: Final = "assumed"
 
 
 @dataclass(frozen=True)
-class Known:
+class CellValues:
     """Values of a cell file by dotted field (`"?"` if unknown), their origins, and notes."""
 
     values: Mapping[str, Any] = field(default_factory=dict)
@@ -50,32 +50,34 @@ class Known:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def of_origin(cls, origin: str, values: Mapping[str, Any], notes: Sequence[str] = ()) -> Known:
+    def of_origin(
+        cls, origin: str, values: Mapping[str, Any], notes: Sequence[str] = ()
+    ) -> CellValues:
         """Create from values of one origin, without unknown fields."""
         nothing: list[Any] = [UNKNOWN]
-        known_values = {
+        stated = {
             name: value
             for name, value in values.items()
             if value != UNKNOWN
             and not (isinstance(value, list) and value and value == nothing * len(value))
         }
-        return cls(known_values, dict.fromkeys(known_values, origin), tuple(notes))
+        return cls(stated, dict.fromkeys(stated, origin), tuple(notes))
 
-    def without(self, table: str) -> Known:
+    def without(self, table: str) -> CellValues:
         """Return the values without those of one table."""
         remaining = {k: v for k, v in self.values.items() if not k.startswith(f"{table}.")}
         return replace(self, values=remaining, origin={k: self.origin[k] for k in remaining})
 
-    def __or__(self, other: Known) -> Known:
+    def __or__(self, other: CellValues) -> CellValues:
         """Merge; `other` has precedence."""
-        return Known(
+        return CellValues(
             {**self.values, **other.values},
             {**self.origin, **other.origin},
             (*self.notes, *other.notes),
         )
 
 
-def from_urdf(urdf: str, joint_names: Sequence[str]) -> Known:
+def from_urdf(urdf: str, joint_names: Sequence[str]) -> CellValues:
     """Return the limits of a URDF in degrees, `"?"` if unknown; all torque limits or none."""
     limits = urdf_limits(urdf, joint_names)
     values: dict[str, Any] = {
@@ -86,10 +88,10 @@ def from_urdf(urdf: str, joint_names: Sequence[str]) -> Known:
     }
     if np.isfinite(limits.effort).all():
         values["limits.torque"] = limits.effort.tolist()
-    return Known.of_origin("from the URDF", values)
+    return CellValues.of_origin("from the URDF", values)
 
 
-def assumed_for_design(cell_values: Known, n_joints: int) -> Known:
+def assumed_for_design(cell_values: CellValues, n_joints: int) -> CellValues:
     """Return assumed values for a cell without controller.
 
     Home is zero, or the middle of a range without zero; continuous joints are limited to ±180°;
@@ -128,10 +130,10 @@ def assumed_for_design(cell_values: Known, n_joints: int) -> Known:
         values["limits.lower_deg"] = low
     if high != upper:
         values["limits.upper_deg"] = high
-    return Known.of_origin(ASSUMED, values)
+    return CellValues.of_origin(ASSUMED, values)
 
 
-def clear_home(urdf: str, cell_values: Known, mesh_folders: Sequence[str]) -> Known:
+def clear_home(urdf: str, cell_values: CellValues, mesh_folders: Sequence[str]) -> CellValues:
     """Return the first clear posture with up to three joints turned by 90° from the home posture.
 
     Where none is clear of the floor, no floor is assumed. Notes report this, and pairs that are not
@@ -147,7 +149,7 @@ def clear_home(urdf: str, cell_values: Known, mesh_folders: Sequence[str]) -> Kn
         try:
             checker = CollisionChecker(urdf, workspace, limits, mesh_folders)
         except CollisionModelError:
-            return Known()
+            return CellValues()
         clear = np.flatnonzero(checker.clear(postures))
         if len(clear) > 0:
             values: dict[str, Any] = {"campaign.home_deg": _degrees(postures[clear[0]])}
@@ -155,8 +157,8 @@ def clear_home(urdf: str, cell_values: Known, mesh_folders: Sequence[str]) -> Kn
             if floor is None:
                 values["workspace.floor"] = "none"
                 notes.append("no posture tried is clear of a floor at 0 m: no floor is assumed")
-            return Known.of_origin(ASSUMED, values, notes)
-    return Known(notes=("every posture tried is a contact: correct campaign.home_deg",))
+            return CellValues.of_origin(ASSUMED, values, notes)
+    return CellValues(notes=("every posture tried is a contact: correct campaign.home_deg",))
 
 
 def _turned(home: Array, limits: JointLimits) -> Iterator[Array]:
@@ -170,7 +172,7 @@ def _turned(home: Array, limits: JointLimits) -> Iterator[Array]:
                     yield posture
 
 
-def from_init(init: InitPacket, n_joints: int, arm: int) -> Known:
+def from_init(init: InitPacket, n_joints: int, arm: int) -> CellValues:
     """Return the values of an init packet for the first `n_joints` axes of an arm (from 1)."""
     row = arm - 1
     n = n_joints
@@ -194,10 +196,10 @@ def from_init(init: InitPacket, n_joints: int, arm: int) -> Known:
         closed = f"axes {missing} of arm {arm} are not open in the controller"
         notes.append(f"{closed}; a campaign needs all axes of the arm")
     version = ".".join(map(str, init.version))
-    return Known.of_origin(f"from the init packet (C4G {version})", values, notes)
+    return CellValues.of_origin(f"from the init packet (C4G {version})", values, notes)
 
 
-def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known:
+def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> CellValues:
     """Return the values of the cell and the init packet in an archive, or raise ArchiveError."""
     archive = open_archive(path, fields=())
 
@@ -210,7 +212,7 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
             f"is of an arm with joints {', '.join(archive.joint_names)}",
             remedy=f"the URDF has {', '.join(joint_names)}",
         )
-    cell_values = Known()
+    cell_values = CellValues()
     if "cell.toml" in archive.attachments:
         try:
             tables = parse_toml(archive.text("cell.toml"))
@@ -222,7 +224,7 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
         values = {f"{name}.{key}": value for name in tables for key, value in tables[name].items()}
         for name in ("cell.urdf", "cell.mesh_folders"):  # paths on the recording computer
             values.pop(name, None)
-        cell_values = Known.of_origin(f"from {archive.path.name}", values)
+        cell_values = CellValues.of_origin(f"from {archive.path.name}", values)
     packet = archive.attachments.get("init_packet.bin")
     if packet is not None:
         arm = cell_values.values.get("controller.arm", 1)
@@ -235,7 +237,7 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
         raise refusal("contains neither a cell nor an init packet")
     if archive.header.only_simulated:
         note = f"{archive.path.name} was recorded from a simulated controller"
-        cell_values |= Known(notes=(note,))
+        cell_values |= CellValues(notes=(note,))
     return cell_values
 
 
