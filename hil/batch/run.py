@@ -71,11 +71,14 @@ def decision_digest(options: Options, arms: Settings | None, refs: Sequence[Arch
 def archives_for_settings(
     refs: Sequence[ArchiveRef], arms: Settings | None
 ) -> tuple[ArchiveRef, ...]:
-    """Return the archives that determine a campaign's settings, those at standstill first."""
+    """Return the archives that determine a campaign's settings, those at standstill first.
+
+    Where the arm has settings only noise and cell are the campaign's own: one excitation is read.
+    """
     ordered = sorted(refs, key=lambda ref: ref.order)
     standstill = [ref for ref in ordered if ref.use == "standstill"]
     fitted = [ref for ref in ordered if ref.use == "excitation"]
-    return (*standstill, *fitted[: 1 if arms is not None and standstill else MAX_RECORDINGS])
+    return (*standstill, *fitted[: MAX_RECORDINGS if arms is None else 1])
 
 
 def cached_settings(

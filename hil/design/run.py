@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 from hil.cell import AngleFrame, Cell
-from hil.errors import InputError, OperatorStopError, UnsafeError
+from hil.errors import HilError, InputError, OperatorStopError, UnsafeError
 from hil.files import convert_write_errors, json_digest, lock_folder, write_atomically
 from hil.motion_checks import violation_text
 from hil.progress import Reporter
@@ -242,7 +242,6 @@ def run_search(
     problem = problem or problem_of(cell, asked)
     settings = search_settings(asked)
     checker = problem.constraints.checker
-    frame = AngleFrame.of(cell)
     total = excitation.most_evaluations(settings)
     if checker is not None and checker.exceptions is not None:
         reporter.say(checker.exceptions)
@@ -270,12 +269,7 @@ def run_search(
                 population, settings, journal=journal, progress=update, scored=scored, stop=stop
             )
         except excitation.NoFeasibleMotionError as error:
-            if error.stopped:
-                raise OperatorStopError(
-                    f"stopped before a feasible motion was found: {infeasible_text(error, frame)}"
-                ) from error
-            chain = cell.model.chain
-            raise no_excitation(error, frame, checker, asked, chain) from error
+            raise _without_motion(error, cell, asked, checker) from error
         if design.complete:  # with fewer motions than the limit
             task.advance(total - done, "done")
     if design.exhausted:
@@ -284,6 +278,20 @@ def run_search(
             "gave no new motions; raise mutation, crossover or population in [search]"
         )
     return design
+
+
+def _without_motion(
+    error: excitation.NoFeasibleMotionError,
+    cell: Cell,
+    asked: DesignSettings,
+    checker: excitation.CollisionChecker | None,
+) -> HilError:
+    """Return the error about a search that was stopped, or ended, without a feasible motion."""
+    frame = AngleFrame.of(cell)
+    if not error.stopped:
+        return no_excitation(error, frame, checker, asked, cell.model.chain)
+    text = infeasible_text(error, frame)
+    return OperatorStopError(f"stopped before a feasible motion was found: {text}")
 
 
 def _note(progress: excitation.Progress) -> str:

@@ -253,15 +253,7 @@ def choose_settings(
     themselves.
     """
     trial = _Trial(model, ready, stated, ripples)
-    now = start
-    if "bandwidth" in questions:
-        now = now.preprocessed(rigid_bandwidth=BANDWIDTHS[0])
-    if "velocity" in questions:
-        now = now.preprocessed(velocity=VELOCITIES[0])
-    if "rows" in questions:
-        now = now.preprocessed(left_out=LEFT_OUT[0])
-    if "presliding" in questions:
-        now = now.with_friction(presliding=PRESLIDING[0])
+    now = _first_candidates(start, questions)
     asked: set[str] = {*questions}
     if "estimator" in asked:
         asked |= {"strength", "consistency"}
@@ -298,6 +290,20 @@ def choose_settings(
             now = decision.settings
             choices = [*choices, decision.choice]
     return replace(now, choices=tuple(choice for choice in choices if len(choice.candidates) > 1))
+
+
+def _first_candidates(start: Settings, questions: Collection[Question]) -> Settings:
+    """Return settings with the first candidate of each that is swept."""
+    settings = start
+    if "bandwidth" in questions:
+        settings = settings.preprocessed(rigid_bandwidth=BANDWIDTHS[0])
+    if "velocity" in questions:
+        settings = settings.preprocessed(velocity=VELOCITIES[0])
+    if "rows" in questions:
+        settings = settings.preprocessed(left_out=LEFT_OUT[0])
+    if "presliding" in questions:
+        settings = settings.with_friction(presliding=PRESLIDING[0])
+    return settings
 
 
 def _choose_prior(
