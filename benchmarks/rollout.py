@@ -17,7 +17,8 @@ the fitted recording, are compared with one that the minimiser of `mujoco.sysid`
 (`benchmarks.sysid_rival`) fits to these windows. All are then simulated in the same held-out
 windows, under the recorded torque and a feedback of 1 Hz. Prints errors, processor time from the
 recording on, and the error of positions that continue at the start velocity; wanted are no larger
-error and a tenth of the time. The recording is that of a simulated NS 16, or those of `--only`.
+error and a tenth of the time. The recording is that of a simulated NS 16, or those of `--only`. It
+needs what `mujoco.sysid` imports: `pip install 'mujoco[sysid]'`.
 """
 
 from __future__ import annotations

@@ -79,14 +79,7 @@ def import_rosbag2(
             states.add(as_joint_state(message))
         files = bag.files
         samples = states.samples()
-        measured = Measured(
-            robot.joint_names,
-            joint_names or {},
-            samples.stamp,
-            samples.position,
-            CommandClock(states.clock == "header", states.latency),
-        )
-        commands = commanded_positions(bag, chosen, measured, command_topic)
+        commands = commanded_positions(bag, chosen, states.measured(samples), command_topic)
     samples = replace(samples, commanded_position=commands.values)
     metadata = {"importer": "rosbag2", "topic": chosen, "effort": effort, "clock": states.clock}
     if commands.values is not None:
@@ -252,16 +245,16 @@ class _States:
             motor_current=effort if self._effort == "motor_current" else None,
         )
 
-    @property
-    def latency(self) -> int:
-        """Median time between stamp and receipt of the messages with a stamp [ns]."""
+    def measured(self, samples: Samples) -> Measured:
+        """Return the positions that commands have to follow, and the clock of their stamps."""
         late = [
             received - stamp
             for part in self._parts.values()
             for stamp, received in zip(part.header, part.received, strict=True)
             if stamp
         ]
-        return int(np.median(late)) if late else 0
+        clock = CommandClock(self.clock == "header", int(np.median(late)) if late else 0)
+        return Measured(self._joints, self._renamed, samples.stamp, samples.position, clock)
 
     def _chosen_parts(self) -> list[_Part]:
         """Return the parts that have each joint once: a whole one, or several."""

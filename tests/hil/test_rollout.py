@@ -29,6 +29,7 @@ from hil.rollout import POLISHED
 from hil.rollout_result import ROLLOUT, ArmErrors, RolloutResult
 from identification.rollout.servo import Servo
 from identification.text import percentage
+from tests.identification.two_link import MODEL, URDF, four_sines, truth
 
 pytestmark = pytest.mark.long
 
@@ -313,3 +314,19 @@ def test_annotated_copies_of_single_archives_lie_beside_them(folder: Path, tmp_p
     shutil.copy(archive, tmp_path / "run.mcap")
     run("identify", tmp_path / "run.mcap", "--annotate")
     assert len([*(tmp_path / "run" / FOLDER).glob("*.mcap")]) == 1
+
+
+def test_a_model_that_must_not_be_relied_on_says_so(tmp_path: Path) -> None:
+    """Torques of the opposite sign: the rollout may be near, the model is not."""
+    time = np.arange(0.0, 12.0, 0.004)
+    motion = four_sines(time, 0.5)
+    noise = np.random.default_rng(1).standard_normal((len(time), 4)) * [1e-5, 1e-5, 3.0, 0.2]
+    torque = -MODEL.torque(truth(), *motion[1:])
+    columns = np.column_stack([time, np.column_stack([motion.position, torque]) + noise])
+    log, urdf, archive = (tmp_path / name for name in ("log.csv", "robot.urdf", "log.mcap"))
+    np.savetxt(log, columns, delimiter=",", header="t,q1,q2,tau1,tau2", comments="")
+    urdf.write_text(URDF)
+    assert run("import", "log", log, "--urdf", urdf, "-o", archive).exit_code == 0
+    done = run("rollout", archive, "--samples", "3")
+    assert done.exit_code == 5, done.exception
+    assert "The model must not be relied on: all torques have the opposite sign" in done.output
