@@ -44,7 +44,7 @@ def test_a_short_motion_is_not_judged() -> None:
 
 
 @pytest.mark.parametrize(("frequency", "rate"), [(26.0, 15.0), (65.0, 30.0)])
-def test_one_that_ends_a_motion_within_tenths_of_a_second_is_named(
+def test_one_that_ends_a_motion_in_tenths_of_a_second_is_named(
     frequency: float, rate: float
 ) -> None:
     time = np.arange(0.0, 0.3, PERIOD)
