@@ -115,7 +115,8 @@ def axis_alone(cell: Cell, joint: str | None) -> int:
     if motors.tolist() != [index + 1]:
         raise InputError(
             None,
-            f"joint {index + 1} is moved by the motors of axes {', '.join(map(str, motors))}",
+            f"{cell.joint_names[index]} is moved by the motors of axes "
+            f"{', '.join(map(str, motors))}",
             field="--only-axis",
             remedy="move another joint first, or open all axes",
         )

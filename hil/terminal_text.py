@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import re
 import shlex
+from collections.abc import Sequence
 from os import PathLike
+from typing import Final
+
+_JOINT_NUMBER: Final = re.compile(r"\bjoint (\d{1,3})\b")
 
 
 def typed(path: str | PathLike[str]) -> str:
     """Return a path as a word of a command line, quoted where a shell needs it."""
     return shlex.quote(str(path))
+
+
+def with_joint_names(text: str, joint_names: Sequence[str]) -> str:
+    """Return a text of the drivers, which number joints from 1, with the names of the joints."""
+
+    def name(match: re.Match[str]) -> str:
+        index = int(match[1]) - 1
+        return joint_names[index] if 0 <= index < len(joint_names) else match[0]
+
+    return _JOINT_NUMBER.sub(name, text)
 
 
 def plural(number: int, noun: str) -> str:

@@ -48,6 +48,7 @@ from hil.archive.schema import (
 from hil.archive.schema import DESCRIPTION as DESCRIPTION_TOPIC
 from hil.errors import ArchiveWriteError
 from hil.files import sync_folder
+from hil.terminal_text import with_joint_names
 
 Array = NDArray[np.float64]
 
@@ -350,9 +351,11 @@ class ArchiveWriter:
     ) -> None:
         """Add an event of one line of text; it is flushed with the cycles that follow.
 
+        Numbers of joints in the text become their names.
         `cycle` is that of the controller in which it happened, None for the newest one written;
         `data` are JSON values.
         """
+        text = with_joint_names(text, self._joint_names)
         time = (self.newest if cycle is None else cycle) * self.period
         self.file.add_event(ArchivedEvent(time, name, text, level, data or {}))
 
@@ -370,6 +373,7 @@ class ArchiveWriter:
         """
         if self.file.closed:
             return
+        reason = with_joint_names(reason, self._joint_names)
         self._emit(everything=True)
         counts = self.file.counts
         cycles = {

@@ -11,7 +11,7 @@ from drivers.errors import Check, GuardError, RefusalError
 from drivers.events import Refused
 from hil.cell import AngleFrame, Cell
 from hil.errors import ExecutionError, HilError, UnsafeError
-from hil.terminal_text import plural
+from hil.terminal_text import plural, with_joint_names
 
 
 class MotionRefusedError(UnsafeError):
@@ -63,7 +63,7 @@ _SET_BY: Final[Mapping[Check, str]] = {
 def refusal_text(cell: Cell, error: RefusalError) -> str:
     """Return a refusal with the joint's name, degrees, and what in the cell file sets the bound."""
     if not isinstance(error, GuardError):
-        return str(error)
+        return with_joint_names(str(error), cell.joint_names)
     joint = error.joint
     check = error.check
     unit = error.unit

@@ -29,6 +29,7 @@ from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded, describe
 from hil.cell import Cell
 from hil.errors import ArchiveWriteError, ControllerError, OperatorStopError
+from hil.terminal_text import with_joint_names
 
 from .connection import Connection, StartTimeout, active_guard, described, not_ready, waiting_text
 from .errors import refusal_text
@@ -205,9 +206,13 @@ class MotionLink:
                 refused = self.connection.refused
                 if refused is not None and ended.reason == str(refused.error):
                     return replace(ended, reason=refusal_text(self.cell, refused.error))
-                return ended
+                return replace(ended, reason=self._named(ended.reason))
             self.complete("stopped", NOT_STARTED)
             return MotionEnded("stopped", NOT_STARTED, -1, -1)
+
+    def _named(self, text: str) -> str:
+        """Return a text of the drivers with the names of the joints."""
+        return with_joint_names(text, self.cell.joint_names)
 
     def complete(self, outcome: str, reason: str) -> Recorded:
         """Complete the archive that is open, and return what it contains."""
@@ -328,7 +333,7 @@ class MotionLink:
                 self._reply_until_rest(stop, watch, f"the recording failed ({error})")
                 raise
         self._reply_until_rest(stop, watch, "recording complete")
-        return recorded
+        return replace(recorded, reason=self._named(recorded.reason))
 
     def _await_session(self, stop: Stop, wait: float, watch: Watch) -> None:
         """Exchange packets until the controller's init packet came."""

@@ -24,12 +24,22 @@ from planner.worker import in_child
 Array = NDArray[np.float64]
 
 
-def read_via_points(path: Path, frame: AngleFrame) -> Array:
+ROUNDING = 1e-9
+"""Degrees by which an angle may pass a limit that was converted to radians and back."""
+
+
+def read_via_points(path: Path, cell: Cell) -> Array:
     """Read via points (m, n) [rad] from a table of degrees, one row per point.
 
     Commas, semicolons or blanks separate values; # begins a comment; a first row without numbers is
     a header.
+
+    Raises:
+        InputError: the file cannot be read, or has no two postures within the limits of the cell.
     """
+    frame = AngleFrame.of(cell)
+    ends = frame.shown(np.array([cell.joint_limits.lower, cell.joint_limits.upper]))
+    bounds = [*zip(cell.joint_names, np.sort(ends, axis=0).T.tolist(), strict=True)]
     lines = enumerate(read_input(path).removeprefix("\ufeff").splitlines(), 1)
     rows = [(k, re.findall(r"[^\s,;]+", line.split("#")[0])) for k, line in lines]
     rows = [(number, cells) for number, cells in rows if cells]
@@ -42,6 +52,11 @@ def read_via_points(path: Path, frame: AngleFrame) -> Array:
             problem = f"{' '.join(cells)!r} is not a posture"
             remedy = f"write one finite angle in degrees for each of the {frame.sign.size} joints"
             raise InputError(path, problem, field=f"line {number}", remedy=remedy)
+        for angle, (name, (lower, upper)) in zip(point, bounds, strict=True):
+            if not lower - ROUNDING <= angle <= upper + ROUNDING:
+                problem = f"{name} = {angle:g}° is outside [limits] of {cell.path}"
+                remedy = f"write an angle from {lower:g}° to {upper:g}°"
+                raise InputError(path, problem, field=f"line {number}", remedy=remedy)
         points.append(point)
     if len(points) < 2:
         remedy = "a motion needs a start and a target"
@@ -98,7 +113,7 @@ def plan(
     points = (
         random_via_points(loaded, frame, random or 1, seed)
         if via is None
-        else read_via_points(via, frame)
+        else read_via_points(via, loaded)
     )
     moves = [Move(target=point, speed=speed / 100, fly_percent=fly) for point in points[1:]]
     # The solver can crash its process.

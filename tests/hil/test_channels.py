@@ -31,7 +31,7 @@ def test_names_say_quantity_and_number(name: str) -> None:
     assert kind_of(name, units.get(name)) == NAMED[name]
 
 
-def test_units_of_torque_are_spelled_alike_with_every_prefix() -> None:
+def test_units_of_torque_have_one_spelling_with_every_prefix() -> None:
     for spelled in ("N.m", "Nm", "N·m", "N m"):
         assert [unit_of(prefix + spelled) for prefix in ("", "m", "k")] == ["N.m", "mN.m", "kN.m"]
 

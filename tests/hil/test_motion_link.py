@@ -158,6 +158,15 @@ def test_what_a_connection_waits_for_is_reported_once(cell: Cell) -> None:
     ]
 
 
+def test_an_end_names_joints_as_the_cell_does(cell: Cell) -> None:
+    port = ScriptedPort(
+        (1.0, started),
+        (2.0, ended("lost", "joint 2 is in mode 0; the motion needs 4")),
+        (2.5, archived("lost")),
+    )
+    assert run(cell, port).reason == f"{cell.joint_names[1]} is in mode 0; the motion needs 4"
+
+
 def test_a_motion_ends_with_its_archive(cell: Cell) -> None:
     port = ScriptedPort((0.1, started), (1.0, ended()), (1.2, archived()))
     assert run(cell, port).outcome == "completed"

@@ -93,10 +93,10 @@ def test_one_axis_alone_is_refused_where_others_open_or_turn(ns16: Cell, tmp_pat
     with UdpController.started(ns16, tmp_path) as controller:
         error = refused(controller.cell_path, "3")
     assert isinstance(error, ExecutionError)
-    assert "joint 1 is in mode 4; the motion needs 0" in str(error)
+    assert "joint_1 is in mode 4; the motion needs 0" in str(error)
     error = refused(CELL_PATH, "4")
     assert isinstance(error, InputError)
-    assert "joint 4 is moved by the motors of axes 4, 5, 6" in str(error)
+    assert "joint_4 is moved by the motors of axes 4, 5, 6" in str(error)
 
 
 def test_a_campaign_keeps_its_moves_and_knows_its_start(campaign: Campaign, tmp_path: Path) -> None:

@@ -44,7 +44,9 @@ def test_a_short_motion_is_not_judged() -> None:
 
 
 @pytest.mark.parametrize(("frequency", "rate"), [(26.0, 15.0), (65.0, 30.0)])
-def test_one_that_ends_a_motion_within_tenths_of_a_second(frequency: float, rate: float) -> None:
+def test_one_that_ends_a_motion_in_tenths_of_a_second_is_named(
+    frequency: float, rate: float
+) -> None:
     time = np.arange(0.0, 0.3, PERIOD)
     error = 1e-6 * np.random.default_rng(1).standard_normal((len(time), 1)) + 1e-2 * time[:, None]
     error[:, 0] += 1e-5 * np.exp(rate * time) * np.sin(2.0 * np.pi * frequency * time)

@@ -101,6 +101,11 @@ HOME = "0 0 -90 0 90 0\n"
         (VIA, ["--via", "VIA", "--picture", "plan.bmp"], "not a picture format"),
         (VIA, ["--via", "VIA", "--picture", "nowhere/plan.png"], "cannot be written"),
         ("0 0 0\n1 1 1\n", ["--via", "VIA"], "line 1: '0 0 0' is not a posture"),
+        (
+            HOME + "0 99 -90 0 90 0\n",
+            ["--via", "VIA"],
+            "line 2: joint_2 = 99° is outside .* write an angle from -50° to 95°",
+        ),
         (HOME, ["--via", "VIA"], "1 via points"),
         ("", ["--via", "VIA"], "0 via points"),
         ("a,b,c,d,e,f\nA,B,C,D,E,F\n" + HOME, ["--via", "VIA"], "line 2: 'A B C D E F' is no"),

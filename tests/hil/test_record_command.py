@@ -148,7 +148,7 @@ def test_a_refusal_is_shown_at_once_and_ends_a_recording(tmp_path: Path, cell: C
     done = record(
         link, cell, tmp_path / NAME, kind="excitation", stop=Stop(), duration=1.0, durable=False
     )
-    cause = "joint 1 is in mode 3: the reply to that mode is unknown"
+    cause = "joint_1 is in mode 3: the reply to that mode is unknown"
     assert (done.outcome, done.reason.partition(" (cycle")[0]) == ("refused", cause)
     assert [line.partition(" (cycle")[0] for line in lines] == [f"REFUSED: {cause}"]
     assert lines[0].endswith(ModeRefused.remedy)

@@ -33,7 +33,7 @@ from hil.campaign.quality import Executed
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.status import conduct_of
 from hil.campaign.warmup import FrictionMeter, WarmUpRecord
-from hil.cell import AngleFrame, Cell
+from hil.cell import Cell
 from hil.cli import app
 from hil.cli.plan import read_via_points
 from hil.errors import ArchiveError, HilError, InputError
@@ -49,6 +49,7 @@ from hil.study.results import StudyResults
 from identification import IdentificationError
 from identification.excitation import Journal
 from planner import PlannerError
+from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_campaign, fast_cell
 
 pytestmark = pytest.mark.safety
@@ -220,7 +221,7 @@ RECORDINGS: dict[str, Callable[[Path], object]] = {
     **{f"log{suffix}": ArrayFile for suffix in READERS},
     "bag.db3": bag_files,
     "bag.mcap": lambda path: open_bag(path).__enter__(),
-    "via.csv": lambda path: read_via_points(path, AngleFrame("urdf", np.ones(3), np.zeros(3))),
+    "via.csv": lambda path: read_via_points(path, Cell.load(CELL_PATH)),
     "results.json": StudyResults.load,
     "excitation_000_a1.mcap": open_archive,
     "excitation_001_a1.mcap": check_archive,
