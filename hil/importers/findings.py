@@ -55,9 +55,9 @@ def examine(
     torque of the nominal inertias, None if the URDF has none; `held_joints` were clamped.
     """
     time = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9)
-    position = unwrap(samples.position)
     limits = urdf_limits(urdf, joint_names)
     turning = _turning(urdf, joint_names)
+    position = in_turns(samples.position, limits, turning)
     held = [f"{name} at {place:.4g}" for name, place in (locked or {}).items()]
     lines = [f"locked, rad or m: {', '.join(held)}"] if held else []
     if len(time) < 2:
@@ -118,17 +118,17 @@ def _fits(position: Array, limits: UrdfLimits) -> NDArray[np.bool_]:
 
 
 def in_turns(position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]) -> Array:
-    """Return positions (m, n) of which a joint within its limits but for a whole turn is within.
+    """Return positions (m, n) without wraps, a joint within its limits but for a turn within them.
 
-    Angles of 0 to 360 degrees and of +-180 are two conventions of one posture; others are as
-    recorded, and so is a joint that no turn brings within its limits.
+    Angles of 0 to 360 degrees and of +-180 are two conventions of one posture; others keep their
+    turn, and so does a joint that none brings within its limits.
     """
     low = position.min(axis=0) + _TOLERANCE
     high = position.max(axis=0) - _TOLERANCE
     usual = ((low > 0.0) & (high < 2.0 * np.pi)) | ((low > -np.pi) & (high < np.pi))
     continued = position.copy()
     continued[:, turning] = unwrap(position[:, turning])
-    result = position.copy()
+    result = continued.copy()
     for turns in (1.0, -1.0, 0.0):
         turned = continued + 2.0 * np.pi * turns * turning
         fits = np.diag(_fits(turned, limits)) & turning & usual

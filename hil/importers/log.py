@@ -66,13 +66,7 @@ def import_log(
     complete = log.complete_rows(clock, values)
     if columns.format.missing == "drop":
         metadata["dropped_rows"] = str(np.count_nonzero(~complete))
-    rows = np.flatnonzero(complete)
-    swapped = sorted_neighbours(clock.stamp[rows], "row")
-    if swapped.note is not None:
-        log.notes.append(f"time: {swapped.note}")
-    rows = rows[swapped.order]
-    stamp = clock.stamp[rows]
-    values = {name: array[rows] for name, array in values.items()}
+    samples = log.samples(clock, values, complete, robot)
     if columns.drive.geared:
         matrix = log.matrix[np.ix_(log.order, log.order)]
         metadata["motor_from_joint"] = json.dumps(matrix.tolist())
@@ -81,15 +75,9 @@ def import_log(
     if (uncertainty := columns.drive.torque_uncertainty) is not None:
         each = np.broadcast_to(uncertainty, len(log.joints))[log.order]
         metadata["torque_uncertainty"] = json.dumps(each.tolist())
-    joint_side = log.in_concluded_units(stamp, values, robot)
-    silent = second_publisher(joint_side["position"], "row")
-    if silent.note is not None:
-        log.notes.append(silent.note)
-        stamp = stamp[~silent.rows]
-        joint_side = {name: array[~silent.rows] for name, array in joint_side.items()}
     return write_imported(
         output,
-        Samples(stamp, **joint_side),
+        samples,
         source=[*log.files],
         robot=robot,
         metadata=metadata,
@@ -274,6 +262,30 @@ class _Log:
                 f"the first after {dropped[0]} rows)"
             )
         return np.asarray(complete)
+
+    def samples(
+        self,
+        clock: _Clock,
+        values: Mapping[str, Array],
+        complete: NDArray[np.bool_],
+        robot: Robot,
+    ) -> Samples:
+        """Return the complete rows (m,) on the joint side, sorted, of the first publisher."""
+        rows = np.flatnonzero(complete)
+        swapped = sorted_neighbours(clock.stamp[rows], "row")
+        if swapped.note is not None:
+            self.notes.append(f"time: {swapped.note}")
+        rows = rows[swapped.order]
+        stamp = clock.stamp[rows]
+        joint = self.in_concluded_units(
+            stamp, {name: array[rows] for name, array in values.items()}, robot
+        )
+        silent = second_publisher(joint["position"], "row")
+        if silent.note is not None:
+            self.notes.append(silent.note)
+            stamp = stamp[~silent.rows]
+            joint = {name: array[~silent.rows] for name, array in joint.items()}
+        return Samples(stamp, **joint)
 
     @np.errstate(over="ignore", invalid="ignore")  # such numbers are refused later
     def in_concluded_units(

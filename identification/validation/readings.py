@@ -368,11 +368,14 @@ class _Search:
                     yield self._try(change)
 
     def _is_spoilt(self, trial: Trial) -> bool:
-        """Whether a change that concerns few joints fits another one worse, or drives one."""
+        """Whether a change that concerns few joints fits another one worse, or drives one.
+
+        With an angle that contains another the posture of all that follows is another.
+        """
         if trial.change.meaning in _IN_ORDER:
             return False
         driven = int(trial.score.driven.sum()) > int(self.score.driven.sum())
-        return trial.against.spoils or driven
+        return driven or (trial.against.spoils and trial.change.meaning not in COUPLED)
 
     def _adopt(self, best: Trial, others: Sequence[Trial]) -> Step:
         """Adopt a change, with those of others that fit alike."""
