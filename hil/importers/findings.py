@@ -115,6 +115,23 @@ def _fits(position: Array, limits: UrdfLimits) -> NDArray[np.bool_]:
     return np.asarray(above & (position.max(axis=0) <= limits.upper[:, None] + _TOLERANCE))
 
 
+def _from_other_turn(position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]) -> Array:
+    """Return positions (m, n) counted from 0 to 360 degrees as within -180 to 180 degrees.
+
+    Of joints that turn, have limits, and go nowhere below zero: -10 degrees are recorded as 350.
+    """
+    turn = 2.0 * np.pi
+    counted = turning & np.isfinite(limits.upper - limits.lower) & (limits.upper < turn)
+    with np.errstate(invalid="ignore"):
+        counted &= (position.min(axis=0) >= 0.0) & (position.max(axis=0) <= turn)
+        counted &= ~np.diag(_fits(position, limits))
+    if not counted.any():
+        return position
+    angles = np.where(counted & (position > np.pi), position - turn, position)
+    continued = unwrap(angles)
+    return np.where(counted, continued, position)
+
+
 class _Outside(NamedTuple):
     """Positions that leave the limits of the URDF."""
 
@@ -127,6 +144,7 @@ def _outside(
     position: Array, names: Sequence[str], limits: UrdfLimits, turning: NDArray[np.bool_]
 ) -> _Outside | None:
     """Return which positions leave the limits of the URDF, and which reading would not."""
+    position = _from_other_turn(position, limits, turning)
     fits = _fits(position, limits)
     joints = range(len(names))
     beyond = [joint for joint in joints if not fits[joint, joint]]
@@ -193,6 +211,7 @@ def are_degrees(position: Array, converted: Array, names: Sequence[str], urdf: s
     if not turning.all() or not len(position):
         return False
     finite = np.isfinite(position).all() and np.isfinite(converted).all()
+    converted = _from_other_turn(converted, limits, turning)
     beyond = ~np.diag(_fits(position, limits))
     far = np.abs(position).max(axis=0) > 3.0 * np.maximum(-limits.lower, limits.upper)
     fits = np.diag(_fits(converted, limits))

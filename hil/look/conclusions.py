@@ -66,11 +66,11 @@ def concluded(
     if error > _OTHER_ARM:
         raise _other_arm(source, error)
     changed = _changed(look)
+    contradictions = Contradictions.of(cell, cell.model, samples, score, error)
     if not changed:
-        contradictions = Contradictions.of(cell, cell.model, samples, score, error)
         imported = _of_this_arm(imported, source, contradictions)
     if look.questions:
-        raise _undecided(source, look.questions[0])
+        raise _undecided(source, look.questions[0], contradictions)
     if look.map_text != imported.map_text or look.options:
         again = _again(imported, source, robot_of, look, use)
         if (few := _few_rows(again.archive)) is not None:
@@ -152,7 +152,9 @@ def _gravity(look: Look) -> tuple[float, ...] | None:
     return tuple(float(word) for word in option_words[1:4]) if option_words else None
 
 
-def _undecided(source: Path, choices: tuple[Choice, ...]) -> SourceError:
+def _undecided(
+    source: Path, choices: tuple[Choice, ...], contradictions: Contradictions
+) -> SourceError:
     errors = [
         f" (error {percentage(choice.error, 1)})" if choice.error else "" for choice in choices
     ]
@@ -169,6 +171,10 @@ def _undecided(source: Path, choices: tuple[Choice, ...]) -> SourceError:
     elif any(choice.line.startswith("--") for choice in choices):
         remedy = f"state {' or '.join(choice.line for choice in choices if choice.line)}"
     problem = f"two readings fit alike: {readings}"
+    if contradictions.is_doubtful:
+        said = "; ".join(contradictions.sentences)
+        problem = f"may not be of the arm of the URDF: {said}; and {problem}"
+        return SourceError(source, problem, field="--urdf", remedy=f"{_REMEDY}; or {remedy}")
     return SourceError(source, problem, field=choices[0].aspect, remedy=remedy)
 
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.cell.text import UrdfLimits, urdf_limits
-from hil.look.physics import Size
-from hil.look.run import mounted
+from hil.look.physics import Size, mounted
+from hil.look.result import Row
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.text import percentage
@@ -116,6 +116,12 @@ class Contradictions:
         """The contradictions there are."""
         parts = (self.motion, self.size, self.lengths, self.torque, self.axes)
         return tuple(filter(None, parts))
+
+    @property
+    def row(self) -> Row:
+        """What a look says of a doubtful arm."""
+        reading = "may be another than that of the URDF"
+        return Row("arm", reading, "open", "; ".join(self.sentences), "give the URDF of this arm")
 
     @property
     def is_doubtful(self) -> bool:

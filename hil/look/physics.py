@@ -71,6 +71,12 @@ _DENSITY_SPREAD: Final = 3.0  # factor of one standard deviation
 _GRAVITY: Final = 9.81
 
 
+def mounted(cell: Cell, gravity: tuple[float, float, float]) -> Cell:
+    """Return a cell whose arm is under another gravity [m/s²]."""
+    robot = cell.file.robot.model_copy(update={"gravity": gravity})
+    return replace(cell, file=cell.file.model_copy(update={"robot": robot}))
+
+
 @dataclass(frozen=True)
 class Size:
     """Measured torque over that which the arm needs.

@@ -18,6 +18,7 @@ from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, i
 from hil.importers.usable import require_motion
 from hil.look import physics, signals
 from hil.look.maps import with_entries
+from hil.look.other_arm import Contradictions
 from hil.look.result import Group, Look, Row
 from hil.look.undescribed import undescribed_robot
 from identification.errors import IdentificationError
@@ -106,6 +107,13 @@ def _finding(
 
 
 def _look_of(finding: physics.Finding, rows: Sequence[Row], groups: tuple[Group, ...]) -> Look:
+    readings = finding.readings
+    score = readings.score
+    contradictions = Contradictions.of(
+        finding.cell, readings.model, readings.samples, score, score.overall
+    )
+    if contradictions.is_doubtful:
+        rows = (*rows, contradictions.row)
     text = finding.map_text
     if text is not None:
         text = with_entries(text, finding.entries())
@@ -124,7 +132,7 @@ def _readings(cell: Cell, recording: Recording, imported: ImportedRecording) -> 
     samples = prepare(recording, cell.model, options=SETTINGS)
     stated = any("position" in line and "no unit stated" not in line for line in imported.lines)
     mountings = {
-        name: mounted(cell, gravity).model
+        name: physics.mounted(cell, gravity).model
         for name, gravity in physics.MOUNTINGS.items()
         if not np.allclose(gravity, cell.model.gravity)
     }
@@ -134,12 +142,6 @@ def _readings(cell: Cell, recording: Recording, imported: ImportedRecording) -> 
         mountings=mountings,
         unit_is_open=not stated,
     )
-
-
-def mounted(cell: Cell, gravity: tuple[float, float, float]) -> Cell:
-    """Return a cell whose arm is under another gravity [m/s²]."""
-    robot = cell.file.robot.model_copy(update={"gravity": gravity})
-    return replace(cell, file=cell.file.model_copy(update={"robot": robot}))
 
 
 def _channel(
