@@ -116,20 +116,20 @@ def _fits(position: Array, limits: UrdfLimits) -> NDArray[np.bool_]:
 
 
 def _from_other_turn(position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]) -> Array:
-    """Return positions (m, n) counted from 0 to 360 degrees as within -180 to 180 degrees.
+    """Return positions (m, n) recorded from 0 to 360 degrees as within -180 to 180 degrees.
 
     Of joints that turn, have limits, and go nowhere below zero: -10 degrees are recorded as 350.
     """
     turn = 2.0 * np.pi
-    counted = turning & np.isfinite(limits.upper - limits.lower) & (limits.upper < turn)
+    circular = turning & np.isfinite(limits.upper - limits.lower) & (limits.upper < turn)
     with np.errstate(invalid="ignore"):
-        counted &= (position.min(axis=0) >= 0.0) & (position.max(axis=0) <= turn)
-        counted &= ~np.diag(_fits(position, limits))
-    if not counted.any():
+        circular &= (position.min(axis=0) >= 0.0) & (position.max(axis=0) <= turn)
+        circular &= ~np.diag(_fits(position, limits))
+    if not circular.any():
         return position
-    angles = np.where(counted & (position > np.pi), position - turn, position)
+    angles = np.where(circular & (position > np.pi), position - turn, position)
     continued = unwrap(angles)
-    return np.where(counted, continued, position)
+    return np.where(circular, continued, position)
 
 
 class _Outside(NamedTuple):

@@ -70,7 +70,7 @@ def concluded(
     if not changed:
         imported = _of_this_arm(imported, source, contradictions)
     if look.questions:
-        raise _undecided(source, look.questions[0], contradictions)
+        raise undecided(source, look.questions[0], contradictions)
     if look.map_text != imported.map_text or look.options:
         again = _again(imported, source, robot_of, look, use)
         if (few := _few_rows(again.archive)) is not None:
@@ -152,9 +152,10 @@ def _gravity(look: Look) -> tuple[float, ...] | None:
     return tuple(float(word) for word in option_words[1:4]) if option_words else None
 
 
-def _undecided(
+def undecided(
     source: Path, choices: tuple[Choice, ...], contradictions: Contradictions
 ) -> SourceError:
+    """Return the refusal of readings that fit alike; a doubtful arm is said first."""
     errors = [
         f" (error {percentage(choice.error, 1)})" if choice.error else "" for choice in choices
     ]

@@ -25,10 +25,11 @@ from hil.identify.sources import cell_of, source_of
 from hil.importers import ColumnMap, Robot
 from hil.importers.recording import ImportOptions
 from hil.look import Look, look_at
-from hil.look.conclusions import concluded
+from hil.look.conclusions import concluded, undecided
 from hil.look.maps import entries_of
 from hil.look.other_arm import Contradictions
 from hil.look.physics import channel_rows
+from hil.look.result import Choice
 from hil.look.run import SETTINGS
 from identification.estimators.delay import DelayEstimate
 from identification.signals.samples import prepare
@@ -266,6 +267,19 @@ class TestOtherArm:
         contradictions = self.contradictions(path, self.described(tmp_path / "x.urdf", text))
         assert contradictions.is_doubtful == bool(said)
         assert contradictions.lengths.startswith(f"the torque fits links {said}" if said else "")
+
+    def test_a_look_says_it(self, tmp_path: Path, table: Mapping[str, Floats]) -> None:
+        text = URDF.replace("<origin xyz='0 0 0.4'/>", "<origin xyz='0 0 0.25'/>")
+        looked = look(self.described(tmp_path / "x.urdf", text), tmp_path / "a.csv", table)
+        assert reading(looked, "arm") == ("may be another than that of the URDF", "open")
+
+    def test_a_doubtful_arm_is_said_before_readings_that_fit_alike(self, tmp_path: Path) -> None:
+        size = Contradictions("a moves 75° beyond its range", "", "", "", "", is_far=True)
+        choices = (Choice("zero", "zero moved", 0.13, "--gravity 0 0 0"),) * 2
+        refusal = undecided(tmp_path / "a.csv", choices, size)
+        assert refusal.field == "--urdf"
+        assert "may not be of the arm of the URDF: a moves 75°" in refusal.problem
+        assert "two readings fit alike" in refusal.problem
 
     @staticmethod
     def contradictions(log: Path, urdf: Path) -> Contradictions:
