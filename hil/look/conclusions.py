@@ -46,19 +46,20 @@ def concluded(
 ) -> ImportedRecording:
     """Return a log imported again with what its motion and torque say, if that is sure.
 
-    A log that a map describes, or whose torque follows its arm, is returned as it is. A warning is
-    among its lines if the URDF may be that of another arm.
+    A log that a map describes, or whose torque follows its arm, is returned as it is, and so is a
+    bag. A warning is among its lines if the URDF may be that of another arm.
 
     Raises:
         SourceError: two readings fit alike, or the URDF is that of another arm.
     """
-    if options.columns is not None or imported.map_text is None:
+    if options.columns is not None:
         return imported
     few = _few_rows(imported.archive)
     if few is None:
         return imported
     cell, samples, score = few
-    if score.overall <= _SUSPECT and not np.any(score.friction < _DRIVES):
+    is_bag = imported.map_text is None  # its joints have names: no other order is searched
+    if is_bag or (score.overall <= _SUSPECT and not np.any(score.friction < _DRIVES)):
         contradictions = Contradictions.of(cell, cell.model, samples, score, score.overall)
         return _of_this_arm(imported, source, contradictions)
     look = look_at_joints(source, imported)
