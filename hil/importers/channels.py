@@ -20,16 +20,17 @@ from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.bags import SUFFIXES, open_bag
 from hil.importers.column_map import Format
 from hil.importers.commands import as_joint_state, measured_topics
+from hil.importers.name_words import is_other
 from hil.importers.rosbag2 import joint_state_topics
 from hil.importers.stamps import concluded_unit
-from hil.importers.table import Table
+from hil.importers.table import Table, is_date
 from hil.importers.units import TIMES, Kind, unit_of, without_unit
 
 _NUMBER: Final = r"[\[(_. ]*(?P<number>\d{1,2})[\])]*"
 CHANNEL_NAMES: Final[Mapping[Kind, tuple[str, ...]]] = {
     "time": (
-        "t", "time", "times", "timestamp", "time_stamp", "stamp", "tstamp", "header.stamp", "clock",
-        "ipoc", "duration", "seconds", "date", "datetime", "zeit",
+        "t", "time", "times", "timestamp", "timestamps", "time_stamp", "stamp", "tstamp",
+        "header.stamp", "clock", "ipoc", "duration", "seconds", "date", "datetime", "zeit",
     ),
     "position": (
         "q", "pos", "position", "positions", "actual_q", "q_actual", "q_meas", "q_act", "state.q",
@@ -72,6 +73,7 @@ class Channel:
         kind: the quantity that the name, or else the unit, says; None if neither does.
         number: the joint's number in the name, None without one.
         joints: that the log names, in the order of the numbers of a sample.
+        text: of the first and the last row of a table, where it is the same and no number.
     """
 
     name: str
@@ -83,6 +85,7 @@ class Channel:
     kind: Kind | None = None
     number: int | None = None
     joints: tuple[str, ...] = ()
+    text: str | None = None
 
 
 def channels_of(path: Path, form: Format | None = None) -> tuple[Channel, ...]:
@@ -117,19 +120,30 @@ def kind_of(name: str, unit: str | None = None) -> tuple[Kind | None, int | None
     kinds: list[Kind] = [
         kind for kind, names in CHANNEL_NAMES.items() if names and unit and unit_of(unit, kind)
     ]
-    return (kinds[0] if len(kinds) == 1 else None), number
+    if len(kinds) != 1 or is_other(bare, kinds[0]):
+        return None, number
+    return kinds[0], number
 
 
 def _of_table(table: Table) -> Iterator[Channel]:
     names = table.names or tuple(map(str, range(table.width)))
     rate = None
     kinds = [kind_of(name, table.unit(place)) for place, name in enumerate(names[: table.width])]
+    first, last = (table.dialect.cells(table.lines[row]) for row in (0, -1))
+    if names[0] == "" and all(kind != "time" for kind, _ in kinds) and is_date(first[0]):
+        kinds[0] = "time", None  # an index of dates, which pandas writes without a name
     for place, (kind, _) in enumerate(kinds):
         if kind == "time" and rate is None:
             rate = _rate(table, place)
     for place, name in enumerate(names[: table.width]):
         kind, number = kinds[place]
-        yield Channel(name, 1, len(table.lines), table.unit(place), "text", rate, kind, number)
+        ends = {row[place] if place < len(row) else "" for row in (first, last)}
+        text = ends.pop() if len(ends) == 1 else None
+        if text is not None and (not text or table.is_number(text)):
+            text = None
+        yield Channel(
+            name, 1, len(table.lines), table.unit(place), "text", rate, kind, number, text=text
+        )
 
 
 def _rate(table: Table | ArrayFile, place: int | str) -> float | None:

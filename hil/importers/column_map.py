@@ -80,7 +80,8 @@ class TimeColumn(_Table):
     """The column of the time, in the file of the positions or in another `file`.
 
     If there is a file of positions per joint, all must have the same times. No unit is the one that
-    the file states, or else the one that gives a rate at which robots are sampled.
+    the file states, or else the one that gives a rate at which robots are sampled. With a column of
+    `nanoseconds` beside it the first is of whole seconds.
     """
 
     column: Column = Field(default=0, description="a name or an index from 0")
@@ -89,6 +90,7 @@ class TimeColumn(_Table):
     unit: Literal["s", "ms", "us", "ns"] | None = Field(
         default=None, description='"s", "ms", "us" or "ns"'
     )
+    nanoseconds: Column | None = Field(default=None, description="a name or an index from 0")
 
 
 class Drive(_Table):

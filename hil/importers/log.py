@@ -184,10 +184,9 @@ class _Log:
             first, *others = self._file_per_joint(position.files, "position.files")
         else:
             first, *others = (self._file(time.file or position.file, "time.file"),)
-        unit = time.unit or self._unit_of_time(first, time)
-        times = first.times(time.column, TIMES[unit], time.array)
+        times = self._times(first, time)
         for other in others:
-            if other.times(time.column, TIMES[unit], time.array) != times:
+            if self._times(other, time) != times:
                 problem = f"has other times than {first.path.name}"
                 remedy = "name one file of times for all joints: [time] file"
                 raise SourceError(other.path, problem, field="time", remedy=remedy)
@@ -196,6 +195,18 @@ class _Log:
             problem = f"has no time in sample {times.index(None)}"
             raise SourceError(first.path, problem, field="time", remedy=HOLE)
         return self._within_archive(times, valid, first.path)
+
+    def _times(self, file: Table | ArrayFile, time: TimeColumn) -> list[int | None]:
+        """Return the times of a file [ns], None where one is missing."""
+        if time.nanoseconds is None:
+            unit = time.unit or self._unit_of_time(file, time)
+            return file.times(time.column, TIMES[unit], time.array)
+        whole = file.times(time.column, TIMES["s"], time.array)
+        parts = file.times(time.nanoseconds, TIMES["ns"], time.array)
+        return [
+            None if second is None or part is None else second + part
+            for second, part in zip(whole, parts, strict=True)
+        ]
 
     def _unit_of_time(self, file: Table | ArrayFile, time: TimeColumn) -> str:
         """Return the unit of a time column where the map states none."""

@@ -9,13 +9,14 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NoReturn
+from typing import Final, NamedTuple, NoReturn
 
 from hil.errors import SourceError, UnrecordedJointError
 from hil.importers.channels import CHANNEL_NAMES, Channel, channels_of, kind_of
 from hil.importers.column_map import ColumnMap, Format, ready_map, ready_maps
+from hil.importers.name_words import kind_by_words, words_of
 from hil.importers.robot import Robot
 from hil.importers.units import UNITS, Kind, unit_of, without_unit
 from hil.reading import parse_toml
@@ -26,8 +27,11 @@ _JOINT_KINDS: Final[tuple[Kind, ...]] = (
     "position", "velocity", "torque", "motor_current", "commanded_position",
 )  # fmt: skip
 _MOST_NAMED: Final = 30
+_NANO: Final = frozenset({"nano", "nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs"})
+"""Words of the nanoseconds of a time whose seconds are in another column."""
 _Columns = str | Sequence[str | int]
 """A name, with ``{}`` for the joint, or a list of names or of indices."""
+_BEFORE_NAMES: Final = 3  # columns of a joint state: seconds, nanoseconds, frame
 _SIDE: Final = 'side = "motor" with [drive] gear_ratio'
 
 
@@ -62,6 +66,7 @@ class _Group:
         size: numbers in a sample.
         unit: that the log states for the first, None without one.
         by_joint: whether the names are those of joints of the URDF.
+        by_words: how the quantity is said, where no whole name does; "" where one does.
     """
 
     pattern: str
@@ -70,6 +75,7 @@ class _Group:
     size: int
     unit: str | None
     by_joint: bool = False
+    by_words: str = ""
 
     @property
     def label(self) -> str:
@@ -117,12 +123,20 @@ def proposed_map(
     chosen = dict(chosen or {})
     joints = robot.joint_names
     form = Format(missing="drop") if drop_missing else None
-    groups = _groups(channels_of(log, form), joints)
+    channels = channels_of(log, form)
+    groups = _groups(channels, joints)
+    names = _joints_in_rows(channels, joints)
+    recorded = () if names.joints == tuple(joints) else names.joints
+    nanoseconds = None
+    if not chosen and sample_rate is None and names.joints and not channels[0].name.strip("0"):
+        chosen = names.columns_of_messages(len(channels))
+        nanoseconds = 1 if chosen else None
     if not chosen and sample_rate is None and form is None:
-        ready = _matching_ready_map(groups, len(joints))
-        if ready is not None:
-            return _of_ready_map(ready)
-    search = _Search(log, joints, groups, chosen, sample_rate)
+        ready = _matching_ready_map(groups, len(recorded or joints))
+        if ready is not None and set(joints) <= set(recorded or joints):
+            return _of_ready_map(ready, recorded)
+    search = _Search(log, joints, groups, chosen, sample_rate, recorded)
+    search.nanoseconds = nanoseconds
     return search.proposal(form)
 
 
@@ -152,8 +166,8 @@ def _groups(channels: Iterable[Channel], joints: Sequence[str]) -> list[_Group]:
         joint = _joint_in(bare, joints)
         if joint is not None:
             quantity = bare.replace(joint, "").strip(" _.-/")
-            of_joint = kind_of(quantity, channel.unit)[0]
-            if of_joint is not None and kind in (None, of_joint):
+            of_joint = kind_of(quantity, channel.unit)[0] or kind_by_words(quantity)
+            if of_joint is not None and (kind in (None, of_joint) or "/" in bare):
                 kind = of_joint
                 by_joint = True
                 pattern = bare.replace(joint, "{}")
@@ -169,6 +183,41 @@ def _groups(channels: Iterable[Channel], joints: Sequence[str]) -> list[_Group]:
         whole = names[0] if len(names) == 1 else pattern
         groups.append(_Group(whole, kind, names, size, unit, by_joint))
     return groups
+
+
+class _RowNames(NamedTuple):
+    """Joints that cells of text name in every row, as `rostopic echo` writes them."""
+
+    place: int  # of the first among the channels
+    joints: tuple[str, ...]
+
+    def columns_of_messages(self, width: int) -> dict[str, str]:
+        """Return the columns of joint states without a header, as of `ros2 topic echo --csv`.
+
+        They are seconds, nanoseconds, frame, then names, positions, velocities and efforts.
+        """
+        count = len(self.joints)
+        if self.place != _BEFORE_NAMES or width != self.place + 4 * count:
+            return {}
+        columns = {"time": "0"}
+        for number, kind in enumerate(("position", "velocity", "torque"), 1):
+            first = self.place + number * count
+            columns[kind] = ",".join(map(str, range(first, first + count)))
+        return columns
+
+
+def _joints_in_rows(channels: Sequence[Channel], joints: Sequence[str]) -> _RowNames:
+    """Return the joints that cells of text name; () without any."""
+    places = [place for place, channel in enumerate(channels) if channel.text in joints]
+    if len(places) < 2:
+        return _RowNames(0, ())
+    first = places[0]
+    names = []
+    for channel in channels[first:]:
+        if channel.text is None:
+            break
+        names.append(channel.text)
+    return _RowNames(first, tuple(names) if len(set(names)) == len(names) else ())
 
 
 def _joint_in(name: str, joints: Sequence[str]) -> str | None:
@@ -191,8 +240,12 @@ def _matching_ready_map(groups: Sequence[_Group], count: int) -> str | None:
     return None
 
 
-def _of_ready_map(name: str) -> Proposal:
+def _of_ready_map(name: str, joints: Sequence[str]) -> Proposal:
     columns = ColumnMap.load(name)
+    text = ready_map(name)
+    if joints:
+        text = f"{to_text({'joints': list(joints)})}\n{text}"
+        columns = columns.model_copy(update={"joints": tuple(joints)})
     reason = f"as in the ready map {name}"
     lines = [
         f"{quantity.columns}: {kind}, {quantity.unit}, {reason}"
@@ -200,7 +253,13 @@ def _of_ready_map(name: str) -> Proposal:
     ]
     if columns.time is not None:
         lines.insert(0, f"{columns.time.column}: time, {columns.time.unit}, {reason}")
-    return Proposal(ready_map(name), columns, tuple(lines))
+    if joints:
+        lines.append(_said_in_rows(joints))
+    return Proposal(text, columns, tuple(lines))
+
+
+def _said_in_rows(joints: Sequence[str]) -> str:
+    return f"joints in the order of the names in the rows: {', '.join(joints)}"
 
 
 class _Search:
@@ -213,9 +272,13 @@ class _Search:
         groups: Sequence[_Group],
         chosen: Mapping[str, str],
         sample_rate: float | None,
+        recorded: Sequence[str],
     ) -> None:
         self._log = log
         self._joints = joints
+        self._recorded = recorded
+        self._columns_of = recorded or joints
+        self.nanoseconds: str | int | None = None  #: column that is added to that of the time
         self._groups = groups
         self._chosen = chosen
         self._rate = sample_rate
@@ -245,7 +308,11 @@ class _Search:
             table = {"sample_rate": self._rate, **table}
         else:
             time = columns["time"]
-            table["time"] = {"column": time if isinstance(time, str) else time[0]}
+            parts = {} if self.nanoseconds is None else {"nanoseconds": self.nanoseconds}
+            table["time"] = {"column": time if isinstance(time, str) else time[0], **parts}
+        if self._recorded:
+            table = {"joints": list(self._recorded), **table}
+            self._lines.append(_said_in_rows(self._recorded))
         if form is not None:
             table["format"] = form.model_dump(exclude_defaults=True)
         comment = "Proposed by hil from the names and units of the channels"
@@ -259,8 +326,7 @@ class _Search:
             self._lines.append(f"{names}: {kind}, as given with --columns")
             self._used.update([names, *map(str.strip, names.split(","))])
             return self._given(names)
-        given = set(self._chosen.values())
-        groups = [g for g in self._groups if g.kind == kind and g.pattern not in given]
+        groups = self._groups_of(kind)
         if not groups:
             return None
         if len(groups) > 1:
@@ -271,11 +337,46 @@ class _Search:
         if kind == "time":
             if group.size > 1:
                 self._refuse_several(kind, [group])
-        elif group.size != len(self._joints):
+        elif group.size != len(self._columns_of) or not set(self._joints) <= set(self._columns_of):
             self._refuse_count(kind, group)
-        self._used.add(group.pattern)
+        self._used.update([group.pattern, *group.names])
         self._lines.append(f"{group.label}: {self._reason(kind, group)}")
-        return group.columns(self._joints)
+        return group.columns(self._columns_of)
+
+    def _groups_of(self, kind: Kind) -> list[_Group]:
+        """Return the groups of a quantity: by whole names, else by words in them."""
+        given = set(self._chosen.values())
+        groups = [g for g in self._groups if g.pattern not in given]
+        named = [g for g in groups if g.kind == kind]
+        if not named:
+            named = self._by_words(kind, [g for g in groups if g.kind is None])
+        if kind != "time":
+            return named
+        single = [g for g in named if g.size == 1]
+        stamps = [g for g in single if {"header", "stamp"} <= set(words_of(g.pattern))]
+        single = stamps or single
+        parts = [g for g in single if _NANO & set(words_of(g.pattern))]
+        if len(single) == 2 and len(parts) == 1:
+            single.remove(parts[0])
+            self.nanoseconds = parts[0].names[0]
+            self._used.add(parts[0].pattern)
+        return single or named
+
+    def _by_words(self, kind: Kind, groups: Sequence[_Group]) -> list[_Group]:
+        """Return the groups whose names say a quantity by a word in them."""
+        said = [g for g in groups if kind_by_words(g.pattern) == kind]
+        said = [replace(g, by_words="by a word in the name") for g in said]
+        if kind == "time":
+            return [g for g in said if g.size == 1]
+        count = len(self._columns_of)
+        several = [g for g in said if g.size > 1]
+        exact = [g for g in several if g.size == count]
+        single = [g for g in said if g.size == 1]
+        if exact or several or len(single) != count:
+            return exact or several
+        names = tuple(g.names[0] for g in single)
+        how = "by a word in the names, joints in the order of the log"
+        return [_Group(",".join(names), kind, names, count, single[0].unit, by_words=how)]
 
     def _is_used(self, group: _Group) -> bool:
         return group.pattern in self._used or self._used.issuperset(group.names)
@@ -306,6 +407,7 @@ class _Search:
         where = "by the URDF's joint in the name" if group.by_joint else "by the name"
         if group.unit is not None and kind_of(group.names[0])[0] is None and not group.by_joint:
             where = "by the unit"
+        where = group.by_words or where
         return f"{kind}, {where}; {unit}"
 
     def _refuse_several(self, kind: Kind, groups: Sequence[_Group]) -> NoReturn:
@@ -333,14 +435,16 @@ class _Search:
             f"({group.label}), and the URDF has {len(self._joints)} joints: {joints}"
         )
         otherwise = "or name the URDF's joint of each channel in joints of a map (--map map.toml)"
-        if count < len(self._joints):
+        if count < len(self._joints) or self._recorded:
             absent, which = self._absent(group)
             options = " ".join(f"--locked {name}" for name in absent)
             remedy = f"fix the joints that were not recorded, {which} with {options}"
             refusal = UnrecordedJointError(
                 self._log, problem, field=kind, remedy=f"{remedy}; {otherwise}"
             )
-            raise refusal.of(count, group.joints(self._joints), group.names)
+            recorded = [name for name in self._recorded if name in self._joints]
+            named = recorded or group.joints(self._joints)
+            raise refusal.of(len(recorded) or count, named, group.names)
         some = ",".join(group.names[: len(self._joints)])
         remedy = "give the URDF of this arm"
         if len(group.names) == count:
@@ -364,7 +468,7 @@ class _Search:
         unnamed = [
             group
             for group in self._groups
-            if group.kind is None and group.size == len(self._joints) and len(group.names) > 1
+            if not self._is_used(group) and group.size == len(self._joints) and len(group.names) > 1
         ]
         listing = ", ".join(group.label for group in self._groups[:_MOST_NAMED])
         examples = [
@@ -381,7 +485,8 @@ class _Search:
             steps = [f"--sample-rate HZ or --columns time={place}"] if "time" in missing else []
             count = len(self._joints)
             for number, kind in enumerate(kind for kind in missing if kind != "time"):
-                pattern = unnamed[0].pattern if unnamed else "NAME{}"
+                place_of = min(number, len(unnamed) - 1)
+                pattern = unnamed[place_of].pattern if unnamed else "NAME{}"
                 if self._nameless:
                     first = 1 + number * count
                     pattern = ",".join(map(str, range(first, first + count)))

@@ -286,8 +286,8 @@ def _imported(
         return _import_bag(source, output, robot_of, bag, options, held_joints, use, force=force)
     lines: tuple[str, ...] = ()
     if options.columns is not None:
-        columns = ColumnMap.load(options.columns)
         robot = robot_of(partial(_joints_of_map, options.columns))
+        columns = ColumnMap.load(options.columns)
         robot = _arm_of_map(robot, columns.arm, options.columns)
         text = map_text(options.columns)
     else:

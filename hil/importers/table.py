@@ -58,11 +58,19 @@ _TYPE: Final = re.compile(
     r"l?real|float(32|64)?|double|single|numeric|number|[usld]{0,2}int(8|16|32|64)?|integer|bool"
     r"(ean)?|l?time|date|datetime|string|text|d?word|byte|[<>]?[fiu][248]"
 )
-_MARKUP: Final = re.compile(r"\ufeff?\s*<[?!A-Za-z]")
+_MARKUP: Final = re.compile(r"\ufeff?\s*(<[?!A-Za-z]|[{\[]\s*[\"{\[]|(?:---\s+)?header:\s)")
 
 
 def _description(path: Path, text: str) -> SourceError:
-    """Return the error for XML in place of rows."""
+    """Return the error for XML, JSON or YAML in place of rows."""
+    start = text.lstrip("\ufeff \t\r\n")
+    if not start.startswith("<"):
+        is_json = start[0] in "{["
+        problem = f"is {'JSON' if is_json else 'YAML of messages'}, not a table of numbers"
+        remedy = "give a table of numbers (CSV), .npz, .mat, .parquet or a bag"
+        if not is_json:
+            remedy = "give the bag, or write it with `ros2 topic echo --csv` or `rostopic echo -p`"
+        return SourceError(path, problem, remedy=remedy)
     if "<robot" in text:
         remedy = f"give the recording first: LOG --urdf {path.name}"
         return SourceError(path, "is a robot description (URDF), not a recording", remedy=remedy)
@@ -157,6 +165,10 @@ class Table:
         below = self.units[place] if place < len(self.units) else ""
         name = self.names[place] if place < len(self.names) else ""
         return unit_of(below.strip("[]() ")) or without_unit(name)[1]
+
+    def is_number(self, cell: str) -> bool:
+        """Return whether a cell is a number, a missing one, or a date stamp."""
+        return _is_written(cell, self.dialect)
 
     def has(self, name: str) -> bool:
         """Return whether a column has this name, with or without its unit."""
@@ -492,6 +504,11 @@ def _normalised(texts: Sequence[str], dialect: Dialect) -> list[str]:
     if dialect.decimal == ".":
         return list(texts)
     return [text.replace(dialect.decimal, ".") if "." not in text else text for text in texts]
+
+
+def is_date(cell: str) -> bool:
+    """Return whether a cell is a date stamp with the time of a day."""
+    return bool(_DATE.fullmatch(cell)) and ":" in cell
 
 
 def _is_written(cell: str, dialect: Dialect) -> bool:

@@ -48,20 +48,21 @@ def concluded(
 ) -> ImportedRecording:
     """Return a log imported again with what its motion and torque say, if that is sure.
 
-    A log that a map describes, or whose torque follows its arm, is returned as it is. A warning is
-    among its lines if the URDF may be that of another arm.
+    A log that a map describes, or whose torque follows its arm, is returned as it is, and so is a
+    bag. A warning is among its lines if the URDF may be that of another arm.
 
     Raises:
         SourceError: two readings fit alike, or the URDF is that of another arm.
     """
-    if options.columns is not None or imported.map_text is None:
+    if options.columns is not None:
         return imported
     few = _few_rows(imported.archive)
     if few is None:
         return imported
     cell, samples, score = few
+    is_bag = imported.map_text is None  # its joints have names: no other order is searched
     suspect = score.overall > _SUSPECT or bool(np.any(score.friction < _DRIVES))
-    if not suspect and not _hangs_otherwise(cell, samples, score):
+    if is_bag or not (suspect or _hangs_otherwise(cell, samples, score)):
         contradictions = Contradictions.of(cell, cell.model, samples, score, score.overall)
         return _of_this_arm(imported, source, contradictions)
     look = look_at_joints(source, imported)
@@ -69,11 +70,11 @@ def concluded(
     if error > _OTHER_ARM:
         raise _other_arm(source, error)
     changed = _changed(look)
+    contradictions = Contradictions.of(cell, cell.model, samples, score, error)
     if not changed:
-        contradictions = Contradictions.of(cell, cell.model, samples, score, error)
         imported = _of_this_arm(imported, source, contradictions)
     if look.questions:
-        raise undecided(source, look.questions[0])
+        raise undecided(source, look.questions[0], contradictions)
     if look.map_text != imported.map_text or look.options:
         again = _again(imported, source, robot_of, look, use)
         if (few := _few_rows(again.archive)) is not None:
@@ -166,8 +167,10 @@ def _gravity(look: Look) -> tuple[float, ...] | None:
     return tuple(float(word) for word in option_words[1:4]) if option_words else None
 
 
-def undecided(source: Path, choices: tuple[Choice, ...]) -> SourceError:
-    """Return the error of readings of which the recording does not choose one."""
+def undecided(
+    source: Path, choices: tuple[Choice, ...], contradictions: Contradictions
+) -> SourceError:
+    """Return the refusal of readings that fit alike; a doubtful arm is said first."""
     errors = [
         f" (error {percentage(choice.error, 1)})" if choice.error else "" for choice in choices
     ]
@@ -187,6 +190,10 @@ def undecided(source: Path, choices: tuple[Choice, ...]) -> SourceError:
         )
     remedy = "; or ".join(steps) or "name joint, unit and sign of each column in a map (--map)"
     problem = f"two readings fit alike: {readings}"
+    if contradictions.is_doubtful:
+        said = "; ".join(contradictions.sentences)
+        problem = f"may not be of the arm of the URDF: {said}; and {problem}"
+        return SourceError(source, problem, field="--urdf", remedy=f"{_REMEDY}; or {remedy}")
     return SourceError(source, problem, field=choices[0].aspect, remedy=remedy)
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.cell.text import UrdfLimits, urdf_limits
 from hil.look.physics import Size, mounted
+from hil.look.result import Row
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.text import percentage
@@ -101,7 +102,7 @@ class Contradictions:
             size = f"the torque of {names[joint]} reaches {effort[joint]:.3g} times its limit"
         elif expected.is_off and factor > 1.0 and not expected.is_thousand:
             size = f"the torque is {factor:.2g} times that of {expected.basis}"
-        lengths = _other_lengths(cell, samples, score, expected)
+        lengths = _other_lengths(cell, model, samples, score, expected)
         if error > _UNEXPLAINED and not lengths:
             torque = f"{percentage(error)} of the torque stays unexplained, whatever the masses"
         several = len(changed) > 1
@@ -117,22 +118,31 @@ class Contradictions:
         return tuple(filter(None, parts))
 
     @property
+    def row(self) -> Row:
+        """What a look says of a doubtful arm."""
+        reading = "may be another than that of the URDF"
+        return Row("arm", reading, "open", "; ".join(self.sentences), "give the URDF of this arm")
+
+    @property
     def is_doubtful(self) -> bool:
         """Whether the arm may be another one, by a finding that is enough or by two."""
         return self.is_far or bool(self.lengths) or len(self.sentences) > 1
 
 
-def _other_lengths(cell: Cell, samples: Samples, score: Score, size: Size) -> str:
+def _other_lengths(
+    cell: Cell, model: RobotModel, samples: Samples, score: Score, size: Size
+) -> str:
     """Return which lengths of the links the torque fits better than those of the URDF.
 
     Longer links have more weight: that a torque by masses is larger as well is evidence of them.
     """
-    if not np.any(cell.model.gravity):
+    if not np.any(model.gravity):
         return ""
-    trials = {factor: _with_lengths(cell, samples, score, factor) for factor in _LENGTHS}
+    gravity = model.gravity
+    trials = {factor: _with_lengths(cell, gravity, samples, score, factor) for factor in _LENGTHS}
     best = min(trials, key=lambda factor: trials[factor][1].ratio)
     for factor in (best / _NEARER, best * _NEARER):
-        trials[factor] = _with_lengths(cell, samples, score, factor)
+        trials[factor] = _with_lengths(cell, gravity, samples, score, factor)
     best = min(trials, key=lambda factor: trials[factor][1].ratio)
     error, against = trials[best]
     least = 1.0 if best > 1.0 else _SHORTER
@@ -148,10 +158,10 @@ def _other_lengths(cell: Cell, samples: Samples, score: Score, size: Size) -> st
 
 
 def _with_lengths(
-    cell: Cell, samples: Samples, score: Score, factor: float
+    cell: Cell, gravity: Array, samples: Samples, score: Score, factor: float
 ) -> tuple[float, Comparison]:
     """Return the error of samples with other lengths of all links, and its comparison."""
-    x, y, z = (float(part) / factor for part in cell.model.gravity)
+    x, y, z = (float(part) / factor for part in gravity)
     model = mounted(cell, (x, y, z)).model
     other = score_of(model, samples)
     return other.overall, compare(other, score, model)

@@ -18,6 +18,7 @@ from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, i
 from hil.importers.usable import require_motion
 from hil.look import physics, signals
 from hil.look.maps import with_entries
+from hil.look.other_arm import Contradictions
 from hil.look.result import Group, Look, Row
 from hil.look.undescribed import undescribed_robot
 from identification.errors import IdentificationError
@@ -108,6 +109,13 @@ def _finding(
 
 
 def _look_of(finding: physics.Finding, rows: Sequence[Row], groups: tuple[Group, ...]) -> Look:
+    readings = finding.readings
+    score = readings.score
+    contradictions = Contradictions.of(
+        finding.cell, readings.model, readings.samples, score, score.overall
+    )
+    if contradictions.is_doubtful:
+        rows = (*rows, contradictions.row)
     text = finding.map_text
     if text is not None:
         text = with_entries(text, finding.entries())

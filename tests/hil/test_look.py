@@ -23,7 +23,7 @@ from hil.cli import app
 from hil.errors import SourceError
 from hil.identify.sources import cell_of, source_of
 from hil.importers import ColumnMap, Robot
-from hil.importers.recording import ImportOptions
+from hil.importers.recording import ImportOptions, import_recording
 from hil.look import Look, look_at
 from hil.look.conclusions import concluded, undecided
 from hil.look.maps import entries_of
@@ -35,7 +35,7 @@ from identification.estimators.delay import DelayEstimate
 from identification.signals.samples import prepare
 from identification.validation.readings import Axes, Change, score_of
 from tests.hil.simulated_logs import write_log, write_moving_log
-from tests.hil.test_importers_rosbag2 import STATE, bag, states
+from tests.hil.test_importers_rosbag2 import STATE, bag, state, states
 from tests.hil.test_log_kinds import JOINTS, URDF
 
 Floats = NDArray[np.float64]
@@ -339,6 +339,37 @@ class TestOtherArm:
         contradictions = self.contradictions(path, self.described(tmp_path / "x.urdf", text))
         assert contradictions.is_doubtful == bool(said)
         assert contradictions.lengths.startswith(f"the torque fits links {said}" if said else "")
+
+    def test_a_look_says_it(self, tmp_path: Path, table: Mapping[str, Floats]) -> None:
+        text = URDF.replace("<origin xyz='0 0 0.4'/>", "<origin xyz='0 0 0.25'/>")
+        looked = look(self.described(tmp_path / "x.urdf", text), tmp_path / "a.csv", table)
+        assert reading(looked, "arm") == ("may be another than that of the URDF", "open")
+
+    def test_an_identification_of_a_bag_says_it(
+        self, tmp_path: Path, table: Mapping[str, Floats]
+    ) -> None:
+        messages = [
+            state(10**9 + round(1e9 * t), q.tolist(), velocity=v.tolist(), effort=tau.tolist(),
+                  names=JOINTS)
+            for t, q, v, tau in zip(*table.values(), strict=True)
+        ]  # fmt: skip
+        source = bag(tmp_path / "x.db3", {"/joint_states": (STATE, messages)})
+        options = ImportOptions()
+        for length, warned in ((0.25, True), (0.4, False)):
+            text = URDF.replace("<origin xyz='0 0 0.4'/>", f"<origin xyz='0 0 {length}'/>")
+            robot = Robot.from_urdf(self.described(tmp_path / "x.urdf", text))
+            archive = tmp_path / f"{length}.mcap"
+            imported = import_recording(source, archive, lambda _, arm=robot: arm, options)
+            again = concluded(imported, source, lambda _, arm=robot: arm, options, "excitation")
+            assert any("another arm: the torque fits links" in x for x in again.lines) == warned
+
+    def test_a_doubtful_arm_is_said_before_readings_that_fit_alike(self, tmp_path: Path) -> None:
+        size = Contradictions("a moves 75° beyond its range", "", "", "", "", is_far=True)
+        choices = (Choice("zero", "zero moved", 0.13, "--gravity 0 0 0"),) * 2
+        refusal = undecided(tmp_path / "a.csv", choices, size)
+        assert refusal.field == "--urdf"
+        assert "may not be of the arm of the URDF: a moves 75°" in refusal.problem
+        assert "two readings fit alike" in refusal.problem
 
     @staticmethod
     def contradictions(log: Path, urdf: Path) -> Contradictions:

@@ -1,0 +1,66 @@
+"""What the words in a channel's name say, where the whole name is in no table.
+
+Loggers put the name of a robot, of a message or of a side before the quantity, and ``measured`` or
+the joint behind it: ``fr3_q1``, ``actuators[0].position``, ``MeasuredJointPosition_2``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Final
+
+from hil.importers.units import Kind
+
+_WORD: Final = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-zäöü]+|[A-Z]+")
+_QUANTITIES: Final[Mapping[Kind, frozenset[str]]] = {
+    "time": frozenset({"t", "time", "times", "timestamp", "timestamps", "stamp", "zeit"}),
+    "position": frozenset(
+        {"q", "pos", "position", "positions", "angle", "angles", "theta", "winkel"}
+    ),
+    "velocity": frozenset(
+        {"qd", "dq", "qdot", "vel", "velocity", "velocities", "speed", "speeds", "omega"}
+    ),
+    "torque": frozenset(
+        {"tau", "torque", "torques", "effort", "efforts", "eff", "trq", "torq", "drehmoment"}
+    ),
+    "motor_current": frozenset({"current", "currents", "cur", "curr", "amp", "strom"}),
+}
+_WANTED: Final = """
+target targets cmd command commanded desired des d setpoint setpoints ref reference goal soll
+planned plan model feedforward ff error err delta predicted estimated est nominal"""
+_OUTSIDE: Final = """
+ext external hat residual contact tcp ee eef tool flange cart cartesian pose gripper finger hand
+wheel battery supply bus"""
+_PART: Final = """
+motor motors rotor gravity friction coriolis inertia ddq qdd acc acceleration dtau temp temperature
+limit limits max min offset std var"""
+_OTHER: Final = frozenset(f"{_WANTED} {_OUTSIDE} {_PART}".split())
+"""Words of channels that are not the measured quantity of a joint."""
+
+
+def words_of(name: str) -> list[str]:
+    """Return the words of a name in lower case, split at marks, digits and capitals.
+
+    ``axisQMsr`` has the words axis, q and msr.
+    """
+    split = re.sub(r"(?<=[a-z])([A-Z])(?=[A-Z][a-z])", r" \1 ", name)
+    return [word.lower() for word in _WORD.findall(split)]
+
+
+def is_other(name: str, kind: Kind) -> bool:
+    """Return whether a word says that a channel is not the measured quantity of a joint.
+
+    A current may be called that of a motor: no other is measured.
+    """
+    allowed = {"motor", "motors"} if kind == "motor_current" else set()
+    return not (_OTHER - allowed).isdisjoint(words_of(name))
+
+
+def kind_by_words(name: str) -> Kind | None:
+    """Return the only quantity that the words of a name say; None if another word denies it."""
+    words = set(words_of(name))
+    kinds = [kind for kind, names in _QUANTITIES.items() if names & words]
+    if len(kinds) > 1 and "time" in kinds and "t" in words:
+        kinds.remove("time")  # the t of an axis or a tool
+    return kinds[0] if len(kinds) == 1 and not is_other(name, kinds[0]) else None

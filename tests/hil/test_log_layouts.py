@@ -1,0 +1,214 @@
+"""Layouts of loggers that nobody wrote a map for: what is read, and from what it is concluded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.archive import open_archive
+from hil.errors import SourceError
+from hil.importers import Robot
+from hil.importers.channels import kind_of
+from hil.importers.name_words import kind_by_words
+from hil.importers.recording import ImportedRecording, ImportOptions, import_recording
+from tests.hil.test_log_kinds import JOINTS, POSITION, SLOPE, TIME, TORQUE, URDF, Floats
+
+EPOCH = 1_700_000_000
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Robot:
+    path = tmp_path / "three.urdf"
+    path.write_text(URDF)
+    return Robot.from_urdf(path)
+
+
+def table(path: Path, names: Sequence[str], *columns: Floats, mark: str = ",") -> Path:
+    """Write a table; a name with {} is that of a column for each joint, from 1."""
+    header = []
+    for name, values in zip(names, columns, strict=True):
+        count = 1 if values.ndim == 1 else values.shape[1]
+        header += [name.replace("{}", str(number)) for number in range(1, count + 1)]
+    rows = [mark.join(f"{value:.15g}" for value in row) for row in np.column_stack(columns)]
+    path.write_text("\n".join([mark.join(header), *rows]) + "\n")
+    return path
+
+
+def sunrise(path: Path) -> Path:
+    """The recorder of an iiwa: a time in two columns, and the robot's name in all others."""
+    nanoseconds = np.rint(1e9 * TIME)
+    parts = [EPOCH + nanoseconds // 10**9, nanoseconds % 10**9]
+    names = ["axisQMsr_LBR_iiwa_7_R800_1[{}]", "axisQCmd_LBR_iiwa_7_R800_1[{}]"]
+    names += ["axisTauMsr_LBR_iiwa_7_R800_1[{}]", "axisTauExtMsr_LBR_iiwa_7_R800_1[{}]"]
+    values = (POSITION, SLOPE, TORQUE, SLOPE)
+    return table(path, ["ZeitInSec", "ZeitInNanoSec", *names], *parts, *values, mark=" ")
+
+
+def kortex(path: Path) -> Path:
+    """A Gen3: joint after joint, degrees from 0 to 360 without a unit, and currents."""
+    names, columns = ["time"], [TIME]
+    for joint in range(3):
+        degrees = np.mod(np.degrees(POSITION[:, joint]), 360.0)
+        for name, values in (("position", degrees), ("torque", TORQUE[:, joint])):
+            names.append(f"actuators[{joint}].{name}")
+            columns.append(values)
+        names.append(f"actuators[{joint}].current_motor")
+        columns.append(SLOPE[:, joint])
+    return table(path, names, *columns)
+
+
+def fast_research(path: Path) -> Path:
+    names = ["Time", "MeasuredJointPosition_{}", "CommandedJointPosition_{}", "MeasuredTorque_{}"]
+    return table(path, [*names, "ExternalTorque_{}"], TIME, POSITION, SLOPE, TORQUE, SLOPE)
+
+
+def prefixed(path: Path) -> Path:
+    return table(path, ["time", "fr3_q{}", "fr3_dq{}", "fr3_tau{}"], TIME, POSITION, SLOPE, TORQUE)
+
+
+def servo_names(path: Path) -> Path:
+    """Joints by names that the URDF does not have, in its order."""
+    names = [f"{joint}.{kind}" for kind in ("pos", "trq") for joint in ("base1", "arm", "wrist")]
+    return table(path, ["timestamp", *names], TIME, *POSITION.T, *TORQUE.T)
+
+
+def desired_beside(path: Path) -> Path:
+    names = ["sim_time", "Achse{}_Ist [Grad]", "Achse{}_Soll [Grad]", "Achse{} [Nm]"]
+    return table(path, names, TIME, np.degrees(POSITION), np.degrees(SLOPE), TORQUE)
+
+
+def plot_juggler(path: Path) -> Path:
+    names = ["__time", "/joint_states/header/stamp"]
+    names += [
+        f"/joint_states/{joint}/{kind}" for joint in JOINTS for kind in ("effort", "position")
+    ]
+    columns = [values[:, joint] for joint in range(3) for values in (TORQUE, POSITION)]
+    return table(path, names, 0.3 + EPOCH + TIME, EPOCH + TIME, *columns)
+
+
+def dates_without_name(path: Path) -> Path:
+    text = table(path, ["", "q_{}", "tau_{}"], TIME, POSITION, TORQUE).read_text().splitlines()
+    rows = [
+        f"2026-11-27 10:00:{float(row.partition(',')[0]):09.6f},{row.partition(',')[2]}"
+        for row in text[1:]
+    ]
+    path.write_text("\n".join([text[0], *rows]) + "\n")
+    return path
+
+
+ORDER = (2, 0, 1)
+
+
+def message_rows(joints: Sequence[int]) -> list[str]:
+    """Seconds, nanoseconds, frame, then names and values of joints in an order."""
+    order, rows = list(joints), []
+    for time, *values in zip(TIME, POSITION, SLOPE, TORQUE, strict=True):
+        nanoseconds = round(1e9 * time)
+        stamp = [str(EPOCH + nanoseconds // 10**9), str(nanoseconds % 10**9), "base"]
+        numbers = [f"{value:.15g}" for row in values for value in row[order]]
+        rows.append(",".join([*stamp, *(JOINTS[joint] for joint in order), *numbers]))
+    return rows
+
+
+def echo_without_header(path: Path) -> Path:
+    """`ros2 topic echo --csv /joint_states`."""
+    path.write_text("\n".join(message_rows(ORDER)) + "\n")
+    return path
+
+
+def echo_in_order(path: Path) -> Path:
+    path.write_text("\n".join(message_rows((0, 1, 2))) + "\n")
+    return path
+
+
+def echo_with_header(path: Path) -> Path:
+    """`rostopic echo -p`, whose joints are in the order of the alphabet."""
+    names = ["%time", "field.header.stamp", "field.header.frame_id"]
+    fields = ("name", "position", "velocity", "effort")
+    names += [f"field.{field}{number}" for field in fields for number in range(3)]
+    rows = [row.split(",") for row in message_rows(ORDER)]
+    lines = [",".join([f"{row[0]}{int(row[1]):09d}"] * 2 + row[2:]) for row in rows]
+    path.write_text("\n".join([",".join(names), *lines]) + "\n")
+    return path
+
+
+LAYOUTS: Mapping[str, Callable[[Path], Path]] = {
+    "sunrise": sunrise,
+    "kortex": kortex,
+    "fast research interface": fast_research,
+    "a robot's name before the quantity": prefixed,
+    "joints of other names": servo_names,
+    "desired beside measured": desired_beside,
+    "plotjuggler": plot_juggler,
+    "an index of dates": dates_without_name,
+    "ros2 topic echo": echo_without_header,
+    "ros2 topic echo in the order of the URDF": echo_in_order,
+    "rostopic echo": echo_with_header,
+}
+
+
+def imported(path: Path, robot: Robot) -> ImportedRecording:
+    return import_recording(path, path.with_suffix(".mcap"), lambda _: robot)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_layout_is_read(tmp_path: Path, robot: Robot, layout: str) -> None:
+    recording = imported(LAYOUTS[layout](tmp_path / "log.csv"), robot)
+    columns = open_archive(recording.archive).columns
+    turns = np.rint((columns["position"] - POSITION) / (2.0 * np.pi))
+    assert np.allclose(columns["position"], POSITION + 2.0 * np.pi * turns, rtol=0.0, atol=1e-6)
+    assert np.allclose(columns["torque"], TORQUE, rtol=0.0, atol=1e-6)
+    elapsed = 1e-9 * (columns["stamp"] - columns["stamp"][0])
+    assert np.allclose(elapsed, TIME, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("layout", ["sunrise", "ros2 topic echo", "rostopic echo"])
+def test_its_map_reads_it_again(tmp_path: Path, robot: Robot, layout: str) -> None:
+    path = LAYOUTS[layout](tmp_path / "log.csv")
+    first = imported(path, robot)
+    (tmp_path / "map.toml").write_text(first.text or "")
+    options = ImportOptions(tmp_path / "map.toml")
+    again = import_recording(path, tmp_path / "b.mcap", lambda _: robot, options)
+    columns = [open_archive(recording.archive).columns for recording in (first, again)]
+    assert all(np.array_equal(columns[0][name], columns[1][name]) for name in columns[1])
+
+
+def test_names_in_rows_are_said(tmp_path: Path, robot: Robot) -> None:
+    recording = imported(echo_with_header(tmp_path / "log.csv"), robot)
+    assert "joints in the order of the names in the rows: ankle, hip, knee" in recording.lines
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ('{"t": 0.0, "q": [1.0]}\n{"t": 0.1, "q": [1.0]}\n', "is JSON, not a table of numbers"),
+        ("header:\n  seq: 1\nposition: [0.0]\n---\n", "is YAML of messages, not a table"),
+    ],
+)
+def test_text_that_is_no_table(tmp_path: Path, robot: Robot, text: str, sentence: str) -> None:
+    (tmp_path / "log.txt").write_text(text)
+    with pytest.raises(SourceError, match=sentence):
+        imported(tmp_path / "log.txt", robot)
+
+
+NOT_MEASURED = (
+    "q_d[0]", "target_moment_1", "ExternalTorque_2", "actual_motor_torque[1]", "dtau_J_1",
+    "axisQCmd_LBR[3]", "tcp_position_1", "gripper_pos", "position_error_1", "tau_ext_hat_1",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NOT_MEASURED)
+def test_words_deny_a_measured_quantity(name: str) -> None:
+    assert kind_of(name)[0] is None
+    assert kind_by_words(name) is None
+
+
+def test_a_channel_without_numbers_of_joints_is_no_quantity(tmp_path: Path, robot: Robot) -> None:
+    """One temperature-like channel with a word of a quantity in its name is left alone."""
+    names = ["t", "q{}", "tau{}", "belt_speed", "valve_position"]
+    path = table(tmp_path / "log.csv", names, TIME, POSITION, TORQUE, TIME, TIME)
+    recording = imported(path, robot)
+    assert "not used: belt_speed, valve_position" in recording.lines
