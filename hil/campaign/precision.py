@@ -186,7 +186,7 @@ class PrecisionStage:
         self._meter = PrecisionMeter(campaign, requirements)
         if self._meter.earlier:
             recordings = plural(self._meter.earlier, "earlier recording")
-            reporter.say(f"the precision counts {recordings} of this arm, too (hil design --given)")
+            reporter.say(f"the precision counts the {recordings} that the motion adds to")
         texts = tuple(str(requirement) for requirement in requirements)
         self._record = PrecisionRecord(plan_hash, texts)
         record = PrecisionRecord.load(self._path, plan_hash)

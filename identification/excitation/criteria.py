@@ -390,8 +390,8 @@ class Objective:
         if weights is not None:
             blocks = [weight * block for weight, block in zip(weights, blocks, strict=True)]
         total = np.zeros(motion.n_samples)
-        states = self._states(motion)
-        for part, rows in model.chunks(*states, self._direction(states)):
+        q, qd, qdd = self._states(motion)
+        for part, rows in model.chunks(q, qd, qdd, self._direction(q, qd)):
             for columns, block in zip(rows, blocks, strict=True):
                 total[part] += np.einsum("pm,pm->m", columns, block @ columns)
         return total
@@ -405,12 +405,11 @@ class Objective:
             acceleration=motion.acceleration,
         )
 
-    def _direction(self, states: tuple[Array, ...]) -> Array:
+    def _direction(self, position: Array, velocity: Array) -> Array:
         """Return the direction of dry friction (m, n + k), less of it below standstill.
 
         A joint that rests while others move has a speed of rounding, whose sign shows no friction.
         """
-        position, velocity, _ = states
         return self._friction.direction(np.zeros(len(position)), position, velocity)
 
     @cached_property
@@ -426,8 +425,8 @@ class Objective:
     def _joint_grams(self, motion: Motion) -> list[Array]:
         """Return the Gram matrix of the columns of each joint."""
         sums = [np.zeros((len(used), len(used))) for used in self.model.plan.columns]
-        states = self._states(motion)
-        for _, rows in self.model.chunks(*states, self._direction(states)):
+        q, qd, qdd = self._states(motion)
+        for _, rows in self.model.chunks(q, qd, qdd, self._direction(q, qd)):
             for joint, block in enumerate(rows):
                 sums[joint] += block @ block.T
         return sums
