@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.design.given import given_sources
 from hil.design.requirements import Requirement, require_known, requirements_from
 from hil.design.result import RESULT
 from hil.design.settings import load_settings
@@ -25,8 +26,10 @@ from hil.identify.cell_context import torque_scale
 from hil.identify.estimating import Posterior, with_uncertain_scale
 from hil.identify.options import FIXED
 from hil.identify.prepared import samples_of, stated_settings
-from hil.identify.sources import gather_sources
+from hil.identify.sources import Source, gather_sources
 from hil.progress import Reporter
+from hil.reading import path_exists
+from hil.terminal_text import plural
 from identification.excitation import midpoints
 from identification.factor.factor import Factor, inverse_variance
 from identification.selection.settings import Strength
@@ -50,7 +53,10 @@ class Measured:
 
 
 class PrecisionMeter:
-    """Measures the precision of the archived repetitions of a campaign."""
+    """Measures the precision of the archived repetitions of a campaign.
+
+    The recordings that its motion was designed to add to (`hil design --given`) count with them.
+    """
 
     def __init__(self, campaign: CampaignState, requirements: Sequence[Requirement]) -> None:
         require_known(requirements, campaign.cell.model)
@@ -68,6 +74,11 @@ class PrecisionMeter:
         ]
         self._reference = ReferenceMotions(campaign.cell.model, motions)
         self._factors: dict[Path, Factor] = {}
+        paths = given_to(campaign)
+        sources = given_sources(campaign.cell, paths) if paths else ()
+        earlier = [self._reduced(source) for source in sources]
+        self._earlier = sum(earlier[1:], earlier[0]) if earlier else None
+        self.earlier = len(earlier)  #: number of those recordings
 
     def measure(self, paths: Sequence[Path]) -> Look:
         """Return the precision that some repetitions give together; archives are read once."""
@@ -92,10 +103,11 @@ class PrecisionMeter:
         for path in paths:
             if path not in self._factors:
                 (source,) = gather_sources([path], FIXED.split, in_sample=True).training
-                samples = samples_of(source, self._cell, self._settings)
-                self._factors[path] = Factor.by_time(self._cell.model, samples)
+                self._factors[path] = self._reduced(source)
         factors = [self._factors[path] for path in paths]
         total = sum(factors[1:], factors[0])
+        if self._earlier is not None:
+            total = total + self._earlier
         posterior = Posterior.of(self._cell, total, "auto", Strength())
         estimate = posterior.free(total).estimate
         scale = torque_scale(self._cell, (), simulated=self._cell.only_simulated)
@@ -112,15 +124,25 @@ class PrecisionMeter:
             wanted=wanted,
             values=directions @ estimate.values,
             half=stated.interval_factor * np.sqrt(variance),
-            noise=noise_shares(factors, weights, estimate.values, moved),
+            noise=noise_shares(factors, weights, estimate.values, moved, self._earlier),
         )
 
+    def _reduced(self, source: Source) -> Factor:
+        samples = samples_of(source, self._cell, self._settings)
+        return Factor.by_time(self._cell.model, samples)
 
-def noise_shares(factors: Sequence[Factor], weights: Array, values: Array, moved: Array) -> Array:
+
+def noise_shares(
+    factors: Sequence[Factor],
+    weights: Array,
+    values: Array,
+    moved: Array,
+    earlier: Factor | None = None,
+) -> Array:
     """Return the share of the variances (k,) that differs between repetitions of a motion.
 
-    The rest is the same in all of them. `moved` (p, k) are the inverse information times the
-    directions. NaN for one repetition.
+    The rest is the same in all of them, or of the `earlier` recordings. `moved` (p, k) are the
+    inverse information times the directions. NaN for one repetition.
     """
     count = len(factors)
     if count < 2:
@@ -128,6 +150,8 @@ def noise_shares(factors: Sequence[Factor], weights: Array, values: Array, moved
     blocks = min(len(factor) for factor in factors)
     pulls = np.array([factor.scores(weights, values)[:blocks] @ moved for factor in factors])
     whole = np.sum(pulls.sum(axis=0) ** 2, axis=0)
+    if earlier is not None:
+        whole += np.sum((earlier.scores(weights, values) @ moved) ** 2, axis=0)
     scatter = np.sum((pulls - pulls.mean(axis=0)) ** 2, axis=(0, 1)) * count / (count - 1)
     return np.asarray(np.clip(scatter / np.where(whole > 0.0, whole, 1.0), 0.0, 1.0))
 
@@ -160,6 +184,9 @@ class PrecisionStage:
         self._path = campaign.folder.precision
         self._limit = campaign.cell.campaign.repetitions
         self._meter = PrecisionMeter(campaign, requirements)
+        if self._meter.earlier:
+            recordings = plural(self._meter.earlier, "earlier recording")
+            reporter.say(f"the precision counts the {recordings} that the motion adds to")
         texts = tuple(str(requirement) for requirement in requirements)
         self._record = PrecisionRecord(plan_hash, texts)
         record = PrecisionRecord.load(self._path, plan_hash)
@@ -189,6 +216,14 @@ class PrecisionStage:
     def _look(self, count: int) -> None:
         paths = self._campaign.folder.completed("excitation")[:count]
         self._record = self._record.with_look(self._meter.measure(paths), self._limit)
+
+
+def given_to(campaign: CampaignState) -> tuple[Path, ...]:
+    """Return the recordings that the design in the folder of a campaign adds to."""
+    path = campaign.folder.root / RESULT
+    if not path_exists(path):
+        return ()
+    return tuple(Path(name) for name in load_settings(path).objective.given)
 
 
 def requirements_of(campaign: CampaignState, texts: Sequence[str]) -> tuple[Requirement, ...]:

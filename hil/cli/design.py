@@ -171,6 +171,14 @@ def design(
     mass = payload_mass if purpose is not None else None
     promise = _promise(loaded, asked.objective.precision, recordings, reporter, mass)
     planned = 1 if promise is None else 2 if purpose else loaded.campaign.repetitions
+    if promise is not None and purpose is None and settings is None and there is None:
+        usual_length = asked.constraints.max_duration
+        asked = promise.lengthened(asked, planned)
+        if (longest := asked.constraints.max_duration) > usual_length:
+            reporter.say(
+                f"repetitions of a motion of {usual_length:g} s would not meet the precision: one "
+                f"of at most {longest:g} s is searched"
+            )
 
     def finish(done: Designed) -> None:
         """Report and draw the result, while the folder is locked."""

@@ -34,7 +34,7 @@ from planner import Trajectory
 
 from .given import given_sources
 from .requirements import Requirement, require_known
-from .settings import DesignSettings, preset
+from .settings import MOST_VIA_POINTS, DesignSettings, preset
 from .wanted import ReferenceMotions, Wanted
 
 Array = NDArray[np.float64]
@@ -184,6 +184,25 @@ class PrecisionDesign:
         """Return the criterion of a search for so many repetitions of a motion."""
         density = self.error + self.noise / repetitions
         return Precision(self.wanted.quantities, density, self.prior)
+
+    def lengthened(self, settings: DesignSettings, repetitions: float) -> DesignSettings:
+        """Return settings of a longer motion, if repetitions of one as long as theirs are too few.
+
+        That is so if random motions of that length do not meet all requirements. Via points are
+        added at equal density, up to `MOST_VIA_POINTS`.
+        """
+        points, longest = settings.via_points, settings.constraints.max_duration
+        if points is None:
+            return settings
+        precision = self.precision(repetitions)
+        rate = self.reference.information(precision.density)
+        for count in range(points.n_via, MOST_VIA_POINTS + 1):
+            seconds = longest * count / points.n_via
+            if precision.ratios(seconds * rate).max() <= 1.0:
+                break
+        return settings.replaced(
+            via_points={"n_via": count}, constraints={"max_duration": round(seconds, 1)}
+        )
 
     def forecasts(self, excitation: Excitation, repetitions: int) -> list[Forecast]:
         """Return what a motion promises for each requirement after so many repetitions."""

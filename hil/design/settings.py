@@ -26,6 +26,8 @@ Fraction = Annotated[Number, Field(gt=0, le=1)]
 _MOTIONS: Final[Mapping[str, Method]] = {"via_points": "b", "sines": "a"}
 RESULT_FORMAT: Final = "designed excitation"
 """Key `format` of a result file, which has a table of the settings."""
+MOST_VIA_POINTS: Final = 60
+"""Most via points of a motion."""
 SHORTEST_RAMP: Final = 0.05
 """Shortest ramp of sines, s; a shorter one is a jerk whose contacts cannot be determined."""
 
@@ -83,7 +85,9 @@ class SearchTable(Table):
 class ViaPointTable(Table):
     """`[via_points]`: a motion through via points, as the controller's interpolator runs it."""
 
-    n_via: Whole = field("a number of via points to search, 2 to 60", ge=2, le=60)
+    n_via: Whole = field(
+        f"a number of via points to search, 2 to {MOST_VIA_POINTS}", ge=2, le=MOST_VIA_POINTS
+    )
     fly: Share = field("a fly-by fraction, 0 (stop at every via point) to 1")
     slowest: Fraction = field("the smallest fraction of a joint's speed limit, above 0, at most 1")
     range_share: Fraction = field(

@@ -7,7 +7,7 @@ unit diagonal against overflow. For a singular matrix each returns its worst val
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, NamedTuple, Self
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from identification.excitation.constraints import midpoints
 from identification.excitation.precision import Precision
 from identification.factor.factor import Factor
+from identification.model.friction import JointFriction
 from identification.model.motion import Motion
 from identification.model.regressor import joint_arrays
 from identification.model.robot import RobotModel
@@ -389,7 +390,8 @@ class Objective:
         if weights is not None:
             blocks = [weight * block for weight, block in zip(weights, blocks, strict=True)]
         total = np.zeros(motion.n_samples)
-        for part, rows in model.chunks(*self._states(motion)):
+        q, qd, qdd = self._states(motion)
+        for part, rows in model.chunks(q, qd, qdd, self._direction(q, qd)):
             for columns, block in zip(rows, blocks, strict=True):
                 total[part] += np.einsum("pm,pm->m", columns, block @ columns)
         return total
@@ -403,10 +405,28 @@ class Objective:
             acceleration=motion.acceleration,
         )
 
+    def _direction(self, position: Array, velocity: Array) -> Array:
+        """Return the direction of dry friction (m, n + k), less of it below standstill.
+
+        A joint that rests while others move has a speed of rounding, whose sign shows no friction.
+        """
+        return self._friction.direction(np.zeros(len(position)), position, velocity)
+
+    @cached_property
+    def _friction(self) -> JointFriction:
+        """The friction with a linear change of direction up to standstill."""
+        friction = self.model.friction
+        laws = tuple(
+            replace(law, zone="linear", presliding=0.0) if law.standstill > 0.0 else law
+            for law in friction.laws
+        )
+        return replace(friction, laws=laws)
+
     def _joint_grams(self, motion: Motion) -> list[Array]:
         """Return the Gram matrix of the columns of each joint."""
         sums = [np.zeros((len(used), len(used))) for used in self.model.plan.columns]
-        for _, rows in self.model.chunks(*self._states(motion)):
+        q, qd, qdd = self._states(motion)
+        for _, rows in self.model.chunks(q, qd, qdd, self._direction(q, qd)):
             for joint, block in enumerate(rows):
                 sums[joint] += block @ block.T
         return sums

@@ -79,10 +79,13 @@ class TestPrecision:
         for name in ("cell.toml", "robot.urdf"):
             shutil.copy(ROOT / "examples" / "two_joints" / name, workplace)
         text = page("precision.md")
-        first, given, campaign = (block for _, block in blocks(text))
+        first, given, campaign, following = (block for _, block in blocks(text))
         assert typed(first) == ["design"]
         assert typed(campaign, (0, 5)) == ["rehearse", "run"]
         assert typed(given) == ["design"]
+        assert typed(following, (0, 5)) == ["rehearse", "run"]
+        every = sorted(str(path) for path in Path("runs").glob("*/archives/*.mcap"))
+        assert typed(f"hil identify {shlex.join(every)} -o all", (0, 5)) == ["identify"]
         record = json.loads((workplace / "runs" / "precise" / "precision.json").read_text())
         assert record["outcome"] in ("met", "out of reach")
 

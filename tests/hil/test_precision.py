@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from hil.campaign.plan import validation_motions
 from hil.cli import app
 from hil.design import DesignResult, load_settings, preset, problem_of
-from hil.design.precision import PrecisionDesign
+from hil.design.precision import PrecisionDesign, short_search
 from hil.design.requirements import FORMS, Requirement, require_known, requirements_from
 from hil.errors import InputError
 from hil.motion_checks import MotionChecks
@@ -122,6 +122,20 @@ class TestPromise:
     def test_a_precision_beyond_a_year_of_motion_is_refused(self, cell, motions) -> None:
         with pytest.raises(InputError, match=r"a year of motion leaves .*; a day leaves"):
             promise(cell, motions, "parameters 1e-9%")
+
+    def test_a_motion_is_longer_where_a_short_one_is_too_short(self, cell, motions) -> None:
+        """Intervals fall with the root of the time; there are as many via points per second."""
+        made = promise(cell, motions, "parameters 5%")
+        short = short_search()
+        rate = made.reference.information(made.precision(4).density)
+        seconds = short.constraints.max_duration
+        ratio = made.precision(4).ratios(seconds * rate).max()
+        for share, longer in ((1.1, 1.0), (1.0 / 1.5, 2.25)):
+            strict = promise(cell, motions, f"parameters {share * 5.0 * ratio}%")
+            settings = strict.lengthened(short, 4)
+            assert settings.via_points.n_via == pytest.approx(8 * longer, abs=1)
+            length = settings.constraints.max_duration
+            assert length / settings.via_points.n_via == pytest.approx(seconds / 8, rel=0.01)
 
     def test_friction_counts_in_both_directions_at_three_speeds(self, cell, motions) -> None:
         made = promise(cell, motions, "friction of elbow 5%")

@@ -11,12 +11,12 @@ from typer.testing import CliRunner
 from hil.campaign import Campaign
 from hil.campaign.operator import Stop
 from hil.campaign.plan import design
-from hil.campaign.precision import further, requirements_of
+from hil.campaign.precision import PrecisionMeter, further, requirements_of
 from hil.campaign.precision_record import Look, PrecisionRecord, Reached
 from hil.cli import app
 from hil.errors import ExecutionError, InputError
 from hil.progress import Silent
-from tests.hil.fast_cell import fast_cell, pass_rehearsal
+from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell, pass_rehearsal
 
 pytestmark = pytest.mark.safety
 
@@ -175,6 +175,48 @@ class TestRefusals:
         arguments = ["run", str(campaign.folder.root), "--precision", "parameters 5%"]
         with pytest.raises(InputError, match="add --until-precise"):
             CliRunner().invoke(app, arguments, catch_exceptions=False)
+
+
+@pytest.fixture(scope="module")
+def continued(met, tmp_path_factory):
+    earlier, _ = met
+    folder = tmp_path_factory.mktemp("next")
+    (folder / "quick.toml").write_text(QUICK_GRADIENT)
+    arguments = ["design", str(earlier.folder.cell), "--settings", str(folder / "quick.toml")]
+    arguments += ["--given", str(earlier.folder.root), "--precision", ", ".join(LOOSE)]
+    arguments += ["-o", str(folder / "it"), "--workers", "1"]
+    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    campaign = Campaign.open(folder / "it")
+    return campaign, run(campaign)
+
+
+class TestEarlierRecordings:
+    """A motion that `hil design --given` designed continues what was recorded before it."""
+
+    def test_they_count_for_its_precision(self, continued) -> None:
+        campaign, heard = continued
+        required = requirements_of(campaign, ("parameters 20%",))
+        paths = campaign.folder.completed("excitation")[:1]
+        together = PrecisionMeter(campaign, required).estimate(paths)
+        design_file = campaign.folder.root / "excitation.toml"
+        aside = design_file.rename(design_file.with_suffix(".aside"))
+        alone = PrecisionMeter(campaign, required).estimate(paths)
+        aside.rename(design_file)
+        ratio = together.half / alone.half  # of each parameter; 1 if they did not count
+        assert np.median(ratio) < 1.0
+        assert any("counts the 2 earlier recordings" in line for line in heard.lines)
+
+    def test_without_them_the_run_is_refused(self, continued, met) -> None:
+        campaign, _ = continued
+        earlier, _ = met
+        aside = earlier.folder.root.with_name("moved")
+        earlier.folder.root.rename(aside)
+        try:
+            with pytest.raises(InputError, match=str(earlier.folder.root)):
+                run(campaign)
+        finally:
+            aside.rename(earlier.folder.root)
 
 
 def test_the_command_prints_what_was_reached(tmp_path) -> None:

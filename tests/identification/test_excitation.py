@@ -460,8 +460,9 @@ def some_motion(seed, n_via=5):
 
 
 def rows_of(motion):
-    """Phi of one motion: a row per sample and joint."""
-    return MODEL.regressor(*motion[1:]).dense(P).reshape(-1, P)
+    """Phi of one motion: a row per sample and joint, with less dry friction below standstill."""
+    direction = np.clip(motion.velocity / MODEL.friction.standstill, -1.0, 1.0)
+    return MODEL.regressor(*motion[1:4], direction).dense(P).reshape(-1, P)
 
 
 def assert_measures(criteria, columns, n_samples):
@@ -552,6 +553,16 @@ class TestMeasures:
         assert objective.n_parameters == len(chosen)
         assert_measures(objective.measures(motion), columns[:, order], motion.n_samples)
         assert_measures(Objective(MODEL).measures(motion), columns, motion.n_samples)
+
+    def test_the_sign_of_a_rounded_speed_shows_no_friction(self):
+        """A joint that holds its place while the other moves has speeds of rounding."""
+        motion = midpoints(some_motion(3))
+        rests = np.arange(motion.n_samples) > motion.n_samples // 2
+        velocity = np.where(rests[:, None] & [False, True], 0.0, motion.velocity)
+        still = motion._replace(velocity=velocity)
+        rounded = still._replace(velocity=velocity + 1e-12)
+        expected = Objective(MODEL).measures(still)
+        assert Objective(MODEL).measures(rounded) == pytest.approx(expected, rel=1e-6)
 
     def test_criteria_are_the_measures_and_more(self):
         trajectory = some_motion(3)
