@@ -189,9 +189,12 @@ def _commands_of(bag: Bag, topic: str, measured: Measured) -> Commands:
         values, reading = read(bag.messages(topic), measured)
     except SourceError as error:
         raise _NotCommandsError(f"its messages cannot be read ({error.problem})") from error
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        raise _NotCommandsError("its messages have other fields, or of other lengths") from error
     known = np.asarray(np.isfinite(values).all(axis=1))
     if np.count_nonzero(known) < 2:
         raise _NotCommandsError("it has no command at the time of the measured positions")
+    values = np.where(known[:, None], values, np.nan)
     position = measured.position[known]
     wrong = np.sqrt(np.mean((values[known] - position) ** 2, axis=0))
     size = position.std(axis=0)
@@ -285,7 +288,7 @@ def _of_trajectories(messages: Iterable[BagMessage], measured: Measured) -> tupl
         start = 1e-9 * (received - origin)
         path = _path(points, places, start, 1e-9 * (begin - origin), before(start))
         end = 1e-9 * (parts[k + 1][0] - origin) if k + 1 < len(parts) else np.inf
-        rows = (time >= start) & (time < end)
+        rows = slice(*np.searchsorted(time, [start, end]))
         values[rows] = path(time[rows])
         before = _state_of(path)
     return values, "trajectories, interpolated as by the trajectory controller of ros2_control"
@@ -362,9 +365,10 @@ def _at_stamps(stamp: Stamps, known: Stamps, values: Array) -> Array:
 
 
 def _point(content: Any, names: Sequence[str]) -> Any:
-    """Return the first of some points in a message that has positions, or the last there is."""
+    """Return the first of some points in a message that has positions, or one without any."""
     points = [getattr(content, name) for name in names if hasattr(content, name)]
-    return next((point for point in points if len(point.positions)), points[-1])
+    nothing = SimpleNamespace(positions=[], velocities=[], effort=[])
+    return next((point for point in points if len(point.positions)), nothing)
 
 
 def _nanoseconds(time: Any) -> int:

@@ -318,6 +318,48 @@ class TestOtherTopics:
         assert imported.command[5:] == pytest.approx(MOVED.command[:-5], abs=2e-3)
 
 
+class TestStrangeMessages:
+    """They cost the commands at most, never the measured positions."""
+
+    def imported(self, tmp_path: Path, urdf: Path, messages: Messages, of: str, sent) -> Imported:
+        topics = {"/joint_states": measured(messages, MOVED), "/arm/command": (of, sent)}
+        imported = Imported(written(tmp_path / "bag", messages, topics), urdf)
+        assert imported.recording.position == pytest.approx(MOVED.position)
+        return imported
+
+    def test_a_controller_without_points(self, tmp_path, urdf) -> None:
+        messages = Messages()
+        store = get_typestore(Stores.ROS2_HUMBLE)
+        text = "std_msgs/Header header\nstring[] joint_names\nfloat64 gain\n"
+        store.register(get_types_from_msg(text, CONTROLLER_STATE))
+        messages.store = store
+        sent = received(MOVED.stamps, [
+            messages.of(CONTROLLER_STATE, header=messages.header(stamp), joint_names=list(JOINTS),
+                        gain=1.0)
+            for stamp in MOVED.stamps
+        ])  # fmt: skip
+        imported = self.imported(tmp_path, urdf, messages, CONTROLLER_STATE, sent)
+        assert imported.command is None
+        assert "/arm/command: it has no positions of these joints" in imported.text
+
+    def test_commands_that_are_not_finite_are_none(self, tmp_path, urdf) -> None:
+        messages = Messages()
+        command = MOVED.command.copy()
+        command[:10, 0] = np.inf
+        command[20, 1] = np.nan
+        rows = zip(MOVED.stamps, command, strict=True)
+        sent = received(MOVED.stamps, [messages.state(*row) for row in rows])
+        imported = self.imported(tmp_path, urdf, messages, STATE, sent)
+        unknown = np.flatnonzero(np.isnan(imported.command).all(axis=1))
+        assert unknown.tolist() == [*range(10), 20]
+
+    def test_trajectories_that_run_backwards(self, tmp_path, urdf) -> None:
+        messages = Messages()
+        points = [messages.point(MOVED.command[k], at=float(5 - k)) for k in range(4)]
+        sent = [(MOVED.stamps[9], messages.trajectory(MOVED.stamps[9], points))]
+        assert self.imported(tmp_path, urdf, messages, TRAJECTORY, sent).command is None
+
+
 class TestSeveralTopics:
     def topics(self, messages: Messages) -> Topics:
         rows = zip(MOVED.stamps, MOVED.command + 0.1, strict=True)
