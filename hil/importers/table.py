@@ -69,7 +69,7 @@ def _description(path: Path, text: str) -> SourceError:
         problem = f"is {'JSON' if is_json else 'YAML of messages'}, not a table of numbers"
         remedy = "give a table of numbers (CSV), .npz, .mat, .parquet or a bag"
         if not is_json:
-            remedy = "give the bag, or write it with `ros2 topic echo --csv` or `rostopic echo -p`"
+            remedy = "give the bag, or a table of its joint states (CSV)"
         return SourceError(path, problem, remedy=remedy)
     if "<robot" in text:
         remedy = f"give the recording first: LOG --urdf {path.name}"
