@@ -78,7 +78,6 @@ NOT_TYPED = {
     "hil run runs/precise": "typed in precision.md",
     "hil rehearse runs/next": "typed in precision.md",
     "hil run runs/next": "typed in precision.md",
-    "hil identify runs/precise/archives/*.mcap": "typed in precision.md",
     "hil identify ur10": "needs a recording; tests/hil/test_one_command.py reads it",
     "hil batch /data": "needs other people's archives",
     "hil study --quick": "minutes; tests/hil/test_study.py runs a shorter one",
