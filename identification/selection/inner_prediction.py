@@ -376,7 +376,14 @@ def _torsion_springs(trial: _Trial, now: Settings, joints: Sequence[str]) -> lis
     shown = tuple(
         name
         for name in joints
-        if trial.is_better_for(name, every, possible) and trial.stiffness(name, every) > 0.0
+        if trial.decide(
+            SPRINGS,
+            [possible, every],
+            SPRING_WORTHWHILE,
+            joint=name,
+            possible=lambda settings, name=name: trial.stiffness(name, settings) > 0.0,
+            certainty=CERTAIN,
+        ).choice.chosen
     )
     if not shown:
         return []
@@ -563,6 +570,7 @@ class _Trial:
         share: float | None = None,
         *,
         by_joint: bool = False,
+        joint: str | None = None,
         rows: Literal["all", "fitted"] = "all",
         possible: Callable[[Settings], bool] | None = None,
         certainty: float = 1.0,
@@ -570,11 +578,16 @@ class _Trial:
         """Return the first candidate, or the best one if it is clearly better, and `possible`.
 
         Better by a share (`WORTHWHILE`), and by more than the standard error of the difference over
-        the segments times the certainty.
+        the segments times the certainty: over all joints, by their geometric mean `by_joint`, or of
+        one `joint`.
         """
         share = WORTHWHILE if share is None else share
         scores = [self.errors(each, rows) for each in candidates]
-        segments = [score.joints if by_joint else score.segments for score in scores]
+        if joint is not None:
+            index = self._model.joint_names.index(joint)
+            segments = [score.segments_of(index) for score in scores]
+        else:
+            segments = [score.joints if by_joint else score.segments for score in scores]
         means = [_mean(part) for part in segments]
         chosen = 0
         for k, mean in enumerate(means):
@@ -594,12 +607,6 @@ class _Trial:
         """
         limit = (1.0 - IMPOSSIBLE_WORTHWHILE) * self.fitted_error(possible)
         return self.fitted_error(settings) < limit
-
-    def is_better_for(self, joint: str, settings: Settings, others: Settings) -> bool:
-        """Return whether settings predict a joint much better than others."""
-        index = self._model.joint_names.index(joint)
-        after, before = (self.errors(each).segments_of(index) for each in (settings, others))
-        return _clearly_better(after, before, SPRING_WORTHWHILE, CERTAIN)
 
     def stiffness(self, joint: str, settings: Settings) -> float:
         """Return the fitted stiffness of the torsion spring of a joint [N·m/rad]."""
