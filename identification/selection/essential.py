@@ -251,7 +251,7 @@ class _Path:
     def _squares(self, subset: _Subset) -> Array:
         """Return the weighted squared held-out error by blocks of time (B,)."""
         augmented = np.append(-subset.values, 1.0)
-        return np.maximum((self._blocks @ augmented) @ augmented, 0.0)
+        return np.asarray(np.maximum((self._blocks @ augmented) @ augmented, 0.0))
 
     def _append_step(self, subset: _Subset, index: int | None) -> None:
         self.steps.append(
