@@ -1,7 +1,7 @@
 """What the defaults of the automatic settings are worth on a robot that they were not chosen on.
 
-Run with ``python -m benchmarks.leave_one_out [--data FOLDER] [--only NAME ...] [--json]``, with
-FOLDER as in `benchmarks.board`.
+Run with ``python -m benchmarks.leave_one_out [--data FOLDER] [--only NAME ...]
+[--defaults NAME ...] [--json]``, with FOLDER as in `benchmarks.board`.
 
 Each default of :mod:`identification.selection.inner_prediction` is varied alone. For each robot,
 the value with the least geometric mean of held-out errors over all *other* robots is
@@ -32,16 +32,22 @@ ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
     "LEFT_OUT": (("halts", "rests", "slow"),),
     "BANDWIDTHS": ((10.0, 7.0, 14.0, 20.0, 40.0), (20.0, 7.0, 10.0, 14.0, 40.0)),
     "VELOCITIES": (("position", "measured"),),
-    "PRESLIDING": ((1e-5, 1e-6, 3e-5, 1e-4, 3e-4, 1e-3),),
+    "PRESLIDING": (
+        (1e-5, 1e-6, 3e-5, 1e-4, 3e-4, 1e-3),
+        (1e-4, 1e-6, 1e-5, 3e-5, 3e-4, 1e-3),
+        (3e-4, 1e-6, 1e-5, 3e-5, 1e-4, 1e-3),
+    ),
     "STRENGTHS": ((0.25, 1.0, 4.0), (4.0, 1.0, 0.25)),
     "FOLDS": (3, 8),
     "SHORT": (0.0, 30.0),
+    "CERTAIN": (1.0, 2.0),
+    "IMPOSSIBLE_WORTHWHILE": (0.02, 0.1),
 }
 """Other values of each default; of a sequence, the first is the one that others have to beat."""
 PRESENT: Final = "present values"
 
 
-def ratios(name: str, data: Path) -> dict[tuple[str, str], float]:
+def ratios(name: str, data: Path, defaults: Sequence[str]) -> dict[tuple[str, str], float]:
     """Return the error relative to the ordinary fit on one robot, by default and its value."""
     split, logs = split_logs(name, data)
     parts = cut(split, logs)
@@ -49,8 +55,8 @@ def ratios(name: str, data: Path) -> dict[tuple[str, str], float]:
     errors = {}
     with tempfile.TemporaryDirectory() as scratch:
         errors[PRESENT, ""] = identified_parts(parts, Path(scratch)).error / fit
-        for default, values in ALTERNATIVES.items():
-            for value in values:
+        for default in defaults:
+            for value in ALTERNATIVES[default]:
                 with patch.object(inner_prediction, default, value):
                     error = identified_parts(parts, Path(scratch)).error
                 errors[default, str(value)] = error / fit
@@ -76,12 +82,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--only", nargs="+", default=known(), help="some of the recordings")
+    parser.add_argument(
+        "--defaults", nargs="+", default=[*ALTERNATIVES], choices=[*ALTERNATIVES], help="some"
+    )
     options = parser.parse_args(arguments)
     if len(set(options.only)) < 2:
         parser.error("--only needs at least two recordings: each is judged by all others")
-    robots = {name: ratios(name, options.data) for name in options.only}
+    robots = {name: ratios(name, options.data, options.defaults) for name in options.only}
     mean = {PRESENT: _geometric([robot_ratios[PRESENT, ""] for robot_ratios in robots.values()])}
-    table = {default: chosen_without(robots, default) for default in ALTERNATIVES}
+    table = {default: chosen_without(robots, default) for default in options.defaults}
     for default, by_robot in table.items():
         mean[default] = _geometric([choice["ratio"] for choice in by_robot.values()])
     show({"mean_ratio": mean, "chosen": table}, only_json=options.json)

@@ -71,7 +71,7 @@ _SETTLED: Final = 1e-3  # relative change of the noise
 _FRICTION_SHARE: Final = 0.5
 # RMS of motions that excite an arm: 0.2 to 4.5 rad/s in the recordings of six arms of the board,
 # half of the joints above 0.45; at a base frequency of 0.1 to 0.2 Hz the acceleration is as large.
-_USUAL_SPEED: Final = 0.5  # rad/s or m/s
+USUAL_SPEED: Final = 0.5  # rad/s or m/s
 _USUAL_ACCELERATION: Final = 0.5  # rad/s² or m/s²
 _SPEEDS: Final = 20  # up to the usual one
 LOAD_SHARE: Final = 0.1
@@ -480,7 +480,7 @@ def _usual_columns(model: RobotModel) -> Array:
     Zero for other parameters.
     """
     usual = np.zeros(model.n_parameters)
-    speeds = np.linspace(0.0, _USUAL_SPEED, _SPEEDS)
+    speeds = np.linspace(0.0, USUAL_SPEED, _SPEEDS)
     for k, term in enumerate(model.friction.terms, model.base.rank):
         usual[k] = np.abs(term.term.column(speeds, np.ones(_SPEEDS))).max()
     rotors = np.isin(model.base.pivots, model.layout.rotors)

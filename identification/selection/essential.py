@@ -150,7 +150,7 @@ class _Subset(NamedTuple):
     solution: Solution  # of the normal equations in these
     relative: Array  # standard deviations (k,), infinite where undetermined
     values: Array  # for the full model (p,), zero elsewhere
-    blocks: Array  # weighted squared held-out error by blocks of time (B,)
+    square: float  # weighted squared held-out error
     held_out: float  # relative error over all joints
     held_out_joint: Array  # (n,), zero for one without rows
 
@@ -169,6 +169,7 @@ class _Path:
         self._rule = rule
         self._equations = total.weighted(weights)
         self._blocks = held_out.occupied().by_block(weights)
+        self._whole = np.asarray(self._blocks.sum(axis=0))
         self.refused: list[int] = []
         self.steps: list[EliminationStep] = []
         self.best = self.current = self._subset(np.arange(total.n_parameters))
@@ -230,19 +231,27 @@ class _Path:
             solution,
             relative,
             values,
-            np.maximum((self._blocks @ augmented) @ augmented, 0.0),
+            float(max(augmented @ self._whole @ augmented, 0.0)),
             self._unseen.relative_error(values),
             np.nan_to_num(self._unseen.relative_errors(values)),
         )
 
     def _is_worse(self, smaller: _Subset) -> bool:
         """Return whether a removal raises the held-out error by more than the rule allows."""
-        if smaller.blocks.sum() <= self.current.blocks.sum():
+        if smaller.square <= self.current.square:
             return False
         overall = (smaller.held_out - self.best.held_out) / self._rule.overall
         axis = (smaller.held_out_joint - self.best.held_out_joint) / self._rule.axis
-        significant = _is_significant(smaller.blocks - self.best.blocks)
-        return max(overall, float(axis.max())) > (self._rule.noticeable if significant else 1.0)
+        increase = max(overall, float(axis.max()))
+        if increase <= self._rule.noticeable:
+            return False
+        change = self._squares(smaller) - self._squares(self.best)
+        return increase > 1.0 or _is_significant(change)
+
+    def _squares(self, subset: _Subset) -> Array:
+        """Return the weighted squared held-out error by blocks of time (B,)."""
+        augmented = np.append(-subset.values, 1.0)
+        return np.asarray(np.maximum((self._blocks @ augmented) @ augmented, 0.0))
 
     def _append_step(self, subset: _Subset, index: int | None) -> None:
         self.steps.append(
@@ -256,7 +265,7 @@ class _Path:
             )
         )
         self.current = subset
-        if subset.blocks.sum() < self.best.blocks.sum():
+        if subset.square < self.best.square:
             self.best = subset
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from identification.errors import IdentificationError
 from identification.estimators.consistent import consistent_values
 from identification.estimators.prior import (
+    USUAL_SPEED,
     BodyPrior,
     body_prior,
     design_effect_of,
@@ -81,8 +82,8 @@ VELOCITIES: Final[tuple[VelocitySource, ...]] = ("measured", "position")
 # Unmodelled dynamics start at about 10 Hz on most arms. The smoother of 14 Hz, the default, leaves
 # nine tenths of an amplitude there, and half of it at 14 Hz.
 BANDWIDTHS: Final = (14.0, 7.0, 10.0, 20.0, 40.0)  # Hz
-# A typical value of gears first. Zero is no candidate: its sign at rest is noise.
-PRESLIDING: Final = (1e-4, 1e-6, 1e-5, 3e-5, 3e-4, 1e-3)  # rad or m
+# The middle of what gears show first. Zero is no candidate: its sign at rest is noise.
+PRESLIDING: Final = (3e-5, 1e-6, 1e-5, 1e-4, 3e-4, 1e-3)  # rad or m
 # Rows of a joint that stands while another moves hold its load; but those near a reversal, or at
 # rest by brake or static friction, can mislead.
 LEFT_OUT: Final[tuple[LeftOut, ...]] = ("rests", "halts", "slow")
@@ -113,7 +114,11 @@ _MEANINGLESS: Final = 1.0
 _EXACT: Final = 1e-5
 # Speeds above this share of the largest are predicted from slower ones to try friction terms.
 _FAST: Final = 0.85
-# Smallest friction within the range of speeds, as a share of Coulomb friction.
+# Share of the rows of a joint in motion that are faster than a Stribeck term reaches.
+_FEWEST_FAST: Final = 0.1
+# Another motion may be faster by this factor, which a friction law has to bear.
+_FASTER: Final = 2.0
+# Smallest friction within the range of speeds, as a share of Coulomb or static friction.
 _LEAST_FRICTION: Final = 0.5
 # Share of load that becomes friction in a worm gear; a larger one is another effect.
 _LARGEST_SHARE: Final = 0.5
@@ -334,9 +339,10 @@ def _choose_prior(
 def _friction_terms(trial: _Trial, now: Settings) -> _Decision:
     """Choose the terms beside Coulomb and viscous friction, the stated ones first.
 
-    A term must also predict fast motion from slower one no worse, and leave friction at all speeds:
-    the law is the choice that carries over to another motion least. Segments of a short motion have
-    the same speeds and do not test it: there a term must predict the fast motion clearly better.
+    A term must also predict fast motion from slower one no worse, and leave friction in a faster
+    motion, too: the law is the choice that carries over to another motion least. Segments of a
+    short motion have the same speeds and do not test it: there a term must predict the fast motion
+    clearly better.
     """
     law = trial.model(now).friction.laws[0].table()
     stated = {"third": law["third"], "stribeck": law["stribeck"]}
@@ -348,7 +354,11 @@ def _friction_terms(trial: _Trial, now: Settings) -> _Decision:
         limit *= 1.0 - TERM_WORTHWHILE
 
     def possible(term: Settings) -> bool:
-        return trial.fast_error(term) <= limit and trial.has_friction(term)
+        return (
+            trial.fast_error(term) <= limit
+            and trial.shows_stribeck(term)
+            and trial.has_friction(term)
+        )
 
     return trial.decide("friction at speed", candidates, TERM_WORTHWHILE, possible=possible)
 
@@ -379,11 +389,19 @@ def _torsion_springs(trial: _Trial, now: Settings, joints: Sequence[str]) -> lis
     if not trial.fits_impossible(now, possible):
         return []
     every = possible.with_friction(springs=tuple(joints))
-    shown = tuple(
-        name
-        for name in joints
-        if trial.is_better_for(name, every, possible) and trial.stiffness(name, every) > 0.0
-    )
+
+    def shows_spring(joint: str) -> bool:
+        decision = trial.decide(
+            SPRINGS,
+            [possible, every],
+            SPRING_WORTHWHILE,
+            joint=joint,
+            possible=lambda settings: trial.stiffness(joint, settings) > 0.0,
+            certainty=CERTAIN,
+        )
+        return bool(decision.choice.chosen)
+
+    shown = tuple(filter(shows_spring, joints))
     if not shown:
         return []
     candidates = [possible, possible.with_friction(springs=shown)]
@@ -577,6 +595,7 @@ class _Trial:
         share: float | None = None,
         *,
         by_joint: bool = False,
+        joint: str | None = None,
         rows: Literal["all", "fitted"] = "all",
         possible: Callable[[Settings], bool] | None = None,
         certainty: float = 1.0,
@@ -584,11 +603,16 @@ class _Trial:
         """Return the first candidate, or the best one if it is clearly better, and `possible`.
 
         Better by a share (`WORTHWHILE`), and by more than the standard error of the difference over
-        the segments times the certainty.
+        the segments times the certainty: over all joints, by their geometric mean `by_joint`, or of
+        one `joint`.
         """
         share = WORTHWHILE if share is None else share
         scores = [self.errors(each, rows) for each in candidates]
-        segments = [score.joints if by_joint else score.segments for score in scores]
+        if joint is not None:
+            index = self._model.joint_names.index(joint)
+            segments = [score.segments_of(index) for score in scores]
+        else:
+            segments = [score.joints if by_joint else score.segments for score in scores]
         means = [_mean(part) for part in segments]
         chosen = 0
         for k, mean in enumerate(means):
@@ -608,12 +632,6 @@ class _Trial:
         """
         limit = (1.0 - IMPOSSIBLE_WORTHWHILE) * self.fitted_error(possible)
         return self.fitted_error(settings) < limit
-
-    def is_better_for(self, joint: str, settings: Settings, others: Settings) -> bool:
-        """Return whether settings predict a joint much better than others."""
-        index = self._model.joint_names.index(joint)
-        after, before = (self.errors(each).segments_of(index) for each in (settings, others))
-        return _clearly_better(after, before, SPRING_WORTHWHILE, CERTAIN)
 
     def stiffness(self, joint: str, settings: Settings) -> float:
         """Return the fitted stiffness of the torsion spring of a joint [N·m/rad]."""
@@ -703,7 +721,10 @@ class _Trial:
         return folds.predicted.relative_error(estimate(folds.fitted))
 
     def has_friction(self, settings: Settings) -> bool:
-        """Return whether the fitted friction of every joint stays near Coulomb's at all speeds."""
+        """Return whether the fitted friction of every joint stays near that at rest at all speeds.
+
+        Up to twice those recorded and at least to a usual one, which another motion may have.
+        """
         model = self.model(settings)
         reduced = self._reduced(settings)
         values = self._estimator(settings, reduced)(reduced.folds.fitted)
@@ -711,21 +732,41 @@ class _Trial:
         fastest = np.max(
             [np.abs(each.motion.velocity).max(axis=0) for each in self.samples(settings)], axis=0
         )
+        fastest = np.maximum(_FASTER * fastest, USUAL_SPEED)
         scatters = torque_scatter(model, reduced.folds.fitted)
         for law, coefficients, speed, scatter in zip(
             model.friction.laws, table, fastest, scatters, strict=False
         ):
-            along = np.linspace(0.0, speed, _SPEEDS)[1:]
+            along = np.linspace(0.0, speed, _SPEEDS)
             columns = law.columns(along, np.ones_like(along))
             forces = [
                 coefficients[symbol] * column
                 for symbol, column in zip(law.symbols, columns, strict=True)
                 if symbol != "fo"
             ]
-            coulomb = coefficients.get("f0", 0.0)
-            least = float(np.sum(forces, axis=0).min())
+            total = np.sum(forces, axis=0)
+            # Stribeck friction at the lowest speed is at most twice that at higher ones.
+            dry = max(coefficients.get("f0", 0.0), float(total[0]))
             # Friction that hardly shows in the torque is not worth a judgement.
-            if coulomb > _SHOWN * scatter and least < _LEAST_FRICTION * coulomb:
+            if dry > _SHOWN * scatter and float(total.min()) < _LEAST_FRICTION * dry:
+                return False
+        return True
+
+    def shows_stribeck(self, settings: Settings) -> bool:
+        """Return whether all joints that move are faster than their Stribeck term reaches, too.
+
+        A slower one does not tell it from viscous friction, and both would be large and opposite.
+        """
+        samples = self.samples(settings)
+        for joint, law in enumerate(self.model(settings).friction.laws):
+            if not law.stribeck:
+                continue
+            speeds = np.concatenate(
+                [np.abs(each.motion.velocity[each.usable[:, joint], joint]) for each in samples]
+            )
+            moving = speeds[speeds > law.standstill]
+            # At twice its speed the term has fallen to 2 %.
+            if moving.size and np.mean(moving > 2.0 * law.stribeck) < _FEWEST_FAST:
                 return False
         return True
 

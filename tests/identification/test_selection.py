@@ -27,6 +27,7 @@ from identification.selection.inner_prediction import (
     LOW_PASS,
     SHORT,
     STRENGTH,
+    TERM_WORTHWHILE,
     WORTHWHILE,
     Errors,
     Folds,
@@ -264,6 +265,12 @@ def chosen(
     return settings, settings.choices
 
 
+def a_slow_motion(amplitude):
+    """Three sines of about half a rad/s; the speed is up to three times the amplitude."""
+    speeds = np.array([[0.3, 0.5], [0.7, 0.4], [1.1, 0.9]])
+    return sine_motion(np.arange(0.0, 30.0, 0.005), amplitude, speeds, speeds)
+
+
 class TestChosenSettings:
     @pytest.mark.parametrize("distance", [1e-4, 1e-3])
     def test_the_true_presliding_is_found(self, distance):
@@ -284,6 +291,27 @@ class TestChosenSettings:
         recording = a_recording(stated, np.append(truth(), [5.0, 4.0]), motion=motion)
         settings, _ = chosen(recording, {"friction"}, model=stated)
         assert settings.friction["stribeck"] == 0.3
+
+    def test_a_law_that_would_drive_faster_motion_is_refused(self):
+        """It is true of the recorded speeds, up to 0.25 rad/s, and without friction at twice."""
+        falling = MODEL.with_friction(third="quadratic")
+        values = np.append(truth(), [-15.0, -8.0])
+        recording = a_recording(falling, values, motion=a_slow_motion(0.12))
+        settings, choices = chosen(recording, {"friction"})
+        decision = next(choice for choice in choices if choice.name == "friction at speed")
+        assert min(decision.errors) < (1.0 - TERM_WORTHWHILE) * decision.errors[0]
+        assert decision.chosen == 0
+        assert settings.friction["third"] == "none"
+
+    def test_stribeck_friction_needs_motion_faster_than_it_reaches(self):
+        """Slower than twice its speed it is not told from viscous friction."""
+        stribeck = MODEL.with_friction(stribeck=0.1)
+        values = np.append(truth(), [2.0, 1.0])
+        laws = []
+        for amplitude in (0.06, 0.5):
+            recording = a_recording(stribeck, values, motion=a_slow_motion(amplitude))
+            laws.append(chosen(recording, {"friction"})[0].friction["stribeck"])
+        assert laws == [0.0, 0.1]
 
     def test_no_friction_term_is_added_without_cause(self):
         settings, _ = chosen(a_recording(duration=LONG), {"friction"})
