@@ -39,7 +39,7 @@ def read_via_points(path: Path, cell: Cell) -> Array:
     """
     frame = AngleFrame.of(cell)
     ends = frame.shown(np.array([cell.joint_limits.lower, cell.joint_limits.upper]))
-    bounds = [*zip(cell.joint_names, np.sort(ends, axis=0).T.tolist(), strict=True)]
+    bounds = [*zip(cell.joint_names, map(sorted, ends.T.tolist()), strict=True)]
     lines = enumerate(read_input(path).removeprefix("\ufeff").splitlines(), 1)
     rows = [(k, re.findall(r"[^\s,;]+", line.split("#")[0])) for k, line in lines]
     rows = [(number, cells) for number, cells in rows if cells]

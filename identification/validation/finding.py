@@ -90,9 +90,9 @@ class Thresholds:
     #: the same as a share of its own limit; sensors resolve some thousandths of their range
     minor_of_limit: float = 0.005
     nominal: float = 0.005  #: overall error above that of the nominal or controller's model
-    #: seconds of unseen motion in which an axis must have moved: eight blocks of the covariance, of
-    #: which an error has a standard deviation of a quarter of it
-    moved: float = 1.0
+    #: seconds of unseen motion in which an axis must have moved: four blocks of the covariance, of
+    #: which an error has a standard deviation of a third of it
+    moved: float = 0.5
     gravity: float = 0.5  #: squared error on unseen motion with the best gravity over declared
     gravity_angle: float = 1.0  #: degrees between the two. Other faults on the NS 16: up to 0.06
     #: share of the additional error on unseen motion that a body on the last link explains. A real

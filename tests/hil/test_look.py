@@ -240,7 +240,8 @@ class TestConclusions:
             Choice("mounting", "upright", 0.07, "--gravity 0 0 -9.81"),
             Choice("zero", "zero moved", 0.07, "[position] offset = [0, 3]", (("a", 1),)),
         )
-        message = str(undecided(Path("my log.csv"), choices))
+        contradictions = Contradictions("", "", "", "", "")
+        message = str(undecided(Path("my log.csv"), choices, contradictions))
         assert "state --gravity 0 0 -9.81; or write the map with `hil look 'my log.csv'" in message
         assert "-o map.toml`, add [position] offset = [0, 3], and give it with --map" in message
 

@@ -137,6 +137,9 @@ class TestSamples:
 class TestPlannedMotions:
     def test_they_excite_the_shares_by_the_load_of_the_description(self):
         motion = a_motion()
+        # Below standstill a plan counts less of dry friction than a recording.
+        fast = LOADED.friction.moving(motion.velocity).all(axis=1)
+        motion = motion.rows(fast)
         gram = Objective(LOADED).information(motion)
         columns = LOADED.regressor(*motion[1:]).dense(LOADED.n_parameters)
         expected = np.einsum("mjp,mjq->pq", columns, columns)

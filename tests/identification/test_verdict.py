@@ -278,7 +278,7 @@ class TestJudgement:
             ({"held_out": an_error(0.2)}, "over all axes, limit 12 %"),
             ({"held_out": an_error(np.array([0.01, 0.4]))}, "exceeds 35 %: two 40 %"),
             ({"training": an_error(0.05), "held_out": an_error(0.2)}, "one 4.0 times, 20.0 %"),
-            ({"moved": np.array([9.0, 0.9])}, "two moved for less than 1 s"),
+            ({"moved": np.array([9.0, 0.4])}, "two moved for less than 0.5 s"),
             ({"held_out": HEAVY}, "model of one predicts no better than the mean torque"),
             ({"estimate": an_estimate(undetermined=MANY)}, ", ".join(MANY)),
             ({"nominal": an_error(0.03)}, "nominal model predicts better"),
