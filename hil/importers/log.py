@@ -520,7 +520,7 @@ class _Log:
         self._set_terms(matrix, self._map.quantities()[name].coupled, field)
         if np.linalg.matrix_rank(matrix) < len(matrix):
             problem = "with these factors the angles do not determine the joints"
-            remedy = "state which angle contains that of another joint; of two angles only one can contain the other"
+            remedy = "of two angles only one can contain the other: state which one does"
             raise SourceError(self.path, problem, field=field, remedy=remedy)
         return matrix
 

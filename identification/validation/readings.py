@@ -723,7 +723,7 @@ class Axes(NamedTuple):
     """Where the joints of a recording are in what was recorded, and how to convert them.
 
     A quantity as read is ``sign * recorded[:, order]``; positions are multiplied by `factor`, and
-    `zero` [rad] is added: angles that may each contain that of other joints, ``coupling @ own``.
+    `zero` [rad] is added: angles that may each contain that of other joints, ``coupling @ angles``.
     """
 
     position_order: NDArray[np.intp]
@@ -782,12 +782,14 @@ class Axes(NamedTuple):
     def read(self, recording: Recording) -> Recording:
         """Return a recording as read."""
         scale = self.factor * self.position_sign
-        own = np.linalg.inv(self.coupling).T
+        uncoupled = np.linalg.inv(self.coupling).T
         velocity = recording.velocity
         torque = recording.torque
         return replace(
             recording,
-            position=(recording.position[:, self.position_order] * scale + self.zero) @ own,
-            velocity=None if velocity is None else velocity[:, self.position_order] * scale @ own,
+            position=(recording.position[:, self.position_order] * scale + self.zero) @ uncoupled,
+            velocity=None
+            if velocity is None
+            else velocity[:, self.position_order] * scale @ uncoupled,
             torque=None if torque is None else torque[:, self.torque_order] * self.torque_sign,
         )
