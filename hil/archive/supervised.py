@@ -135,6 +135,11 @@ class Channel:
 END_TIMEOUT = 30.0  # Time for the last flush of a slow disk, s
 HUNG = 5.0
 """Time without a heartbeat after which the process is killed, s; a slow disk does not stop it."""
+NO_TIME = (
+    "it was suspended, or this PC gave it no processor time: end other programs, and check this PC "
+    "with `hil doctor`"
+)
+"""Why a process sends no heartbeat, and what to do."""
 EXIT_TIMEOUT = 2.0  # Time to exit for a process that was killed or has closed its socket, s
 POLL = 0.05  # Time between two checks whether the process has ended, s
 
@@ -146,6 +151,11 @@ class SharedMemory(Protocol):
     ring_fd: int
     event_fd: int
     control_fd: int
+
+
+def silent_for(silence: float) -> str:
+    """Return why a process was ended that sent no heartbeat for a time [s]."""
+    return f"sent no heartbeat for {silence:g} s and was ended ({NO_TIME})"
 
 
 @dataclass(eq=False)
@@ -185,7 +195,7 @@ class ArchiveProcessHandle:
     def failure(self) -> str | None:
         """Return the fault of the process, None if it works; one that hangs is killed."""
         if self.alive and self.monitor.silence() > HUNG:
-            self.kill(f"sent no heartbeat for {HUNG:g} s and was ended")
+            self.kill(silent_for(HUNG))
         if self.alive:
             return None
         return f"the archive process {self._ended_for or f'ended ({self.process.last_error})'}"
@@ -231,7 +241,7 @@ class ArchiveProcessHandle:
         deadline = time.monotonic() + END_TIMEOUT
         while self.process.alive and not self._gone:
             if self.monitor.silence() > HUNG:
-                self.kill(f"sent no heartbeat for {HUNG:g} s and was ended")
+                self.kill(silent_for(HUNG))
             elif time.monotonic() > deadline:
                 self.kill(f"did not end within {END_TIMEOUT:g} s and was killed")
             else:

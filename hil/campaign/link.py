@@ -27,6 +27,7 @@ from drivers.states import HAS_SET_POINTS, Outcome, State
 from hil.archive import ArchiveSpec
 from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded, describe
+from hil.archive.supervised import NO_TIME
 from hil.cell import Cell
 from hil.errors import ArchiveWriteError, ControllerError, OperatorStopError
 from hil.terminal_text import with_joint_names
@@ -601,10 +602,7 @@ def archive_silence(disk_waited: float) -> str:
     if disk_waited > SLOW_DISK:
         cause = f"it waited for its disk for {disk_waited:.1f} s: check that disk"
     else:
-        cause = (
-            "it was suspended, or this PC gave it no processor time: end other programs, and "
-            "check this PC with `hil doctor`"
-        )
+        cause = NO_TIME
     return f"{NO_ARCHIVE}, for more than {HEARTBEAT_TIMEOUT:g} s ({cause})"
 
 

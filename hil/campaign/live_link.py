@@ -40,6 +40,7 @@ from hil.archive.supervised import (
     Open,
     Opened,
     Serving,
+    silent_for,
 )
 from hil.cell import Cell
 from hil.errors import ArchiveWriteError, ControllerError
@@ -143,7 +144,7 @@ class ExchangeMonitor:
         """Return why the process no longer replies, None while it does; kill one that hangs."""
         if self.exchange.alive and self._monitor.silence() > HUNG:
             self.exchange.kill()
-            self.ended_for = f"sent no heartbeat for {HUNG:g} s and was ended"
+            self.ended_for = silent_for(HUNG)
         if self.exchange.alive:
             return None
         self._read()

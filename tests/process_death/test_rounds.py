@@ -208,7 +208,7 @@ def round_in_which(victim: Victim) -> int:
             "archive",
             "freeze",
             4,
-            "sent no heartbeat for 5 s and was ended; the arm was brought to rest",
+            "with `hil doctor`); the arm was brought to rest",
         ),
         ("archive", "disk-full", 2, "cannot be written further"),
     ],
