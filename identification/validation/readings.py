@@ -187,10 +187,11 @@ class Step:
     def sure(self) -> bool:
         """Whether nothing else fits alike, and the arm explains the torque.
 
-        Friction alone says it of a whole arm; of one joint a lag of the torque looks the same.
+        Friction, or a slightly smaller error, says it of a whole arm; of one joint a lag of the
+        torque looks the same.
         """
-        of_one_joint = len(self.change.joints) == 1
-        return not self.alike and self.error < EXPLAINED and not (self.by_friction and of_one_joint)
+        slight = self.ratio > 1.0 - _LARGE and len(self.change.joints) == 1
+        return not self.alike and self.error < EXPLAINED and not slight
 
 
 @dataclass(frozen=True, eq=False)
