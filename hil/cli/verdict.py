@@ -30,10 +30,11 @@ def finish(
 ) -> None:
     """Print table, findings and verdict, or JSON; exit 5 if it is not good.
 
-    With `quiet`, warnings go to stderr. `written` are folder and report, which the last line names.
+    With `quiet`, warnings go to stderr. `written` are folder and report, which the last line or
+    the JSON names.
     """
     if json:
-        typer.echo(as_json(results))
+        typer.echo(as_json(results, written))
     else:
         lines = sentences(results, quiet=quiet)
         if not quiet:
@@ -45,14 +46,17 @@ def finish(
         for line in lines:
             say(line, err=quiet)
         say(results.verdict.line)
-    if written is not None and not quiet:
+    if written is not None and not (quiet or json):
         say(f"results: {written[0]}, report: {written[1]}")
     if not results.verdict.good:
         raise typer.Exit(NOT_GOOD)
 
 
-def as_json(results: Results) -> str:
-    """Return the verdict, its findings and the errors per joint as JSON."""
+def as_json(results: Results, written: tuple[Path, Path] | None = None) -> str:
+    """Return the verdict, its findings and the errors per joint as JSON.
+
+    `written` are the folder and the report, which it names.
+    """
     fields = results.model_dump(mode="json")
     keys = ("next_steps", "findings", "joints", "in_sample")
     document = fields["verdict"] | {key: fields["judgement"][key] for key in keys}
@@ -60,6 +64,8 @@ def as_json(results: Results) -> str:
         parameter.name for parameter in results.parameters if parameter.undetermined
     ]
     document |= {key: fields[key] for key in ("delays", "fitted", "calibration", "exports")}
+    if written is not None:
+        document |= {"folder": str(written[0]), "report": str(written[1])}
     return json_module.dumps(document)
 
 

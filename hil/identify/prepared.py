@@ -25,6 +25,7 @@ from identification.selection.inner_prediction import (
     RATE,
     Known,
     Question,
+    SuggestedDelay,
     choose_settings,
 )
 from identification.selection.settings import Settings
@@ -170,7 +171,7 @@ class _DelayChoice:
 
     estimate: DelayEstimate | None
     assumed: float  # that the choice begins with [s]
-    suggested: tuple[float, ...]  # that it may choose as well [s]
+    suggested: tuple[SuggestedDelay, ...]  # that it may choose as well
     notes: tuple[str, ...]
 
     @classmethod
@@ -193,7 +194,8 @@ class _DelayChoice:
         has_controller = sources.cell.file.controller is not None
         if options.delay is not None or (has_controller and not (far and estimate.determined)):
             return unused
-        suggested = (estimate.delay,) if estimate.significant else ()
+        delay = SuggestedDelay(estimate.delay, estimate.determined)
+        suggested = (delay,) if estimate.significant else ()
         return replace(unused, suggested=suggested, notes=described)
 
     def confirmed_by(self, how: Preprocessing) -> tuple[DelayEstimate | None, tuple[str, ...]]:
@@ -206,7 +208,7 @@ class _DelayChoice:
             # It was estimated without the low-pass, and may be the lag of that.
             unchanged = f"no other delay than the assumed {self.assumed * 1e3:.3g} ms was applied"
             return None, (f"{unchanged} beside the low-pass of the torque",)
-        if how.torque_delay in self.suggested:
+        if how.torque_delay in [delay.value for delay in self.suggested]:
             return self.estimate, (*self.notes, _compensated(how.torque_delay))
         if how.torque_delay != self.assumed:
             return None, (_compensated(how.torque_delay),)
@@ -237,7 +239,9 @@ def _with_noise_of(settings: Settings, sources: Sources) -> Settings:
     return replace(settings, noise_variance=position, torque_variance=torque)
 
 
-def _questions(sources: Sources, options: Options, suggested: Sequence[float]) -> set[Question]:
+def _questions(
+    sources: Sources, options: Options, suggested: Sequence[SuggestedDelay]
+) -> set[Question]:
     """Return the questions that inner prediction has to answer."""
     recorded = [source.recording for source in sources.training]
     questions: dict[Question, bool] = {
@@ -308,11 +312,11 @@ def known_parameters(cell: Cell) -> Known:
 def _chosen(
     sources: Sources,
     stated: Settings,
-    suggested: Sequence[float],
+    suggested: Sequence[SuggestedDelay],
     options: Options,
     reporter: Reporter,
 ) -> Settings:
-    """Choose the automatic settings by inner prediction; `suggested` delays [s] are candidates."""
+    """Choose the automatic settings by inner prediction; `suggested` delays are candidates."""
     cell = sources.cell
     questions = _questions(sources, options, suggested)
     if not questions:

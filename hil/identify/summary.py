@@ -18,6 +18,7 @@ from identification.excitation import (
     Excitation,
     correlation,
     coupling_index_max,
+    friction_of_excitation,
     information,
 )
 from identification.model.elements import TorqueRipple
@@ -166,12 +167,15 @@ def _period(samples: Samples) -> float:
 def _excitation(prepared: Prepared) -> tuple[results.ExcitationResult, Array]:
     """Return the criteria of executed and planned motion, and the information (p, p); all rows."""
     model = prepared.sources.cell.model
+    friction = friction_of_excitation(model)
     lengths = []
     factor = Factor.zero(model)
     for source, samples in zip(prepared.sources.training, prepared.training, strict=True):
         part = executed_rows(source, samples)
         lengths.append(part.stop - part.start)
-        motion = samples.motion.rows(part)._replace(direction=None)
+        motion = samples.motion.rows(part)
+        direction = friction.direction(motion.time, motion.position, motion.velocity)
+        motion = motion._replace(direction=direction)
         factor = factor + Factor.from_samples(model, motion, samples.torque[part])
     gram = information(factor)
     most = coupling_index_max(len(gram))

@@ -22,6 +22,7 @@ from identification.excitation.criteria import (
     coupling_index,
     coupling_index_max,
     fitness_eq7,
+    friction_of_excitation,
     information,
     log10_det,
 )

@@ -150,6 +150,19 @@ def columns(values: Array, criteria: Sequence[str]) -> Array:
     return np.take(values, [names.index(name) for name in criteria], axis=-1)
 
 
+def friction_of_excitation(model: RobotModel) -> JointFriction:
+    """Return the friction of a model, of which there is less below standstill.
+
+    A joint that rests while others move has a speed of rounding or noise, whose sign shows no dry
+    friction.
+    """
+    laws = tuple(
+        replace(law, zone="linear", presliding=0.0) if law.standstill > 0.0 else law
+        for law in model.friction.laws
+    )
+    return replace(model.friction, laws=laws)
+
+
 def measures(gram: Array, n_samples: float) -> dict[str, float]:
     """Return the values of all `CRITERIA` for a Gram matrix (p, p)."""
     root = _factorised(gram)
@@ -405,22 +418,12 @@ class Objective:
             acceleration=motion.acceleration,
         )
 
-    def _direction(self, position: Array, velocity: Array) -> Array:
-        """Return the direction of dry friction (m, n + k), less of it below standstill.
-
-        A joint that rests while others move has a speed of rounding, whose sign shows no friction.
-        """
-        return self._friction.direction(np.zeros(len(position)), position, velocity)
-
     @cached_property
     def _friction(self) -> JointFriction:
-        """The friction with a linear change of direction up to standstill."""
-        friction = self.model.friction
-        laws = tuple(
-            replace(law, zone="linear", presliding=0.0) if law.standstill > 0.0 else law
-            for law in friction.laws
-        )
-        return replace(friction, laws=laws)
+        return friction_of_excitation(self.model)
+
+    def _direction(self, position: Array, velocity: Array) -> Array:
+        return self._friction.direction(np.zeros(len(position)), position, velocity)
 
     def _joint_grams(self, motion: Motion) -> list[Array]:
         """Return the Gram matrix of the columns of each joint."""

@@ -239,23 +239,30 @@ Known = Mapping[str, tuple[float, float]]
 """Mean and standard deviation of parameters that are known beforehand."""
 
 
+class SuggestedDelay(NamedTuple):
+    """A delay of the torque that differs significantly from that of the settings."""
+
+    value: float  # s
+    determined: bool  # whether to a millisecond
+
+
 def choose_settings(
     model: RobotModel,
     ready: Ready,
     start: Settings,
     questions: Collection[Question],
     low_passes: LowPasses,
-    delays: Sequence[float] = (),
+    delays: Sequence[SuggestedDelay] = (),
     ripples: Sequence[Sequence[TorqueRipple]] = (),
     springs: Sequence[str] = (),
     stated: Known | None = None,
 ) -> Settings:
     """Choose settings one after the other, from data that `ready` prepares for the arm's `model`.
 
-    Significant `delays` of the torque [s] are candidates for "delay" that must predict no worse
-    than that of `start`, `ripples` those for "ripple", and joints `springs` those for "springs".
-    Returns settings with their choices; `start` if the data are too short, or predict no part of
-    themselves.
+    `delays` of the torque are candidates for "delay" that must predict no worse than that of
+    `start`, or better if they are not determined; `ripples` those for "ripple", and joints
+    `springs` those for "springs". Returns settings with their choices; `start` if the data are too
+    short, or predict no part of themselves.
     """
     trial = _Trial(model, ready, stated, ripples)
     now = _first_candidates(start, questions)
@@ -415,7 +422,7 @@ def _compare_delays(
     now: Settings,
     choices: list[Choice],
     questions: Collection[str],
-    delays: Sequence[float],
+    delays: Sequence[SuggestedDelay],
 ) -> tuple[Settings, Settings, list[Choice]]:
     """Compensate a significant delay unless it predicts worse, and choose the other settings again.
 
@@ -425,14 +432,14 @@ def _compare_delays(
     compared: list[Choice] = []
     for delay in delays:
         sliding = now.preprocessed(left_out="slow")
-        late = sliding.preprocessed(torque_delay=delay)
-        # A short recording has to show that the delay predicts better.
-        short = trial.duration(now) < SHORT
-        pair = [sliding, late] if short else [late, sliding]
+        late = sliding.preprocessed(torque_delay=delay.value)
+        # A short recording has to show that the delay predicts better, and so has a wide interval.
+        doubtful = trial.duration(now) < SHORT or not delay.determined
+        pair = [sliding, late] if doubtful else [late, sliding]
         decision = trial.decide(DELAY, pair, 0.0, rows="fitted")
         compared.append(decision.choice)
-        if decision.settings.preprocessing.torque_delay == delay:
-            first = first.preprocessed(torque_delay=delay)
+        if decision.settings.preprocessing.torque_delay == delay.value:
+            first = first.preprocessed(torque_delay=delay.value)
             now, choices = _sweep(trial, first, questions)
     return first, now, [*compared, *choices]
 

@@ -121,7 +121,9 @@ class TestCampaign:
         results = identification.results
         assert sorted(p.table2_id or 0 for p in results.parameters) == list(range(1, 59))
         assert results.coverage.within_3 >= 55
-        assert results.calibration.inside >= 0.93  # held-out torque inside its intervals
+        # Held-out torque inside its 95 % intervals, within two standard deviations of the share.
+        unsure = 2.0 * np.sqrt(0.95 * 0.05 / results.calibration.means)
+        assert results.calibration.inside >= 0.95 - unsure
         assert None not in results.calibration.joint_inside
 
     def test_planned_criteria_are_those_that_were_executed(self, identification):
@@ -278,11 +280,10 @@ class TestSources:
         assert identification.verdict.line.startswith(line)
 
     @pytest.mark.parametrize("noise", [0.0, 0.01])
-    def test_with_a_noiseless_torque_are_named(self, tmp_path, noise):
-        """It was filtered by a low-pass, or computed."""
+    def test_with_a_noiseless_torque_are_not_called_filtered(self, tmp_path, noise):
         identification = identified(imported(tmp_path / "smooth.mcap", noise=noise))
         named = [finding.check for finding in identification.results.judgement.findings]
-        assert ("torque bandwidth" in named) == (noise == 0.0)
+        assert "torque bandwidth" not in named
 
 
 class TestJudgement:

@@ -5,6 +5,7 @@ All recordings are simulated, but for those of the folder of real recordings.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -307,6 +308,12 @@ def test_a_map_of_a_bag_with_a_wrong_entry(tmp_path: Path, urdf: Path) -> None:
 
 
 class TestIdentify:
+    def test_json_is_all_that_is_printed_of_it(self, tmp_path: Path, urdf: Path) -> None:
+        result = hil("identify", moving(tmp_path / "a.csv"), "--urdf", urdf, "--json")
+        printed = json.loads(result.stdout)
+        assert printed["folder"] == str(tmp_path / "a")
+        assert Path(printed["report"]).exists()
+
     def test_a_log_and_a_urdf_are_enough(self, tmp_path: Path, urdf: Path) -> None:
         """One log fitted, one predicted; the folder holds what the next run needs."""
         first, second = moving(tmp_path / "a.csv"), moving(tmp_path / "b.csv", seed=1)
