@@ -321,6 +321,11 @@ def _chosen(
     questions = _questions(sources, options, suggested)
     if not questions:
         return stated
+    start = stated
+    if "rows" in questions and cell.file.controller is not None:
+        # The motion of a campaign moves every joint: what its validation runs hold of joints that
+        # stand, with static friction, it cannot show, and their load shows in motion as well.
+        start = stated.preprocessed(left_out="slow")
     # One repetition of a motion is enough.
     some = sources.training[:1] if sources.same_motion else sources.training
     read = [averaged_source(source, RATE) for source in some]
@@ -347,7 +352,7 @@ def _chosen(
         chosen = choose_settings(
             cell.model,
             ready,
-            stated,
+            start,
             questions,
             low_passes,
             suggested,

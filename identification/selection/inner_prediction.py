@@ -312,7 +312,8 @@ def _first_candidates(start: Settings, questions: Collection[Question]) -> Setti
     if "velocity" in questions:
         settings = settings.preprocessed(velocity=VELOCITIES[0])
     if "rows" in questions:
-        settings = settings.preprocessed(left_out=LEFT_OUT[0])
+        rows = start.preprocessing.left_out or LEFT_OUT[0]
+        settings = settings.preprocessed(left_out=rows)
     if "presliding" in questions:
         settings = settings.with_friction(presliding=PRESLIDING[0])
     return settings
@@ -847,6 +848,7 @@ def _sweep(
     trial: _Trial, now: Settings, questions: Collection[str]
 ) -> tuple[Settings, list[Choice]]:
     """Decide interdependent settings in turn until nothing changes."""
+    usual_rows = now.preprocessing.left_out
     asked = [swept for swept in _SWEPT if swept.question in questions]
     short = trial.duration(now) < SHORT
     choices: list[Choice] = []
@@ -863,6 +865,8 @@ def _sweep(
                     for each, width in zip(candidates, widths, strict=True)
                     if width >= widths[0]
                 ]
+            if swept.question == "rows":
+                candidates.sort(key=lambda each: each.preprocessing.left_out != usual_rows)
             if swept.size is not None:
                 candidates = [candidates[k] for k in trial.walk(candidates, swept.size)]
             decision = trial.decide(swept.name, candidates, certainty=certainty)

@@ -80,7 +80,6 @@ TYPED = {
 ELSEWHERE = {
     "find the torque constants with `hil torque-constants`": "tests/hil/test_importers.py",
     "hil run FIELD --payload FIELD": "tests/hil/test_payload_campaign.py",
-    "check this PC with `hil doctor`": "a computer that was suspended; tests/hil/test_doctor.py",
     "stopped before the end of the search": "tests/hil/test_design_command.py, interrupted",
     "repeat with --resume to draw it": "a picture on a full disk",
     "free disk space": "tests/disk",
