@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from identification.model.pseudo_inertia import Body
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
@@ -61,6 +63,8 @@ def principal_axes(inertia: Array) -> tuple[Array, Rotation]:
             if right_handed and better:
                 best_moments = moments[list(order)]
                 best_axes = turned
+    from scipy.spatial.transform import Rotation  # 0.2 s, of which `hil run` needs nothing
+
     return best_moments, Rotation.from_matrix(best_axes)
 
 
