@@ -322,7 +322,8 @@ def _chosen(
     if not questions:
         return stated
     start = stated
-    if "rows" in questions and cell.file.controller is not None:
+    is_campaign = cell.file.controller is not None and not sources.in_sample
+    if "rows" in questions and is_campaign:
         # The motion of a campaign moves every joint: what its validation runs hold of joints that
         # stand, with static friction, it cannot show, and their load shows in motion as well.
         start = stated.preprocessed(left_out="slow")
