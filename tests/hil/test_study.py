@@ -142,7 +142,7 @@ class TestCompared:
         assert verdict_of(ratio, low, high) == verdict
         row = Comparison(ratio=ratio, wins=3, motions=9, low=low, high=high, verdict=verdict)
         methods = [SimpleNamespace(values=[[0.0]] * 3, duration=size) for size in (20.0, 8.0)]
-        made = SimpleNamespace(description="with effects", comparison=row, methods=methods)
+        made = SimpleNamespace(words="with effects", comparison=row, methods=methods)
         first, second = conclusion_of([cast(Any, made)], quick=False)
         assert ("better" in first) == ("better" in verdict or "worse" in verdict)
         assert first.startswith("With effects: B is") == ("better" in verdict)
