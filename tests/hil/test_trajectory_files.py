@@ -147,8 +147,8 @@ def test_the_program_asks_first_and_its_speed_scales_time() -> None:
 
     def commands(speed: float) -> list[tuple[str, Any]]:
         """Names and targets of the commands that the program gives at a speed."""
-        kept = [line for line in text.splitlines() if line.strip() != "end"]
-        program = re.sub(r"speed = .*", f"speed = {speed}", "\n".join(kept), count=1)
+        lines = [line for line in text.splitlines() if line.strip() != "end"]
+        program = re.sub(r"speed = .*", f"speed = {speed}", "\n".join(lines), count=1)
         program = program.replace("while repetition < repetitions", "while repetition < 1")
         program = program.replace("  halt", "  return")
         for name in {*re.findall(r"global (\w+)", program)}:

@@ -304,7 +304,7 @@ class TestChosenSettings:
         assert settings.friction["third"] == "none"
 
     def test_stribeck_friction_needs_motion_faster_than_it_reaches(self):
-        """Slower than twice its speed it is not told from viscous friction."""
+        """Slower than twice its speed it cannot be distinguished from viscous friction."""
         stribeck = MODEL.with_friction(stribeck=0.1)
         values = np.append(truth(), [2.0, 1.0])
         laws = []
