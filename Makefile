@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # The tests start processes by the hundred, and each would compile all sources anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo docs pictures lint quick test test-safety test-all test-slow coverage mutants audit bench clean
+.PHONY: help setup demo docs pictures lint test test-safety test-all test-slow coverage mutants audit bench clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -43,12 +43,8 @@ lint: $(STAMP)  ## form, types, floors and declared dependencies
 	$(BIN)/lint-imports
 	$(BIN)/deptry .
 
-quick: $(STAMP)
+test: $(STAMP)  ## the quick tests, for every change
 	$(PYTEST) -m "not slow and not safety and not long"
-
-# Side by side: without its cache mypy takes half a minute on a core, while the tests wait at times.
-test: $(STAMP)  ## lint and the quick tests
-	@$(MAKE) --no-print-directory --jobs=2 lint quick
 
 test-safety: $(STAMP)  ## what drives an arm, and what breaks it: for any change on the way to the controller
 	$(PYTEST) -m "safety and not slow"
