@@ -42,6 +42,7 @@ from hil.design.precision import PrecisionDesign, payload_search, short_search
 from hil.design.problem import problem_of
 from hil.design.requirements import Requirement, requirements_from
 from hil.design.run import run_search
+from hil.identify.payload_run import flange_of
 from hil.motion_checks import MotionChecks
 from hil.payload_campaign import (
     FEWEST,
@@ -325,8 +326,14 @@ def weighings(count: int, required: str) -> dict[str, Any]:
 def _weighed(
     cell: Cell, plan: CampaignPlan, load: Body, requirements: Sequence[Requirement]
 ) -> Weighed:
-    """Run one payload campaign on an arm that carries a load on its last joint."""
-    carried = Carried(len(cell.joint_names) - 1, *load)
+    """Run one payload campaign on an arm that carries a load, as it is in the flange's frame."""
+    joint, rotation, translation = cell.model.chain.frame(flange_of(cell.model))
+    carried = Carried(
+        joint,
+        load.mass,
+        translation + rotation @ load.centre,
+        rotation @ load.inertia @ rotation.T,
+    )
 
     def link(side: Campaign, session: int) -> MotionLink:
         is_loaded = side.cell.model.payload is not None
