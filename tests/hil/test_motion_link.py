@@ -163,11 +163,11 @@ def test_a_count_that_grows_is_no_other_reason(cell: Cell) -> None:
     stop = Stop()
 
     def came(count: int) -> Happens:
-        return lambda port: port.events.append(PacketRejected("malformed", count, "228 bytes: no init"))
+        event = PacketRejected("malformed", count, "228 bytes: no init")
+        return lambda port: port.events.append(event)
 
-    port = ScriptedPort(
-        (1.0, came(290)), (3.0, came(1)), (4.0, came(11)), (5.0, lambda _: setattr(stop, "requested", True))
-    )
+    end = (5.0, lambda _: setattr(stop, "requested", True))
+    port = ScriptedPort((1.0, came(290)), (3.0, came(1)), (4.0, came(11)), end)
     port.state = State.SYNC
     link = MotionLink(cell, port)  # type: ignore[arg-type]
     lines: list[str] = []
