@@ -7,6 +7,7 @@ that of `hil.campaign.live_link` in real time.
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -49,6 +50,7 @@ NOT_STARTED: Final = "it had not begun"
 STOPPED: Final = "stopped by the operator"
 WAIT_REPORTED: Final = 2.0  # s after which a controller that is not ready is reported
 READY: Final = frozenset((State.CLOSED, State.OPENING, State.OPEN))
+_COUNT: Final = re.compile(r"\d+ packets?")
 """States with the drive on. A controller may open its axes at once: they are held where they are
 until a motion is requested."""
 
@@ -160,8 +162,9 @@ class MotionLink:
         """Report once why no motion can begin yet, and what the operator does about it."""
         reason = self._waiting() if state is State.SYNC else ""
         text = waiting_text(state, reason)
-        if text and text != self._reported:
-            self._reported = text
+        reported = _COUNT.sub("", text)  # a count that grows is no other reason
+        if text and reported != self._reported:
+            self._reported = reported
             self.connection.report(f"waiting up to {timeout:g} s for the controller: {text}")
 
     # --- one motion; nothing here delays a reply

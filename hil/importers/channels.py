@@ -129,7 +129,8 @@ def _of_table(table: Table) -> Iterator[Channel]:
     names = table.names or tuple(map(str, range(table.width)))
     rate = None
     kinds = [kind_of(name, table.unit(place)) for place, name in enumerate(names[: table.width])]
-    first, last = (table.dialect.cells(table.lines[row]) for row in (0, -1))
+    first = table.dialect.cells(table.lines[0])
+    texts = table.texts
     if names[0] == "" and all(kind != "time" for kind, _ in kinds) and is_date(first[0]):
         kinds[0] = "time", None  # an index of dates, which pandas writes without a name
     for place, (kind, _) in enumerate(kinds):
@@ -137,13 +138,10 @@ def _of_table(table: Table) -> Iterator[Channel]:
             rate = _rate(table, place)
     for place, name in enumerate(names[: table.width]):
         kind, number = kinds[place]
-        ends = {row[place] if place < len(row) else "" for row in (first, last)}
-        text = ends.pop() if len(ends) == 1 else None
-        if text is not None and (not text or table.is_number(text)):
-            text = None
         yield Channel(
-            name, 1, len(table.lines), table.unit(place), "text", rate, kind, number, text=text
-        )
+            name, 1, len(table.lines), table.unit(place), "text", rate, kind, number,
+            text=texts[place],
+        )  # fmt: skip
 
 
 def _rate(table: Table | ArrayFile, place: int | str) -> float | None:

@@ -20,6 +20,7 @@ from hil.importers.column_map import HOLE, KINEMATIC, ColumnMap, Quantity, TimeC
 from hil.importers.findings import are_degrees, has_degrees_per_second
 from hil.importers.publishers import second_publisher
 from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
+from hil.importers.row_names import row_names
 from hil.importers.stamps import YEAR, concluded_unit, sorted_neighbours, without_wraps
 from hil.importers.table import Table
 from hil.importers.units import PER_CENT, TIMES, UNITS, unit_of
@@ -117,10 +118,10 @@ class _Log:
         self._folder = path if path.is_dir() else path.parent
         self._map = columns
         self.files: dict[Path, Table | ArrayFile] = {}
-        self.joints = columns.joints or robot.joint_names
+        self.notes: list[str] = []
+        self.joints = columns.joints or self._row_names(robot.joint_names)
         self.order = self._joint_order(robot)
         self.matrix = self._motor_from_joint()
-        self.notes: list[str] = []
         self._unstated: set[str] = set()  # quantities whose unit nothing states
 
     def read(self, name: str) -> Array:
@@ -476,6 +477,19 @@ class _Log:
             read = ArrayFile(path) if arrays else Table.read(path, self._map.format)
             self.files[path] = read
         return self.files[path]
+
+    def _row_names(self, joints: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the joints that the rows name, for columns in their order; else those given."""
+        quantities = self._map.quantities().values()
+        numbered = all("{}" in str(quantity.columns) for quantity in quantities)
+        if not numbered or any(quantity.file or quantity.files for quantity in quantities):
+            return joints
+        file = self._file(None, "position.file")
+        names = row_names(file.texts, joints) if isinstance(file, Table) else None
+        if names is None or names.joints in ((), joints):
+            return joints
+        self.notes.append(names.message)
+        return names.joints
 
     def _joint_order(self, robot: Robot) -> list[int]:
         """Return the column of the log of each joint of the robot."""

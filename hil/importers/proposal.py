@@ -11,13 +11,14 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NamedTuple, NoReturn
+from typing import Final, NoReturn
 
 from hil.errors import SourceError, UnrecordedJointError
 from hil.importers.channels import CHANNEL_NAMES, Channel, channels_of, kind_of
 from hil.importers.column_map import ColumnMap, Format, ready_map, ready_maps
 from hil.importers.name_words import kind_by_words, words_of
 from hil.importers.robot import Robot
+from hil.importers.row_names import RowNames, row_names
 from hil.importers.units import UNITS, Kind, unit_of, without_unit
 from hil.reading import parse_toml
 from hil.toml_text import to_text
@@ -31,7 +32,6 @@ _NANO: Final = frozenset({"nano", "nanosec", "nanosecs", "nanoseconds", "nsec", 
 """Words of the nanoseconds of a time whose seconds are in another column."""
 _Columns = str | Sequence[str | int]
 """A name, with ``{}`` for the joint, or a list of names or of indices."""
-_BEFORE_NAMES: Final = 3  # columns of a joint state: seconds, nanoseconds, frame
 _SIDE: Final = 'side = "motor" with [drive] gear_ratio'
 
 
@@ -125,7 +125,7 @@ def proposed_map(
     form = Format(missing="drop") if drop_missing else None
     channels = channels_of(log, form)
     groups = _groups(channels, joints)
-    names = _joints_in_rows(channels, joints)
+    names = row_names([channel.text for channel in channels], joints)
     recorded = () if names.joints == tuple(joints) else names.joints
     nanoseconds = None
     if not chosen and sample_rate is None and names.joints and not channels[0].name.strip("0"):
@@ -185,41 +185,6 @@ def _groups(channels: Iterable[Channel], joints: Sequence[str]) -> list[_Group]:
     return groups
 
 
-class _RowNames(NamedTuple):
-    """Joints that cells of text name in every row, as `rostopic echo` writes them."""
-
-    place: int  # of the first among the channels
-    joints: tuple[str, ...]
-
-    def columns_of_messages(self, width: int) -> dict[str, str]:
-        """Return the columns of joint states without a header, as of `ros2 topic echo --csv`.
-
-        They are seconds, nanoseconds, frame, then names, positions, velocities and efforts.
-        """
-        count = len(self.joints)
-        if self.place != _BEFORE_NAMES or width != self.place + 4 * count:
-            return {}
-        columns = {"time": "0"}
-        for number, kind in enumerate(("position", "velocity", "torque"), 1):
-            first = self.place + number * count
-            columns[kind] = ",".join(map(str, range(first, first + count)))
-        return columns
-
-
-def _joints_in_rows(channels: Sequence[Channel], joints: Sequence[str]) -> _RowNames:
-    """Return the joints that cells of text name; () without any."""
-    places = [place for place, channel in enumerate(channels) if channel.text in joints]
-    if len(places) < 2:
-        return _RowNames(0, ())
-    first = places[0]
-    names = []
-    for channel in channels[first:]:
-        if channel.text is None:
-            break
-        names.append(channel.text)
-    return _RowNames(first, tuple(names) if len(set(names)) == len(names) else ())
-
-
 def _joint_in(name: str, joints: Sequence[str]) -> str | None:
     """Return the joint whose name is in that of a channel, the longest; None without one."""
     return max((joint for joint in joints if joint in name), key=len, default=None)
@@ -254,12 +219,8 @@ def _of_ready_map(name: str, joints: Sequence[str]) -> Proposal:
     if columns.time is not None:
         lines.insert(0, f"{columns.time.column}: time, {columns.time.unit}, {reason}")
     if joints:
-        lines.append(_said_in_rows(joints))
+        lines.append(RowNames(0, tuple(joints)).message)
     return Proposal(text, columns, tuple(lines))
-
-
-def _said_in_rows(joints: Sequence[str]) -> str:
-    return f"joints in the order of the names in the rows: {', '.join(joints)}"
 
 
 class _Search:
@@ -312,7 +273,7 @@ class _Search:
             table["time"] = {"column": time if isinstance(time, str) else time[0], **parts}
         if self._recorded:
             table = {"joints": list(self._recorded), **table}
-            self._lines.append(_said_in_rows(self._recorded))
+            self._lines.append(RowNames(0, tuple(self._recorded)).message)
         if form is not None:
             table["format"] = form.model_dump(exclude_defaults=True)
         comment = "Proposed by hil from the names and units of the channels"

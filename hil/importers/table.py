@@ -166,6 +166,17 @@ class Table:
         name = self.names[place] if place < len(self.names) else ""
         return unit_of(below.strip("[]() ")) or without_unit(name)[1]
 
+    @property
+    def texts(self) -> list[str | None]:
+        """The text of each column, None if it is a number or not the same in first and last row."""
+        first, last = (self.dialect.cells(self.lines[row]) for row in (0, -1))
+        texts: list[str | None] = []
+        for place in range(self.width):
+            ends = {row[place] if place < len(row) else "" for row in (first, last)}
+            text = ends.pop() if len(ends) == 1 else ""
+            texts.append(None if not text or self.is_number(text) else text)
+        return texts
+
     def is_number(self, cell: str) -> bool:
         """Return whether a cell is a number, a missing one, or a date stamp."""
         return _is_written(cell, self.dialect)

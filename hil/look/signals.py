@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.importers.commands import COMMANDED
 from hil.importers.findings import against_position, outside_limits
+from hil.importers.row_names import ORDER
 from hil.look.result import Certainty, Row
 from identification.signals.clock import time_base
 from identification.signals.recording import STUCK_MOVEMENT, UNWRAPPED, Recording
@@ -71,6 +72,8 @@ def _quantity(line: str, notes: Sequence[str]) -> Row:
     """Return the row of a group of channels."""
     channels, _, meaning = line.partition(": ")
     kind, _, reason = meaning.partition(", ")
+    if channels == ORDER:
+        return Row("joints", meaning, "sure", "in the order of the names in the rows")
     if not reason:
         return Row("channels", channels, "likely", meaning)
     concluded = next((note for note in notes if note.startswith(f"{kind}: ")), "")

@@ -51,6 +51,8 @@ _INSIDE: Final = 1e-6  # smallest eigenvalue of a pseudo-inertia relative to the
 _ROTOR_INSIDE: Final = 1e-6  # of the rotors' matrix, relative to its scale
 _SOLVED: Final = ("Solved", "AlmostSolved")
 _TOLERANCE: Final = 1e-9  # of the conic solver
+_SHORT_STEP: Final = 0.9  # share of the way to the border of a cone, where the usual 0.99 fails
+_REFINEMENTS: Final = 50  # of each linear system then, at most
 _NO_CERTIFICATE: Final = 1e-16  # the constraints have solutions: any bodies of the references
 _DEPENDENT: Final = 1e-15  # distance of a column from those before it, relative to its length
 
@@ -123,20 +125,25 @@ class Program:
         q, triangle = np.linalg.qr(_of_full_rank(rows @ self.to_parameters))
         middle = np.linalg.solve(triangle, q[: len(target)].T @ target)
         constraints, bounds, cones = self._constraints
-        settings = clarabel.DefaultSettings()
-        settings.verbose = False
-        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = _TOLERANCE
-        # Exact data of an arm that cannot be are far from all that can: no certificate by rounding.
-        settings.tol_infeas_abs = settings.tol_infeas_rel = _NO_CERTIFICATE
         size = len(middle)
-        solution = clarabel.DefaultSolver(
+        problem = (
             scipy.sparse.eye_array(size, format="csc"),
             np.zeros(size),
             scipy.sparse.csc_matrix(np.linalg.solve(triangle.T, constraints.T).T),
             bounds - constraints @ middle,
             cones,
-            settings,
-        ).solve()
+        )
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = _TOLERANCE
+        # Exact data of an arm that cannot be are far from all that can: no certificate by rounding.
+        settings.tol_infeas_abs = settings.tol_infeas_rel = _NO_CERTIFICATE
+        solution = clarabel.DefaultSolver(*problem, settings).solve()
+        if str(solution.status) not in _SOLVED:
+            # Rounding ended it; shorter steps stay further from the borders of the cones.
+            settings.max_step_fraction = _SHORT_STEP
+            settings.iterative_refinement_max_iter = _REFINEMENTS
+            solution = clarabel.DefaultSolver(*problem, settings).solve()
         if str(solution.status) not in _SOLVED:
             raise SolverError(
                 f"no physically consistent parameters were found (conic solver: {solution.status})"

@@ -191,6 +191,37 @@ def test_simulators_run_what_was_exported(workplace: Path) -> None:
     assert (names["model"].armature > 0.0).all()  # type: ignore[attr-defined]
 
 
+def masked(text: str) -> set[str]:
+    """Lines without their numbers, whose width and size are those of the day."""
+    return {
+        " ".join(re.sub(r"[\d.]+(e[-+]?\d+)?", "#", line).split()) for line in text.splitlines()
+    }
+
+
+@pytest.mark.slow
+def test_simulators_print_what_the_page_shows(workplace: Path) -> None:
+    """The five commands as they stand, on the arm of the page; numbers are not compared."""
+    pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
+    text = page("simulators.md")
+    ((_, block),) = blocks(text)
+    printed = ""
+    for line in block.splitlines():
+        assert line.startswith("hil ")
+        done = subprocess.run(
+            [sys.executable, "-m", *shlex.split(line)], capture_output=True, text=True
+        )
+        assert (done.returncode, done.stderr) == (0, ""), (line, done.stdout)
+        printed += done.stdout
+    shown = re.findall(
+        r"^```text\n((?:parameters: |written: 20|\d+ windows).*?)```", text, re.M | re.S
+    )
+    assert len(shown) == 3
+    leading = "The identified arm is better than the nominal one"
+    for line in masked("".join(shown)) - masked(printed):
+        assert line.startswith(leading), line  # which joint and effect lead is a matter of numbers
+    assert leading in printed
+
+
 class TestFirstHour:
     TEXT = page("first-hour-simulated.md")
     STEPS = commands(ROOT / "docs" / "first-hour-simulated.md")

@@ -14,6 +14,7 @@ from hil.importers import Robot
 from hil.importers.channels import kind_of
 from hil.importers.name_words import kind_by_words
 from hil.importers.recording import ImportedRecording, ImportOptions, import_recording
+from hil.look import look_at
 from tests.hil.test_log_kinds import JOINTS, POSITION, SLOPE, TIME, TORQUE, URDF, Floats
 
 EPOCH = 1_700_000_000
@@ -179,6 +180,21 @@ def test_its_map_reads_it_again(tmp_path: Path, robot: Robot, layout: str) -> No
 def test_names_in_rows_are_said(tmp_path: Path, robot: Robot) -> None:
     recording = imported(echo_with_header(tmp_path / "log.csv"), robot)
     assert "joints in the order of the names in the rows: ankle, hip, knee" in recording.lines
+
+
+def test_a_look_names_them(tmp_path: Path, robot: Robot) -> None:
+    looked = look_at(echo_with_header(tmp_path / "log.csv"), lambda _: robot, ImportOptions())
+    (row,) = [row for row in looked.rows if "names in the rows" in row.reason]
+    assert (row.aspect, row.reading) == ("joints", "ankle, hip, knee")
+
+
+def test_a_ready_map_leaves_the_order_to_the_names(tmp_path: Path, robot: Robot) -> None:
+    path = echo_with_header(tmp_path / "log.csv")
+    options = ImportOptions(Path("ros_joint_states"))
+    recording = import_recording(path, tmp_path / "a.mcap", lambda _: robot, options)
+    archive = open_archive(recording.archive)
+    assert np.allclose(archive.columns["position"], POSITION, rtol=0.0, atol=1e-6)
+    assert np.allclose(archive.columns["torque"], TORQUE, rtol=0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import RequestError
-from drivers.events import MotionEnded, MotionStarted
+from drivers.events import MotionEnded, MotionStarted, PacketRejected
 from drivers.exchange.event_log import NO_ARCHIVE, EventsLost
 from drivers.exchange.process import ExchangeError, WithdrawnError
 from drivers.states import State
@@ -156,6 +156,26 @@ def test_what_a_connection_waits_for_is_reported_once(cell: Cell) -> None:
         f"{start}{nothing}; start its Open program",
         f"{start}its drive is off; switch it on",
     ]
+
+
+def test_a_count_that_grows_is_no_other_reason(cell: Cell) -> None:
+    """A controller still ends its last session, for tens of packets that get no reply."""
+    stop = Stop()
+
+    def came(count: int) -> Happens:
+        event = PacketRejected("malformed", count, "228 bytes: no init")
+        return lambda port: port.events.append(event)
+
+    end = (5.0, lambda _: setattr(stop, "requested", True))
+    port = ScriptedPort((1.0, came(290)), (3.0, came(1)), (4.0, came(11)), end)
+    port.state = State.SYNC
+    link = MotionLink(cell, port)  # type: ignore[arg-type]
+    lines: list[str] = []
+    link.connection.report = lines.append
+    with pytest.raises(ControllerError, match="ended by the operator"):
+        link.connect(stop)
+    (line,) = lines
+    assert "290 packets came" in line
 
 
 def test_an_end_names_joints_as_the_cell_does(cell: Cell) -> None:

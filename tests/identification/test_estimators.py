@@ -4,7 +4,9 @@ import re
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
+from types import SimpleNamespace
 
+import clarabel
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -920,6 +922,19 @@ class TestConsistentEstimate:
         assert_consistent(MODEL, consistent)
         assert "no consistent parameters fit" in consistent.status
         assert error_rise(consistent) > 0.02
+
+    def test_a_solver_that_stalls_takes_shorter_steps(self, monkeypatch):
+        """As for a drawn arm of the KR 300, whose equations span eight orders of magnitude."""
+        usual = fit_of(truth(), 0.01, 6)
+        solver = clarabel.DefaultSolver
+
+        def stalling(*problem):
+            if problem[-1].max_step_fraction < 0.99:
+                return solver(*problem)
+            return SimpleNamespace(solve=lambda: SimpleNamespace(status="InsufficientProgress"))
+
+        monkeypatch.setattr(clarabel, "DefaultSolver", stalling)
+        np.testing.assert_allclose(fit_of(truth(), 0.01, 6).standard, usual.standard, rtol=1e-5)
 
     def test_errors_and_covariance_are_correct(self):
         motion = five_sines(MODEL, 7, samples=300)

@@ -356,6 +356,20 @@ class TestJudgement:
         assert axes(0.03, noise_floor=np.array([0.1, 0.2])).good
         assert axes(0.03, torque_limit=np.array([30.0, 100.0])).good
 
+    @pytest.mark.parametrize("power", [1.0, 1e-8])
+    def test_an_error_beyond_all_torque_is_no_noise(self, power):
+        """567 times the torque: a faster motion would not help."""
+        error = an_error(np.array([0.05, 567.38]))
+        size = np.array([1.0, power])
+        error = replace(
+            error, squared=error.squared * size, torque_squared=error.torque_squared * size
+        )
+        verdict = judged(held_out=error, training=error)
+        assert any("56738 %" in words for words in (*verdict.reasons, *verdict.warnings))
+        steps = " ".join(finding.next_step for finding in verdict.findings)
+        assert "check sign, gear ratio and torque constant of two" in steps
+        assert "faster" not in steps
+
     def test_an_error_of_rounding_does_not_grow(self):
         tiny = {"training": an_error(1e-7), "held_out": an_error(1e-6)}
         assert not {"generalisation", "outliers"} & {

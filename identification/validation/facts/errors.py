@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -24,8 +24,20 @@ _NOT_COVERED: Final = (
 )
 
 
+# Where torque and its prediction are noise of the same size, the error is this share of the torque.
+_NOISE_ALONE: Final = 2.0**0.5
+
+
 def _faster(joints: str) -> str:
     return f"move {joints} faster and further, so that the torque exceeds the noise"
+
+
+def _drive(joints: str) -> str:
+    return f"check sign, gear ratio and torque constant of {joints}, and the unit of the torque"
+
+
+def _not_covered(_joints: str) -> str:
+    return _NOT_COVERED
 
 
 def _minor(evidence: Evidence, limits: Thresholds) -> Mask:
@@ -128,14 +140,21 @@ class ErrorFacts:
                 "symptom",
             )
         minor = self.large & self.minor
-        if minor.any():
-            shares = naming.each(minor, lambda joint: f"{share(joint)} of {self.torque[joint]}")
+        beyond = minor & (self.relative > _NOISE_ALONE)
+        for joints, step in (
+            (minor & ~beyond, _faster),
+            (beyond & ~self.grown, _drive),
+            (beyond & self.grown, _not_covered),
+        ):
+            if not joints.any():
+                continue
+            shares = naming.each(joints, lambda joint: f"{share(joint)} of {self.torque[joint]}")
             yield Finding(
                 check,
                 "doubtful",
                 f"the torque error on {naming.motion} exceeds {limit} for axes of little torque:"
                 f" {shares}",
-                _faster(naming.of(minor)),
+                step(naming.of(joints)),
                 "symptom",
             )
         grown = self.large & self.grown & ~self.minor
@@ -193,6 +212,7 @@ class ExplainedFacts:
     explained: Array  # (n,), NaN where unknown
     none: Mask  # axes that the mean predicts as well (n,)
     little: Mask  # axes of which little is explained (n,)
+    beyond: Mask  # axes whose error exceeds what noise alone explains (n,)
     limits: Thresholds
 
     @classmethod
@@ -201,29 +221,36 @@ class ExplainedFacts:
         explained = evidence.held_out.explained
         none = (explained <= limits.explained) & ~_minor(evidence, limits)
         little = (explained < limits.little_explained) & ~none
-        return cls(explained, none, little, limits)
+        beyond = evidence.held_out.relative > _NOISE_ALONE
+        return cls(explained, none, little, beyond, limits)
+
+    def _parts(self, mask: Mask) -> Iterator[tuple[Mask, Callable[[str], str]]]:
+        """Yield the axes that noise may explain and the others, each with the next step."""
+        for part, step in ((mask & ~self.beyond, _faster), (mask & self.beyond, _drive)):
+            if part.any():
+                yield part, step
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
         """Yield axes of which little is explained, or the least explained one."""
         check = "variance explained (R²)"
-        if self.none.any():
-            joints = naming.of(self.none)
+        for mask, step in self._parts(self.none):
+            joints = naming.of(mask)
             yield Finding(
                 check,
                 "wrong",
                 f"the model of {joints} predicts no better than the mean torque (R² at most"
                 f" {self.limits.explained:g})",
-                _faster(joints),
+                step(joints),
                 "symptom",
             )
-        if self.little.any():
-            shares = naming.each(self.little, lambda joint: percentage(self.explained[joint]))
+        for mask, step in self._parts(self.little):
+            shares = naming.each(mask, lambda joint: percentage(self.explained[joint]))
             yield Finding(
                 check,
                 "doubtful",
                 f"the model explains less than {percentage(self.limits.little_explained)} of the"
                 f" torque variance: {shares}",
-                _faster(naming.of(self.little)),
+                step(naming.of(mask)),
                 "symptom",
             )
         enough = not (self.none | self.little).any()
