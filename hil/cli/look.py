@@ -12,7 +12,7 @@ import typer
 from hil.cli.arguments import JsonOption, print_json, with_options
 from hil.cli.imports import Described, Reading
 from hil.files import write_output
-from hil.look import Choice, Group, Look, Row, look_at
+from hil.look import Choice, Group, Look, Row, fit_alike, look_at
 from hil.look.maps import with_entries
 from hil.progress import say
 from hil.terminal_text import printable
@@ -76,7 +76,8 @@ def _print(result: Look) -> None:
         for line in groups_table(result.groups):
             typer.echo(printable(line))
     for choices in result.questions:
-        typer.echo(f"\n{choices[0].aspect}: two readings fit alike; choose one line for the map:")
+        doubt = fit_alike(choices)
+        typer.echo(f"\n{choices[0].aspect}: {doubt}; choose one line for the map:")
         for number, choice in enumerate(choices, 1):
             error = "" if choice.error is None else f" (error {percentage(choice.error, 2)})"
             typer.echo(printable(f"  {number}  {choice.line or choice.reading}"))
@@ -87,7 +88,8 @@ def _print(result: Look) -> None:
 
 def _ask(choices: Sequence[Choice]) -> Choice | None:
     """Ask which reading is right; None if that is not known."""
-    answer = typer.prompt(f"{choices[0].aspect}: 1 or 2, or 0 if unknown", type=int, default=0)
+    numbers = "1 or 2" if len(choices) == 2 else f"1 to {len(choices)}"
+    answer = typer.prompt(f"{choices[0].aspect}: {numbers}, or 0 if unknown", type=int, default=0)
     return choices[answer - 1] if 1 <= answer <= len(choices) else None
 
 

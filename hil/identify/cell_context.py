@@ -19,7 +19,7 @@ from identification.estimators.torque_channel import torque_noiseless_above
 from identification.estimators.torque_scale import DATA_SHEET, described
 from identification.factor.factor import Estimate
 from identification.model.friction import TERMS, FrictionLaw
-from identification.selection.inner_prediction import LOAD, LOW_PASS
+from identification.selection.inner_prediction import LOAD, LOW_PASS, REVERSAL
 from identification.signals.masks import SATURATED
 from identification.signals.recording import UNWRAPPED, Recording
 from identification.signals.samples import Samples
@@ -202,7 +202,7 @@ def _added_friction(prepared: Prepared) -> tuple[str, ...]:
 
 def _friction_law(prepared: Prepared) -> Iterator[Finding]:
     """Yield a finding if inner prediction chose another friction law than the archives state."""
-    names = (_FRICTION_AT_SPEED, LOAD)
+    names = (_FRICTION_AT_SPEED, LOAD, REVERSAL)
     if not any(choice.chosen for choice in prepared.settings.choices if choice.name in names):
         return
     cell = prepared.sources.cell
@@ -214,6 +214,8 @@ def _friction_law(prepared: Prepared) -> Iterator[Finding]:
         f" {stated.summary()[0]}"
     )
     removed = [term.label.lower() for term in stated.terms if term not in law.terms]
+    if law.tanh is not None and law.coulomb:
+        removed = [label for label in removed if label != "coulomb"]  # it reverses smoothly
     if removed:
         yield _condition(
             "friction law",
@@ -253,7 +255,8 @@ def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
             advice,
         )
         return
-    if any(choice.errors[choice.chosen] < _EXACT for choice in prepared.settings.choices):
+    exact = any(choice.errors[choice.chosen] < _EXACT for choice in prepared.settings.choices)
+    if exact or REVERSAL in chosen:
         return  # computed for this motion, or it would not be predicted to rounding
     above = torque_noiseless_above(prepared.sources.training[0].recording)
     if above is not None and width is None and above < _FAST * how.rigid_bandwidth:

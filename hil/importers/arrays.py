@@ -301,7 +301,7 @@ def _parquet(path: Path) -> dict[str, Stored]:
     for name in table.column_names:
         values = table[name].to_numpy()
         if values.dtype == object and len(values) and isinstance(values[0], np.ndarray):
-            values = np.stack(values)
+            values = _stacked(path, name, values)
         arrays[name] = _as_numbers(values)
     episodes = np.unique(arrays.get("episode_index", np.zeros(1)))
     if len(episodes) > 1:
@@ -309,6 +309,19 @@ def _parquet(path: Path) -> dict[str, Stored]:
         remedy = "save one of them as a file of its own"
         raise SourceError(path, problem, field="episode_index", remedy=remedy)
     return _in_memory(arrays)
+
+
+def _stacked(path: Path, name: str, lists: NDArray[Any]) -> NDArray[Any]:
+    """Return lists of equal length as a matrix, a list that is missing as NaN."""
+    size = len(lists[0])
+    odd = [row for row, part in enumerate(lists) if part is not None and len(part) != size]
+    if odd:
+        problem = f"row {odd[0]} has a list of {len(lists[odd[0]])} numbers, row 0 one of {size}"
+        remedy = (
+            f"leave such rows out when the table is saved: df[df[{name!r}].str.len() == {size}]"
+        )
+        raise SourceError(path, problem, field=name, remedy=remedy)
+    return np.stack([np.full(size, np.nan) if part is None else part for part in lists])
 
 
 def _as_numbers(values: NDArray[Any]) -> NDArray[Any]:

@@ -117,6 +117,25 @@ def _fits(position: Array, limits: UrdfLimits) -> NDArray[np.bool_]:
     return np.asarray(above & (position.max(axis=0) <= limits.upper[:, None] + _TOLERANCE))
 
 
+def limit_excess(low: Array, high: Array, limits: UrdfLimits) -> Array:
+    """Return how far ranges of positions leave the limits of each joint, negative within them."""
+    return np.maximum(limits.lower - low, high - limits.upper)
+
+
+def whole_turns(
+    low: Array, high: Array, limits: UrdfLimits, turning: NDArray[np.bool_], most: int
+) -> Array:
+    """Return the angles of whole turns [rad] that bring ranges nearest to the limits (n,).
+
+    At most `most` turns, and none where that is as near.
+    """
+    counts = np.array(sorted(range(-most, most + 1), key=abs))
+    turns = 2.0 * np.pi * counts[:, None] * turning
+    excess = limit_excess(low + turns, high + turns, limits)
+    nearest = np.maximum(excess - _TOLERANCE, 0.0).argmin(axis=0)
+    return np.asarray(turns[nearest, np.arange(len(low))])
+
+
 def in_turns(position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]) -> Array:
     """Return positions (m, n) without wraps, a joint within its limits but for a turn within them.
 
@@ -128,12 +147,11 @@ def in_turns(position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]) ->
     usual = ((low > 0.0) & (high < 2.0 * np.pi)) | ((low > -np.pi) & (high < np.pi))
     continued = position.copy()
     continued[:, turning] = unwrap(position[:, turning])
-    result = continued.copy()
-    for turns in (1.0, -1.0, 0.0):
-        turned = continued + 2.0 * np.pi * turns * turning
-        fits = np.diag(_fits(turned, limits)) & turning & usual
-        result[:, fits] = turned[:, fits]
-    return result
+    low = continued.min(axis=0)
+    high = continued.max(axis=0)
+    turns = whole_turns(low, high, limits, turning, 1)
+    fits = limit_excess(low + turns, high + turns, limits) <= _TOLERANCE
+    return np.where(fits & usual, continued + turns, continued)
 
 
 class _Outside(NamedTuple):

@@ -20,7 +20,7 @@ from hil.cell.arms import Links, joints_outside
 from hil.cell.gripper import gripper_joints
 from hil.cell.text import urdf_limits, with_values
 from hil.errors import ArchiveWriteError, SourceError
-from hil.files import file_digest, replace_file
+from hil.files import file_digest, make_folder, replace_file
 from hil.identify.cell_context import nominal_of
 from hil.importers.dh import Convention, urdf_of_dh
 from hil.importers.findings import (
@@ -331,6 +331,7 @@ def write_imported(
             period=period,
         )
 
+    make_folder(output.parent)
     if not force:
         return write(output)
     with _replaced(output) as temporary:

@@ -18,8 +18,9 @@ from hil.errors import SourceError
 from hil.importers.arrays import READERS
 from hil.importers.column_map import HOLE, Column, Format
 from hil.importers.date_stamps import nanoseconds_of_dates
+from hil.importers.list_cells import spread_lists
 from hil.importers.units import unit_of, without_unit
-from hil.reading import read_text, remedy_for_missing
+from hil.reading import open_file, read_text, remedy_for_missing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,6 +59,29 @@ _TYPE: Final = re.compile(
     r"l?real|float(32|64)?|double|single|numeric|number|[usld]{0,2}int(8|16|32|64)?|integer|bool"
     r"(ean)?|l?time|date|datetime|string|text|d?word|byte|[<>]?[fiu][248]"
 )
+_OF_PANDAS: Final = "save its table with pandas: {}(FILE).to_parquet('log.parquet')"
+_BINARY: Final = {
+    b"PK\x03\x04": ("a spreadsheet or a zip file", "save the sheet as CSV, or unpack the file"),
+    b"\xd0\xcf\x11\xe0": ("an Excel file", "save the sheet as CSV"),
+    b"\x1f\x8b": ("compressed by gzip", "unpack it: gunzip FILE"),
+    b"\x28\xb5\x2f\xfd": ("compressed by zstd", "unpack it: unzstd FILE"),
+    b"\x89HDF\r\n": (
+        "HDF5",
+        "save its arrays, of h5py.File(FILE) as f, by names of your choice: "
+        "numpy.savez('log.npz', t=f['t'], q=f['q'], tau=f['tau'])",
+    ),
+    b"ARROW1": ("Feather", _OF_PANDAS.format("pandas.read_feather")),
+    b"\x80\x03": ("a pickle of Python", _OF_PANDAS.format("pandas.read_pickle")),
+    b"\x80\x04": ("a pickle of Python", _OF_PANDAS.format("pandas.read_pickle")),
+    b"\x80\x05": ("a pickle of Python", _OF_PANDAS.format("pandas.read_pickle")),
+    b"PAR1": ("Parquet", "let its name end in .parquet"),
+    b"\x93NUMPY": ("an array of numpy", "let its name end in .npy"),
+    b"MATLAB": ("MATLAB's format", "let its name end in .mat"),
+    b"\x89MCAP0": ("MCAP", "let its name end in .mcap"),
+    b"#ROSBAG": ("a bag of ROS 1", "let its name end in .bag"),
+    b"SQLite format 3": ("a database, as bags of ROS 2 are", "let its name end in .db3"),
+}
+"""Formats by the bytes at their start, each with a remedy."""
 _MARKUP: Final = re.compile(r"\ufeff?\s*(<[?!A-Za-z]|[{\[]\s*[\"{\[]|(?:---\s+)?header:\s)")
 
 
@@ -131,6 +155,7 @@ class Table:
         text = _text(path, form)
         if _MARKUP.match(text):
             raise _description(path, text)
+        text = spread_lists(path, text, drop=form.missing == "drop")
         numbered = [
             (number, line)
             for number, line in enumerate(text.splitlines(), 1)
@@ -320,9 +345,19 @@ class Table:
         raise SourceError(self.path, problem, field=field, remedy=remedy)
 
 
+def _refuse_binary(path: Path) -> None:
+    """Raise SourceError for a file of a format that is no text, whatever its suffix."""
+    with open_file(path) as stream:
+        start = stream.read(_PROBED)
+    for mark, (kind, remedy) in _BINARY.items():
+        if start.startswith(mark):
+            raise SourceError(path, f"is {kind}, not text", remedy=remedy)
+
+
 def _text(path: Path, form: Format) -> str:
     """Return the text of a file in any usual encoding."""
     try:
+        _refuse_binary(path)
         text = read_text(path, _LONGEST, encoding=form.encoding, or_latin=True)
     except (OSError, ValueError, LookupError) as error:
         reason = error.strerror if isinstance(error, OSError) else error

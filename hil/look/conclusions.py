@@ -15,7 +15,7 @@ from hil.identify.sources import cell_of, source_of
 from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, import_recording
 from hil.importers.robot import Robot, Use
 from hil.look.other_arm import Contradictions
-from hil.look.result import Choice, Look, Row
+from hil.look.result import Choice, Look, Row, fit_alike
 from hil.look.run import SETTINGS, look_at_joints, mountings
 from hil.terminal_text import typed
 from identification.errors import IdentificationError
@@ -189,7 +189,7 @@ def undecided(
             "with --map"
         )
     remedy = "; or ".join(steps) or "name joint, unit and sign of each column in a map (--map)"
-    problem = f"two readings fit alike: {readings}"
+    problem = f"{fit_alike(choices)}: {readings}"
     if contradictions.is_doubtful:
         said = "; ".join(contradictions.sentences)
         problem = f"may not be of the arm of the URDF: {said}; and {problem}"

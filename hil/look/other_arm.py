@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.cell.text import UrdfLimits, urdf_limits
+from hil.cell.text import urdf_limits
+from hil.importers.findings import limit_excess, whole_turns
 from hil.look.physics import Size, mounted
 from hil.look.result import Row
 from identification.model.robot import RobotModel
@@ -83,13 +84,14 @@ class Contradictions:
         position = samples.motion.position
         low, high = np.quantile(position, (1.0 - _MOST, _MOST), axis=0)
         turns = model.chain.revolute
-        beyond = _beyond(low, high, limits, turns)
+        turns_aside = whole_turns(low, high, limits, turns, _TURNS)
+        excess = limit_excess(low + turns_aside, high + turns_aside, limits)
         speed = _largest(samples.motion.velocity) / limits.velocity
         effort = _largest(samples.torque) / limits.effort
         motion = size = torque = ""
-        if beyond.max() > _BEYOND:
-            joint = int(beyond.argmax())
-            far = f"{np.degrees(beyond[joint]):.0f}°" if turns[joint] else f"{beyond[joint]:.2g} m"
+        if excess.max() > _BEYOND:
+            joint = int(excess.argmax())
+            far = f"{np.degrees(excess[joint]):.0f}°" if turns[joint] else f"{excess[joint]:.2g} m"
             motion = f"{names[joint]} moves {far} beyond its range"
         elif speed.max() > _OVER:
             joint = int(speed.argmax())
@@ -108,7 +110,7 @@ class Contradictions:
         several = len(changed) > 1
         axes = f"the torque follows it with other {' and '.join(changed)} only" if several else ""
         is_larger = expected.by_masses and size.endswith(expected.basis)
-        is_far = is_larger or bool(np.any(beyond > np.where(turns, _FAR, np.inf)))
+        is_far = is_larger or bool(np.any(excess > np.where(turns, _FAR, np.inf)))
         return cls(motion, size, lengths, torque, axes, is_far=is_far)
 
     @property
@@ -165,13 +167,6 @@ def _with_lengths(
     model = mounted(cell, (x, y, z)).model
     other = score_of(model, samples)
     return other.overall, compare(other, score, model)
-
-
-def _beyond(low: Array, high: Array, limits: UrdfLimits, turns: NDArray[np.bool_]) -> Array:
-    """Return how far positions leave the range of each joint (n,), whole turns aside."""
-    places = 2.0 * np.pi * np.arange(-_TURNS, _TURNS + 1)[:, None] * turns
-    excess = np.maximum(limits.lower - (low + places), high + places - limits.upper)
-    return np.asarray(excess.min(axis=0))
 
 
 def _largest(values: Array) -> Array:

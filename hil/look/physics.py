@@ -64,6 +64,7 @@ _ASPECTS: Final[Mapping[Meaning, str]] = {
 }
 """The row of the table that a change belongs to."""
 _HALF: Final = 0.5
+_MOST_CHOICES: Final = 3
 _ALIKE: Final = 1.02  # error ratio of readings of which the recording does not choose one
 _OTHER_UNIT: Final = 3.0  # factor beyond which the masses of a URDF do not explain a torque
 _THOUSAND: Final = 1000.0
@@ -369,13 +370,16 @@ class Finding:
         return Row("payload", "none stated; part of the last body", "likely", reason, decide)
 
     def questions(self) -> tuple[tuple[Choice, ...], ...]:
-        """Return the readings that fit alike."""
+        """Return the readings that fit alike, the best of each meaning."""
         choices = []
         for step in self.readings.steps:
             if not step.alike:
                 continue
             pairs = [(step.change, step.error), *step.alike]
-            choices.append(tuple(self._choice(step, change, error) for change, error in pairs[:2]))
+            meanings = [change.meaning for change, _ in pairs]
+            first = [pair for k, pair in enumerate(pairs) if meanings[k] not in meanings[:k]]
+            shown = first[:_MOST_CHOICES] if len(first) > 1 else pairs[:2]
+            choices.append(tuple(self._choice(step, *pair) for pair in shown))
         size = self.size
         if size.is_off and not size.is_thousand and (size.factor or 1.0) < 1.0:
             choices.append(self._sides())

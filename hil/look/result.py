@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -30,7 +31,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Choice:
-    """One of two readings that fit alike.
+    """One of the readings that fit alike.
 
     Attributes:
         aspect: that of a row.
@@ -57,6 +58,11 @@ class Group:
     identifiable: int
     weak: int
     missing: int
+
+
+def fit_alike(choices: Sequence[Choice]) -> str:
+    """Return how many readings fit alike, in words."""
+    return f"{'two' if len(choices) == 2 else 'three'} readings fit alike"
 
 
 @dataclass(frozen=True)

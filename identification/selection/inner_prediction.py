@@ -71,6 +71,7 @@ DETAILS: Final[frozenset[str]] = frozenset({"bandwidth", "presliding"})
 a narrower bandwidth: what is smoothed away is not predicted wrongly, but on another motion."""
 CERTAIN: Final = 3.0
 LOW_PASS: Final = "low-pass of the torque"
+REVERSAL: Final = "reversal of dry friction"
 DELAY: Final = "delay of the torque"
 LOAD: Final = "friction that grows with load"
 STRENGTH: Final = "strength of the prior"
@@ -87,6 +88,9 @@ PRESLIDING: Final = (3e-5, 1e-6, 1e-5, 1e-4, 3e-4, 1e-3)  # rad or m
 # Rows of a joint that stands while another moves hold its load; but those near a reversal, or at
 # rest by brake or static friction, can mislead.
 LEFT_OUT: Final[tuple[LeftOut, ...]] = ("rests", "halts", "slow")
+# Speeds over which dry friction may reverse smoothly, and factors that refine the best of them.
+REVERSAL_SPEEDS: Final = (0.02, 0.08, 0.3)  # rad/s or m/s
+REVERSAL_STEPS: Final = (1.5, 1.25, 1.12, 1.06, 1.03, 1.015, 1.008)
 NEARBY: Final = (1.0, 0.9, 0.95, 1.05, 1.1)  # factors of the bandwidth of a low-pass
 STRENGTHS: Final = (1.0, 4.0)
 """Weights of the prior: factors of the rows that count as one by the correlation of residuals.
@@ -504,9 +508,32 @@ def _compare_low_passes(
         both = trial.decide(LOW_PASS, [late, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
         if delay.choice.chosen and not both.choice.chosen:
             return late, [*choices, delay.choice, both.choice]
+    if decision.choice.chosen and "friction" in questions:
+        # Dry friction that reverses smoothly, as in most simulators, resembles it: of a filter that
+        # does not exist.
+        reversal = _smooth_reversal(trial, start, filtered)
+        if reversal.choice.chosen:
+            return reversal.settings, [*choices, reversal.choice]
     if decision.choice.chosen:
         return filtered, [*behind, decision.choice]
     return now, [*choices, decision.choice]
+
+
+def _smooth_reversal(trial: _Trial, now: Settings, filtered: Settings) -> _Decision:
+    """Choose friction of ``tanh(v / v_t)`` in place of a low-pass if it predicts clearly better."""
+    best = trial.best([_with_tanh(now, speed) for speed in REVERSAL_SPEEDS])
+    for step in REVERSAL_STEPS:
+        if trial.best([best, filtered]) is filtered and step < REVERSAL_STEPS[0]:
+            break
+        speed = float(best.friction["tanh"])
+        best = trial.best([best, *(_with_tanh(now, speed * part) for part in (1.0 / step, step))])
+    return trial.decide(
+        REVERSAL, [filtered, best], LOW_PASS_WORTHWHILE, by_joint=True, certainty=CERTAIN
+    )
+
+
+def _with_tanh(now: Settings, speed: float) -> Settings:
+    return now.with_friction(tanh=speed).preprocessed(left_out="rests")
 
 
 class _Decision(NamedTuple):

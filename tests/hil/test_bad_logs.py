@@ -106,6 +106,14 @@ def xml(path: Path, _: Table) -> Path:
     return path
 
 
+def starts_with(mark: bytes) -> Callable[[Path, Table], Path]:
+    def write(path: Path, _: Table) -> Path:
+        path.write_bytes(mark + bytes(range(256)))
+        return path
+
+    return write
+
+
 def a_hollow_mat(path: Path, _: Table) -> Path:
     path = path.with_suffix(".mat")
     head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
@@ -129,6 +137,11 @@ CASES: list[tuple[Callable[[Path, Table], Path], str, str]] = [
     (of_another_motion, "its torque does not follow the arm of the URDF", "give the URDF of this"),
     (a_urdf, "is a robot description (URDF), not a recording", "LOG --urdf arm.urdf"),
     (xml, "is XML, not a table of numbers", "give a table of numbers"),
+    (starts_with(b"PK\x03\x04"), "is a spreadsheet or a zip file", "save the sheet as CSV"),
+    (starts_with(b"\x1f\x8b\x08"), "is compressed by gzip", "gunzip"),
+    (starts_with(b"ARROW1\0\0"), "is Feather", "pandas.read_feather"),
+    (starts_with(b"\x80\x05\x95"), "is a pickle of Python", "pandas.read_pickle"),
+    (starts_with(b"\x89HDF\r\n\x1a\n"), "is HDF5", "numpy.savez"),
     (a_hollow_mat, "its data are lost", "copy it again"),
 ]
 

@@ -21,8 +21,11 @@ from tests.hil.test_log_kinds import URDF
 COMPLAINTS = {"resolution", "outliers", "generalisation", "joint order"}
 
 
-def write_clean_log(path: Path, urdf: Path, *, repeated: bool) -> Path:
-    """Write the torques of the URDF's own rigid model; every second stamp may repeat another."""
+def write_clean_log(path: Path, urdf: Path, *, repeated: bool, smooth: float = 0.0) -> Path:
+    """Write the torques of the URDF's own rigid model; every second stamp may repeat another.
+
+    With a speed `smooth` [rad/s] there is friction, which reverses as in simulators.
+    """
     model = pin.buildModelFromUrdf(str(urdf))
     data, random = model.createData(), np.random.default_rng(0)
     time = np.arange(2500) / 250.0
@@ -33,6 +36,9 @@ def write_clean_log(path: Path, urdf: Path, *, repeated: bool) -> Path:
     acceleration = -0.25 * (rate**2 * np.sin(angle)).sum(axis=1)
     states = zip(position, velocity, acceleration, strict=True)
     torque = np.array([pin.rnea(model, data, *state) for state in states])
+    if smooth:
+        size = np.sqrt(np.mean(torque**2, axis=0))
+        torque += size * (0.2 * np.tanh(velocity / smooth) + 0.05 * velocity)
     stamps = np.repeat(time[::2], 2) if repeated else time
     np.savez(path, time=stamps, position=position, velocity=velocity, torque=torque)
     return path
@@ -48,14 +54,19 @@ LIFT = (
 """A prismatic joint along gravity below the three joints."""
 
 
-@pytest.fixture(scope="module", params=["three joints", "on a lift", "UR5", "UR5, stamps repeated"])
+ARMS = ["three joints", "on a lift", "UR5", "UR5, stamps repeated", "smooth 0.05", "smooth 0.2"]
+
+
+@pytest.fixture(scope="module", params=ARMS)
 def arm(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> IdentifiedArm:
     folder, urdf = tmp_path_factory.mktemp("clean"), urdf_path("ur5_robot.urdf")
     if not request.param.startswith("UR5"):
         urdf = folder / "three.urdf"
         lifted = URDF.replace("<link name='base'/>", LIFT)
         urdf.write_text(lifted if request.param == "on a lift" else URDF)
-    log = write_clean_log(folder / "log.npz", urdf, repeated="repeated" in request.param)
+    kind, _, speed = request.param.partition("smooth ")
+    smooth = float(speed or 0.0)
+    log = write_clean_log(folder / "log.npz", urdf, repeated="repeated" in kind, smooth=smooth)
     return hil.identify(log, urdf=urdf)  # without a warning of numpy, which would be an error
 
 

@@ -1015,6 +1015,12 @@ class TestReplacing:
         arguments = ["import", "log", str(tmp_path / "log.npz"), "-o", str(tmp_path / "a.mcap")]
         return [*arguments, "--urdf", str(panda.urdf), "--lock-others", "--map"]
 
+    def test_a_folder_that_is_missing_is_made(self, command: list[str], tmp_path: Path) -> None:
+        place = tmp_path / "new" / "a.mcap"
+        arguments = [*command, str(tmp_path / "q.toml"), "-o", str(place), "--force"]
+        assert CliRunner().invoke(app, arguments).exit_code == 0
+        assert open_archive(place).header.purpose
+
     @pytest.mark.long
     def test_only_with_force(self, command: list[str], tmp_path: Path) -> None:
         right = [*command, str(tmp_path / "q.toml")]

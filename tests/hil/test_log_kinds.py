@@ -12,8 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from hil.archive import Archive, open_archive
+from hil.cell.text import UrdfLimits
 from hil.errors import SourceError
 from hil.importers import ColumnMap, Robot, import_log
+from hil.importers.findings import whole_turns
 
 Floats = NDArray[np.float64]
 RATE, COUNT = 250, 400
@@ -463,3 +465,15 @@ def test_cases_have_the_samples_of_plain(tmp_path: Path, cases: Path, name: str)
     assert np.abs(elapsed - expected["stamp"] + expected["stamp"][0]).max() < 1000  # ns
     for quantity in ("position", "torque"):
         assert samples[quantity] == pytest.approx(expected[quantity], abs=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("low", "turns"),
+    [(-0.5, 0), (0.04 - 3.0, 0), (5.5, -1), (-6.9, 1), (11.8, -2), (-19.4, 3)],
+)
+def test_whole_turns_bring_a_joint_nearest_to_its_limits(low: float, turns: int) -> None:
+    limits = UrdfLimits(*(np.array([value]) for value in (-3.0, 3.0, 1.0, 1.0)))
+    joint = np.array([low])
+    angle = whole_turns(joint, joint + 0.5, limits, np.array([True]), 3)
+    assert angle == pytest.approx(2.0 * np.pi * turns)
+    assert not whole_turns(joint, joint + 0.5, limits, np.array([False]), 3)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from hil.archive import open_archive
@@ -100,6 +101,18 @@ def dates_without_name(path: Path) -> Path:
     return path
 
 
+def lists(bracket: Callable[[Floats], str]) -> Callable[[Path], Path]:
+    """`DataFrame.to_csv` of columns whose cells are lists, tuples or arrays."""
+
+    def write(path: Path) -> Path:
+        rows = zip(TIME, POSITION, TORQUE, strict=True)
+        lines = [f'{time:.15g},"{bracket(q)}","{bracket(tau)}"' for time, q, tau in rows]
+        path.write_text("\n".join(["t,q,tau", *lines]) + "\n")
+        return path
+
+    return write
+
+
 ORDER = (2, 0, 1)
 
 
@@ -148,6 +161,9 @@ LAYOUTS: Mapping[str, Callable[[Path], Path]] = {
     "ros2 topic echo": echo_without_header,
     "ros2 topic echo in the order of the URDF": echo_in_order,
     "rostopic echo": echo_with_header,
+    "cells that are lists": lists(lambda row: str(row.tolist())),
+    "cells that are tuples": lists(lambda row: str(tuple(row.tolist()))),
+    "cells that are arrays": lists(lambda row: str(row).replace(" ", "  ")),
 }
 
 
@@ -175,6 +191,30 @@ def test_its_map_reads_it_again(tmp_path: Path, robot: Robot, layout: str) -> No
     again = import_recording(path, tmp_path / "b.mcap", lambda _: robot, options)
     columns = [open_archive(recording.archive).columns for recording in (first, again)]
     assert all(np.array_equal(columns[0][name], columns[1][name]) for name in columns[1])
+
+
+class TestListsOfAnotherLength:
+    def test_of_text_are_named_and_left_out(self, tmp_path: Path, robot: Robot) -> None:
+        path = lists(lambda row: str(row.tolist()))(tmp_path / "log.csv")
+        lines = path.read_text().splitlines()
+        lines[20] = f'{TIME[19]},"[0.1, 0.2]","[1.0, 2.0, 3.0]"'
+        path.write_text("\n".join(lines) + "\n")
+        with pytest.raises(SourceError, match=r"q: line 21 has a list of 2 numbers.*--drop-miss"):
+            imported(path, robot)
+        without = ImportOptions(drop_missing=True)
+        archive = import_recording(path, tmp_path / "b.mcap", lambda _: robot, without).archive
+        assert len(open_archive(archive).columns["stamp"]) == len(TIME) - 1
+
+    def test_of_a_parquet_are_named(self, tmp_path: Path, robot: Robot) -> None:
+        path = tmp_path / "log.parquet"
+        frame = pd.DataFrame({"t": TIME, "q": POSITION.tolist(), "tau": TORQUE.tolist()})
+        frame.at[7, "q"] = [0.1]
+        frame.to_parquet(path)
+        with pytest.raises(SourceError, match="q: row 7 has a list of 1 numbers") as refused:
+            imported(path, robot)
+        assert str(refused.value).endswith("df[df['q'].str.len() == 3]")
+        frame[frame["q"].str.len() == 3].to_parquet(path)
+        imported(path, robot)
 
 
 def test_names_in_rows_are_said(tmp_path: Path, robot: Robot) -> None:

@@ -18,6 +18,7 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
+from benchmarks.look import measure
 from hil.archive import open_archive
 from hil.cli import app
 from hil.errors import SourceError
@@ -32,8 +33,9 @@ from hil.look.physics import channel_rows
 from hil.look.result import Choice
 from hil.look.run import SETTINGS
 from identification.estimators.delay import DelayEstimate
+from identification.model.robot import RobotModel
 from identification.signals.samples import prepare
-from identification.validation.readings import Axes, Change, score_of
+from identification.validation.readings import Axes, Change, Score, compare, score_of
 from tests.hil.simulated_logs import write_log, write_moving_log
 from tests.hil.test_importers_rosbag2 import STATE, bag, state, states
 from tests.hil.test_log_kinds import JOINTS, URDF
@@ -124,6 +126,37 @@ def test_a_planted_meaning_is_named(
 ) -> None:
     looked = look(urdf, tmp_path / "a.csv", table, **plant(table))
     assert phrase in reading(looked, aspect)[0]
+
+
+def test_a_torque_is_compared_with_itself(urdf: Path, tmp_path: Path) -> None:
+    """Another order of the torques is no other error."""
+    model = RobotModel.from_urdf(urdf.read_text())
+    squares = np.random.default_rng(0).uniform(1.0, 2.0, (20, 3)) * [1.0, 100.0, 1e-6]
+    torque = np.array([400.0, 900.0, 1e-4])  # the last is too small to decide
+    score = Score(squares, torque, np.ones(3), np.ones(3), np.arange(3))
+    order = np.array([2, 0, 1])
+    other = Score(squares[:, order], torque[order], np.ones(3), np.ones(3), order)
+    assert compare(other, score, model).ratio == pytest.approx(1.0)
+    halved = replace(other, squares=0.25 * other.squares)
+    assert compare(halved, score, model).ratio == pytest.approx(0.5)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("arm", "meaning"),
+    [
+        ("lwr4", "torque 6 negated"),
+        ("lwr4", "joints permuted"),
+        ("lwr4", "zero of joint 2"),
+        ("lwr4", "zero of joint 4"),
+        ("lwr4", "position 6 negated"),
+        ("gen3", "joints permuted"),
+    ],
+)
+def test_a_meaning_planted_in_a_real_log(shared_data: Path, arm: str, meaning: str) -> None:
+    (row,) = measure(shared_data, arm, meaning)
+    assert row["right"], row["said"]
+    assert not row["wrong"]
 
 
 def test_a_delay_that_other_parts_do_not_confirm_is_open() -> None:
