@@ -31,7 +31,7 @@ from hil.cell import Cell
 from hil.errors import ControllerError
 from hil.simulation import simulated_link
 from hil.testing import faulty_link
-from planner import Move, PiecewiseCubic, plan_moves
+from planner import Move, PiecewiseCubic, TrajectoryPlayer, plan_moves
 from tests.hil.fast_cell import fast_campaign, fast_cell, on_path
 from tests.laws.motions import as_planned
 from tests.laws.second_reader import read
@@ -133,6 +133,37 @@ def test_a_hold_rests_on_the_path_and_is_resumed(arm: WatchedArm) -> None:
     moving = np.flatnonzero(~rests)
     assert rests[moving[0] : moving[-1]].sum() > 10, "no rest in the midst of the motion"
     np.testing.assert_allclose(points[-1], arm.motion.sample(np.array([1e9]))[0][0], atol=2e-3)
+
+
+def test_a_motion_that_ends_during_a_hold_ends_its_supervision(
+    arm: WatchedArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was waited for the operator to release a motion that had ended, forever."""
+    advance = TrajectoryPlayer.advance
+
+    def fails_at_rest(player: TrajectoryPlayer) -> tuple[np.ndarray, np.ndarray]:
+        if player.rate == 0.0 and player.motion_time > 0.1:
+            raise RuntimeError("planted")
+        return advance(player)
+
+    def script(time: float, asked: int) -> OperatorRequest:
+        assert asked < 1000, "the operator is asked after the end of the motion"
+        return OperatorRequest(held=time > 0.4)
+
+    monkeypatch.setattr(TrajectoryPlayer, "advance", fails_at_rest)
+    monkeypatch.setattr("hil.campaign.link.REQUEST_PERIOD", 0.0)
+    stop = Stop()
+    seen = Watcher(script)
+    show = seen.show
+
+    def show_some(progress: MotionProgress) -> None:
+        show(progress)
+        stop.requested = len(seen.seen) > 1000  # else a failure would not end
+
+    monkeypatch.setattr(seen, "show", show_some)
+    ended = arm.run(seen, stop)
+    assert (ended.outcome, stop.requested) == ("refused", False)
+    assert "planted" in ended.reason
 
 
 def test_a_stop_ends_a_hold(arm: WatchedArm) -> None:
