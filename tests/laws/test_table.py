@@ -77,7 +77,7 @@ def test_a_motion_that_counts_was_executed_as_planned(monkeypatch: pytest.Monkey
     assert texts == [f"{path} counts, and it ended ''"]
 
 
-def test_every_part_of_the_evidence_has_a_law_and_nothing_is_judged_without() -> None:
+def test_every_part_of_the_evidence_has_a_law() -> None:
     parts = {field.name for field in fields(Evidence)} - CONTEXT
     assert {law.part for law in LAWS.values()} - {"entries"} == parts
     assert applying(Evidence()) == []
