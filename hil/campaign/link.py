@@ -538,8 +538,9 @@ class _Supervision:
         while True:
             if control.due:
                 control.show(self._link.cell.drive_train, self._guard, port.status())
-            if not self._link.motion_ended:
-                control.follow()
+            if self._link.motion_ended:
+                return  # nothing is left to be released
+            control.follow()
             rests = port.is_virtual and control.held and port.status().rate == 0.0
             if not rests or self._stop.requested:
                 return

@@ -12,8 +12,10 @@ from hil.archive import open_archive
 from hil.errors import ArchiveError
 from hil.identify import identify_archives
 from hil.progress import Silent
-from tests.disk.damage import KINDS, SWAPPED, Undamaged, blamed, broken, campaign, play
+from tests.disk.damage import KINDS, SWAPPED, campaign, harmed, play
+from tests.disk.readers import Undamaged, blamed
 from tests.hil.mcap_bytes import chunks
+from tests.laws.table import broken
 
 pytestmark = pytest.mark.safety
 
@@ -89,5 +91,6 @@ def test_wrong_sample_violates_a_law(truth: Undamaged, monkeypatch: pytest.Monke
         current[len(current) // 2] += 0.002
         return replace(archive, columns={**archive.columns, "target_current": current})
 
-    monkeypatch.setattr("tests.disk.damage.open_archive", wrong)
-    assert any("never written" in law for law in broken(truth, [path], 1))
+    monkeypatch.setattr("tests.disk.readers.open_archive", wrong)
+    unchanged = {path: truth.files[path]}
+    assert any("never written" in text for _, text in broken(harmed(truth, unchanged, 1)))

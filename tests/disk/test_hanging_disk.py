@@ -22,8 +22,8 @@ from tests.disk.disks import Disk, processes_disk
 from tests.faults import DiskFault, parse_disk_fault
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 from tests.hil.loopback import loopback_link, on_loopback
-from tests.laws.archives import gap_free, not_truncated, nothing_lost, readable
-from tests.laws.second_reader import read
+from tests.laws.evidence import ArchiveFile, Broken, Evidence
+from tests.laws.table import broken
 
 pytestmark = pytest.mark.safety
 
@@ -81,20 +81,11 @@ def run(campaign: Campaign, disk: Disk, rule: DiskFault | None, after: str) -> E
     return Ended(process.returncode, output, arm)
 
 
-def lost(campaign: Campaign) -> list[str]:
+def lost(campaign: Campaign) -> list[Broken]:
     """What the laws of archives say: nothing of what was answered is lacking."""
-    problems = []
-    for path in sorted(campaign.folder.archives.glob("*.mcap")):
-        archive = open_archive(path)
-        outcome = archive.outcome or ArchiveOutcome()
-        texts = (
-            *not_truncated(complete=archive.complete, problem=archive.missing or "", excused=False),
-            *nothing_lost(outcome.records_lost),
-            *gap_free(archive.columns["cycle"], outcome.lost_packets or 0),
-            *readable(read(path), campaign.cell.period),
-        )
-        problems += [f"{path.name}: {text}" for text in texts]
-    return problems
+    paths = sorted(campaign.folder.archives.glob("*.mcap"))
+    files = tuple(ArchiveFile.of(path) for path in paths)
+    return broken(Evidence(period=campaign.cell.period, files=files))
 
 
 @pytest.mark.slow

@@ -14,12 +14,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
 from drivers.transports.simulated import SimulatedTransport
-from hil.archive import open_archive
 from hil.campaign import Campaign, CampaignPlan
 from hil.campaign.virtual_link import VirtualLink
 from hil.cell import Cell
@@ -30,18 +28,10 @@ from hil.simulation import controller_settings, simulated_controller
 from tests.disk.disks import Disk, planted_disk
 from tests.faults import CREATE, REFUSALS, RENAME, SYNC, WRITE, DiskFault, parse_disk_fault
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
-from tests.laws.archives import gap_free, readable
-from tests.laws.arm import stands
-from tests.laws.errors import OF_DISKS, of_disk
-from tests.laws.manifests import (
-    Entry,
-    entered_as_archived,
-    entered_once,
-    entries_kept,
-    manifest_of,
-    nothing_missing,
-)
-from tests.laws.second_reader import read
+from tests.laws.errors import OF_DISKS
+from tests.laws.evidence import ArchiveFile, Evidence, Rest, entries_of
+from tests.laws.manifests import Entry
+from tests.laws.table import Scenario, broken, judged
 
 pytestmark = pytest.mark.safety
 
@@ -91,51 +81,68 @@ def random_rule(rng: random.Random) -> DiskFault:
     )
 
 
-def entered(campaign: Campaign) -> list[Entry]:
-    return manifest_of(campaign.folder.root)[1]
+def entered(campaign: Campaign) -> tuple[Entry, ...]:
+    return entries_of(campaign.folder.root)
 
 
-def unreadable(campaign: Campaign) -> Iterator[str]:
-    """Each file has a prefix without gaps, or was truncated before its header and not entered."""
+def files_of(campaign: Campaign) -> tuple[tuple[ArchiveFile, ...], tuple[str, ...]]:
+    """Return the archives, and what is wrong with files that cannot be opened.
+
+    A file may be truncated anywhere, if it is not entered before its header.
+    """
     in_manifest = {entry.name for entry in entered(campaign)}
+    files: list[ArchiveFile] = []
+    problems: list[str] = []
     for path in campaign.folder.archives.glob("*.mcap"):
         try:
-            cycles = open_archive(path).columns.get("cycle", np.zeros(0))
+            files.append(ArchiveFile.of(path, excused=True))
         except NotAnArchiveError:
             if path.name in in_manifest:
-                yield f"{path.name} is entered and no archive"
+                problems.append(f"{path.name} is entered and no archive")
         except ArchiveError as error:
-            yield f"{path.name}: {error}"
-        else:
-            laws = (*gap_free(cycles), *readable(read(path), campaign.cell.period))
-            yield from (f"{path.name}: {text}" for text in laws)
-    for entry in entered(campaign):
-        yield from entered_as_archived(entry, campaign.folder.root)
+            problems.append(f"{path.name}: {error}")
+    return tuple(files), tuple(problems)
+
+
+def evidence_of(campaign: Campaign, before: tuple[Entry, ...], **parts: Any) -> Evidence:
+    files, unreadable = files_of(campaign)
+    return Evidence(
+        period=campaign.cell.period,
+        files=files,
+        unreadable=unreadable,
+        folder=campaign.folder.root,
+        manifests=(before, entered(campaign)),
+        **parts,
+    )
 
 
 def refused_run(disk: Disk, campaign: Campaign, rule: DiskFault) -> list[str]:
     """Run on a disk that fails, then on one that works; return the failed operations."""
-    before = entered(campaign)
-    disk.do_wrong(rule)
-    raised = None
-    try:
-        Campaign.open(campaign.folder.root).run(
-            None, None, Silent(), accept_dry_run=True, durable=True
-        )
-    except HilError as error:
-        raised = error
-    struck = disk.do_wrong()
-    assert bool(struck) == (raised is not None), f"{struck} struck, and it was raised: {raised}"
-    if raised is not None:
-        assert list(of_disk(raised, campaign.folder.root)) == []
-    after = entered(campaign)
-    assert list(entries_kept(before, after)) == []
-    assert list(unreadable(campaign)) == []
-    result = Campaign.open(campaign.folder.root).run(None, None, Silent(), accept_dry_run=True)
-    assert result.complete
-    assert list(entries_kept(after, entered(campaign))) == []
-    counts = (1, campaign.cell.campaign.repetitions, len(campaign.plan.validation))
-    assert [*nothing_missing(entered(campaign), counts), *entered_once(entered(campaign))] == []
+    root = campaign.folder.root
+    struck: list[str] = []
+
+    def refused() -> Evidence:
+        before = entered(campaign)
+        disk.do_wrong(rule)
+        raised = None
+        try:
+            Campaign.open(root).run(None, None, Silent(), accept_dry_run=True, durable=True)
+        except HilError as error:
+            raised = error
+        struck.extend(disk.do_wrong())
+        return evidence_of(campaign, before, disk=(tuple(struck), raised))
+
+    def works() -> Evidence:
+        before = entered(campaign)
+        result = Campaign.open(root).run(None, None, Silent(), accept_dry_run=True)
+        assert result.complete
+        counts = (1, campaign.cell.campaign.repetitions, len(campaign.plan.validation))
+        motions = {("excitation", k): campaign.plan.excitation.trajectory for k in range(counts[1])}
+        motions |= {("validation", k): v.trajectory for k, v in enumerate(campaign.plan.validation)}
+        return evidence_of(campaign, before, counts=counts, motions=motions)
+
+    assert judged(Scenario(root.name, (str(rule),), refused)) == []
+    assert judged(Scenario(f"{root.name}, resumed", (), works)) == []
     return struck
 
 
@@ -198,8 +205,9 @@ def test_rehearsal_passes_after_a_disk_error(disk: Disk, designed: Designed) -> 
         disk.do_wrong(parse_disk_fault(f"EIO@{operation}+{after}:*"))
         with pytest.raises(HilError) as raised:
             campaign.rehearse()
-        assert disk.do_wrong()
-        assert list(of_disk(raised.value, campaign.folder.root)) == []
+        refused = (tuple(disk.do_wrong()), raised.value)
+        assert refused[0]
+        assert broken(Evidence(folder=campaign.folder.root, disk=refused)) == []
         assert Campaign.open(campaign.folder.root).rehearse().passed
 
 
@@ -322,4 +330,5 @@ def test_removed_folder_is_reported_with_the_arm_at_rest(
     assert raised.value.exit_code in (1, 2)
     assert str(root) in str(raised.value)
     assert "check whether it was moved or removed" in str(raised.value)
-    assert list(stands(controller.plant.velocity, 1e-3, "at the end")) == []
+    rest = Rest("at the end", controller.plant.velocity, 1e-3)
+    assert broken(Evidence(rests=(rest,))) == []

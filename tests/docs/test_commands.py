@@ -20,6 +20,7 @@ from hil import Campaign, Cell
 from hil.campaign import design
 from hil.cli import app
 from hil.progress import Silent
+from tests import messages
 from tests.docs.typed import PAGES, ROOT, commands, parse
 from tests.hil.simulated_logs import write_moving_log
 
@@ -253,7 +254,7 @@ def test_ten_lines_of_the_readme_identify_a_log(
     begin = time.process_time()
     exec(compile(code, "README.md", "exec"), names)
     assert time.process_time() - begin < 10.0
-    assert capsys.readouterr().out.startswith("The model predicts the rest of the same motion well")
+    assert capsys.readouterr().out.startswith(messages.PREDICTS_SAME_MOTION)
     assert np.abs(names["holding"]).max() > 0.0
     assert (workplace / "result" / "report.html").exists()
     assert (workplace / "torques.png").stat().st_size > 5_000

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import itertools
+import socket
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from drivers.exchange.loop import exchange
+from drivers.session import Session
 from drivers.states import (
     HAS_SET_POINTS,
     LOSS_WINDOW,
@@ -20,7 +26,8 @@ from drivers.states import (
     decide,
     keeps_request,
 )
-from tests.drivers.rig import PERIOD, moving
+from drivers.transports.udp import UdpSpec
+from tests.drivers.rig import PERIOD, Cruise, Rig, moving
 
 pytestmark = pytest.mark.safety
 
@@ -155,16 +162,56 @@ class TestLosses:
         assert tracker.instead_of_packets == "the controller restarted: it sent sync packets"
 
 
+class TestOwner:
+    @pytest.fixture
+    def setters(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, set[str]]:
+        """Files that set a value of a session, by its name."""
+        setters: dict[str, set[str]] = {}
+
+        def note(session: Session, name: str, value: object) -> None:
+            caller = Path(sys._getframe(1).f_code.co_filename)
+            setters.setdefault(name, set()).add(caller.name)
+            object.__setattr__(session, name, value)
+
+        monkeypatch.setattr(Session, "__setattr__", note, raising=False)
+        return setters
+
+    def test_only_the_session_changes_its_state(self, setters: dict[str, set[str]]) -> None:
+        """To the end of a motion, after a long gap, a refusal, a silence and a restart."""
+        rig = moving(20)[0]
+        rig.session.stop("over")
+        rig.run()
+        assert rig.ended.outcome == "stopped"
+        rig = moving()[0]
+        rig.miss(2 * GAP)
+        rig.run()
+        rig = moving()[0]
+        rig.put_arm_at(rig.records["position"][-1] + 1.0)
+        rig.cycle()
+        assert rig.state is State.FAULTED
+        rig = moving()[0]
+        rig.session.tick(rig.now + 60.0)
+        rig.start()
+        assert rig.state is State.INIT
+        changed = {"state", "stop_reason", "execution", "interval", "in_interval", "entered_at"}
+        assert changed <= set(setters)
+        assert set().union(*setters.values()) == {"session.py"}
+
+
 IN_THE_SESSION = {
     "session", "packets", "safe_reply", "open_mode", "guard", "drive_train", "execution",
 }  # fmt: skip
-"""With `transports.udp` and `exchange.loop` before them the nine files from packet to reply."""
 BESIDE = {"states", "record"}
 """The session's table, and the ring that receives the record."""
 
 
-def test_a_packet_in_motion_passes_these_files_only():
-    rig, _ = moving()
+BEFORE = {"udp", "loop"}
+"""Transport and exchange: the nine files from packet to reply begin with them."""
+
+
+@contextmanager
+def files_passed() -> Iterator[set[str]]:
+    """Files of `drivers` whose functions are called."""
     folder = str(Path(__file__).parents[2] / "drivers")
     passed: set[str] = set()
 
@@ -172,12 +219,44 @@ def test_a_packet_in_motion_passes_these_files_only():
         if event == "call" and frame.f_code.co_filename.startswith(folder):
             passed.add(Path(frame.f_code.co_filename).stem)
 
-    packet = rig.packet()
     sys.setprofile(note)
     try:
-        reply = rig.session.reply(packet, rig.now)
+        yield passed
     finally:
         sys.setprofile(None)
+
+
+def test_a_packet_in_motion_passes_these_files_only():
+    rig, _ = moving()
+    packet = rig.packet()
+    with files_passed() as passed:
+        reply = rig.session.reply(packet, rig.now)
     assert reply is not None
     assert rig.session.execution is not None
     assert passed == IN_THE_SESSION | BESIDE
+
+
+def test_a_packet_from_the_network_passes_nine_files():
+    """From the socket to the socket, in motion, at this moment, however busy the computer is."""
+    rig = Rig(silence_timeout=60.0)
+    rig.now = time.monotonic() - 300 * PERIOD
+    rig.session.request(Cruise())
+    rig.open()
+    rig.cycle(200)
+    transport = UdpSpec("127.0.0.1", 0, "127.0.0.1").open()
+    controller = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    with closing(transport), controller:
+        controller.settimeout(10.0)
+        controller.sendto(rig.packet(), transport.address)
+        replied = rig.session.counters.replied
+        with files_passed() as passed:
+            exchange(
+                transport,
+                rig.session,
+                ends_when=lambda: rig.session.counters.replied > replied,
+            )
+        assert len(controller.recv(2048)) == len(rig.packet())
+    assert rig.state is State.OPEN
+    assert rig.session.execution is not None
+    assert passed == BEFORE | IN_THE_SESSION | BESIDE
+    assert len(BEFORE | IN_THE_SESSION) == 9

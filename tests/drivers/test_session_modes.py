@@ -12,6 +12,7 @@ from drivers.errors import (
 from drivers.packets import MODE_FIELDS
 from drivers.states import HOLDABLE, INCREMENTAL, POSITION_MODES
 from planner import JointLimits, TrajectoryPlayer, plan
+from tests import messages
 from tests.drivers.rig import (
     MOVE,
     PERIOD,
@@ -171,7 +172,7 @@ class TestHold:
         rig.run()
         assert source.stops == 1
         assert rig.ended.outcome == "stopped"
-        assert rig.ended.reason == "held, which this motion cannot: it was stopped instead"
+        assert rig.ended.reason == messages.CANNOT_HOLD
         rig = closed()  # one that has not begun is dropped
         rig.session.request(Cruise())
         rig.session.hold()

@@ -14,7 +14,8 @@ import pytest
 
 from drivers.exchange.control import BINS, upper_edge
 from tests.endurance.__main__ import main
-from tests.endurance.verdict import PROCESSES, Line, Piece, judge, read_journal
+from tests.endurance.piece import PROCESSES, Line, Piece
+from tests.endurance.verdict import judge, read_journal
 from tests.journal import Journal
 
 pytestmark = pytest.mark.safety

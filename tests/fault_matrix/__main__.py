@@ -47,7 +47,7 @@ def main() -> None:
             outcomes = [run.outcome for run in runs]
             cells.append(" / ".join(outcomes if len(set(outcomes)) > 1 else outcomes[:1]))
             for run in runs:
-                broken.update(run.broken)
+                broken.update((text for _, text in run.broken))
                 if run.outcome != "no start" and not run.recovery.startswith("completed"):
                     broken[f"a new motion afterwards: {run.recovery}"] += 1
         sys.stdout.write("| " + " | ".join(cells) + " |\n")

@@ -36,7 +36,8 @@ from sim_fixtures.faults import split_faults
 from tests.drivers.judge import Conduct, Judged
 from tests.fault_matrix import small_cell
 from tests.faults import parse_script
-from tests.laws.arm import stands
+from tests.laws.evidence import Broken, Evidence, Rest
+from tests.laws.table import broken
 
 Array = NDArray[np.float64]
 
@@ -236,7 +237,7 @@ class Run:
     moving: float = 0.75
     outcome: str = ""
     recovery: str = ""  # what came of a motion requested after it, once the drive was on again
-    broken: list[str] = field(default_factory=list)  # laws that were broken, in words
+    rests: list[Rest] = field(default_factory=list)  # when the arm had to be at rest
     cycles: dict[str, int] = field(default_factory=dict)  # first cycle of each situation
 
     def __post_init__(self) -> None:
@@ -257,7 +258,11 @@ class Run:
         self._check_calm()
         if self.session.state is not State.ENDED and self.controller.phase is not Phase.ENDED:
             self.recovery = self._recover()
-        self.broken += self.session.broken
+
+    @property
+    def broken(self) -> list[Broken]:
+        """Laws that were broken."""
+        return broken(Evidence(rests=tuple(self.rests), session=tuple(self.session.broken)))
 
     def _exchange(self, until: Callable[[], bool], limit: int) -> None:
         end = self.transport.cycle + limit
@@ -361,9 +366,9 @@ class Run:
         if self.session.state is not State.ENDED and self.controller.phase is not Phase.ENDED:
             self._exchange(long_at_rest, 900)
             if not self.session.requested and rested < 60:
-                self.broken += stands(self._speed(), 0.0, "900 cycles after its motion")
+                self.rests.append(Rest("900 cycles after its motion", self._speed(), 0.0))
         else:
-            self.broken += stands(self._speed(), AT_REST, "where the session ended")
+            self.rests.append(Rest("where the session ended", self._speed(), AT_REST))
 
 
 def _leaves_open(event: Any) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.campaign import Campaign, CampaignPlan, Stop, design
+from hil.campaign import Campaign, CampaignPlan, Stop, design, operator_control
 from hil.cell import Cell
 from hil.progress import Silent
 from hil.simulation import simulated_link, simulated_provenance
@@ -45,6 +45,15 @@ def run_campaign(
     provenance = simulated_provenance(cell, effects)
     campaign.run(link, Stop(), Silent(), provenance=provenance, durable=False, unrehearsed=True)
     return campaign
+
+
+@pytest.fixture
+def shown_in_virtual_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A motion in virtual time is shown every 100 cycles, whatever the wall clock says.
+
+    Shown every 0.1 s by the clock, it would be over before a fast computer shows it again.
+    """
+    monkeypatch.setattr(operator_control, "SHOW_PERIOD", 0.0)
 
 
 @pytest.fixture(scope="session")

@@ -20,6 +20,7 @@ from hil.archive import Archive, open_archive
 from hil.cli import app
 from hil.errors import SourceError
 from hil.importers import Robot, import_rosbag2, recorded_joints
+from tests import messages
 from tests.hil.test_importers_rosbag2 import DEFINITION, STATE, bag, mcap, state
 from tests.hil.test_log_kinds import COUNT, JOINTS, POSITION, RATE, SLOPE, TIME, TORQUE, URDF
 
@@ -102,7 +103,7 @@ class TestPublishers:
         typed = Typed(urdf, parts, *options)
         assert_right(typed.archive)
         assert typed.archive.joint_names == JOINTS
-        assert "merged from messages of their own, with the same stamps" in typed.message
+        assert messages.MERGED_MESSAGES in typed.message
         assert recorded_joints(typed.path) == ("knee", "hip", "ankle")
 
     def test_of_other_stamps_they_are_interpolated(self, urdf) -> None:

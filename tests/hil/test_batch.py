@@ -39,6 +39,7 @@ from hil.identify.sources import gather_sources
 from hil.progress import Silent
 from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Preprocessing
+from tests import messages
 
 from .batch_work import NOTHING_OPEN, Deadly, Here
 from .conftest import small
@@ -338,7 +339,7 @@ class TestBroken:
     @pytest.mark.parametrize("kinds", [["validation"], ["validation", "standstill"]])
     def test_campaigns_without_excitation(self, campaign, folder, tmp_path, kinds):
         alone = copied(campaign, tmp_path / "alone", *(f"{kind}_000" for kind in kinds))
-        with pytest.raises(InputError, match="alone could not be used: it holds no excitation"):
+        with pytest.raises(InputError, match=messages.HOLDS_NO_EXCITATION):
             batch(alone)
         result = batch(alone, folder)
         assert len(result.campaigns) == 1
@@ -520,7 +521,7 @@ class TestGroups:
         assert not result.broken
         assert reasons_of(result.skipped) == {
             "b.mcap": f"is a copy of {original}",
-            "y.mcap": "was recorded with a payload that was to be weighed",
+            "y.mcap": messages.PAYLOAD_TO_BE_WEIGHED,
             "z.mcap": "belongs to a rehearsal",
         }
 

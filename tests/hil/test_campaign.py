@@ -52,6 +52,7 @@ from planner import (
     plan_moves,
 )
 from sim_fixtures import SimulatedController
+from tests import messages
 from tests.hil.fast_cell import set_points
 
 pytestmark = pytest.mark.safety
@@ -257,7 +258,7 @@ def test_a_refusal_has_names_and_fields_of_the_cell_file(
         arm.campaign.run(arm.link, Stop(), reporter, unrehearsed=True)
     text = failed.value.reason
     assert text.startswith(f"following error of {cell.joint_names[0]} is ")
-    assert ", set by [drive_train] following_error, or the controller" in text
+    assert messages.SET_BY_FOLLOWING_ERROR in text
     error = failed.value.refused.error
     assert f"REFUSED: {text}; {error.remedy}" in lines
 

@@ -21,6 +21,7 @@ from hil.toml_text import to_text
 from identification.excitation import NoFeasibleMotionError, Violation
 from identification.model.kinematics import chain_from_urdf
 from sim_fixtures.ns16 import CELL_PATH
+from tests import messages
 from tests.hil.simulated_logs import urdf_path
 
 
@@ -208,7 +209,7 @@ def test_too_large_currents_at_home_are_reported(cell):
         problem_of(weak, SINES.replaced(sines={"offset": "home"}))
     problem_of(weak, VIA.kinematic())
     folded = SINES.replaced(sines={"offset": [0.0, 90.0, -165.0, 0.0, 90.0, 0.0]})
-    with pytest.raises(NoExcitationError, match=r"in the mean posture of the sines: collision of"):
+    with pytest.raises(NoExcitationError, match=messages.COLLISION_IN_MEAN_POSTURE):
         problem_of(cell, folded)
 
 

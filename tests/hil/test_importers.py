@@ -46,6 +46,7 @@ from hil.importers.table import Table
 from hil.recordings import open_recording
 from identification import FrictionLaw
 from identification.model.kinematics import chain_from_urdf
+from tests import messages
 from tests.hil.simulated_logs import (
     JOINTS,
     Simulated,
@@ -953,14 +954,14 @@ class TestWarnings:
     def test_positions_in_degrees_order_or_zero(self, panda: Simulated) -> None:
         """The ranges of joints 4 and 6 of this arm exclude each other."""
         (sentence, *others) = warnings(panda, position=DEGREES, velocity=DEGREES)
-        assert sentence.startswith("as mapped, every row leaves the limits of the URDF")
-        assert 'as degrees read as radians, none would: write [position] unit = "deg"' in sentence
+        assert sentence.startswith(messages.EVERY_ROW_LEAVES_LIMITS)
+        assert messages.NONE_AS_DEGREES in sentence
         assert all("degrees" in other for other in others)
         sentences = warnings(replace(panda, position=panda.position[:, ORDER]))
         names = ", ".join(panda.joint_names[j] for j in ORDER)
         assert f"those of {names}, none would" in sentences[0]
         sentences = warnings(replace(panda, position=panda.position + 20.0 * (np.arange(7) == 3)))
-        assert "check unit, sign and zero in the column map" in sentences[0]
+        assert messages.CHECK_UNIT_SIGN_ZERO in sentences[0]
         assert "order" not in sentences[0]
 
 

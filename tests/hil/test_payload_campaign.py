@@ -168,6 +168,7 @@ class TestRecording:
 
 
 class TestInterrupted:
+    @pytest.mark.usefixtures("shown_in_virtual_time")
     @pytest.mark.parametrize("stage", range(4), ids=ORDER)
     def test_a_stop_in_each_stage_is_resumed(self, tmp_path, stage: int) -> None:
         """Ctrl-C brings the arm to rest on its path; complete recordings stay."""
@@ -176,10 +177,9 @@ class TestInterrupted:
         stop = Stop()
 
         class Stopping:
-            """Stops in the repetition of a stage."""
+            """Stops in the repetition of a stage, as soon as more than 100 cycles are done."""
 
             can_answer = False
-            seen = 0
 
             def show(self, status) -> None:
                 moving = status.motion is not None and status.motion.cycles > 100

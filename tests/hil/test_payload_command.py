@@ -21,6 +21,7 @@ from hil.identify.payload_run import find_payload
 from hil.importers.column_map import Drive
 from hil.progress import Silent
 from identification import FrictionLaw
+from tests import messages
 from tests.docs.test_commands import QUICK
 from tests.docs.typed import ROOT, commands
 from tests.hil.simulated_logs import Simulated, archive_of, simulate
@@ -356,7 +357,7 @@ def test_an_inertia_that_is_not_determined_is_not_typed_in(tmp_path: Path) -> No
             line for line in typed.splitlines() if not line.startswith(("#", "//", "--", ";", "!"))
         ]
         assert not any("INERTIA" in line or "0.00000" in line for line in commands_only)
-        assert "not determined: enter the maker's, or record faster motion" in typed
+        assert messages.ENTER_THE_MAKERS in typed
     assert "set_target_payload(" in document["controllers"]["UR"]
 
 
@@ -386,7 +387,7 @@ def test_a_load_without_centre_is_assumed_at_the_flange_and_said(currents: Path)
     assert gains(currents, "empty.mcap", *BOTH)["assumed"] is None
     assert "--centre" in gains(currents, "empty.mcap", *BOTH[:4])["assumed"]
     text = run(currents, "empty.mcap", *BOTH[:4], "--quiet", command="torque-constants")[1]
-    assert "the load's centre of mass is assumed at the origin" in text
+    assert messages.LOAD_AT_ORIGIN in text
 
 
 def test_the_output_is_an_entry_of_the_column_map(currents: Path) -> None:

@@ -29,6 +29,7 @@ from hil.rollout import POLISHED
 from hil.rollout_result import ROLLOUT, ArmErrors, RolloutResult
 from identification.rollout.servo import Servo
 from identification.text import percentage
+from tests import messages
 from tests.identification.two_link import MODEL, URDF, four_sines, truth
 
 pytestmark = pytest.mark.long
@@ -142,7 +143,7 @@ class TestSectionOfTheReport:
 
     def test_an_arm_of_the_rollout_is_not_that_of_the_report(self, folder: Path) -> None:
         done = run("rollout", folder, "--samples", "3", "--again")
-        assert "not in report.html: the arm was identified for this rollout" in done.output
+        assert messages.NOT_IN_REPORT in done.output
         assert "Simulated motion" not in (folder / REPORT).read_text()
 
 
@@ -329,4 +330,4 @@ def test_a_model_that_must_not_be_relied_on_says_so(tmp_path: Path) -> None:
     assert run("import", "log", log, "--urdf", urdf, "-o", archive).exit_code == 0
     done = run("rollout", archive, "--samples", "3")
     assert done.exit_code == 5, done.exception
-    assert "The model must not be relied on: all torques have the opposite sign" in done.output
+    assert messages.ALL_TORQUES_OPPOSITE in done.output

@@ -11,6 +11,7 @@ from hil.cli import app
 from hil.errors import HilError, InputError
 from hil.recordings import open_recording
 from hil.rollout_result import ROLLOUT, RolloutResult
+from tests import messages
 from tests.identification.test_encoders import DELAY, KP, TRUE, URDF, an_arm, on_its_servo
 
 pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
@@ -66,7 +67,7 @@ def test_the_servo_is_identified_as_far_as_determined(archive: Path, tmp_path: P
         assert rows[f"f0_{joint + 1}"].value == pytest.approx(TRUE[joint, 3], rel=0.15)
     assert result.servo.delay == pytest.approx(DELAY, abs=0.003)
     assert not rows["f1_1"].determined
-    assert "in proportion to the masses of the URDF only" in done.output
+    assert messages.BY_MASSES_OF_URDF in done.output
     assert "Not determined: f1_1, f1_2." in done.output
     for number, joint in enumerate(result.joint_names, 1):
         assert re.search(rf"^{number} {joint} +[\d.]+ ± ", done.output, re.M), done.output

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import subprocess
 import sys
@@ -30,8 +31,10 @@ from hil.cell import Cell
 from hil.errors import ControllerError
 from hil.simulation import simulated_link
 from hil.testing import faulty_link
-from planner import Move, PiecewiseCubic, plan_moves
+from planner import Move, PiecewiseCubic, TrajectoryPlayer, plan_moves
 from tests.hil.fast_cell import fast_campaign, fast_cell, on_path
+from tests.laws.motions import as_planned
+from tests.laws.second_reader import read
 
 pytestmark = pytest.mark.safety
 
@@ -92,7 +95,7 @@ def spec(cell: Cell, path: Path) -> ArchiveSpec:
 
 
 @pytest.fixture
-def arm(cell: Cell, tmp_path: Path) -> WatchedArm:
+def arm(cell: Cell, tmp_path: Path, shown_in_virtual_time: None) -> WatchedArm:
     return WatchedArm.connected(cell, tmp_path / "a.mcap")
 
 
@@ -132,6 +135,37 @@ def test_a_hold_rests_on_the_path_and_is_resumed(arm: WatchedArm) -> None:
     np.testing.assert_allclose(points[-1], arm.motion.sample(np.array([1e9]))[0][0], atol=2e-3)
 
 
+def test_a_motion_that_ends_during_a_hold_ends_its_supervision(
+    arm: WatchedArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was waited for the operator to release a motion that had ended, forever."""
+    advance = TrajectoryPlayer.advance
+
+    def fails_at_rest(player: TrajectoryPlayer) -> tuple[np.ndarray, np.ndarray]:
+        if player.rate == 0.0 and player.motion_time > 0.1:
+            raise RuntimeError("planted")
+        return advance(player)
+
+    def script(time: float, asked: int) -> OperatorRequest:
+        assert asked < 1000, "the operator is asked after the end of the motion"
+        return OperatorRequest(held=time > 0.4)
+
+    monkeypatch.setattr(TrajectoryPlayer, "advance", fails_at_rest)
+    monkeypatch.setattr("hil.campaign.link.REQUEST_PERIOD", 0.0)
+    stop = Stop()
+    seen = Watcher(script)
+    show = seen.show
+
+    def show_some(progress: MotionProgress) -> None:
+        show(progress)
+        stop.requested = len(seen.seen) > 1000  # else a failure would not end
+
+    monkeypatch.setattr(seen, "show", show_some)
+    ended = arm.run(seen, stop)
+    assert (ended.outcome, stop.requested) == ("refused", False)
+    assert "planted" in ended.reason
+
+
 def test_a_stop_ends_a_hold(arm: WatchedArm) -> None:
     stop, held = Stop(), 0
 
@@ -144,6 +178,41 @@ def test_a_stop_ends_a_hold(arm: WatchedArm) -> None:
     assert arm.run(Watcher(script), stop).outcome == "stopped"
     assert arm.archive.complete
     arm.commanded()
+
+
+class StopAt(Stop):
+    """A stop that is requested from a cycle of the controller on."""
+
+    def __init__(self, link: VirtualLink, cycle: int) -> None:
+        super().__init__()
+        self._link, self._cycle = link, cycle
+
+    @property  # type: ignore[override]
+    def requested(self) -> bool:
+        return self._link.port.status().cycle >= self._cycle
+
+    @requested.setter
+    def requested(self, value: bool) -> None:
+        assert not value
+
+
+@pytest.mark.usefixtures("shown_in_virtual_time")
+def test_a_motion_is_completed_by_its_last_set_point_only(cell: Cell, tmp_path: Path) -> None:
+    """Stopped in any cycle about its end, while the end is held and while its axes close."""
+    full = WatchedArm.connected(cell, tmp_path / "full.mcap")
+    full.run(Watcher())
+    (began,) = (event.time for event in full.archive.events if event.name == "MotionStarted")
+    cycles = math.ceil(full.motion.duration / cell.period)
+    settled = round(cell.campaign.settle_s / cell.period)
+    outcomes = {}
+    for after in (-cycles // 2, -20, *range(-3, 4), settled // 2, settled - 1, settled + 20):
+        arm = WatchedArm.connected(cell, tmp_path / f"{after}.mcap")
+        last = round(began / cell.period) + cycles
+        outcomes[after] = arm.run(Watcher(), StopAt(arm.link, last + after)).outcome
+        problems = list(as_planned(read(arm.path), arm.motion, cell.period))
+        assert (outcomes[after] == "completed") == (not problems), f"{after}: {problems}"
+    assert outcomes[-20] == "stopped"
+    assert {outcomes[after] for after in outcomes if after > 1} == {"completed"}
 
 
 @pytest.mark.parametrize("what", ["hold", "hold, opening", "stop, opening"])

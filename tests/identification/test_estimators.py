@@ -65,6 +65,7 @@ from identification.signals.recording import in_succession
 from identification.signals.smoothing import low_pass
 from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.ns16 import CELL_PATH, urdf_text
+from tests import messages
 from tests.identification.robots import robot_text
 from tests.identification.two_link import (
     MODEL,
@@ -1192,7 +1193,7 @@ class TestDelay:
 
     def test_a_delay_beyond_the_range_is_undetermined(self):
         estimate = estimate_delay(delayed(0.06), MODEL)
-        assert estimate.reason == "the residual decreases up to the longest delay tested"
+        assert estimate.reason == messages.RESIDUAL_DECREASES
         assert estimate.applied == 0.0
 
     def test_it_is_found_beside_an_assumed_delay(self):
@@ -1264,7 +1265,7 @@ class TestUndeterminedDelay:
         assert slow.applied == 0.0
         line = slow.describe()
         assert line.startswith("all axes: not determined; 95 % interval of ± ")
-        assert line.endswith("the torques change too slowly, or are too noisy")
+        assert line.endswith(messages.TORQUES_TOO_SLOW_OR_NOISY)
         unknown = replace(slow, std=np.inf)
         assert unknown.variance == pytest.approx(LONGEST_DELAY**2 / 3.0)
         assert replace(slow, std=1e-4).variance == pytest.approx(1e-8)

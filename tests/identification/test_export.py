@@ -34,6 +34,7 @@ from identification.model.robot import RobotModel
 from identification.model.urdf_text import LONGEST, MOST_LINKS, refusal, urdf_tree
 from identification.signals.smoothing import LowPassShape, low_passed, noiseless_above
 from sim_fixtures.ns16 import urdf_text
+from tests import messages
 from tests.identification.robots import random_urdf, robot_text, some_bodies
 from tests.identification.two_link import URDF, as_samples, four_sines
 from tests.identification.two_link import URDF as TWO_LINK
@@ -741,7 +742,7 @@ class TestLoadFriction:
         model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(load=True))
         assert not_in_urdf(model)[-2:] == (
             "a term f2 with the speed squared",
-            "friction that grows with the transmitted torque, a share fl of it",
+            messages.FRICTION_GROWS,
         )
 
 

@@ -31,6 +31,7 @@ from identification.validation.residuals import (
 )
 from identification.validation.verdict import judge
 from sim_fixtures.ns16 import load_truth, urdf_text
+from tests import messages
 from tests.identification import two_link
 from tests.identification.robots import ns16_values
 from tests.identification.two_link import as_samples, four_sines, sine_motion
@@ -198,7 +199,7 @@ class TestUnseenMotion:
         verdict, _ = campaign(unseen_disturbance=warmer)
         assert not verdict.good
         assert "joint_1 +20 %" in verdict.reasons[0] and "temperature" in verdict.reasons[0]
-        assert verdict.next_steps == ("warm the arm up by moving it before recording",)
+        assert verdict.next_steps == (messages.WARM_THE_ARM_UP,)
 
     @pytest.mark.parametrize("share", [0.01, 0.001])
     def test_outliers_are_named(self, share):

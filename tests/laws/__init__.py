@@ -1,8 +1,9 @@
-"""Laws of campaigns with faults, simulated or of real processes.
+"""Laws of runs with faults, simulated or of real processes: `table` has all of them.
 
-A law is a function that yields a sentence for each violation. What it reads is decoded
-independently of the product where that is possible (`second_reader`, `manifests`).
-`tests.simulate`, `tests.process_death`, `tests.disk`, `tests.fault_matrix` and `tests.endurance`
-check those whose input they have; laws of what only one observes, as each packet on a simulated
-wire, stand there. Session and guard are judged by `tests.drivers.judge`, packets by its `oracle`.
+A scenario says what controller, network, disk and processes do; its run leaves `evidence`; the laws
+of `table` whose part of the evidence is there judge it. A law is a function that yields a sentence
+for each violation. What it reads is decoded independently of the product where that is possible
+(`second_reader`, `manifests`). Laws of what one source of scenarios alone observes, as each packet
+on a simulated wire, stand beside it and are entries of the same table. Session and guard are judged
+by `tests.drivers.judge`, packets by its `oracle`.
 """

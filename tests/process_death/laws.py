@@ -19,21 +19,14 @@ from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
 from hil.campaign import Campaign
 from hil.errors import ArchiveError
 from sim_fixtures import Phase
-from tests.laws.archives import (
-    as_exchanged,
-    gap_free,
-    in_one_archive,
-    not_truncated,
-    nothing_lost,
-    readable,
-)
+from tests.laws.archives import as_exchanged, in_one_archive
 from tests.laws.arm import IN_OPEN_MODE, closed, stands
 from tests.laws.errors import names_one
-from tests.laws.manifests import entries_kept, manifest_of
+from tests.laws.evidence import ArchiveFile, Evidence, entries_of
 from tests.laws.motions import on_path
 from tests.laws.second_reader import read
 from tests.process_death.controller import REST, STILL, at_rest
-from tests.process_death.rig import Seen
+from tests.process_death.rig import Death, Seen
 
 Records = NDArray[np.void]
 
@@ -64,48 +57,79 @@ class Recorded:
     cycles: NDArray[np.int64]
 
 
-def broken_by(
-    seen: Seen, campaign: Campaign, earlier: frozenset[str] = frozenset()
-) -> tuple[list[str], dict[str, int]]:
-    """Return broken laws, and figures; archives in `earlier` are not checked."""
-    figures: dict[str, int] = {}
-    folder = campaign.folder.root
-    problems = [*_supervisor(seen), *_arm(seen), *_link(seen)]
-    problems += entries_kept(seen.entered, manifest_of(folder)[1])
-    if seen.left:
-        problems.append(f"processes are left over: {seen.left}")
-    if seen.port_in_use:
-        problems.append("the port is still in use")
+@dataclass(frozen=True, eq=False)
+class Processes:
+    """One run of real processes.
+
+    Attributes:
+        seen: from outside.
+        campaign: that was run.
+        recorded: its archives of this run.
+        others: names of files among the archives that are none.
+        undisturbed: no fault struck, so that the run completes.
+    """
+
+    seen: Seen
+    campaign: Campaign
+    recorded: tuple[Recorded, ...]
+    others: tuple[str, ...] = ()
+    undisturbed: bool = False
+
+
+def evidence_of(
+    seen: Seen,
+    campaign: Campaign,
+    earlier: frozenset[str] = frozenset(),
+    *,
+    undisturbed: bool = False,
+) -> Evidence:
+    """Return what a run left behind; archives in `earlier` are not those of this run."""
     recorded: list[Recorded] = []
+    others: list[str] = []
+    unreadable: list[str] = []
     for path in sorted(campaign.folder.archives.iterdir()):
         if path.name in earlier:
             continue
         name = ArchiveName.parse(path)
         if name is None:
-            problems.append(f"{path.name} lies among the archives")
+            others.append(path.name)
             continue
         try:
             archive = open_archive(path)
         except ArchiveError as error:
-            if not ("archive" in seen.killed and _is_newest(path)):
-                problems.append(f"{path.name} cannot be read: {error}")
+            if not _died_writing(path, seen):
+                unreadable.append(f"{path.name} cannot be read: {error}")
             continue
         cycles = archive.columns.get("cycle", np.zeros(0))
         recorded.append(Recorded(path, name, archive, np.asarray(cycles, np.int64)))
-    for recording in recorded:
-        texts = [
-            *_readable(recording, seen, campaign.cell.period),
-            *_as_exchanged(recording, seen.records),
-            *_outcome(recording, seen),
-        ]
-        problems += [f"{recording.path.name}: {text}" for text in texts]
-    problems += _archived(recorded, seen, figures)
-    problems += _motions(recorded, seen, campaign)
-    return problems, figures
+    return Evidence(
+        period=campaign.cell.period,
+        files=tuple(file_of(recording, seen) for recording in recorded),
+        unreadable=tuple(unreadable),
+        folder=campaign.folder.root,
+        manifests=(tuple(seen.entered), entries_of(campaign.folder.root)),
+        processes=Processes(seen, campaign, tuple(recorded), tuple(others), undisturbed),
+    )
 
 
-def _supervisor(seen: Seen) -> Iterator[str]:
+def file_of(recording: Recorded, seen: Seen) -> ArchiveFile:
+    """Return an archive for the laws of all runs; the newest one may be truncated by a kill."""
+    archive = recording.archive
+    lost = 0 if archive.outcome is None else archive.outcome.records_lost
+    return ArchiveFile(
+        read(recording.path),
+        archive.complete,
+        archive.missing or "",
+        _died_writing(recording.path, seen),
+        lost or 0,
+    )
+
+
+def supervisor(processes: Processes) -> Iterator[str]:
     """A surviving supervisor names the process that died, in an error of the project."""
+    seen = processes.seen
+    if processes.undisturbed and seen.status != 0:
+        yield f"the next run failed with status {seen.status}: {seen.report}"
     if seen.status is None:
         return
     if seen.status not in (0, 2, 4) or not seen.report:
@@ -116,8 +140,9 @@ def _supervisor(seen: Seen) -> Iterator[str]:
         yield from names_one(f"{' and '.join(seen.killed)} died", text, names)
 
 
-def _arm(seen: Seen) -> Iterator[str]:
+def arm(processes: Processes) -> Iterator[str]:
     """The controller missed and rejected nothing, and the arm is at rest at the end."""
+    seen = processes.seen
     rows = seen.rows
     if not len(rows):
         return
@@ -149,8 +174,9 @@ def _seen_last(rows: Records) -> Phase:
     return Phase(rows["phase"][last - 1]) if last else Phase.START
 
 
-def _link(seen: Seen) -> Iterator[str]:
+def link(processes: Processes) -> Iterator[str]:
     """The records of the exchange contain each packet that the controller had replied to, once."""
+    seen = processes.seen
     rows, records = seen.rows, seen.records
     if not len(records):
         return
@@ -174,18 +200,33 @@ def _is_newest(path: Path) -> bool:
     return path == max(path.parent.iterdir(), key=lambda sibling: sibling.stat().st_mtime_ns)
 
 
-def _readable(recording: Recorded, seen: Seen, period: float) -> Iterator[str]:
-    """An archive is a gap-free prefix, also for the second reader."""
-    archive = recording.archive
-    yield from gap_free(recording.cycles)
-    yield from not_truncated(
-        complete=archive.complete,
-        problem=archive.missing or "",
-        excused="archive" in seen.killed and _is_newest(recording.path),
-    )
-    yield from readable(read(recording.path), period)
-    if archive.outcome is not None:
-        yield from nothing_lost(archive.outcome.records_lost)
+def _died_writing(path: Path, seen: Seen) -> bool:
+    """Return whether a file may be truncated: the archive process was killed at it."""
+    return "archive" in seen.killed and _is_newest(path)
+
+
+def left_over(processes: Processes) -> Iterator[str]:
+    """No process, open port or foreign file is left."""
+    if processes.seen.left:
+        yield f"processes are left over: {processes.seen.left}"
+    if processes.seen.port_in_use:
+        yield "the port is still in use"
+    for name in processes.others:
+        yield f"{name} lies among the archives"
+
+
+def exchanged(processes: Processes) -> Iterator[str]:
+    """Archives contain what was exchanged."""
+    for recording in processes.recorded:
+        for text in _as_exchanged(recording, processes.seen.records):
+            yield f"{recording.path.name}: {text}"
+
+
+def outcomes(processes: Processes) -> Iterator[str]:
+    """Archives have the outcomes of their motions."""
+    for recording in processes.recorded:
+        for text in _outcome(recording, processes.seen):
+            yield f"{recording.path.name}: {text}"
 
 
 def _as_exchanged(recording: Recorded, records: Records) -> Iterator[str]:
@@ -229,31 +270,56 @@ def _rows_of(recording: Recorded, records: Records) -> Records | None:
     return rows if len(rows) == recording.cycles.size else None
 
 
-def _archived(recorded: list[Recorded], seen: Seen, figures: dict[str, int]) -> Iterator[str]:
-    """Every cycle of motion is archived, except what a dead archive process may cost."""
-    records = seen.records
-    if not len(records):
-        return
-    moving = records["cycle"][_moving(records)]
-    there = np.concatenate([np.zeros(0, np.int64), *(recording.cycles for recording in recorded)])
-    yield from in_one_archive(recording.cycles.tolist() for recording in recorded)
-    missing = np.setdiff1d(moving, there)
-    death = next((candidate for candidate in seen.deaths if candidate.victim == "archive"), None)
+def archived(processes: Processes) -> Iterator[str]:
+    """Every cycle of motion is archived once, except what a dead archive process may cost."""
+    yield from in_one_archive(recording.cycles.tolist() for recording in processes.recorded)
+    death = _death_of_archive(processes.seen)
+    missing = _missing(processes)
     if death is None:
         if missing.size:
             yield f"{missing.size} cycles of motion are in no archive"
         return
-    lost = int(np.count_nonzero(missing < records["cycle"][0] + death.written))
-    if any(not recording.archive.complete for recording in recorded) or lost:
-        figures["lost"] = lost
+    lost = lost_cycles(processes)
     # Records that the system gave it no time to read are not its loss.
     if lost > PROMISED + death.behind:
         yield f"{lost} cycles of motion were lost with the archive process"
 
 
-def _motions(recorded: list[Recorded], seen: Seen, campaign: Campaign) -> Iterator[str]:
+def lost_cycles(processes: Processes) -> int:
+    """Return how many cycles of motion were lost with the archive process; 0 if it lived."""
+    death = _death_of_archive(processes.seen)
+    if death is None:
+        return 0
+    first = processes.seen.records["cycle"][:1].sum()
+    return int(np.count_nonzero(_missing(processes) < first + death.written))
+
+
+def torn(processes: Processes) -> bool:
+    """Return whether the death of the archive process left an incomplete archive."""
+    return _death_of_archive(processes.seen) is not None and any(
+        not recording.archive.complete for recording in processes.recorded
+    )
+
+
+def _death_of_archive(seen: Seen) -> Death | None:
+    return next((death for death in seen.deaths if death.victim == "archive"), None)
+
+
+def _missing(processes: Processes) -> NDArray[np.int64]:
+    """Return the cycles of motion that are in no archive."""
+    records = processes.seen.records
+    if not len(records):
+        return np.zeros(0, np.int64)
+    cycles = [recording.cycles for recording in processes.recorded]
+    moving = records["cycle"][_moving(records)]
+    missing: NDArray[np.int64] = np.setdiff1d(moving, np.concatenate([np.zeros(0, int), *cycles]))
+    return missing
+
+
+def motions(processes: Processes) -> Iterator[str]:
     """Every set-point of a repetition or validation motion lies on its planned path."""
-    for recording in recorded:
+    seen, campaign = processes.seen, processes.campaign
+    for recording in processes.recorded:
         plan = campaign.plan
         match recording.name.kind:
             case "excitation":
@@ -284,3 +350,16 @@ def _motions(recorded: list[Recorded], seen: Seen, campaign: Campaign) -> Iterat
         short = np.abs(commanded[-1] - commanded[0] - (ends[1] - ends[0])).max() > 1e-6
         if short and (recording.archive.outcome or ArchiveOutcome()).outcome == "completed":
             yield f"{recording.path.name} is marked completed, and its motion was not"
+
+
+LAWS: Final = {
+    "a supervisor names the process that died": supervisor,
+    "the controller sees an arm that comes to rest": arm,
+    "the exchange records what it answered": link,
+    "nothing is left over": left_over,
+    "archives hold what was exchanged": exchanged,
+    "archives have the outcome of their motion": outcomes,
+    "motion is archived once": archived,
+    "set-points are on the path": motions,
+}
+"""By name, of real processes (`tests.laws.table`)."""

@@ -7,6 +7,7 @@ import shutil
 import time
 import traceback
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -22,19 +23,11 @@ from hil.simulation import simulated_controller
 from identification import Estimate
 from tests.faults import Strikes
 from tests.hil.fast_cell import fast_cell
-from tests.laws.estimates import alike
-from tests.laws.manifests import (
-    completed,
-    entered_as_archived,
-    entered_once,
-    entries_kept,
-    manifest_of,
-    nothing_missing,
-)
-from tests.laws.motions import as_planned
-from tests.laws.second_reader import read
-from tests.process_death.laws import broken_by
-from tests.process_death.rig import ARCHIVE, EXCHANGE, Seen, made, run
+from tests.laws.evidence import Evidence, entries_of
+from tests.laws.manifests import Entry
+from tests.laws.table import Scenario, judged
+from tests.process_death.laws import evidence_of, lost_cycles, torn
+from tests.process_death.rig import ARCHIVE, EXCHANGE, made, run
 from tests.process_death.rounds import Round, round_of
 
 
@@ -143,63 +136,86 @@ def play(stage: Stage, number: int, strikes: Strikes | None = None) -> dict[str,
     folder = stage.folder / f"round_{number:05d}"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    broken: list[str]
     result: dict[str, Any] = {"round": number, "what": str(played)}
     campaign = made(folder, stage.cell, stage.plan)
-    try:
-        seen = run(campaign, played, played.strikes, folder / "report.json", stage.planted)
-        broken, figures = broken_by(seen, campaign)
-        result |= {
-            "killed": list(seen.killed),
-            "status": seen.status,
-            "message": seen.report.get("text", ""),
-            "cycles": len(seen.rows),
-            **figures,
-        }
-        broken += finished(campaign, played, seen, folder)
-        if not broken and number % ESTIMATED == 0:
-            broken += alike(estimate_of(campaign), stage.undisturbed)
-    except Exception as error:
-        # Of any kind: this round is reported, and the others continue.
-        broken = [f"{type(error).__name__}: {error}"]
-        (folder / "error.txt").write_text(traceback.format_exc())
+
+    def killed() -> Evidence:
+        with _error_in(folder):
+            seen = run(campaign, played, played.strikes, folder / "report.json", stage.planted)
+            evidence = evidence_of(seen, campaign)
+            result.update(
+                killed=list(seen.killed),
+                status=seen.status,
+                message=seen.report.get("text", ""),
+                cycles=len(seen.rows),
+            )
+            lost = lost_cycles(evidence.processes)
+            if torn(evidence.processes) or lost:
+                result["lost"] = lost
+            return evidence
+
+    lines = played.strikes.lines
+    scenarios = [Scenario(str(played), lines, killed), resumed(campaign, played, folder)]
+    problems = [violation.text for scenario in scenarios for violation in judged(scenario)]
+    if not problems and number % ESTIMATED == 0:
+        estimated = Scenario(
+            f"{played}, estimated",
+            lines,
+            lambda: Evidence(estimates=(estimate_of(campaign), stage.undisturbed)),
+        )
+        problems += [violation.text for violation in judged(estimated)]
     now = os.times()
     processor = sum(now[:4]) - sum(used[:4])
-    result |= {"broken": broken, "seconds": time.monotonic() - began, "processor": processor}
-    if not broken:
+    result |= {"broken": problems, "seconds": time.monotonic() - began, "processor": processor}
+    if not problems:
         shutil.rmtree(folder)
     return result
 
 
-def finished(campaign: Campaign, played: Round, seen: Seen, folder: Path) -> list[str]:
-    """Finish the campaign; return broken laws."""
-    earlier = frozenset(path.name for path in campaign.folder.archives.iterdir())
-    before = manifest_of(campaign.folder.root)[1]
-    problems: list[str] = []
-    if played.over_sockets:
-        again = run(campaign, played, None, folder / "report-again.json")
-        if again.status != 0:
-            problems.append(f"the next run failed with status {again.status}: {again.report}")
-        problems += broken_by(again, campaign, earlier)[0]
-    else:
-        finish_in_virtual_time(campaign, seed=played.seed)
-    problems += entries_kept(before, manifest_of(campaign.folder.root)[1])
-    return [*problems, *_complete(campaign, seen)]
+@contextmanager
+def _error_in(folder: Path) -> Iterator[None]:
+    """Write an error of the round itself, of any kind, into its folder."""
+    try:
+        yield
+    except Exception:
+        (folder / "error.txt").write_text(traceback.format_exc())
+        raise
 
 
-def _complete(campaign: Campaign, seen: Seen) -> Iterator[str]:
-    """Each motion of the plan is entered once as completed, as it was planned."""
-    folder, plan = campaign.folder.root, campaign.plan
-    entries = manifest_of(folder)[1]
-    yield from nothing_missing(entries, (1, campaign.cell.campaign.repetitions, 1))
-    yield from entered_once(entries)
-    for entry in entries:
-        yield from entered_as_archived(entry, folder)
-    for entry in completed(entries):
-        kind, index = entry.motion
-        if kind != "standstill":
-            motion = plan.excitation if kind == "excitation" else plan.validation[index]
-            archived = read(folder / "archives" / entry.name)
-            yield from as_planned(archived, motion.trajectory, campaign.cell.period)
-    if damaged := campaign.folder.damaged():
-        yield f"after {seen.killed}: {damaged}"
+def resumed(campaign: Campaign, played: Round, folder: Path) -> Scenario:
+    """Return the scenario in which a campaign is run to its end, without a fault."""
+
+    def complete() -> Evidence:
+        with _error_in(folder):
+            earlier = frozenset(path.name for path in campaign.folder.archives.iterdir())
+            before = entries_of(campaign.folder.root)
+            if played.over_sockets:
+                seen = run(campaign, played, None, folder / "report-again.json")
+                of_run = evidence_of(seen, campaign, earlier, undisturbed=True)
+            else:
+                finish_in_virtual_time(campaign, seed=played.seed)
+                of_run = Evidence()
+            return completed_evidence(campaign, before, of_run)
+
+    return Scenario(f"{played}, resumed", (), complete)
+
+
+def completed_evidence(campaign: Campaign, before: tuple[Entry, ...], run_of: Evidence) -> Evidence:
+    """Return the evidence of a run that completed a campaign, with all of its motions."""
+    plan = campaign.plan
+    motions = {
+        ("excitation", index): plan.excitation.trajectory
+        for index in range(campaign.cell.campaign.repetitions)
+    }
+    motions |= {
+        ("validation", index): motion.trajectory for index, motion in enumerate(plan.validation)
+    }
+    return replace(
+        run_of,
+        period=campaign.cell.period,
+        folder=campaign.folder.root,
+        manifests=(before, entries_of(campaign.folder.root)),
+        counts=(1, campaign.cell.campaign.repetitions, len(plan.validation)),
+        motions=motions,
+        unreadable=(*run_of.unreadable, *campaign.folder.damaged()),
+    )

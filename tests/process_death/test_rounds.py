@@ -20,17 +20,19 @@ from hil.progress import Silent
 from sim_fixtures import Phase
 from tests.faults import Moment, StrikeKind, Victim, parse_strikes
 from tests.hil.fast_cell import fast_cell
+from tests.laws.evidence import Evidence
+from tests.laws.second_reader import Archived
+from tests.laws.table import LAWS, broken, judged
 from tests.process_death.controller import ROW
 from tests.process_death.laws import (
     PROMISED,
+    Processes,
     Recorded,
-    _archived,
-    _arm,
-    _readable,
-    _supervisor,
-    broken_by,
+    evidence_of,
+    file_of,
+    lost_cycles,
 )
-from tests.process_death.play import DEFECTS, NOISE, SHORT, finished
+from tests.process_death.play import DEFECTS, NOISE, SHORT, resumed
 from tests.process_death.rig import Death, Seen, made, run
 from tests.process_death.rounds import VICTIMS, round_of
 
@@ -56,6 +58,14 @@ def recorded(
     return Recorded(path, cast("Any", None), archive, np.arange(count, dtype=np.int64))
 
 
+def ran(seen: Seen, *recordings: Recorded) -> Processes:
+    return Processes(seen, cast("Any", None), recordings)
+
+
+def problems(processes: Processes, law: str) -> list[str]:
+    return list(LAWS[law].check(Evidence(processes=processes)))
+
+
 @pytest.mark.parametrize(
     ("lost", "behind", "allowed"),
     [(PROMISED, 0, True), (PROMISED + 1, 0, False), (PROMISED + 20, 20, True), (2500, 100, False)],
@@ -63,10 +73,9 @@ def recorded(
 def test_a_dead_archive_process_costs_a_chunk_and_its_backlog(
     lost: int, behind: int, allowed: bool
 ) -> None:
-    figures: dict[str, int] = {}
-    broken = list(_archived([recorded(CYCLES - lost)], seen("archive", behind=behind), figures))
-    assert bool(broken) is not allowed
-    assert figures["lost"] == lost
+    processes = ran(seen("archive", behind=behind), recorded(CYCLES - lost))
+    assert bool(problems(processes, "motion is archived once")) is not allowed
+    assert lost_cycles(processes) == lost
 
 
 def test_only_the_newest_archive_may_be_truncated(
@@ -76,11 +85,16 @@ def test_only_the_newest_archive_may_be_truncated(
     for place, path in enumerate((older, newest), 1):
         path.touch()
         os.utime(path, ns=(place * 10**9, place * 10**9))
-    monkeypatch.setattr("tests.process_death.laws.readable", lambda *_: ())
-    assert list(_readable(recorded(7, newest), seen("archive"), 0.002)) == []
-    (broken,) = _readable(recorded(7, older), seen("archive"), 0.002)
-    assert "is incomplete (truncated)" in broken
-    assert list(_readable(recorded(7, newest), seen("exchange"), 0.002))
+    monkeypatch.setattr("tests.process_death.laws.read", Archived)
+
+    def problems_of(path: Path, victim: Victim) -> list[str]:
+        file = file_of(recorded(7, path), seen(victim))
+        return list(LAWS["archives are complete"].check(Evidence(files=(file,))))
+
+    assert problems_of(newest, "archive") == []
+    (problem,) = problems_of(older, "archive")
+    assert "is incomplete (truncated)" in problem
+    assert problems_of(newest, "exchange")
 
 
 @pytest.mark.parametrize(
@@ -98,7 +112,8 @@ def test_only_the_newest_archive_may_be_truncated(
     ],
 )
 def test_a_supervisor_names_the_process_that_died(victim: Victim, text: str, true: bool) -> None:
-    assert (not list(_supervisor(seen(victim, text=text)))) is true
+    law = "a supervisor names the process that died"
+    assert (not problems(ran(seen(victim, text=text)), law)) is true
 
 
 @pytest.mark.parametrize(
@@ -120,8 +135,9 @@ def test_an_exchange_ends_with_closed_axes(
     rows["deserted"][10:] = True
     rows["replied"][10:] = False
     rows["replied"][10] = deserted_answered
-    problems = list(_arm(Seen([Death("supervisor", 20)], None, {}, rows, rows, [])))
-    assert any("exchange ended by itself axes are open" in p for p in problems) is broken
+    dead = Seen([Death("supervisor", 20)], None, {}, rows, rows, [])
+    texts = problems(ran(dead), "the controller sees an arm that comes to rest")
+    assert any("exchange ended by itself axes are open" in text for text in texts) is broken
 
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -222,10 +238,10 @@ def test_what_is_no_kill_brings_the_arm_to_rest_too(
     played = replace(round_of(round_in_which(victim)), over_sockets=False)
     strikes = replace(played.strikes, kind=kind)
     seen = run(campaign, played, strikes, tmp_path / "report.json")
-    assert broken_by(seen, campaign)[0] == []
+    assert broken(evidence_of(seen, campaign)) == []
     assert seen.status == status
     assert message in seen.report["text"]
-    assert finished(campaign, played, seen, tmp_path) == []
+    assert judged(resumed(campaign, played, tmp_path)) == []
 
 
 @pytest.mark.slow

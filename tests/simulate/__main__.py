@@ -14,7 +14,7 @@ from hil.progress import reporter
 from tests.arguments import at_least_one, parser_of, whole_number
 from tests.faults import GRAMMAR
 from tests.simulate.many import played, stage_folder
-from tests.simulate.verdicts import Stage, Verdict, judged, runs_of, summary
+from tests.simulate.verdicts import Stage, Verdict, broken_by, runs_of, summary
 from tests.simulate.world import UndisturbedError
 
 EPILOG = f"""\
@@ -72,7 +72,7 @@ def _one(options: argparse.Namespace) -> int:
         except UndisturbedError as error:
             sys.stdout.write(f"BROKEN undisturbed: {error}\n")
             return 1
-        broken, runs = judged(seen), runs_of(seen)
+        broken, runs = broken_by(seen), runs_of(seen)
         lines = [f"seed {options.seed}: {stage.twin(options.seed).scene.words}"]
     if options.json:
         document = {

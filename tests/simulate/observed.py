@@ -140,12 +140,5 @@ class Observed:
         return "complete" if self.complete else "incomplete"
 
 
-class Broken(NamedTuple):
-    """A violation of a law."""
-
-    law: str  # its name
-    text: str  # with the values
-
-
 Law = Callable[[Observed], Iterable[str]]
 """Yields a text for each violation."""

@@ -26,11 +26,13 @@ from hil.errors import ControllerError
 from hil.simulation import simulated_controller
 from planner import Move, TrajectoryPlayer, plan_moves
 from sim_fixtures import Phase, SimulatedController
+from tests import messages
 from tests.faults import parse_script
 from tests.hil.fast_cell import fast_cell
+from tests.simulate.laws.whole import completion
 from tests.simulate.observed import Observed
 from tests.simulate.scenes import NEIGHBOURS, scene_of
-from tests.simulate.verdicts import Stage, completion, judged
+from tests.simulate.verdicts import Stage, broken_by
 from tests.simulate.world import _twin, play
 
 pytestmark = pytest.mark.safety
@@ -95,7 +97,7 @@ def test_a_motion_does_not_wait_for_a_drive_that_went_off(
     packets = iter(range(10))
     exchange(link.port.transport, link.port.session, ends_when=lambda: next(packets, None) is None)
     motion, spec = short_way(cell, where, tmp_path)
-    with pytest.raises(ControllerError, match="went off before the motion began; nothing was sent"):
+    with pytest.raises(ControllerError, match=messages.NOTHING_WAS_SENT):
         link.run(motion, spec, Stop())
     assert (open_archive(spec.path).outcome or ArchiveOutcome()).outcome == "void"
 
@@ -192,6 +194,7 @@ RECEIVED_TWICE = (202544,)  # beside a packet with another number
 CLOCK_SET_FORWARD = (201111,)  # behind an init packet: the start is over
 CLOCK_SET_BACK = (101575,)  # a start timeout of an hour, with the drive off
 SCATTERED_REPETITIONS = (100232,)  # they rejected one another in turn
+REFUSED_DURING_A_HOLD = (700132,)  # the run waited forever for the hold to be released
 HALF_A_SECOND = (400869, 102383)  # see `TestHalfASecond`
 
 
@@ -207,6 +210,7 @@ HALF_A_SECOND = (400869, 102383)  # see `TestHalfASecond`
         *CLOCK_SET_FORWARD,
         *CLOCK_SET_BACK,
         *SCATTERED_REPETITIONS,
+        *REFUSED_DURING_A_HOLD,
         *HALF_A_SECOND,
     ],
 )
@@ -241,7 +245,7 @@ class TestHalfASecond:
 
     def test_two_repetitions_disturbed_alike_are_replaced(self, stage: Stage) -> None:
         seen = stage.observed(102383, ["delay@577x1:7ms", "delay@296x1:7ms"])
-        assert judged(seen) == []
+        assert broken_by(seen) == []
         assert seen.complete
         assert outcome_of(seen, "excitation_000_a1") == outcome_of(seen, "excitation_001_a1")
         assert outcome_of(seen, "excitation_000_a1") == "rejected"
@@ -250,7 +254,7 @@ class TestHalfASecond:
         twin = _twin(scene_of(400869 // NEIGHBOURS, variant=1), tmp_path / "twin")
         assert "2 joints, upright, 2 ms; sines, 0.53 s; 3 repetitions" in twin.scene.words
         script = parse_script(["restart@875:cold"])
-        assert judged(play(400869, twin, tmp_path, script)) == []
+        assert broken_by(play(400869, twin, tmp_path, script)) == []
 
     def test_one_that_is_disturbed_is_replaced(self, stage: Stage) -> None:
         seen = stage.observed(102383, ["delay@296x1:7ms"])

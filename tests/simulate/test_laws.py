@@ -22,9 +22,9 @@ from tests.faults import parse_script
 from tests.hil.mcap_bytes import chunks
 from tests.laws.estimates import FALSE_ALARM, SEEDS, bound, degrees_of_freedom
 from tests.laws.second_reader import read
+from tests.simulate.laws import LAWS
 from tests.simulate.laws.conversation import Talk, heard
 from tests.simulate.observed import Observed
-from tests.simulate.verdicts import LAWS
 from tests.simulate.world import NEIGHBOURS, Twin, play, twin_of
 
 pytestmark = pytest.mark.safety

@@ -17,9 +17,10 @@ from hil.archive.recorder import Recorder
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.runner import Runner
 from planner import TrajectoryPlayer
+from tests.laws.table import judged
 from tests.simulate.many import stage_folder
 from tests.simulate.scenes import NEIGHBOURS
-from tests.simulate.verdicts import Stage, judged
+from tests.simulate.verdicts import Stage
 
 pytestmark = pytest.mark.safety
 
@@ -103,9 +104,9 @@ FAST = "a motion catches up, unguarded"
 def test_it_is_found(name: str, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     plant, lines, law = DEFECTS[name]
     wanted = script(stage, lines)
-    assert judged(stage.observed(SEED, wanted)) == []
+    assert judged(stage.scenario(SEED, wanted)) == []
     plant(monkeypatch)
-    assert law in {violation.law for violation in judged(stage.observed(SEED, wanted))}
+    assert law in {violation.law for violation in judged(stage.scenario(SEED, wanted))}
 
 
 def test_a_defect_without_faults_is_reported(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from tests.simulate.__main__ import main
 from tests.simulate.draws import DRAWS, Story, draw_script
 from tests.simulate.many import stage_folder
 from tests.simulate.scenes import NEIGHBOURS, scene_of
-from tests.simulate.verdicts import Stage, Verdict, judged, shrunk, summary
+from tests.simulate.verdicts import Stage, Verdict, broken_by, shrunk, summary
 from tests.simulate.world import SceneError, _twin, twin_of
 
 pytestmark = pytest.mark.safety
@@ -136,16 +136,16 @@ class TestCommand:
     ],
 )
 def test_laws_allow_what_they_once_did_not(seed: int, script: list[str], tmp_path: Path) -> None:
-    assert judged(Stage(tmp_path).observed(seed, script)) == []
+    assert broken_by(Stage(tmp_path).observed(seed, script)) == []
 
 
 def test_a_campaign_that_does_not_end_is_a_finding(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage = Stage(tmp_path)
-    assert judged(stage.observed(4, [])) == []
+    assert broken_by(stage.observed(4, [])) == []
     monkeypatch.setattr(world, "MOST_CYCLES", 500)
-    broken = judged(stage.observed(4, ["drive-drop@300"]))
+    broken = broken_by(stage.observed(4, ["drive-drop@300"]))
     assert any("EndlessError" in violation.text for violation in broken)
 
 

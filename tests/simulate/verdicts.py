@@ -1,103 +1,30 @@
-"""Laws of whole campaigns, the verdict on a seed, the reduction of scripts, the summary of many."""
+"""Scenarios of simulated campaigns: verdict on a seed, reduction of scripts, summary of many."""
 
 from __future__ import annotations
 
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, Self
 
-import numpy as np
-
 from drivers.events import Event, GapSeen, InitReceived, LinkLost, MotionEnded, RepliesLost
-from tests.drivers import oracle
-from tests.faults import DISTURBS_THE_ARM, kind_of, parse_script
+from tests.faults import kind_of, parse_script
+from tests.laws.evidence import Broken, Evidence
+from tests.laws.table import Scenario, broken, judged
 from tests.simulate.draws import DRAWS
-from tests.simulate.laws import LAWS as OTHERS
-from tests.simulate.laws.conversation import heard
-from tests.simulate.observed import Broken, Law, Life, Observed
+from tests.simulate.laws import LAWS
+from tests.simulate.observed import Life, Observed
 from tests.simulate.scenes import NEIGHBOURS
 from tests.simulate.world import Twin, UndisturbedError, play, twin_of
 
-_NUMBERS: Final = 0x7FFF  # largest packet number
 
-
-def gaps(seen: Observed) -> Iterator[str]:
-    """A motion with more consecutive missed packets than allowed does not complete.
-
-    `docs/safety-rules.md`: it is stopped on its path, refused or lost.
-    """
-    most = seen.cell.controller.max_gap
-    for number, life in enumerate(seen.runs, start=1):
-        ends = [event for _, event in life.events if isinstance(event, MotionEnded)]
-        completed = {end.interval: end.cycle for end in ends if end.outcome == "completed"}
-        rows = life.records[
-            [exchanged.record for exchanged in life.exchanged if exchanged.record >= 0]
-        ]
-        speed = rows["commanded_velocity"]
-        moves = np.append(np.nan_to_num(speed).any(axis=1), [True, True])
-        missed = np.diff(rows["number"]) % _NUMBERS - 1
-        # Set-points move before a gap and for some cycles after it.
-        amid = moves[:-3] & moves[1:-2] & moves[2:-1] & moves[3:]
-        amid &= np.isfinite(speed[1:]).all(axis=1)
-        for at in np.flatnonzero(amid & (missed > most) & (missed < _NUMBERS // 2)):
-            row = rows[at + 1]
-            if completed.get(int(row["interval"]), -1) >= row["cycle"]:
-                text = f"run {number}: {missed[at]} packets missed before packet {row['number']}"
-                yield f"{text}, {most} are allowed, and the motion completed"
-
-
-def piles(seen: Observed) -> Iterator[str]:
-    """Of packets of one kind that waited together in open mode, one is answered.
-
-    Answers to the others would run the motion ahead of the arm (ARCHITECTURE.md).
-    """
-    for number, life in enumerate(seen.runs, start=1):
-        for talk in heard(seen)[number - 1].talks:
-            received, cycle = talk.received, np.array([life.exchanged[k].cycle for k in talk.index])
-            together = (np.diff(cycle) == 0) & (np.diff(received.number) != 0)
-            kind = np.concatenate((received.status, received.mode), axis=1)
-            on = (received.status == oracle.DRIVE_ON).any(axis=1)
-            opens = on & (received.mode == seen.cell.controller.mode).any(axis=1)
-            for at in np.flatnonzero(together & (kind[1:] == kind[:-1]).all(axis=1) & opens[1:]):
-                text = f"run {number}: packets {received.number[at]} and {received.number[at + 1]}"
-                yield f"{text} waited together; both were answered in open mode"
-
-
-_NEEDS_OPERATOR: Final = frozenset({"RepetitionsRejectedError"})
-
-
-def completion(seen: Observed) -> Iterator[str]:
-    """Without further faults the campaign completes and is identified.
-
-    If the arm was disturbed, its repetitions may differ, and the run may request an inspection.
-    """
-    if seen.complete:
-        if seen.found is None:
-            yield f"complete, and not identified: {seen.unidentified}"
-        return
-    disturbed = any(kind_of(line) in {*DISTURBS_THE_ARM, "corrupt"} for line in seen.struck)
-    excused = type(seen.runs[-1].error).__name__ in _NEEDS_OPERATOR
-    if not (excused and disturbed):
-        yield f"after {len(seen.runs)} runs it ended {seen.ended}"
-
-
-LAWS: Final[dict[str, Law]] = {"completion": completion, "gaps": gaps, "piles": piles, **OTHERS}
-
-
-def judged(seen: Observed) -> list[Broken]:
-    """Return the violations of all laws; an exception of a law is a violation of its name."""
-    violations: list[Broken] = []
-    for name, law in LAWS.items():
-        try:
-            violations.extend(Broken(name, text) for text in law(seen))
-        except Exception as error:
-            violations.append(Broken(f"{name} (exception)", f"{type(error).__name__}: {error}"))
-    return violations
+def broken_by(seen: Observed) -> list[Broken]:
+    """Return the laws that a campaign breaks."""
+    return broken(Evidence(simulated=seen))
 
 
 MOST_TRIES: Final = 40  # largest number of campaigns simulated for the reduction
@@ -205,10 +132,8 @@ class Stage:
         for old in self._root.glob("twin_*"):
             shutil.rmtree(old)
         twin = twin_of(group, self._root)
-        if broken := judged(twin.seen):
-            raise UndisturbedError(
-                "; ".join(f"{violation.law}: {violation.text}" for violation in broken)
-            )
+        if problems := broken_by(twin.seen):
+            raise UndisturbedError("; ".join(f"{law}: {text}" for law, text in problems))
         return twin
 
     def twin(self, seed: int) -> Twin:
@@ -226,6 +151,15 @@ class Stage:
         self.clear()
         return play(seed, twin, self._root, script)
 
+    def scenario(self, seed: int, lines: Iterable[str] | None = None) -> Scenario:
+        """Return a seed, with its own script or another one, as a scenario."""
+        script = None if lines is None else tuple(lines)
+
+        def play_seed() -> Evidence:
+            return Evidence(simulated=self.observed(seed, script))
+
+        return Scenario(f"python -m tests.simulate --seed {seed}", script or (), play_seed)
+
     def clear(self) -> None:
         for old in self._root.glob("seed_*"):
             shutil.rmtree(old)
@@ -237,14 +171,13 @@ class Stage:
             seen = self.observed(seed)
         except UndisturbedError as error:
             return Verdict(seed, broken=(("undisturbed", str(error)),))
-        broken = judged(seen)
+        problems = broken_by(seen)
 
         def fails(lines: tuple[str, ...]) -> bool:
-            return any(
-                violation.law == broken[0].law for violation in judged(self.observed(seed, lines))
-            )
+            violations = judged(self.scenario(seed, lines))
+            return any(violation.law == problems[0].law for violation in violations)
 
-        smallest = shrunk(seen.schedule, fails) if broken and shrink else ()
+        smallest = shrunk(seen.schedule, fails) if problems and shrink else ()
         self.clear()
         return Verdict(
             seed=seed,
@@ -254,7 +187,7 @@ class Stage:
             met=situations(seen),
             runs=runs_of(seen),
             cycles=len(seen.arm.sent),
-            broken=tuple((violation.law, violation.text) for violation in broken),
+            broken=tuple((violation.law, violation.text) for violation in problems),
             shrunk=smallest,
             redrawn=self.twin(seed).redrawn,
             seconds=time.process_time() - begun,

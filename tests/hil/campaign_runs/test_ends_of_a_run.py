@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import hil.files
-from hil.campaign import link as link_module
 from hil.campaign.errors import (
     MotionFailedError,
 )
@@ -24,10 +21,11 @@ from tests.hil.campaign_runs.rig import Make, Operator, kinds
 pytestmark = pytest.mark.safety
 
 
+@pytest.mark.usefixtures("shown_in_virtual_time")
 @pytest.mark.parametrize("warmup_drift", [0.0, 0.002])
 @pytest.mark.parametrize("first_repetitions", [0, 3])
 def test_the_time_left_is_right_and_counts_down(
-    make: Make, monkeypatch: pytest.MonkeyPatch, warmup_drift: float, first_repetitions: int
+    make: Make, warmup_drift: float, first_repetitions: int
 ) -> None:
     """Within a fifth after the first tenth, with a dry run, and where an earlier run is resumed."""
     campaign, stop = make(repetitions=6, warmup_drift=warmup_drift), Stop()
@@ -41,13 +39,11 @@ def test_the_time_left_is_right_and_counts_down(
         with pytest.raises(MotionFailedError, match="stopped"):
             campaign.run(stop=stop, operator=Operator(stopping), durable=False)
     link = simulated_link(campaign.cell)
-    controller_time = SimpleNamespace(monotonic=lambda: link.cycles * 0.002, sleep=time.sleep)
-    monkeypatch.setattr(link_module, "time", controller_time)
     estimates = list[tuple[float, float]]()
 
     class Clock(Operator):
         def show(self, status: RunStatus) -> None:
-            estimates.append((link.cycles * 0.002, status.time_left))
+            estimates.append((link.port.now, status.time_left))
 
     campaign.run(link, operator=Clock(), durable=False)
     now, left = np.array(estimates).T

@@ -28,6 +28,7 @@ from hil.simulation import (
     simulated_controller,
 )
 from sim_fixtures.faults import parse_fault, split_faults
+from tests import messages
 from tests.hil.campaign_runs.rig import (
     Make,
     Operator,
@@ -66,7 +67,7 @@ def test_a_slowed_repetition_is_rejected_and_run_again(make: Make) -> None:
     assert rejected.archive not in {
         source.name for source in (*sources.training, *sources.held_out)
     }
-    assert any("rejected and left out: it was held or slowed" in text for text in sources.warnings)
+    assert any(messages.HELD_OR_SLOWED in text for text in sources.warnings)
 
 
 def test_a_motion_that_is_always_rejected_ends_the_run(make: Make) -> None:
@@ -194,7 +195,13 @@ class TestMissedPackets:
         first, second = (int(of_repetition[0]) + _AT_REST for of_repetition in cycles)
         return [first + k * (second - first) for k in range(9)]
 
-    def run(self, campaign: Campaign, begins: Sequence[int], missed: Collection[int]) -> RunResult:
+    def run(
+        self,
+        campaign: Campaign,
+        begins: Sequence[int],
+        missed: Collection[int],
+        disturbed: int = 2,
+    ) -> RunResult:
         # Each missed packet delays what follows by a cycle.
         cycles = [
             begin + sum(k in missed for k in range(number)) for number, begin in enumerate(begins)
@@ -204,7 +211,7 @@ class TestMissedPackets:
         controller = simulated_controller(
             campaign.cell,
             settings=settings,
-            faults=[Push(cycles[k] + 100 + (k in missed)) for k in range(2)],  # type: ignore[misc]
+            faults=[Push(cycles[k] + 100 + (k in missed)) for k in range(disturbed)],  # type: ignore[misc]
         )
         link = VirtualLink.over(
             SimulatedTransport(controller, lost), campaign.cell, controller.finish
@@ -218,10 +225,29 @@ class TestMissedPackets:
         assert [rejection.archive[11:-5] for rejection in result.rejected] == [
             *("002_a1", "002_a2", "000_a1", "001_a1"),
         ]
-        assert "packets were missed in it, and none in those" in result.rejected[-1].reason
+        assert messages.MISSED_IN_IT_ONLY in result.rejected[-1].reason
         assert any("disturbed alike, or the arm was changed" in note for note in result.notes)
         good = [path.name[11:-5] for path in campaign.folder.completed("excitation")]
         assert good == ["000_a2", "001_a2", "002_a3"]
+
+    def test_one_that_missed_some_is_none_of_those_that_agree(
+        self, make: Make, begins: list[int]
+    ) -> None:
+        """The first of the later ones missed a packet: it takes one attempt more."""
+        campaign = make(repetitions=3)
+        result = self.run(campaign, begins, {0, 1, 2})
+        assert result.complete
+        assert [rejection.archive[11:-5] for rejection in result.rejected] == [
+            *("002_a1", "002_a2", "002_a3", "000_a1", "001_a1"),
+        ]
+
+    def test_as_many_must_agree_as_are_replaced(self, make: Make, begins: list[int]) -> None:
+        campaign = make(repetitions=4, bad_repetitions=2)
+        result = self.run(campaign, begins, {0, 1, 2}, disturbed=3)
+        assert result.complete
+        assert [rejection.archive[11:-5] for rejection in result.rejected] == [
+            *("003_a1", "003_a2", "000_a1", "001_a1", "002_a1"),
+        ]
 
     @pytest.mark.parametrize("missed", [{0}, {1}, set(), {*range(9)}])
     def test_others_need_an_operator(

@@ -15,8 +15,12 @@ from .guarded import guard
 from .replies import replies
 from .rest import rest
 from .resumed import resume
+from .whole import completion, gaps, piles
 
 LAWS: dict[str, Law] = {
+    "completion": completion,
+    "gaps": gaps,
+    "piles": piles,
     "replies": replies,
     "guard": guard,
     "rest": rest,
