@@ -342,4 +342,3 @@ def _unpacked(
         grams = _matrices(arrays["sum"], columns)
         total = Factor(grams, columns, arrays["sum_counts"], names, block=content["block"])
     return Reduction(tuple(summaries), total, cached=len(refs))
-
