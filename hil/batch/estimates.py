@@ -22,9 +22,10 @@ from identification.estimators.least_squares import no_narrower
 from identification.factor.factor import QR_CONDITION, Estimate, Factor, require_rows
 from identification.selection.settings import Settings
 
+from .cache import CacheLocation
 from .cluster import SkippedArchive
 from .discovery import ArchiveRef, cell_from
-from .reduction import Reduction, Summary, added, plus, settings_digest
+from .reduction import Reduction, Summary, added, plus, reduce_archives, settings_digest
 
 Array = NDArray[np.float64]
 
@@ -171,6 +172,24 @@ def estimate_campaign(
     return result, group
 
 
+def estimate_cached(
+    partitions: Sequence[Sequence[ArchiveRef]],
+    cache: CacheLocation,
+    arm: ArmModel,
+    settings: Settings,
+    campaign: str,
+) -> tuple[CampaignResult, Group]:
+    """Estimate one campaign from its archives, of which each partition has a cached sum.
+
+    Reading a sum takes less time than a task of its own.
+
+    Raises:
+        CacheError: a damaged sum is computed again, and the cache cannot be written.
+    """
+    parts = [reduce_archives(refs, settings, cache) for refs in partitions]
+    return estimate_campaign(parts, arm, settings, campaign)
+
+
 def result_of(
     pair: tuple[CampaignResult, Group] | SkippedArchive,
 ) -> CampaignResult | SkippedArchive:
@@ -296,7 +315,7 @@ class Estimator:
             when=ref.when,
             repetitions=1,
             estimate=estimate,
-            torque_rms=_rms(replace(summary.total)),
+            torque_rms=_rms(summary.total),
             unseen_rms=nothing,
             unseen_torque_rms=nothing,
             settings=settings,
@@ -358,7 +377,7 @@ def warning_lines(warned: Sequence[tuple[ArchiveRef, Sequence[str]]]) -> tuple[s
 
 def _rms(factor: Factor, squares: Array | None = None) -> Array:
     """Return the RMS per joint (n,) of sums over rows, by default of the torque; NaN of none."""
-    squares = factor.gram[:, -1, -1] if squares is None else squares
+    squares = factor.squared_torque if squares is None else squares
     return np.asarray(np.sqrt(squares / np.where(factor.samples > 0, factor.samples, np.nan)))
 
 

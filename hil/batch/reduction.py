@@ -211,21 +211,18 @@ def _write(reduction: Reduction, settings: Settings, cache: CacheLocation) -> No
 def _packed(reduction: Reduction) -> tuple[dict[str, Any], Arrays]:
     """Return a reduction as JSON data and arrays: each kind in one array for all archives.
 
-    Gram matrices are symmetric, so one triangle is stored.
+    An array costs a third of a millisecond to read, whatever its size.
     """
     summaries = reduction.summaries
     first = summaries[0].total
-    arrays: Arrays = {f"columns_{j}": columns for j, columns in enumerate(first.columns)}
+    totals = [_triangles(summary.total) for summary in summaries]
+    arrays: Arrays = {
+        "counts": np.concatenate([summary.total.counts for summary in summaries]),
+        "totals": np.concatenate(totals),
+    }
     if reduction.total is not None:
         arrays["sum_counts"] = reduction.total.counts
-    for j in range(first.n_joints):
-        upper = np.triu_indices(len(first.columns[j]) + 1)
-        arrays[f"total_{j}"] = np.array(
-            [summary.total.matrices[j][0][upper] for summary in summaries]
-        )
-        if reduction.total is not None:
-            arrays[f"sum_{j}"] = reduction.total.matrices[j][:, *upper]
-    arrays["counts"] = np.array([summary.total.counts[0] for summary in summaries])
+        arrays["sum"] = _triangles(reduction.total)
     fits = [summary.fit for summary in summaries if summary.fit is not None]
     for name in ("values", "covariance", "noise_std", "samples"):
         arrays[name] = np.array([getattr(fit, name) for fit in fits])
@@ -238,8 +235,33 @@ def _packed(reduction: Reduction) -> tuple[dict[str, Any], Arrays]:
     return {
         "parameters": first.parameter_names,
         "units": fits[0].units if fits else (),
+        "columns": [columns.tolist() for columns in first.columns],
+        "block": None if reduction.total is None else reduction.total.block,
         "archives": [_entry(summary) for summary in summaries],
     }, arrays
+
+
+def _triangles(factor: Factor) -> Array:
+    """Return the upper triangles of the Gram matrices, which are symmetric, side by side (B, k)."""
+    joints = []
+    for matrices in factor.matrices:
+        row, column = np.triu_indices(matrices.shape[1])
+        joints.append(matrices[:, row, column])
+    return np.concatenate(joints, axis=1)
+
+
+def _matrices(triangles: Array, columns: Sequence[NDArray[np.intp]]) -> tuple[Array, ...]:
+    """Return the Gram matrices of the joints (B, c_j + 1, c_j + 1) of :func:`_triangles`."""
+    matrices = []
+    begin = 0
+    for width in (len(joint_columns) + 1 for joint_columns in columns):
+        place = np.zeros((width, width), dtype=np.intp)
+        row, column = np.triu_indices(width)
+        end = begin + len(row)
+        place[row, column] = place[column, row] = np.arange(begin, end)
+        matrices.append(np.take(triangles, place, axis=1))
+        begin = end
+    return tuple(matrices)
 
 
 def _entry(summary: Summary) -> dict[str, Any]:
@@ -273,9 +295,8 @@ def _unpacked(
         return None
     names = tuple(map(intern, content["parameters"]))
     units = tuple(map(intern, content["units"]))
-    n_joints = arrays["counts"].shape[1]
-    columns = tuple(arrays[f"columns_{j}"] for j in range(n_joints))
-    totals = [_symmetric(arrays[f"total_{j}"]) for j in range(n_joints)]
+    columns = tuple(np.array(joint, dtype=np.intp) for joint in content["columns"])
+    totals = _matrices(arrays["totals"], columns)
     summaries = []
     k, begin, measured = 0, 0, 0  # fits, rows of scatter and products so far
     for number, (ref, entry) in enumerate(zip(refs, content["archives"], strict=True)):
@@ -318,15 +339,6 @@ def _unpacked(
         )
     total = None
     if "sum_counts" in arrays:
-        grams = tuple(_symmetric(arrays[f"sum_{j}"]) for j in range(n_joints))
-        total = Factor(grams, columns, arrays["sum_counts"], names)
+        grams = _matrices(arrays["sum"], columns)
+        total = Factor(grams, columns, arrays["sum_counts"], names, block=content["block"])
     return Reduction(tuple(summaries), total, cached=len(refs))
-
-
-def _symmetric(triangles: Array) -> Array:
-    """Return the matrices (B, c, c) of upper triangles (B, c (c + 1) / 2)."""
-    width = (int(np.sqrt(8 * triangles.shape[1] + 1)) - 1) // 2
-    place = np.zeros((width, width), dtype=np.intp)
-    row, column = np.triu_indices(width)
-    place[row, column] = place[column, row] = np.arange(triangles.shape[1])
-    return np.take(triangles, place, axis=1)

@@ -1,8 +1,8 @@
 """The batch: find archives, decide settings, and estimate by one graph of Dask tasks.
 
 archive -> factor (cached) -> sum -> estimate: a task reduces up to `PARTITION` archives of a
-campaign, each of which is cached, and adds their factors; one task adds these sums and estimates
-the campaign; others pool the campaigns of an arm.
+campaign, each of which is cached, and adds their factors; one task adds these sums, which it reads
+itself if all of them are cached, and estimates the campaign; others pool the campaigns of an arm.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from .estimates import (
     BatchEstimator,
     CampaignResult,
     estimate_arm,
+    estimate_cached,
     estimate_campaign,
     group_of,
     result_of,
@@ -361,9 +362,10 @@ class _Batch:
         The archives that did are removed from these, and reported.
         """
         archives = sum(self._uncached(campaign) for arm in arms for campaign in arm.campaigns)
-        #: who receives a result, by the key of its future. No reference to a future is held, so
-        #: that the workers release results that nothing else needs
-        receivers: dict[str, Callable[[Any], None]] = {}
+        #: who receives a future that is done, by its key. No reference to one is held, so that the
+        #: workers release results that nothing else needs, and only results of campaigns and arms
+        #: are fetched: sums are fifty times as large
+        receivers: dict[str, Callable[[Future], None]] = {}
         damaged: list[_ArmWork] = []
 
         def submitted() -> Iterator[Future]:
@@ -371,9 +373,7 @@ class _Batch:
                 yield from self._submit(arm, receivers, archives, advance)
 
         for future in self.cluster.completed(submitted()):
-            result = self.cluster.outcome_of(future)
-            if not isinstance(result, Death):
-                receivers[future.key](result)
+            receivers[future.key](future)
         for arm in arms:
             if any(campaign.key not in arm.results for campaign in arm.campaigns):
                 damaged.append(arm)
@@ -385,7 +385,7 @@ class _Batch:
     def _submit(
         self,
         arm: _ArmWork,
-        receivers: dict[str, Callable[[Any], None]],
+        receivers: dict[str, Callable[[Future], None]],
         archives: int,
         advance: Callable[[float, str], None],
     ) -> Iterator[Future]:
@@ -398,22 +398,47 @@ class _Batch:
         campaigns: list[Future] = []
         for campaign in arm.campaigns:
             place = campaign.key.campaign
+            partitions = campaign.partitions
+            estimated = (arm.model, campaign.ready, place)
             parts = []
-            for refs in campaign.partitions:
-                part = submit(place, reduce_archives, refs, campaign.ready, self.cache)
-                receivers[part.key] = _advance(advance, len(refs), place)
-                parts.append(part)
-            pair = submit(place, estimate_campaign, parts, arm.model, campaign.ready, place)
+            if all(self._has(refs, campaign) for refs in partitions):
+                pair = submit(place, estimate_cached, partitions, self.cache, *estimated)
+                receivers[pair.key] = _advance(advance, sum(map(len, partitions)), place)
+                yield pair
+            else:
+                for refs in partitions:
+                    part = submit(place, reduce_archives, refs, campaign.ready, self.cache)
+                    receivers[part.key] = _advance(advance, len(refs), place)
+                    parts.append(part)
+                pair = submit(place, estimate_campaign, parts, *estimated)
+                yield from parts
             result = submit(place, result_of, pair)
-            receivers[result.key] = _receive_campaign(arm, campaign.key)
+            receivers[result.key] = self._receive_campaign(arm, campaign.key)
             campaigns.append(pair)
-            yield from parts
             yield result
         if arm.has_pooled:
             sums = [submit("", group_of, chunk) for chunk in _chunks(campaigns)]
             pooled = submit(f"arm {arm.model.digest[:8]}", estimate_arm, sums, arm.model)
-            receivers[pooled.key] = _receive_pooled(arm)
+            receivers[pooled.key] = self._receive_pooled(arm)
             yield pooled
+
+    def _receive_campaign(self, arm: _ArmWork, key: GroupKey) -> Callable[[Future], None]:
+        def receive(future: Future) -> None:
+            result = self.cluster.outcome_of(future)
+            if isinstance(result, SkippedArchive):
+                result = CampaignResult((), (result,), 0, 0)
+            if not isinstance(result, Death):
+                arm.results[key] = result
+
+        return receive
+
+    def _receive_pooled(self, arm: _ArmWork) -> Callable[[Future], None]:
+        def receive(future: Future) -> None:
+            result = self.cluster.outcome_of(future)
+            if not isinstance(result, Death):
+                arm.pooled = result
+
+        return receive
 
     def _uncached(self, campaign: _Campaign) -> int:
         """Return how many archives of a campaign have to be read."""
@@ -476,20 +501,10 @@ def _arm_of(model: ArmModel) -> Arm:
 def _advance(
     advance: Callable[[float, str], None], count: int, note: str
 ) -> Callable[[Future], None]:
-    return lambda _: advance(count, note)
+    """Return what is done when `count` archives are reduced."""
 
-
-def _receive_campaign(arm: _ArmWork, key: GroupKey) -> Callable[[Any], None]:
-    def receive(result: CampaignResult | SkippedArchive) -> None:
-        if isinstance(result, SkippedArchive):
-            result = CampaignResult((), (result,), 0, 0)
-        arm.results[key] = result
-
-    return receive
-
-
-def _receive_pooled(arm: _ArmWork) -> Callable[[Any], None]:
-    def receive(result: Any) -> None:
-        arm.pooled = result
+    def receive(future: Future) -> None:
+        if future.status != "error":
+            advance(count, note)
 
     return receive

@@ -240,6 +240,11 @@ class Factor:
         total = weights @ self.gram.reshape(len(weights), -1)
         return np.asarray(total.reshape(self.gram.shape[1:]))
 
+    @property
+    def squared_torque(self) -> Array:
+        """Sum of the squared torque per joint (n,)."""
+        return np.array([total[-1, -1] for total in self._sums])
+
     def squared_errors(self, values: Array) -> Array:
         """Return the sum of squared torque errors of parameters (p,) per joint (n,)."""
         augmented = np.ones(self.n_parameters + 1)

@@ -11,7 +11,7 @@ import time
 import zlib
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import ClassVar, get_args
 
 import numpy as np
 import pytest
@@ -37,6 +37,7 @@ from hil.identify.options import FIXED
 from hil.identify.prepared import decide, prepare_sources
 from hil.identify.sources import gather_sources
 from hil.progress import Silent
+from identification.factor import factor
 from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Preprocessing
 from tests import messages
@@ -269,6 +270,33 @@ class TestCache:
         assert (second.read, second.cached) == (0, 5)
         assert "consistent" in second.campaigns[0].estimate.method
         assert batch(folder, cache=CacheLocation(), delay=0.002).read == 5
+
+    def test_of_a_campaign_is_read_by_the_task_that_estimates_it(self, folder, tmp_path):
+        class Spied(Here):
+            tasks: ClassVar[list[str]] = []
+
+            def submit(self, task, *, archives):
+                self.tasks.append(task.function.__name__)
+                return super().submit(task, archives=archives)
+
+        cache = CacheLocation(str(tmp_path / "cache"))
+        first = batch(folder, cache=cache)
+        second = batch(folder, cache=cache, cluster=Spied())
+        assert bits(second) == bits(first)
+        assert Spied.tasks[-2:] == ["estimate_cached", "result_of"]
+        assert "reduce_archives" not in Spied.tasks
+
+    def test_preserves_the_blocks_of_long_recordings(self, folder, tmp_path, monkeypatch):
+        """Which are longer than those of short ones, and are merged before they are added."""
+        monkeypatch.setattr(factor, "_MANY_BLOCKS", 4)
+        (ref, *_) = found_in(excitations(folder)[0]).refs
+        cache = CacheLocation(str(tmp_path / "cache"))
+        computed = reduce_archives((ref,), SETTINGS, cache).total
+        cached = cached_reduction((ref,), SETTINGS, cache).total
+        assert cached.block == computed.block > factor.FINE_BLOCK
+        assert [matrix.tobytes() for matrix in cached.matrices] == [
+            matrix.tobytes() for matrix in computed.matrices
+        ]
 
     def test_of_a_read_only_folder_is_in_the_home(self, folder, tmp_path, monkeypatch):
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
