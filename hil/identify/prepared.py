@@ -22,6 +22,7 @@ from identification.estimators.torque_channel import possible_low_passes
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import (
+    DELAY,
     RATE,
     Known,
     Question,
@@ -160,9 +161,21 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
     delay = _DelayChoice.of(_delays(sources, stated, options, reporter), sources, stated, options)
     started = stated.preprocessed(torque_delay=delay.assumed)
     chosen = _chosen(sources, started, delay.suggested, options, reporter)
+    if _adds_load(sources.cell, chosen) and chosen.preprocessing.torque_bandwidth is None:
+        # Without friction that grows with load its absence was estimated as a delay.
+        loaded = replace(sources, cell=sources.cell.with_friction(**chosen.friction))
+        delay = _DelayChoice.of(_delays(loaded, stated, options, reporter), loaded, stated, options)
+        chosen = delay.applied_to(chosen)
     estimate, notes = delay.confirmed_by(chosen.preprocessing)
     variance = estimate.variance if estimate is not None and notes else 0.0
     return Decided(replace(chosen, delay_variance=variance), estimate, notes)
+
+
+def _adds_load(cell: Cell, chosen: Settings) -> bool:
+    """Return whether the chosen friction grows with load and the stated one does not."""
+    return not cell.model.friction.has_load and (
+        cell.with_friction(**chosen.friction).model.friction.has_load
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,6 +210,14 @@ class _DelayChoice:
         delay = SuggestedDelay(estimate.delay, estimate.determined)
         suggested = (delay,) if estimate.significant else ()
         return replace(unused, suggested=suggested, notes=described)
+
+    def applied_to(self, chosen: Settings) -> Settings:
+        """Return settings with the determined delay, whatever others they were chosen beside."""
+        values = [delay.value for delay in self.suggested if delay.determined]
+        choices = tuple(choice for choice in chosen.choices if choice.name != DELAY)
+        return replace(chosen, choices=choices).preprocessed(
+            torque_delay=values[0] if values else self.assumed
+        )
 
     def confirmed_by(self, how: Preprocessing) -> tuple[DelayEstimate | None, tuple[str, ...]]:
         """Return the estimate if the chosen preprocessing agrees with it, and the notes on it."""
@@ -321,12 +342,6 @@ def _chosen(
     questions = _questions(sources, options, suggested)
     if not questions:
         return stated
-    start = stated
-    is_campaign = cell.file.controller is not None and not sources.in_sample
-    if "rows" in questions and is_campaign:
-        # The motion of a campaign moves every joint: what its validation runs hold of joints that
-        # stand, with static friction, it cannot show, and their load shows in motion as well.
-        start = stated.preprocessed(left_out="slow")
     # One repetition of a motion is enough.
     some = sources.training[:1] if sources.same_motion else sources.training
     read = [averaged_source(source, RATE) for source in some]
@@ -353,7 +368,7 @@ def _chosen(
         chosen = choose_settings(
             cell.model,
             ready,
-            start,
+            stated,
             questions,
             low_passes,
             suggested,

@@ -15,7 +15,7 @@ a velocity reversal are left out: presliding friction is similar to a delay.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from identification.distributions import student_limit
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread
+from identification.estimators.load_friction import fit_with_load
 from identification.estimators.torque_scale import DATA_SHEET
 from identification.factor.factor import (
     Estimate,
@@ -210,11 +211,15 @@ def estimate_delay(
     # Reversals are left out below, less widely than beside a smoother of this bandwidth.
     options = replace(options, smooth_torque=False, rigid_bandwidth=narrow, left_out="halts")
     samples = prepare(recording, model, noise_variance=noise_variance, options=options)
-    reader = _Reader.of(model, samples)
     ends = (-LONGEST_DELAY - assumed, LONGEST_DELAY - assumed)
     grid = np.linspace(*ends, 1 + 2 * int(np.ceil(LONGEST_DELAY / _PROFILE_STEP)))
-    heights, values = reader.profile(grid)
-    values = np.concatenate([values, np.zeros(model.n_joints)])
+    # Friction that grows with load resembles a delay of some milliseconds.
+    loaded = fit_with_load(
+        model, (samples,), lambda parts: _Reader.of(model, parts[0]).profile(grid)
+    )
+    reader = _Reader.of(model, loaded.samples[0])
+    heights = loaded.result.heights
+    values = np.concatenate([loaded.result.values, np.zeros(model.n_joints)])
     shift = float(grid[np.argmin(heights)])
     for _ in range(_ITERATIONS):
         blocks = reader.linearised(shift, values)
@@ -225,7 +230,8 @@ def estimate_delay(
         shift = float(np.clip(shift + step, *ends))
         if abs(shift - before) <= max(_CONVERGED, _OF_STD * float(np.sqrt(solution.inverse[p, p]))):
             break
-    other = _other_minimum(grid, heights, shift, reader.profile(np.array([shift]))[0][0])
+    height = reader.profile(np.array([shift])).heights[0]
+    other = _other_minimum(grid, heights, shift, height)
     std, count = blocks.delay_std(solution)
     factor, by_chance = (float(student_limit(share, count - 1)) for share in (0.025, _CHANCE))
     at_limit = shift <= ends[0] or shift >= ends[1]
@@ -319,6 +325,13 @@ class _Blocks:
         return error / self.rows
 
 
+class _Profile(NamedTuple):
+    """Fits at K common shifts."""
+
+    heights: Array  # mean log residual variance (K,)
+    values: Array  # parameters (p,) of the lowest
+
+
 @dataclass(frozen=True, eq=False)
 class _Reader:
     """Recording with torque averaged over short bins, and motion at any time shift."""
@@ -386,8 +399,8 @@ class _Reader:
         result = replace(self.binned, motion=Motion(time, **moved), usable=usable)
         return replace(result, torque=result.torque - result.known_torque(self.model))
 
-    def profile(self, shifts: Array) -> tuple[Array, Array]:
-        """Return mean log residual variance at common shifts (K,), and the best parameters."""
+    def profile(self, shifts: Array) -> _Profile:
+        """Fit the parameters at common shifts (K,)."""
         heights = np.full(len(shifts), np.inf)
         best = np.zeros(self.model.n_parameters)
         for k, shift in enumerate(shifts.tolist()):
@@ -400,7 +413,7 @@ class _Reader:
                 best = fit.values if heights[k] <= heights.min() else best
         if not np.isfinite(heights).any():
             raise IdentificationError(no_rows_message(self.model))
-        return heights, best
+        return _Profile(heights, best)
 
     def linearised(self, shift: float, values: Array, weights: Array | None = None) -> _Blocks:
         """Return normal equations at a shift, linear near p parameters and n scales (p + n,)."""

@@ -77,6 +77,7 @@ LOAD: Final = "friction that grows with load"
 STRENGTH: Final = "strength of the prior"
 CONSISTENT: Final = "physical consistency"
 SPRINGS: Final = "torsion springs"
+ROWS_IN_MOTION: Final = "rows that are left out, by the error in motion"
 """Names of decisions."""
 # A drive differentiates its encoder at a higher rate than the log has.
 VELOCITIES: Final[tuple[VelocitySource, ...]] = ("measured", "position")
@@ -220,15 +221,15 @@ class Folds:
         others = self.fitted.samples - self.fitted.counts
         return bool(others.any(axis=1).all())
 
-    def errors(
-        self, estimate: Callable[[Factor], Array], rows: Literal["all", "fitted"] = "all"
-    ) -> Errors:
-        """Return prediction errors of ``estimate(factor without a segment)`` on its rows."""
-        targets = self.predicted if rows == "all" else self.fitted
+    def errors(self, estimate: Callable[[Factor], Array], targets: Factor) -> Errors:
+        """Return errors of ``estimate(factor without a segment)`` on its part of the targets."""
         values = np.array([estimate(self.without(k)) for k in range(FOLDS)])
         torque = np.array([table[:, -1, -1] for table in targets.matrices]).T
         return Errors(targets.squared_errors_by_block(values), torque)
 
+
+Rows = Literal["all", "fitted", "moving"]
+"""Rows that are predicted; moving ones are those that slide, whichever are fitted."""
 
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
 """Prepares the fitted data for a model, averaged to `RATE`."""
@@ -283,13 +284,10 @@ def choose_settings(
     if "low-pass" in asked:
         now, choices = _compare_low_passes(trial, first, now, choices, asked, low_passes)
     if "friction" in asked:
-        had_load = trial.model(now).friction.has_load
         for decide in (_friction_terms, _load_friction):
             decision = decide(trial, now)
             now = decision.settings
             choices = [*choices, decision.choice]
-        if "delay" in asked and trial.model(now).friction.has_load and not had_load:
-            now, choices = _confirm_delay(trial, start, now, choices)
     if "ripple" in asked:
         rippled = [now.with_friction(ripple=orders) for orders in trial.ripples]
         decision = trial.decide("torque ripple", [now, *rippled])
@@ -316,8 +314,7 @@ def _first_candidates(start: Settings, questions: Collection[Question]) -> Setti
     if "velocity" in questions:
         settings = settings.preprocessed(velocity=VELOCITIES[0])
     if "rows" in questions:
-        rows = start.preprocessing.left_out or LEFT_OUT[0]
-        settings = settings.preprocessed(left_out=rows)
+        settings = settings.preprocessed(left_out=LEFT_OUT[0])
     if "presliding" in questions:
         settings = settings.with_friction(presliding=PRESLIDING[0])
     return settings
@@ -447,22 +444,6 @@ def _compare_delays(
             first = first.preprocessed(torque_delay=delay.value)
             now, choices = _sweep(trial, first, questions)
     return first, now, [*compared, *choices]
-
-
-def _confirm_delay(
-    trial: _Trial, start: Settings, now: Settings, choices: list[Choice]
-) -> tuple[Settings, list[Choice]]:
-    """Leave out a delay that predicts worse beside friction that grows with load, be it by little.
-
-    It was estimated without that friction, whose absence may resemble a delay of some milliseconds.
-    """
-    undelayed = now.preprocessed(torque_delay=start.preprocessing.torque_delay)
-    if trial.key(undelayed) == trial.key(now):
-        return now, choices
-    pair = [each.preprocessed(left_out="slow") for each in (now, undelayed)]
-    decision = trial.decide(DELAY, pair, 0.0, rows="fitted", certainty=0.0)
-    others = [choice for choice in choices if choice.name != DELAY]
-    return (now, undelayed)[decision.choice.chosen], [*others, decision.choice]
 
 
 def _compare_low_passes(
@@ -631,7 +612,7 @@ class _Trial:
         *,
         by_joint: bool = False,
         joint: str | None = None,
-        rows: Literal["all", "fitted"] = "all",
+        rows: Rows = "all",
         possible: Callable[[Settings], bool] | None = None,
         certainty: float = 1.0,
     ) -> _Decision:
@@ -702,22 +683,25 @@ class _Trial:
         """Return the candidate with the least error by joint."""
         return min(candidates, key=lambda each: _mean(self.errors(each).joints))
 
-    def errors(self, settings: Settings, rows: Literal["all", "fitted"] = "all") -> Errors:
+    def errors(self, settings: Settings, rows: Rows = "all") -> Errors:
         """Return the errors of predicting these rows of each segment from the others."""
         key = *self.key(settings), rows
         if key not in self._errors:
             self._errors[key] = self._predicted(settings, rows)
         return self._errors[key]
 
-    def _predicted(self, settings: Settings, rows: Literal["all", "fitted"]) -> Errors:
+    def _predicted(self, settings: Settings, rows: Rows) -> Errors:
         reduced = self._reduced(settings)
         n = self.model(settings).n_joints
         unknown = Errors(np.full((FOLDS, n), np.inf), np.ones((FOLDS, n)))
         if not reduced.folds.separable:
             return unknown
         estimate = self._estimator(settings, reduced)
+        targets = reduced.folds.predicted if rows == "all" else reduced.folds.fitted
+        if rows == "moving":
+            targets = self._reduced(settings.preprocessed(left_out="slow")).folds.fitted
         try:
-            return reduced.folds.errors(estimate, rows)
+            return reduced.folds.errors(estimate, targets)
         except (IdentificationError, np.linalg.LinAlgError):
             return unknown
 
@@ -875,7 +859,6 @@ def _sweep(
     trial: _Trial, now: Settings, questions: Collection[str]
 ) -> tuple[Settings, list[Choice]]:
     """Decide interdependent settings in turn until nothing changes."""
-    usual_rows = now.preprocessing.left_out
     asked = [swept for swept in _SWEPT if swept.question in questions]
     short = trial.duration(now) < SHORT
     choices: list[Choice] = []
@@ -892,16 +875,31 @@ def _sweep(
                     for each, width in zip(candidates, widths, strict=True)
                     if width >= widths[0]
                 ]
-            if swept.question == "rows":
-                candidates.sort(key=lambda each: each.preprocessing.left_out != usual_rows)
             if swept.size is not None:
                 candidates = [candidates[k] for k in trial.walk(candidates, swept.size)]
             decision = trial.decide(swept.name, candidates, certainty=certainty)
             now = decision.settings
             choices = [*choices, decision.choice]
+            if swept.question == "rows":
+                decision = _rows_for_motion(trial, now, candidates, certainty)
+                now = decision.settings
+                choices = [*choices, decision.choice]
         if trial.key(now) == trial.key(before):
             break
     return now, choices
+
+
+def _rows_for_motion(
+    trial: _Trial, now: Settings, candidates: Sequence[Settings], certainty: float
+) -> _Decision:
+    """Choose among the candidates that predict all rows as well by the rows in motion.
+
+    Static friction holds a joint at rest with any torque: its rows cannot be predicted, and decide
+    the error over all rows. Fitted, they spoil the friction at speed.
+    """
+    limit = trial.errors(now).overall * (1.0 + WORTHWHILE)
+    others = [each for each in candidates if each != now and trial.errors(each).overall < limit]
+    return trial.decide(ROWS_IN_MOTION, [now, *others], rows="moving", certainty=certainty)
 
 
 class _Swept(NamedTuple):

@@ -5,7 +5,8 @@ On each part the measured torque of a joint is compared with its prediction,
 .. math:: \tau = (1 + g)\,\hat\tau + e \qquad \text{or} \qquad \tau = \hat\tau + h\,\hat\tau_f + e
 
 with the predicted torque and its friction part. A joint has changed if one of the two factors
-brings its error on unseen motion down to that of the fitted motion.
+brings its error on unseen motion down to what is usual: the error of the fitted motion, and that of
+parameters which the fitted motion leaves uncertain.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.factor.factor import Estimate, Factor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.residuals import BlockMean, block_index, block_mean
@@ -28,9 +30,9 @@ _SIGMAS: Final = 3.0  # standard deviations of a significant change
 # Smallest change that is named; a torque constant drifts by some per cent with the temperature of
 # its magnets.
 _LEAST: Final = 0.03
-# Error on unseen over fitted motion of a joint that may have changed: half of its square again, so
-# that there is an additional error to explain. A change that other axes contradict is an error of
-# the fit as well, and grows it by little.
+# Error on unseen motion over the usual one of a joint that may have changed: half of its square
+# again, so that there is an additional error to explain. A change that other axes contradict is an
+# error of the fit as well, and grows it by little.
 _GROWN: Final = 1.25
 # Error that remains with the change, of a joint that is then predicted as well as usual: twice that
 # of the fitted motion, or that of published fits.
@@ -49,7 +51,7 @@ class Change(NamedTuple):
     kind: ChangeKind
     joint: int
     ratio: float  # unseen over fitted
-    std: float  # standard deviation over blocks of time
+    std: float  # standard deviation over blocks of time, and by the uncertainty of the parameters
     relative: float  # remaining relative error of the joint on unseen motion
 
 
@@ -90,12 +92,46 @@ class _Part(NamedTuple):
         return cls(torque, error, (gain, friction), products[:, 0] ** 2 / power)
 
 
+class _Doubt(NamedTuple):
+    """What the uncertainty of the parameters alone makes of unseen motion (n,)."""
+
+    relative: Array  # error over torque
+    shares: tuple[Array, Array]  # standard deviations of g and h
+
+    @classmethod
+    def of(cls, model: RobotModel, estimate: Estimate, unseen: Factor) -> _Doubt:
+        """Propagate the covariance; an undetermined parameter has none."""
+        determined = np.isfinite(np.diag(estimate.covariance))
+        covariance = np.where(np.outer(determined, determined), estimate.covariance, 0.0)
+        gram = unseen.gram
+        regressor = gram[:, :-1, :-1]
+        squares = np.einsum("ik,jki->j", covariance, regressor)
+        values = estimate.values
+        parts = values, np.where(model.friction_columns, values, 0.0)
+        shares = []
+        for part in parts:
+            mixed = regressor @ part
+            power = mixed @ part
+            spread = np.sqrt(np.maximum(np.einsum("ji,ik,jk->j", mixed, covariance, mixed), 0.0))
+            shares.append(spread / np.where(power > 0.0, power, np.inf))
+        return cls(_relative(squares, gram[:, -1, -1]), (shares[0], shares[1]))
+
+
 def find_changes(
-    model: RobotModel, values: Array, training: Sequence[Samples], held_out: Sequence[Samples]
+    model: RobotModel,
+    estimate: Estimate,
+    training: Sequence[Samples],
+    held_out: Sequence[Samples],
+    held_out_factor: Factor,
 ) -> tuple[Change, ...]:
-    """Compare unseen with fitted motion under parameters (p,); return the joints that changed."""
+    """Compare unseen with fitted motion under an estimate; return the joints that changed.
+
+    The factor is that of the usable held-out rows.
+    """
+    values = estimate.values
     fitted, unseen = (_Part.of(model, values, runs) for runs in (training, held_out))
-    usual = np.maximum(fitted.relative, 1e-9)
+    doubt = _Doubt.of(model, estimate, held_out_factor)
+    usual = np.maximum(np.hypot(fitted.relative, doubt.relative), 1e-9)
     changes = []
     for joint in np.flatnonzero(unseen.relative > _GROWN * usual).tolist():
         beyond = unseen.relative[joint] ** 2 - usual[joint] ** 2
@@ -105,7 +141,7 @@ def find_changes(
             reference = fitted.shares[k]
             base = 1.0 + float(np.nan_to_num(reference.mean[joint]))
             share = float(unseen_share.mean[joint])
-            std = float(unseen_share.std[joint])
+            std = float(np.hypot(unseen_share.std[joint], doubt.shares[k][joint]))
             if not np.isfinite(share) or base <= 0.0:
                 continue
             ratio = (1.0 + share) / base

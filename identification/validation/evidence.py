@@ -373,7 +373,7 @@ def gather(
         noise_floor=floor,
         disagreement=None if noise is None else _disagreement(result),
         causes=find_causes(model, training, values, names, noise=floor),
-        changes=find_changes(model, values, training, others) if others else (),
+        changes=find_changes(model, pooled, training, others, unseen) if others else (),
         one_way=_one_way(training),
         gravity=gravity,
         load=load,

@@ -265,6 +265,20 @@ def chosen(
     return settings, settings.choices
 
 
+def a_motion_with_halts(duration):
+    """The second joint halts for a second in every four; return the rows in which it stands."""
+    motion = a_motion(duration)
+    pace = np.clip(4.0 * np.sin(0.5 * np.pi * motion.time) + 3.0, 0.0, 1.0)
+    pace = np.convolve(pace, np.hanning(41) / np.hanning(41).sum(), mode="same")
+    step = motion.time[1] - motion.time[0]
+    path = CubicSpline(motion.time, motion.position[:, 1])(step * (np.cumsum(pace) - pace[0]))
+    second = CubicSpline(motion.time, path)
+    position = np.column_stack([motion.position[:, 0], path])
+    velocity = np.column_stack([motion.velocity[:, 0], second(motion.time, 1)])
+    acceleration = np.column_stack([motion.acceleration[:, 0], second(motion.time, 2)])
+    return Motion(motion.time, position, velocity, acceleration), pace < 1e-9
+
+
 def a_slow_motion(amplitude):
     """Three sines of about half a rad/s; the speed is up to three times the amplitude."""
     speeds = np.array([[0.3, 0.5], [0.7, 0.4], [1.1, 0.9]])
@@ -406,6 +420,18 @@ class TestChosenSettings:
         assert names[LONG] - names[0.9 * SHORT] == {STRENGTH}
         assert "rows that are left out" in names[0.9 * SHORT]
 
+    def test_rests_that_no_law_predicts_are_not_fitted(self):
+        """They decide the error over all rows, and say nothing of the friction in motion."""
+        motion, standing = a_motion_with_halts(LONG)
+        recording = a_recording(motion=motion, noise=1.0)
+        held = np.zeros_like(recording.torque)
+        held[standing, 1] = 5.0 * np.sign(np.sin(2.0 * motion.time[standing]))
+        settings, choices = chosen(replace(recording, torque=recording.torque + held), {"rows"})
+        by_all_rows, in_motion = choices
+        assert by_all_rows.chosen == 0
+        assert settings.preprocessing.left_out == "halts"
+        assert in_motion.errors[1] < (1.0 - WORTHWHILE) * in_motion.errors[0]
+
     def test_a_joint_may_rest_in_some_segments(self):
         """Joints that move one after the other have segments without rows."""
         recording = a_recording(duration=LONG)
@@ -480,7 +506,7 @@ class TestFolds:
         samples = prepare(recording, MODEL, options=Preprocessing(left_out="slow"))
         folds = Folds.of(MODEL, [samples])
         values = truth()
-        errors = folds.errors(lambda _: values)
+        errors = folds.errors(lambda _: values, folds.predicted)
         edges = np.linspace(0, len(samples.torque), len(errors.squares) + 1).round().astype(int)
         error = samples.torque - samples.predicted_torque(MODEL, values)
         for k, part in enumerate(pairwise(edges)):

@@ -14,7 +14,14 @@ from scipy.signal import lfilter
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import estimate_repetitions
 from identification.estimators.prior import NOMINAL_SHARE
-from identification.factor.factor import Estimate, Factor, estimate, joint_weights, solve
+from identification.factor.factor import (
+    Estimate,
+    Factor,
+    estimate,
+    joint_weights,
+    solve,
+    total_factor,
+)
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
@@ -720,8 +727,8 @@ def with_friction(factor):
 
 def changes_between(fitted, unseen):
     training, held_out = [arm_with(fitted, 1)], [arm_with(unseen, 2)]
-    values = estimate_repetitions(MODEL, training).pooled.values
-    return find_changes(MODEL, values, training, held_out)
+    estimate = estimate_repetitions(MODEL, training).pooled
+    return find_changes(MODEL, estimate, training, held_out, total_factor(MODEL, held_out))
 
 
 class TestChangesToUnseenMotion:

@@ -402,7 +402,8 @@ class TestJudgement:
             (Change("gain", 1, 0.95, 0.001, 0.01), 0.05, "doubtful", "two 0.95 ± 0.002"),
             (Change("friction", 0, 1.3, 0.01, 0.01), 0.1, "wrong", "one +30 %"),
             (Change("friction", 0, 1.3, 0.01, 0.01), 0.03, "wrong", "one +30 %"),
-            (Change("friction", 0, 1.3, 0.01, 0.01), 0.01, "doubtful", "one +30 %"),
+            (Change("friction", 0, 1.3, 0.01, 0.01), 0.01, "wrong", "one +30 %"),
+            (Change("friction", 0, 1.3, 0.01, 0.01), 0.004, "doubtful", "one +30 %"),
             (Change("friction", 0, 0.92, 0.01, 0.01), 0.1, "doubtful", "one -8 %"),
         ],
     )

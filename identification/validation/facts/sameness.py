@@ -69,7 +69,7 @@ class ChangeFacts:
     gain: Mask  # joints of another torque (n,)
     friction: Mask  # joints of other friction (n,)
     matters: Mask  # joints with an error that has to be explained (n,)
-    noticed: Mask  # joints with an error beyond that of a right model (n,)
+    noticed: Mask  # joints with an error that is not one of rounding (n,)
 
     @classmethod
     def of(
@@ -83,7 +83,8 @@ class ChangeFacts:
         # Or it has spoilt the parameters.
         if (load is not None and load.carried) or (gravity is not None and gravity.off):
             return None
-        causes = evidence.causes or ()
+        # A gain of the fitted motion has not: of that motion only, it is what changed.
+        causes = [cause for cause in evidence.causes or () if cause.fault.kind != "gain"]
         if any(cause.fault.discrete or cause.ratio < limits.cause for cause in causes):
             return None
         error = evidence.held_out
@@ -97,7 +98,8 @@ class ChangeFacts:
             gain=_joints_of(evidence, "gain"),
             friction=_joints_of(evidence, "friction"),
             matters=error.relative > limits.unexplained,
-            noticed=error.relative > limits.noticeable,
+            # An error below that of a pattern is one of rounding or smoothing.
+            noticed=error.relative > limits.pattern,
         )
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
@@ -143,10 +145,11 @@ class FrictionFacts:
     def of(
         cls, evidence: Evidence, limits: Thresholds, changes: ChangeFacts | None
     ) -> FrictionFacts | None:
-        """Use repetitions, with which friction is compared apart from noise, else the changes."""
+        """Use changes beyond temperature, else repetitions, which tell friction from noise."""
+        by_factor = None if changes is None else cls._of_changes(changes, limits)
         change = evidence.friction_change
-        if change is None:
-            return None if changes is None else cls._of_changes(changes, limits)
+        if change is None or (by_factor is not None and by_factor.wrong):
+            return by_factor
         nothing = np.zeros(len(evidence.held_out.rows))
         share = evidence.systematic
         apart = evidence.systematic_without_friction
