@@ -178,7 +178,7 @@ class Cluster:
         client = Client(cluster, set_as_default=False)
         self._open.callback(client.close)
         if not few:
-            self._reporter.say(f"{count} workers on this PC; dashboard {cluster.dashboard_link}")
+            self._reporter.step(f"{count} workers on this PC; dashboard {cluster.dashboard_link}")
         return client
 
     def _connected(self, address: str) -> Client:
@@ -201,7 +201,7 @@ class Cluster:
             raise self._without_workers() from error
         self._require_same_code(client)
         count = len(client.scheduler_info(n_workers=-1)["workers"])
-        self._reporter.say(f"{count} workers of {address}; dashboard {client.dashboard_link}")
+        self._reporter.step(f"{count} workers of {address}; dashboard {client.dashboard_link}")
         return client
 
     def _require_same_code(self, client: Client) -> None:

@@ -30,7 +30,7 @@ from hil.batch.run import reidentify
 from hil.cli import app
 from hil.errors import InputError
 from hil.identify.options import FIXED
-from hil.progress import Silent
+from hil.progress import Messages, Silent
 
 from . import batch_work as work
 from .batch_work import NOTHING_OPEN, HandMade, Here
@@ -78,6 +78,13 @@ def test_tasks_that_fail_or_end_their_process_affect_no_other():
     work.check_unused(results[2], "crash-2.mcap", "ended the process that read it, twice")
     work.check_unused(results[4], "absent-4.mcap", "No such file")
     work.check_unused(results[7], "faulty-7.mcap", "IndexError")
+
+
+def test_workers_are_named_on_a_terminal_only(capfd):
+    """What is piped is the result."""
+    with Cluster(1, reporter=Messages()) as cluster:
+        assert cluster.results([work.task(work.number, 3)]) == [3]
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(
