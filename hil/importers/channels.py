@@ -30,28 +30,33 @@ _NUMBER: Final = r"[\[(_. ]*(?P<number>\d{1,2})[\])]*"
 CHANNEL_NAMES: Final[Mapping[Kind, tuple[str, ...]]] = {
     "time": (
         "t", "time", "times", "timestamp", "timestamps", "time_stamp", "stamp", "tstamp",
-        "header.stamp", "clock", "ipoc", "duration", "seconds", "date", "datetime", "zeit",
+        "header.stamp", "clock", "tick", "ticks", "ipoc", "duration", "seconds", "date", "datetime",
+        "zeit",
     ),
     "position": (
-        "q", "pos", "position", "positions", "actual_q", "q_actual", "q_meas", "q_act", "state.q",
+        "q", "pos", "position", "positions", "qpos", "jointposition", "motor_state.q",
+        "motorstate.q", "actual_q", "q_actual", "q_meas", "q_act", "state.q",
         "joint_position", "joint_positions", "jointpos", "angle", "angles", "joint_angle",
         "joint_angles", "aipos.a", "theta", "winkel", "field.position", "observation.state",
         "observation.position",
     ),
     "velocity": (
-        "qd", "dq", "vel", "v", "velocity", "velocities", "actual_qd", "qd_actual", "qd_meas",
+        "qd", "dq", "vel", "v", "qvel", "jointvelocity", "motor_state.dq", "motorstate.dq",
+        "velocity", "velocities", "actual_qd", "qd_actual", "qd_meas",
         "state.dq", "joint_velocity", "joint_velocities", "jointvel", "omega", "speed", "qdot",
         "dtheta", "field.velocity", "observation.velocity",
     ),
     "torque": (
         "tau", "torque", "torques", "effort", "efforts", "eff", "m", "moment", "tau_j",
-        "state.tau_j",
+        "state.tau_j", "qfrc_actuator", "appliedjointmotortorque", "motor_state.tau_est",
+        "motorstate.tauest",
         "tau_meas", "tau_actual", "joint_torque", "joint_torques", "jointtorque", "geartorque.a",
         "drehmoment", "field.effort", "observation.effort", "observation.torque",
     ),
     "motor_current": (
-        "i", "iq", "cur", "curr", "current", "currents", "actual_current", "motor_current",
-        "motor_currents", "motorcurrent", "joint_current", "strom", "amp", "observation.current",
+        "i", "iq", "cur", "curr", "current", "currents", "actual_current", "actuali",
+        "motor_current", "motor_currents", "motorcurrent", "joint_current", "strom", "amp",
+        "observation.current",
     ),
     "commanded_position": (),  # stated by the user: names of commands differ too much
 }  # fmt: skip
@@ -74,6 +79,7 @@ class Channel:
         number: the joint's number in the name, None without one.
         joints: that the log names, in the order of the numbers of a sample.
         text: of the first and the last row of a table, where it is the same and no number.
+        first: of the first row of a table, where it is no number.
     """
 
     name: str
@@ -86,6 +92,7 @@ class Channel:
     number: int | None = None
     joints: tuple[str, ...] = ()
     text: str | None = None
+    first: str | None = None
 
 
 def channels_of(path: Path, form: Format | None = None) -> tuple[Channel, ...]:
@@ -138,9 +145,11 @@ def _of_table(table: Table) -> Iterator[Channel]:
             rate = _rate(table, place)
     for place, name in enumerate(names[: table.width]):
         kind, number = kinds[place]
+        beginning = first[place] if place < len(first) else ""
         yield Channel(
             name, 1, len(table.lines), table.unit(place), "text", rate, kind, number,
             text=texts[place],
+            first=None if not beginning or table.is_number(beginning) else beginning,
         )  # fmt: skip
 
 

@@ -13,16 +13,19 @@ from typing import Final
 from hil.importers.units import Kind
 
 _WORD: Final = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-zäöü]+|[A-Z]+")
+_COMPOUND: Final = re.compile(r"^(ist|soll)((?:position|winkel|\w*moment|strom|wert)\w*)$")
+_MEASURED: Final = frozenset({"actual", "act", "measured", "meas", "msr", "ist"})
 _QUANTITIES: Final[Mapping[Kind, frozenset[str]]] = {
     "time": frozenset({"t", "time", "times", "timestamp", "timestamps", "stamp", "zeit"}),
     "position": frozenset(
         {"q", "pos", "position", "positions", "angle", "angles", "theta", "winkel"}
     ),
     "velocity": frozenset(
-        {"qd", "dq", "qdot", "vel", "velocity", "velocities", "speed", "speeds", "omega"}
+        {"qd", "dq", "qdot", "vel", "velo", "velocity", "velocities", "speed", "speeds", "omega"}
     ),
     "torque": frozenset(
-        {"tau", "torque", "torques", "effort", "efforts", "eff", "trq", "torq", "drehmoment"}
+        {"tau", "moment", "torque", "torques", "effort", "efforts", "eff", "trq", "torq"}
+        | {"drehmoment"}
     ),
     "motor_current": frozenset({"current", "currents", "cur", "curr", "amp", "strom"}),
 }
@@ -45,7 +48,8 @@ def words_of(name: str) -> list[str]:
     ``axisQMsr`` has the words axis, q and msr.
     """
     split = re.sub(r"(?<=[a-z])([A-Z])(?=[A-Z][a-z])", r" \1 ", name)
-    return [word.lower() for word in _WORD.findall(split)]
+    words = [word.lower() for word in _WORD.findall(split)]
+    return [part for word in words for part in _COMPOUND.sub(r"\1 \2", word).split()]
 
 
 def is_other(name: str, kind: Kind) -> bool:
@@ -57,10 +61,23 @@ def is_other(name: str, kind: Kind) -> bool:
     return not (_OTHER - allowed).isdisjoint(words_of(name))
 
 
-def kind_by_words(name: str) -> Kind | None:
-    """Return the only quantity that the words of a name say; None if another word denies it."""
+def is_measured(name: str) -> bool:
+    """Return whether a word says that a channel was measured, not wanted or computed."""
+    return not _MEASURED.isdisjoint(words_of(name))
+
+
+def kinds_said(name: str) -> list[Kind]:
+    """Return the quantities of the words of a name, whatever denies them."""
     words = set(words_of(name))
     kinds = [kind for kind, names in _QUANTITIES.items() if names & words]
     if len(kinds) > 1 and "time" in kinds and "t" in words:
         kinds.remove("time")  # the t of an axis or a tool
+    return kinds
+
+
+def kind_by_words(name: str) -> Kind | None:
+    """Return the only quantity that the words of a name say; None if another word denies it."""
+    kinds = kinds_said(name.rpartition(".")[2])  # positions.timestamps
+    if len(kinds) != 1:
+        kinds = kinds_said(name)
     return kinds[0] if len(kinds) == 1 and not is_other(name, kinds[0]) else None

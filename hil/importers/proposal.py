@@ -16,7 +16,7 @@ from typing import Final, NoReturn
 from hil.errors import SourceError, UnrecordedJointError
 from hil.importers.channels import CHANNEL_NAMES, Channel, channels_of, kind_of
 from hil.importers.column_map import ColumnMap, Format, ready_map, ready_maps
-from hil.importers.name_words import kind_by_words, words_of
+from hil.importers.name_words import is_measured, kind_by_words, kinds_said, words_of
 from hil.importers.robot import Robot
 from hil.importers.row_names import RowNames, row_names
 from hil.importers.units import UNITS, Kind, unit_of, without_unit
@@ -124,6 +124,7 @@ def proposed_map(
     joints = robot.joint_names
     form = Format(missing="drop") if drop_missing else None
     channels = channels_of(log, form)
+    _refuse_row_for_each_joint(log, channels, joints)
     groups = _groups(channels, joints)
     names = row_names([channel.text for channel in channels], joints)
     recorded = () if names.joints == tuple(joints) else names.joints
@@ -138,6 +139,23 @@ def proposed_map(
     search = _Search(log, joints, groups, chosen, sample_rate, recorded)
     search.nanoseconds = nanoseconds
     return search.proposal(form)
+
+
+def _refuse_row_for_each_joint(
+    log: Path, channels: Sequence[Channel], joints: Sequence[str]
+) -> None:
+    """Raise SourceError for a table that names the joint of each row."""
+    column = next((each for each in channels if each.first in joints and not each.text), None)
+    time = next((each.name for each in channels if each.kind == "time"), "time")
+    if column is None or len(joints) < 2:
+        return
+    problem = f"has a row for each joint, named in column {column.name}, not one for each time"
+    remedy = (
+        f"make columns of the joints, in pandas: wide = df.pivot(index={time!r}, "
+        f"columns={column.name!r}); wide.columns = ['_'.join(name) for name in wide.columns]; "
+        "wide.to_csv('wide.csv')"
+    )
+    raise SourceError(log, problem, field=column.name, remedy=remedy)
 
 
 def kinds_of_file(path: Path) -> list[Kind]:
@@ -290,6 +308,9 @@ class _Search:
         groups = self._groups_of(kind)
         if not groups:
             return None
+        measured = [group for group in groups if is_measured(group.pattern)]
+        if len(measured) == 1:
+            groups = measured
         if len(groups) > 1:
             self._refuse_several(kind, groups)
         (group,) = groups
@@ -446,8 +467,8 @@ class _Search:
             steps = [f"--sample-rate HZ or --columns time={place}"] if "time" in missing else []
             count = len(self._joints)
             for number, kind in enumerate(kind for kind in missing if kind != "time"):
-                place_of = min(number, len(unnamed) - 1)
-                pattern = unnamed[place_of].pattern if unnamed else "NAME{}"
+                pattern = _likely(kind, unnamed)
+                unnamed = [group for group in unnamed if group.pattern != pattern]
                 if self._nameless:
                     first = 1 + number * count
                     pattern = ",".join(map(str, range(first, first + count)))
@@ -458,7 +479,7 @@ class _Search:
                     "; without torque, commanded positions (--columns"
                     " 'commanded_position=NAME{}') are enough for `hil rollout --polish`"
                 )
-                if not unnamed:
+                if pattern == "NAME{}":
                     remedy = f"record it, or {remedy}"
         raise SourceError(self._log, problem, field=", ".join(missing), remedy=remedy)
 
@@ -486,6 +507,14 @@ class _Search:
             f"write a map of the files (--map map.toml): {'; '.join(lines)}; and {_SIDE} where a "
             "quantity was measured before the gears"
         )
+
+
+def _likely(kind: str, groups: Sequence[_Group]) -> str:
+    """Return the pattern of the group that may be of a quantity: by its words, else the first."""
+    said = {group.pattern: kinds_said(group.pattern) for group in groups if group.kind is None}
+    patterns = [pattern for pattern, kinds in said.items() if kind in kinds]
+    patterns += [pattern for pattern, kinds in said.items() if not kinds]
+    return patterns[0] if patterns else "NAME{}"
 
 
 def _named(kind: str) -> str:

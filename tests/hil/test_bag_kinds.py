@@ -59,14 +59,38 @@ def urdf(tmp_path: Path) -> Path:
     return path
 
 
+def ros_1_bag(path: Path, messages: Sequence[Message]) -> Path:
+    """Write joint states of ROS 2 to a bag of ROS 1."""
+    new, old = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
+    kinds = (STATE, "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    state, header, clock = (old.types[kind] for kind in kinds)
+    with Ros1Writer(path) as writer:
+        connection = writer.add_connection("/joint_states", STATE, typestore=old)
+        for k, (received, data) in enumerate(messages):
+            content = new.deserialize_cdr(data, STATE)
+            stamp = content.header.stamp
+            time = clock(sec=stamp.sec, nanosec=stamp.nanosec)
+            converted = state(
+                header=header(seq=k, stamp=time, frame_id=""), name=content.name,
+                position=content.position, velocity=content.velocity, effort=content.effort,
+            )  # fmt: skip
+            writer.write(connection, received, old.serialize_ros1(converted, STATE))
+    return path
+
+
 class Typed:
     """What `hil import rosbag2` of these messages says and writes."""
 
+    suffix = "db3"
+
     def __init__(self, urdf: Path, messages: Sequence[Message], *options: str) -> None:
         self.urdf, self.folder = urdf, urdf.parent
-        self.path = self.folder / "bag.db3"
+        self.path = self.folder / f"bag.{self.suffix}"
         self.path.unlink(missing_ok=True)
-        bag(self.path, {"/joint_states": (STATE, list(messages))})
+        if self.suffix == "bag":
+            ros_1_bag(self.path, messages)
+        else:
+            bag(self.path, {"/joint_states": (STATE, list(messages))})
         self.again(*options)
 
     def again(self, *options: str) -> Typed:
@@ -96,6 +120,13 @@ def assert_right(archive: Archive, *, rows: slice = slice(None), tolerance: floa
     assert columns["torque"] == pytest.approx(TORQUE[rows], abs=1e3 * tolerance)
 
 
+@pytest.fixture(params=["db3", "bag"])
+def each_kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bags of ROS 2 in a database, and of ROS 1."""
+    monkeypatch.setattr(Typed, "suffix", request.param)
+
+
+@pytest.mark.usefixtures("each_kind")
 class TestPublishers:
     @pytest.mark.parametrize("options", [(), ("--lock-others",)])
     def test_joints_of_several_messages_are_merged_by_stamp(self, urdf, options) -> None:
@@ -208,6 +239,7 @@ class TestPublishers:
         assert not Typed(urdf, [sent for sent in WHOLE for _ in range(2)]).refused
 
 
+@pytest.mark.usefixtures("each_kind")
 class TestMissingQuantities:
     def test_the_joint_without_effort_is_named(self, urdf) -> None:
         effort = TORQUE.copy()
@@ -226,6 +258,7 @@ class TestMissingQuantities:
         assert "velocity: joint knee has none in any message" in typed.message
 
 
+@pytest.mark.usefixtures("each_kind")
 class TestClocks:
     def test_messages_that_changed_places_are_sorted_and_counted(self, urdf) -> None:
         messages = list(WHOLE)
@@ -337,21 +370,7 @@ class TestFiles:
         assert_right(self.read(copy, urdf))
 
     def test_a_bag_of_ros_1(self, urdf) -> None:
-        store = get_typestore(Stores.ROS1_NOETIC)
-        header, clock = (
-            store.types[f"{kind}"]
-            for kind in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time")
-        )
-        path = urdf.with_name("old.bag")
-        with Ros1Writer(path) as writer:
-            connection = writer.add_connection("/joint_states", STATE, typestore=store)
-            for k, stamp in enumerate(STAMPS):
-                time = clock(sec=stamp // 10**9, nanosec=stamp % 10**9)
-                state = store.types[STATE](
-                    header=header(seq=k, stamp=time, frame_id=""), name=list(JOINTS),
-                    position=POSITION[k], velocity=SLOPE[k], effort=TORQUE[k],
-                )  # fmt: skip
-                writer.write(connection, stamp + 77, store.serialize_ros1(state, STATE))
+        path = ros_1_bag(urdf.with_name("old.bag"), WHOLE)
         assert_right(self.read(path, urdf))
 
     def test_a_truncated_mcap_names_what_recovers_it(self, urdf) -> None:

@@ -113,6 +113,48 @@ def lists(bracket: Callable[[Floats], str]) -> Callable[[Path], Path]:
     return write
 
 
+def of(time: str, *names: str) -> Callable[[Path], Path]:
+    """Names of position, velocity and torque, then of others; {} is a joint from 0."""
+
+    def write(path: Path) -> Path:
+        factor = 180.0 / np.pi if any("deg" in name or "°" in name for name in names) else 1.0
+        columns = [factor * POSITION, factor * SLOPE, TORQUE, 0.01 * TORQUE, 0.01 * TORQUE]
+        header, values = [time], [TIME]
+        for name, part in zip(names, columns, strict=False):
+            numbered = [name.replace("{}", str(joint)) for joint in range(3)]
+            header += [name.replace("JOINT", JOINTS[k]) for k, name in enumerate(numbered)]
+            values += [*part.T]
+        return table(path, header, *values, mark=";")
+
+    return write
+
+
+# As these loggers name them: DynamicJointState, Doosan's state, MuJoCo's data, Isaac Gym, a
+# Unitree's low state, PyBullet's joint states, the traces of FANUC, KUKA and TwinCAT.
+NAMES = {
+    "doosan": of(
+        "time_stamp", "actual_joint_position[{}]", "actual_joint_velocity[{}]",
+        "actual_joint_torque[{}]", "raw_joint_torque[{}]", "external_joint_torque[{}]",
+    ),
+    "mujoco": of("sim_time", "qpos_{}", "qvel_{}", "qfrc_actuator_{}", "qfrc_bias_{}"),
+    "isaac": of("step_time", "dof_pos_{}", "dof_vel_{}", "dof_torque_{}"),
+    "unitree": of(
+        "tick", "motor_state[{}].q", "motor_state[{}].dq", "motor_state[{}].tau_est",
+        "motor_state[{}].temperature",
+    ),
+    "pybullet": of(
+        "t", "JOINT_jointPosition", "JOINT_jointVelocity", "JOINT_appliedJointMotorTorque"
+    ),
+    "fanuc": of("Tick", "J{} Angle(deg)", "J{} Speed(deg/s)", "J{} Torque(Nm)", "J{} Current(A)"),
+    "kuka": of(
+        "Zeit [s]", "A{} Istposition [°]", "A{} Istgeschw. [°/s]", "A{} Drehmoment [Nm]"
+    ),
+    "twincat": of(
+        "Time", "GVL.Axis[{}].NcToPlc.ActPos", "GVL.Axis[{}].NcToPlc.ActVelo",
+        "GVL.Axis[{}].NcToPlc.ActTorque",
+    ),
+}  # fmt: skip
+
 ORDER = (2, 0, 1)
 
 
@@ -161,6 +203,7 @@ LAYOUTS: Mapping[str, Callable[[Path], Path]] = {
     "ros2 topic echo": echo_without_header,
     "ros2 topic echo in the order of the URDF": echo_in_order,
     "rostopic echo": echo_with_header,
+    **NAMES,
     "cells that are lists": lists(lambda row: str(row.tolist())),
     "cells that are tuples": lists(lambda row: str(tuple(row.tolist()))),
     "cells that are arrays": lists(lambda row: str(row).replace(" ", "  ")),
@@ -191,6 +234,37 @@ def test_its_map_reads_it_again(tmp_path: Path, robot: Robot, layout: str) -> No
     again = import_recording(path, tmp_path / "b.mcap", lambda _: robot, options)
     columns = [open_archive(recording.archive).columns for recording in (first, again)]
     assert all(np.array_equal(columns[0][name], columns[1][name]) for name in columns[1])
+
+
+def test_wanted_and_measured_in_german(tmp_path: Path, robot: Robot) -> None:
+    path = of("Zeit [s]", "A{} Istwinkel [rad]", "A{} Sollwinkel [rad]", "A{} Moment [Nm]")
+    lines = imported(path(tmp_path / "log.csv"), robot).lines
+    assert any(line.startswith("A0 Istwinkel .. A2 Istwinkel: position") for line in lines)
+    assert any("not used: A0 Sollwinkel" in line for line in lines)
+
+
+def test_a_row_for_each_joint(tmp_path: Path, robot: Robot) -> None:
+    rows = [
+        {"time": time, "joint": name, "position": q, "effort": tau}
+        for time, *values in zip(TIME, POSITION, TORQUE, strict=True)
+        for name, q, tau in zip(JOINTS, *values, strict=True)
+    ]
+    frame = pd.DataFrame(rows)
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(SourceError, match="row for each joint, named in column joint") as refused:
+        imported(tmp_path / "log.csv", robot)
+    assert "df.pivot(index='time', columns='joint')" in str(refused.value)
+    wide = frame.pivot(index="time", columns="joint")
+    wide.columns = pd.Index(["_".join(name) for name in wide.columns])
+    wide.to_csv(tmp_path / "wide.csv")
+    columns = open_archive(imported(tmp_path / "wide.csv", robot).archive).columns
+    assert np.allclose(columns["position"], POSITION, rtol=0.0, atol=1e-6)
+
+
+def test_a_missing_torque_is_offered_by_its_words(tmp_path: Path, robot: Robot) -> None:
+    path = of("time", "q{}", "omega_x{}", "target_torque{}")(tmp_path / "log.csv")
+    with pytest.raises(SourceError, match=r"--columns 'torque=target_torque\{\}'"):
+        imported(path, robot)
 
 
 class TestListsOfAnotherLength:
