@@ -243,8 +243,9 @@ class Criteria:
 
     @property
     def measures(self) -> tuple[float, ...]:
-        """Values of `CRITERIA`, in their order."""
-        return tuple(getattr(self, name) for name in CRITERIA)
+        """Values of `CRITERIA`, in their order; NaN of those that an earlier file lacks."""
+        values = (getattr(self, name) for name in CRITERIA)
+        return tuple(np.nan if value is None else value for value in values)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
