@@ -53,6 +53,7 @@ class Change(NamedTuple):
     ratio: float  # unseen over fitted
     std: float  # standard deviation over blocks of time, and by the uncertainty of the parameters
     relative: float  # remaining relative error of the joint on unseen motion
+    alike: bool = False  # whether the other kind explains it as well
 
 
 class _Part(NamedTuple):
@@ -158,7 +159,7 @@ def find_changes(
         if trials:
             least = min(trial.relative for trial in trials)
             alike = [trial for trial in trials if trial.relative <= _ALIKE * least]
-            changes.append(alike[-1])
+            changes.append(alike[-1]._replace(alike=len(alike) > 1))
     return tuple(changes)
 
 

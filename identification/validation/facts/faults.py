@@ -158,7 +158,7 @@ class FaultFacts:
         for cause in self.causes:
             joints = [naming.joints[joint] for joint in cause.fault.joints] or ["all axes"]
             text = _text(cause, " and ".join(joints), naming)
-            certain = cause.fault.discrete or cause.ratio < self.certain_below
+            certain = cause.fault.discrete or self._ratio_of(cause) < self.certain_below
             if self._is_assumed(cause):
                 std = percentage(self._scale_std_of(cause), 1)
                 yield Finding(
@@ -176,6 +176,11 @@ class FaultFacts:
                 text.step,
                 "cause",
             )
+
+    def _ratio_of(self, cause: Cause) -> float:
+        """Return the ratio of the errors: of a gain that of its joint, from the mean over all."""
+        own = cause.fault.kind == "gain" and cause.fault.part is None
+        return cause.ratio ** (len(self.scale_std) if own else 1)
 
     def _is_assumed(self, cause: Cause) -> bool:
         """Return whether a torque is off by no more than the scale of torques may be."""
