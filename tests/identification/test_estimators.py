@@ -1169,7 +1169,7 @@ class TestDelay:
         assert np.abs(errors).max() < 1.5
 
     def test_friction_that_grows_with_load_does_not_bias_it(self):
-        """A tenth of the transmitted torque, which resembles a delay where no term stands for it."""
+        """A tenth of the transmitted torque, which resembles a delay without its term."""
         recording = delayed(1.6e-3, torque_noise=0.3)
         motion = four_sines_at(recording.time - 1.6e-3)
         grown = 0.1 * np.abs(MODEL.gear_torque(TRUTH, *motion)) * np.sign(motion[1])

@@ -411,7 +411,7 @@ class TestJudgement:
         (cause,) = (finding for finding in judged(**changes).findings if finding.role == "cause")
         assert cause.level == level and message in cause.words
 
-    def test_a_torque_that_changed_as_friction_may_have_is_named_with_it(self):
+    def test_torque_and_friction_that_are_alike_are_both_named(self):
         changes = (Change("friction", 1, 1.1001, 0.001, 0.01, alike=True),)
         (cause,) = (each for each in judged(changes=changes).findings if each.role == "cause")
         assert "another torque constant of two explains it as well" in cause.words
@@ -433,16 +433,22 @@ class TestJudgement:
         assert named == any(finding.check == "torque constant" for finding in findings)
 
     @pytest.mark.parametrize(
-        ("size", "ratio", "level"),
-        [(0.1, 0.8, "information"), (0.2, 0.8, "wrong"), (0.2, 0.9, "doubtful")],
+        ("size", "ratio", "error", "level"),
+        [
+            (0.1, 0.8, 0.1, "information"),
+            (0.2, 0.8, 0.1, "wrong"),
+            (0.2, 0.9, 0.1, "doubtful"),
+            (0.2, 0.8, 0.05, "doubtful"),
+        ],
     )
-    def test_a_constant_within_the_assumed_scale_is_no_cause(self, size, ratio, level):
+    def test_a_constant_within_the_assumed_scale_is_no_cause(self, size, ratio, error, level):
         """Three standard deviations of the ratio of two torques known to 3 % are 13 %.
 
         The ratio is that of both axes: the error of the second is multiplied by its square.
         """
         causes = (Cause(Fault("gain", (1,)), ratio, size, 0.001),)
-        verdict = judged(causes=causes, scale_std=np.full(2, 0.03))
+        errors = {"held_out": an_error(error), "training": an_error(error)}
+        verdict = judged(causes=causes, scale_std=np.full(2, 0.03), **errors)
         (finding,) = (each for each in verdict.findings if each.check == "torque constant")
         assert finding.level == level
         assert ("assumed uncertainty" in finding.words) == (level == "information")

@@ -121,6 +121,7 @@ class FaultFacts:
     certain_below: float  # ratio of the errors
     # of the scale of one joint's torque over those of the others, as it is assumed (n,)
     scale_std: Array
+    matters: Mask  # joints with an error that has to be explained (n,)
 
     @classmethod
     def of(
@@ -151,7 +152,8 @@ class FaultFacts:
         std = evidence.context.scale_std
         std = np.zeros(len(evidence.held_out.rows)) if std is None else std
         others = np.sqrt(np.maximum((std**2).sum() - std**2, 0.0) / max(len(std) - 1, 1))
-        return cls(causes, limits.cause, np.hypot(std, others))
+        matters = np.nan_to_num(evidence.held_out.relative) > limits.unexplained
+        return cls(causes, limits.cause, np.hypot(std, others), matters)
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
         """Yield each fault."""
@@ -178,9 +180,12 @@ class FaultFacts:
             )
 
     def _ratio_of(self, cause: Cause) -> float:
-        """Return the ratio of the errors: of a gain that of its joint, from the mean over all."""
-        own = cause.fault.kind == "gain" and cause.fault.part is None
-        return cause.ratio ** (len(self.scale_std) if own else 1)
+        """Return the ratio of the errors, of a gain that matters that of its joint alone.
+
+        It is a geometric mean over all joints, of which a gain of one hardly changes the others.
+        """
+        alone = cause.fault.kind == "gain" and bool(self.matters[[*cause.fault.joints]].any())
+        return cause.ratio ** (len(self.matters) if alone else 1)
 
     def _is_assumed(self, cause: Cause) -> bool:
         """Return whether a torque is off by no more than the scale of torques may be."""
