@@ -37,9 +37,10 @@ _GROWN: Final = 1.25
 # Error that remains with the change, of a joint that is then predicted as well as usual: twice that
 # of the fitted motion, or that of published fits.
 _USUAL: Final = (2.0, 0.1)
-# Share of the additional squared error that the change has to explain. Planted changes: at least
-# 0.95; another motion that the fitted one does not cover: below 0.6.
-_EXPLAINED: Final = 0.8
+# Share of the additional squared error that the change has to explain: twice what is left. Planted
+# changes: at least 0.72, of a friction that is a twentieth of the torque; another motion that the
+# fitted one does not cover: below 0.6.
+_EXPLAINED: Final = 2.0 / 3.0
 # Ratio of remaining errors up to which the two kinds are alike, as for a joint that has little more
 # than friction: friction varies, a gain is set once.
 _ALIKE: Final = 1.1
