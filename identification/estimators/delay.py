@@ -213,13 +213,8 @@ def estimate_delay(
     samples = prepare(recording, model, noise_variance=noise_variance, options=options)
     ends = (-LONGEST_DELAY - assumed, LONGEST_DELAY - assumed)
     grid = np.linspace(*ends, 1 + 2 * int(np.ceil(LONGEST_DELAY / _PROFILE_STEP)))
-    # Friction that grows with load resembles a delay of some milliseconds.
-    loaded = fit_with_load(
-        model, (samples,), lambda parts: _Reader.of(model, parts[0]).profile(grid)
-    )
-    reader = _Reader.of(model, loaded.samples[0])
-    heights = loaded.result.heights
-    values = np.concatenate([loaded.result.values, np.zeros(model.n_joints)])
+    reader, (heights, values) = _profiled(model, samples, grid)
+    values = np.concatenate([values, np.zeros(model.n_joints)])
     shift = float(grid[np.argmin(heights)])
     for _ in range(_ITERATIONS):
         blocks = reader.linearised(shift, values)
@@ -250,6 +245,15 @@ def estimate_delay(
             and blocks.predicted() < unshifted.predicted(with_delay=False)
         ),
     )
+
+
+def _profiled(model: RobotModel, samples: Samples, shifts: Array) -> tuple[_Reader, _Profile]:
+    """Return a reader of the samples, with their load, and its profile at common shifts (K,)."""
+    # Friction that grows with load resembles a delay of some milliseconds.
+    loaded = fit_with_load(
+        model, (samples,), lambda parts: _Reader.of(model, parts[0]).profile(shifts)
+    )
+    return _Reader.of(model, loaded.samples[0]), loaded.result
 
 
 def _other_minimum(grid: Array, heights: Array, shift: float, height: float) -> float:

@@ -228,7 +228,7 @@ class Folds:
         return Errors(targets.squared_errors_by_block(values), torque)
 
 
-Rows = Literal["all", "fitted", "moving"]
+PredictedRows = Literal["all", "fitted", "moving"]
 """Rows that are predicted; moving ones are those that slide, whichever are fitted."""
 
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
@@ -612,7 +612,7 @@ class _Trial:
         *,
         by_joint: bool = False,
         joint: str | None = None,
-        rows: Rows = "all",
+        rows: PredictedRows = "all",
         possible: Callable[[Settings], bool] | None = None,
         certainty: float = 1.0,
     ) -> _Decision:
@@ -683,14 +683,14 @@ class _Trial:
         """Return the candidate with the least error by joint."""
         return min(candidates, key=lambda each: _mean(self.errors(each).joints))
 
-    def errors(self, settings: Settings, rows: Rows = "all") -> Errors:
+    def errors(self, settings: Settings, rows: PredictedRows = "all") -> Errors:
         """Return the errors of predicting these rows of each segment from the others."""
         key = *self.key(settings), rows
         if key not in self._errors:
             self._errors[key] = self._predicted(settings, rows)
         return self._errors[key]
 
-    def _predicted(self, settings: Settings, rows: Rows) -> Errors:
+    def _predicted(self, settings: Settings, rows: PredictedRows) -> Errors:
         reduced = self._reduced(settings)
         n = self.model(settings).n_joints
         unknown = Errors(np.full((FOLDS, n), np.inf), np.ones((FOLDS, n)))

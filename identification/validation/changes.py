@@ -37,9 +37,10 @@ _GROWN: Final = 1.25
 # Error that remains with the change, of a joint that is then predicted as well as usual: twice that
 # of the fitted motion, or that of published fits.
 _USUAL: Final = (2.0, 0.1)
-# Share of the additional squared error that the change has to explain. Planted changes: at least
-# 0.95; another motion that the fitted one does not cover: below 0.6.
-_EXPLAINED: Final = 0.8
+# Share of the additional squared error that the change has to explain: twice what is left. Planted
+# changes: at least 0.72, of a friction that is a twentieth of the torque; another motion that the
+# fitted one does not cover: below 0.6.
+_EXPLAINED: Final = 2.0 / 3.0
 # Ratio of remaining errors up to which the two kinds are alike, as for a joint that has little more
 # than friction: friction varies, a gain is set once.
 _ALIKE: Final = 1.1
@@ -53,6 +54,7 @@ class Change(NamedTuple):
     ratio: float  # unseen over fitted
     std: float  # standard deviation over blocks of time, and by the uncertainty of the parameters
     relative: float  # remaining relative error of the joint on unseen motion
+    alike: bool = False  # whether the other kind explains it as well
 
 
 class _Part(NamedTuple):
@@ -158,7 +160,7 @@ def find_changes(
         if trials:
             least = min(trial.relative for trial in trials)
             alike = [trial for trial in trials if trial.relative <= _ALIKE * least]
-            changes.append(alike[-1])
+            changes.append(alike[-1]._replace(alike=len(alike) > 1))
     return tuple(changes)
 
 

@@ -74,7 +74,8 @@ class Thresholds:
     systematic: float = 0.03
     #: the same, doubtful; a wrist torque constant wrong by 30 % causes 1 to 3 %
     noticeable: float = 0.02
-    #: error ratio with a fault corrected below which it is wrong; signs and orders always are
+    #: error ratio with a fault corrected below which it is wrong, on its joints; signs and orders
+    #: always are
     cause: float = 0.7
     unexplained: float = 0.06  #: error over all axes accepted without a cause, whatever the noise
     multiple: float = 5.0  #: the same, in noise floors
@@ -82,7 +83,7 @@ class Thresholds:
     friction: float = 0.03  #: change of friction to unseen motion that is doubtful
     drift: float = 0.03  #: change of friction during the recordings, as a share of the torque
     #: error on unseen over error on fitted motion, as shares of the torque; wrong if also above
-    #: half of `axis`, above a quarter of it if the torque errors themselves have this ratio
+    #: half of `axis`, above `unexplained` if the torque error itself has grown by a half
     generalisation: float = 2.5
     #: torque of an axis as a share of that of all axes below which it alone does not decide: an
     #: eighth of `overall`, so that losing it entirely adds 0.1 points to the error over all axes

@@ -1184,6 +1184,18 @@ class TestDelay:
             assert estimate.half_interval < 1.2 * exact.half_interval
         assert np.abs(errors).max() < 1.5
 
+    def test_friction_that_grows_with_load_does_not_bias_it(self):
+        """A tenth of the transmitted torque, which resembles a delay without its term."""
+        recording = delayed(1.6e-3, torque_noise=0.3)
+        motion = four_sines_at(recording.time - 1.6e-3)
+        grown = 0.1 * np.abs(MODEL.gear_torque(TRUTH, *motion)) * np.sign(motion[1])
+        loaded = replace(recording, torque=recording.torque + grown)
+        without, beside = (
+            estimate_delay(loaded, MODEL.with_friction(load=load)) for load in (False, True)
+        )
+        assert beside.delay == pytest.approx(1.6e-3, abs=beside.half_interval)
+        assert beside.half_interval < 0.5 * without.half_interval
+
     def test_recordings_in_succession_determine_it_better(self):
         recordings = [delayed(1.6e-3, seed=seed) for seed in range(4)]
         single = estimate_delay(recordings[0], MODEL)

@@ -779,6 +779,20 @@ class TestChangesToUnseenMotion:
         assert (change.kind, change.joint) == ("gain", 1)
         assert change.ratio == pytest.approx(1.1, abs=0.02)
 
+    def test_an_uncertain_friction_is_no_change(self):
+        """What the fitted motion leaves open differs on unseen motion by no fault of it."""
+        training, held_out = (
+            [arm_with(as_it_is, 1)],
+            [arm_with(with_friction(np.array([1.0, 1.3])), 2)],
+        )
+        estimate = estimate_repetitions(MODEL, training).pooled
+        unseen = total_factor(MODEL, held_out)
+        friction = np.diag(MODEL.friction_columns * (0.3 * estimate.values) ** 2)
+        doubted = replace(estimate, covariance=estimate.covariance + friction)
+        (change,) = find_changes(MODEL, estimate, training, held_out, unseen)
+        assert change.joint == 1
+        assert find_changes(MODEL, doubted, training, held_out, unseen) == ()
+
     def test_another_error_is_no_change(self):
         def waved(motion, torque):
             return torque + 3.0 * np.sin(40.0 * motion.time)[:, None]

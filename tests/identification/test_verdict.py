@@ -381,6 +381,20 @@ class TestJudgement:
         changes = {"training": an_error(np.array([0.05, 0.015])), "held_out": an_error(0.1)}
         assert any("two 6.7 times, 10.0 %" in reason for reason in judged(**changes).reasons)
 
+    def test_nor_is_one_whose_share_grew_more_than_its_error(self):
+        """Twice the error, of less torque."""
+        fitted, unseen = an_error(np.array([0.04, 0.03])), an_error(np.array([0.04, 0.09]))
+        less = np.array([1.0, 0.45])
+        unseen = replace(
+            unseen, squared=unseen.squared * less, torque_squared=unseen.torque_squared * less
+        )
+        (reason,) = judged(training=fitted, held_out=unseen).reasons
+        assert "two 3.0 times, 9.0 %" in reason
+        still = replace(
+            unseen, squared=unseen.squared / 4, torque_squared=unseen.torque_squared / 4
+        )
+        assert judged(training=fitted, held_out=still).good
+
     def test_nor_is_one_of_little_torque(self):
         """A hundredth of the other's; but one that is lost in noise is excused."""
         power = np.array([1.0, 1e-4])
@@ -412,6 +426,19 @@ class TestJudgement:
         (cause,) = (finding for finding in judged(**changes).findings if finding.role == "cause")
         assert cause.level == level and message in cause.words
 
+    def test_torque_and_friction_that_are_alike_are_both_named(self):
+        changes = (Change("friction", 1, 1.1001, 0.001, 0.01, alike=True),)
+        (cause,) = (each for each in judged(changes=changes).findings if each.role == "cause")
+        assert "another torque constant of two explains it as well" in cause.words
+
+    def test_a_gain_of_the_fitted_motion_alone_has_changed(self):
+        """The fit shows it against the other axes, unseen motion shows that it is gone."""
+        changes = (Change("gain", 1, 0.91, 0.001, 0.01),)
+        causes = (Cause(Fault("gain", (1,)), 0.4, 0.1, 0.001),)
+        assumed = {"scale_std": np.full(2, 0.03), "held_out": an_error(0.1)}
+        verdict = judged(causes=causes, changes=changes, **assumed)
+        assert any("differs from that of the fitted motion" in each for each in verdict.reasons)
+
     @pytest.mark.parametrize(("changed", "named"), [(0, False), (1, True), (None, True)])
     def test_a_torque_that_changed_is_no_reference_of_constants(self, changed, named):
         """The constant of axis 1 is relative to axis 0."""
@@ -420,11 +447,23 @@ class TestJudgement:
         findings = judged(causes=causes, changes=changes, held_out=an_error(0.1)).findings
         assert named == any(finding.check == "torque constant" for finding in findings)
 
-    @pytest.mark.parametrize(("size", "level"), [(0.1, "information"), (0.2, "doubtful")])
-    def test_a_constant_within_the_assumed_scale_is_no_cause(self, size, level):
-        """Three standard deviations of the ratio of two torques known to 3 % are 13 %."""
-        causes = (Cause(Fault("gain", (1,)), 0.8, size, 0.001),)
-        verdict = judged(causes=causes, scale_std=np.full(2, 0.03))
+    @pytest.mark.parametrize(
+        ("size", "ratio", "error", "level"),
+        [
+            (0.1, 0.8, 0.1, "information"),
+            (0.2, 0.8, 0.1, "wrong"),
+            (0.2, 0.9, 0.1, "doubtful"),
+            (0.2, 0.8, 0.05, "doubtful"),
+        ],
+    )
+    def test_a_constant_within_the_assumed_scale_is_no_cause(self, size, ratio, error, level):
+        """Three standard deviations of the ratio of two torques known to 3 % are 13 %.
+
+        The ratio is that of both axes: the error of the second is multiplied by its square.
+        """
+        causes = (Cause(Fault("gain", (1,)), ratio, size, 0.001),)
+        errors = {"held_out": an_error(error), "training": an_error(error)}
+        verdict = judged(causes=causes, scale_std=np.full(2, 0.03), **errors)
         (finding,) = (each for each in verdict.findings if each.check == "torque constant")
         assert finding.level == level
         assert ("assumed uncertainty" in finding.words) == (level == "information")

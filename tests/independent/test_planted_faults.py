@@ -42,16 +42,17 @@ def with_gain(log: Logged, joint: int) -> Logged:
     return log._replace(torque=log.torque * scale)
 
 
-def with_friction(log: Logged, arm: Arm, seed: int) -> Logged:
-    """Friction of the held-out motion is larger by three tenths."""
+def with_friction(log: Logged, arm: Arm, seed: int, joint: int | None = None) -> Logged:
+    """Friction of the held-out motion is larger by three tenths, of one joint or of all."""
     motion = drawn_motion(
         arm.robot, np.random.default_rng([seed, 2, 1]), HELD_OUT_TIME, DEFAULTS.speed
     )
     velocity = motion.at(log.time)[1]
     more = arm.friction._replace(offset=0.0 * arm.friction.offset)
-    return log._replace(
-        torque=log.torque + (FRICTION - 1.0) * more.torque(velocity, 0.0 * velocity)
-    )
+    added = (FRICTION - 1.0) * more.torque(velocity, 0.0 * velocity)
+    if joint is not None:
+        added[:, np.arange(added.shape[1]) != joint] = 0.0
+    return log._replace(torque=log.torque + added)
 
 
 def identified(name: str, seed: int, fault: str, joint: int, folder: Path) -> Identification:
@@ -65,6 +66,8 @@ def identified(name: str, seed: int, fault: str, joint: int, folder: Path) -> Id
     )
     if fault == "gain":
         fitted = with_gain(fitted, joint)
+    elif fault == "friction of one joint":
+        held_out = with_friction(held_out, arm, seed, joint)
     else:
         held_out = with_friction(held_out, arm, seed)
     archives = [
@@ -103,3 +106,22 @@ class TestFaultOfOnePart:
         assert not identification.verdict.good
         (friction,) = findings(identification, "friction")
         assert friction.level == "wrong" and "springs" not in friction.next_step
+
+
+@pytest.mark.parametrize("seed", [811, 812])
+class TestFaultThatIsHardToSee:
+    def test_a_gain_of_the_base_axis(self, seed: int, tmp_path: Path) -> None:
+        """Without gravity other bodies explain most of it, or no bodies do."""
+        identification = identified("panda", seed, "gain", 0, tmp_path)
+        assert not identification.verdict.good
+        named = findings(identification, "torque constant", "generalisation")
+        assert any("panda_joint1 " in finding.words for finding in named)
+
+    @pytest.mark.parametrize("joint", [1, 3])
+    def test_friction_of_a_joint_of_much_gravity(
+        self, seed: int, joint: int, tmp_path: Path
+    ) -> None:
+        """A twentieth of its torque."""
+        identification = identified("panda", seed, "friction of one joint", joint, tmp_path)
+        (friction,) = findings(identification, "friction")
+        assert friction.level == "wrong" and f"panda_joint{joint + 1} +" in friction.words

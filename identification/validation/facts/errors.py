@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 
 UNEXPLAINED: Final = "unexplained error"
 """Name of the check whether any fault explains the error."""
+# Ratio of torque errors that is no chance: three standard deviations of 24 blocks, as in 12 s.
+_GROWN: Final = 1.5
 # A wrong sign would increase the error of the fitted motion as well.
 _NOT_COVERED: Final = (
     "fit a longer or more varied motion: the fitted motion does not cover the predicted one"
@@ -281,7 +283,7 @@ class GeneralisationFacts:
         times, grown = _growth(evidence, limits)
         # Less torque on unseen motion alone raises the share.
         ratio = error.rms / np.maximum(evidence.training.rms, 1e-300)
-        least = np.where(ratio > limits.generalisation, 0.25, 0.5) * limits.axis
+        least = np.where(ratio > _GROWN, limits.unexplained, 0.5 * limits.axis)
         # Little torque does not excuse an axis that was fitted several times better.
         far = grown & (error.relative > least) & ~_lost_in_noise(evidence, limits)
         return cls(error.relative, times, far, grown & ~far, limits.generalisation)
@@ -303,7 +305,8 @@ class GeneralisationFacts:
             "wrong" if wrong else "doubtful",
             f"the torque error on {naming.motion} is more than {self.limit:g} times that of the"
             f" fitted motion: {ratios}",
-            _NOT_COVERED,
+            f"{_NOT_COVERED}; if it does, check what changed for {naming.of(joints)} between the"
+            " recordings",
             "symptom",
         )
 

@@ -121,6 +121,7 @@ class FaultFacts:
     certain_below: float  # ratio of the errors
     # of the scale of one joint's torque over those of the others, as it is assumed (n,)
     scale_std: Array
+    matters: Mask  # joints with an error that has to be explained (n,)
 
     @classmethod
     def of(
@@ -151,14 +152,15 @@ class FaultFacts:
         std = evidence.context.scale_std
         std = np.zeros(len(evidence.held_out.rows)) if std is None else std
         others = np.sqrt(np.maximum((std**2).sum() - std**2, 0.0) / max(len(std) - 1, 1))
-        return cls(causes, limits.cause, np.hypot(std, others))
+        matters = np.nan_to_num(evidence.held_out.relative) > limits.unexplained
+        return cls(causes, limits.cause, np.hypot(std, others), matters)
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
         """Yield each fault."""
         for cause in self.causes:
             joints = [naming.joints[joint] for joint in cause.fault.joints] or ["all axes"]
             text = _text(cause, " and ".join(joints), naming)
-            certain = cause.fault.discrete or cause.ratio < self.certain_below
+            certain = cause.fault.discrete or self._ratio_of(cause) < self.certain_below
             if self._is_assumed(cause):
                 std = percentage(self._scale_std_of(cause), 1)
                 yield Finding(
@@ -176,6 +178,14 @@ class FaultFacts:
                 text.step,
                 "cause",
             )
+
+    def _ratio_of(self, cause: Cause) -> float:
+        """Return the ratio of the errors, of a gain that matters that of its joint alone.
+
+        It is a geometric mean over all joints, of which a gain of one hardly changes the others.
+        """
+        alone = cause.fault.kind == "gain" and bool(self.matters[[*cause.fault.joints]].any())
+        return cause.ratio ** (len(self.matters) if alone else 1)
 
     def _is_assumed(self, cause: Cause) -> bool:
         """Return whether a torque is off by no more than the scale of torques may be."""

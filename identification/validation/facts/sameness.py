@@ -68,6 +68,7 @@ class ChangeFacts:
     half_interval: Array  # of 95 % (n,)
     gain: Mask  # joints of another torque (n,)
     friction: Mask  # joints of other friction (n,)
+    alike: Mask  # those of them whose torque may be another as well (n,)
     matters: Mask  # joints with an error that has to be explained (n,)
     noticed: Mask  # joints with an error that is not one of rounding (n,)
 
@@ -97,6 +98,9 @@ class ChangeFacts:
             half_interval=half_interval,
             gain=_joints_of(evidence, "gain"),
             friction=_joints_of(evidence, "friction"),
+            alike=np.isin(
+                np.arange(len(error.rows)), [each.joint for each in evidence.changes if each.alike]
+            ),
             matters=error.relative > limits.unexplained,
             # An error below that of a pattern is one of rounding or smoothing.
             noticed=error.relative > limits.pattern,
@@ -138,6 +142,7 @@ class FrictionFacts:
     change: Array  # relative (n,)
     joints: Mask  # whose change is to be named (n,)
     axes: Mask  # whose error it explains (n,)
+    alike: Mask  # axes of which another torque explains it as well (n,)
     wrong: bool  # whether it is beyond what temperature causes
     limit: float  # of a change that is not named
 
@@ -160,6 +165,7 @@ class FrictionFacts:
             change=change,
             joints=explained | ((np.abs(change) > limits.friction) & ~beyond),
             axes=explained,
+            alike=np.zeros_like(explained),
             wrong=bool(explained.any()),
             limit=limits.friction,
         )
@@ -169,7 +175,14 @@ class FrictionFacts:
         change = changes.ratio - 1.0
         joints = changes.friction
         far = joints & changes.noticed & (np.abs(change) > FRICTION_CHANGE)
-        return cls(change, joints, axes=joints, wrong=bool(far.any()), limit=limits.friction)
+        return cls(
+            change,
+            joints,
+            axes=joints,
+            alike=joints & changes.alike,
+            wrong=bool(far.any()),
+            limit=limits.friction,
+        )
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
         """Yield the joints of other friction."""
@@ -178,14 +191,19 @@ class FrictionFacts:
         changes = naming.each(
             self.joints, lambda joint: percentage(self.change[joint], signed=True)
         )
+        other = step = ""
+        if self.alike.any():
+            # A joint of little more than friction.
+            other = f"; another torque constant of {naming.of(self.alike)} explains it as well"
+            step = f", and check what else changed for {naming.of(self.alike)}"
         if self.wrong:
             yield Finding(
                 "friction",
                 "wrong",
                 f"friction on {naming.motion} differs from the estimate: {changes}, beyond the"
                 f" {percentage(FRICTION_CHANGE)} that gear temperature causes; this explains the"
-                f" error of {naming.of(self.axes)}",
-                WARMER,
+                f" error of {naming.of(self.axes)}{other}",
+                WARMER + step,
                 "cause",
             )
         else:
@@ -193,7 +211,7 @@ class FrictionFacts:
                 "friction",
                 "doubtful",
                 f"friction on {naming.motion} differs by more than {percentage(self.limit)}:"
-                f" {changes}; gear temperature may have changed",
-                WARMER,
+                f" {changes}; gear temperature may have changed{other}",
+                WARMER + step,
                 "cause",
             )
