@@ -95,6 +95,8 @@ class GaussianPrior:
     mean: Array  #: (p,)
     root: Array  #: (k, p); flat in directions without information
     origin: str
+    #: what is believed, if this prior is a stronger one; None: this one
+    believed: GaussianPrior | None = None
 
     @classmethod
     def of_combinations(
@@ -123,11 +125,25 @@ class GaussianPrior:
 
     @cached_property
     def std(self) -> Array:
-        """Standard deviations (p,), infinite where the prior is flat."""
-        solution = solve_rows(self.root, np.zeros(len(self.root)), _WORST_CONDITION)
+        """Standard deviations (p,) of what is believed, infinite where it is flat."""
+        solution = (self.believed or self)._solution
         covariance = solution.inverse
         mark_undetermined(covariance, solution.determined)
         return np.sqrt(np.diag(covariance))
+
+    @cached_property
+    def scatter(self) -> Array:
+        """Covariance (p, p) of ``information @ (pi - mean)`` by what is believed.
+
+        That of this prior is its information; a stronger one errs by more than it says.
+        """
+        if self.believed is None:
+            return self.information
+        return np.asarray(self.information @ self.believed._solution.inverse @ self.information)
+
+    @property
+    def _solution(self) -> Solution:
+        return solve_rows(self.root, np.zeros(len(self.root)), _WORST_CONDITION)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,13 +154,29 @@ class BodyPrior:
     std: Array  #: likewise; infinite where nothing is known
     combinations: Array  #: ``pi = combinations @ [standard; others]``, (p, s + k)
     origin: str
+    bodies: NDArray[np.intp]  #: where the standard parameters of the links are
     #: whether the description has no masses, or masses without relation to the torque
     placeholder: bool = False
+    believed: BodyPrior | None = None  #: what is believed, if this prior is a stronger one
 
     @cached_property
     def gaussian(self) -> GaussianPrior:
         """The prior of the parameters (p,)."""
-        return GaussianPrior.of_combinations(self.combinations, self.mean, self.std, self.origin)
+        prior = GaussianPrior.of_combinations(self.combinations, self.mean, self.std, self.origin)
+        return prior if self.believed is None else replace(prior, believed=self.believed.gaussian)
+
+    def with_weight(self, weight: float) -> BodyPrior:
+        """Return the prior with so many times the information on bodies.
+
+        Of friction, rotors and offsets, whose mean of zero says nothing, it stays the same. The
+        estimate is closer to the described bodies; its intervals believe them no more.
+        """
+        if weight == 1.0:
+            return self
+        std = self.std.copy()
+        std[self.bodies] /= np.sqrt(weight)
+        origin = f"{self.origin}, which weigh {weight:g} times"
+        return replace(self, std=std, origin=origin, believed=self.believed or self)
 
     def most_probable(self, values: Array) -> Array:
         """Return the most probable standard and other parameters (s + k,) of parameters (p,)."""
@@ -280,7 +312,9 @@ def fit_posterior(
     if design_effect is None:
         design_effect = design_effect_of(factor, prior)
     values, weights = posterior_values(factor, prior, design_effect)
-    spread = block_covariance(factor, weights, values, prior.information, design_effect)
+    spread = block_covariance(
+        factor, weights, values, prior.information, design_effect, prior.scatter
+    )
     alone = factor.solve(weights)
     solution = Solution(values, spread.root, alone.condition, alone.determined)
     method = f"posterior of the prior ({prior.origin}), {design_effect:.3g} rows count as one; "
@@ -310,15 +344,14 @@ class ScoreScatter:
         triangle = np.linalg.qr(spread.scores, mode="r")
         return cls(triangle @ of_parameters, spread.interval_factor, spread.description)
 
-    def covariance(self, root: Array, precision: Array, design_effect: float) -> Array:
+    def covariance(self, root: Array, prior: Array) -> Array:
         """Return the covariance of a posterior (p, p).
 
-        `root` S (p, k) with S S' the inverse of the information of data and prior, of which
-        `precision` (p, p) is the prior's as it counts, see :func:`block_covariance`.
+        `root` S (p, k) with S S' the inverse of the information of data and prior, and the scatter
+        (p, p) of the prior's scores as it counts, see :func:`block_covariance`.
         """
         data = self.rows @ root @ root.T
-        prior = root.T @ precision @ root
-        return np.asarray(data.T @ data + design_effect * root @ prior @ root.T)
+        return np.asarray(data.T @ data + root @ (root.T @ prior @ root) @ root.T)
 
 
 def design_effect_of(factor: Factor, prior: GaussianPrior) -> float:
@@ -421,7 +454,8 @@ def body_prior(
         mean[names.index(name)], std[names.index(name)] = value, spread
     if stated:
         origin += f", {len(stated)} given"
-    return BodyPrior(mean, std, combinations, origin, bool(reason))
+    bodies = layout.links.ravel()
+    return BodyPrior(mean, std, combinations, origin, bodies, bool(reason))
 
 
 def nominal_deviations(model: RobotModel, share: float = BODY_SHARE) -> Array:

@@ -71,6 +71,7 @@ from tests.identification.two_link import (
     URDF,
     P,
     a_motion,
+    as_samples,
     coloured,
     four_sines,
     gaussian,
@@ -610,6 +611,45 @@ class TestPosterior:
         assert result.normalized_change[at] < -4.0
         others = np.delete(result.normalized_change, at)
         assert np.nanmax(np.abs(others)) < 4.0
+
+
+class TestWeightOfBodies:
+    """A stronger prior on the described bodies, whose deviations are believed as before."""
+
+    PRIOR = body_prior(MODEL, Factor.of(MODEL, noisy()))
+
+    def test_an_infinite_one_keeps_them(self):
+        samples = simulated(MODEL, 1.2 * truth(), a_motion(), NOISE)
+        factor = Factor.by_time(MODEL, samples)
+        prior = self.PRIOR.with_weight(1e8).gaussian
+        values, _ = posterior_values(factor, prior)
+        nominal = values_of(MODEL, np.zeros(4))
+        bodies = [k for k, name in enumerate(MODEL.parameter_names) if name.startswith("mc")]
+        np.testing.assert_allclose(values[bodies], nominal[bodies], rtol=1e-3, atol=1e-4)
+
+    def test_friction_and_rotors_are_as_free_as_before(self):
+        stronger = self.PRIOR.with_weight(100.0)
+        ratio = stronger.std / self.PRIOR.std
+        links = MODEL.layout.links.ravel()
+        np.testing.assert_allclose(ratio[links], 0.1)
+        np.testing.assert_allclose(np.delete(ratio, links), 1.0)
+
+    def test_intervals_hold_for_bodies_as_uncertain_as_is_believed(self):
+        """Arms drawn from the prior, fitted as if their bodies were nearly the described ones."""
+        rng, motion = np.random.default_rng(4), a_motion(5.0)
+        stronger = self.PRIOR.with_weight(100.0).gaussian
+        inside = []
+        for _ in range(30):
+            spread = self.PRIOR.combinations @ (
+                self.PRIOR.std * rng.standard_normal(len(self.PRIOR.std))
+            )
+            values = self.PRIOR.gaussian.mean + spread
+            torque = MODEL.torque(values, *motion[1:]) + gaussian(rng, motion)
+            factor = Factor.by_time(MODEL, as_samples(MODEL, motion, torque))
+            estimate = fit_posterior(MODEL, factor, stronger).estimate
+            half = estimate.interval_factor * estimate.std
+            inside.append(np.abs(estimate.values - values) < half)
+        assert np.mean(inside) > 0.9
 
 
 class TestDesignEffect:
