@@ -272,7 +272,9 @@ class Estimator:
         solution = solve_with_prior(total.weighted(weights), precision)
         return replace(
             result.estimate,
-            covariance=scatter.covariance(solution.root, precision, result.design_effect),
+            covariance=scatter.covariance(
+                solution.root, result.design_effect**2 * posterior.prior.gaussian.scatter
+            ),
             interval_factor=scatter.interval_factor,
             method=f"{result.estimate.method.partition('; ')[0]}; {scatter.description}",
         )

@@ -263,8 +263,8 @@ class Posterior:
         prior = body_prior(cell.model, factor, share, known_parameters(cell))
         if name != "auto":
             strength = Strength()
-        effect = strength.design_effect(design_effect_of(factor, prior.gaussian))
-        return cls(cell.model, prior, effect, strength.consistent)
+        effect = design_effect_of(factor, prior.gaussian)
+        return cls(cell.model, prior.with_weight(strength.weight), effect, strength.consistent)
 
     @property
     def precision(self) -> Array:

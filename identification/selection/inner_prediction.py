@@ -63,7 +63,7 @@ RATE: Final = 125.0
 SHORT: Final = 15.0
 """Time of motion [s] below which fewer questions are asked: ten segments of less than a second and
 a half show no period of an exciting motion."""
-IF_LONG: Final[frozenset[str]] = frozenset({"strength", "springs"})
+IF_LONG: Final[frozenset[str]] = frozenset({"springs"})
 """Questions that are asked of long recordings only: their answers correct small errors, and a wrong
 one costs much on another motion."""
 DETAILS: Final[frozenset[str]] = frozenset({"bandwidth", "presliding"})
@@ -93,8 +93,8 @@ LEFT_OUT: Final[tuple[LeftOut, ...]] = ("rests", "halts", "slow")
 REVERSAL_SPEEDS: Final = (0.02, 0.08, 0.3)  # rad/s or m/s
 REVERSAL_STEPS: Final = (1.5, 1.25, 1.12, 1.06, 1.03, 1.015, 1.008)
 NEARBY: Final = (1.0, 0.9, 0.95, 1.05, 1.1)  # factors of the bandwidth of a low-pass
-STRENGTHS: Final = (1.0, 4.0)
-"""Weights of the prior: factors of the rows that count as one by the correlation of residuals.
+STRENGTHS: Final = (1.0, 4.0, 16.0, 64.0, 1e4)
+"""Weights of the described bodies: deviations of 30, 15, 7.5, 4 and 0.3 % of their masses.
 
 None below one: folds of one motion would favour a weaker prior, which another motion pays for.
 """
@@ -117,6 +117,7 @@ IMPOSSIBLE_WORTHWHILE: Final = 0.05
 # An error above the torque itself chooses nothing, nor does one that no sensor resolves.
 _MEANINGLESS: Final = 1.0
 _EXACT: Final = 1e-5
+_SAME: Final = 1e-4  # relative difference of errors that is none
 # Speeds above this share of the largest are predicted from slower ones to try friction terms.
 _FAST: Final = 0.85
 # Share of the rows of a joint in motion that are faster than a Stribeck term reaches.
@@ -328,9 +329,9 @@ def _choose_prior(
     Returns the settings after each of the two, and the decisions.
     """
     choices: list[Choice] = []
-    if "strength" in asked:
+    if "strength" in asked and trial.knows_bodies(now):
         weights = [replace(now.strength, weight=weight) for weight in STRENGTHS]
-        decision = trial.decide(STRENGTH, [replace(now, strength=weight) for weight in weights])
+        decision = trial.decide_last(STRENGTH, [replace(now, strength=each) for each in weights])
         now = decision.settings
         choices = [decision.choice]
     compared = now
@@ -638,8 +639,34 @@ class _Trial:
             if better and (possible is None or possible(candidates[k])):
                 chosen = k
         self._retain_samples(candidates[chosen])
+        return self._decision(name, candidates, means, chosen)
+
+    def decide_last(self, name: str, candidates: Sequence[Settings]) -> _Decision:
+        """Return the last candidate up to which none predicts worse than the first.
+
+        For candidates in the order of what is safer where nothing is predicted, which therefore
+        need not be better. None behind one that is worse is tried.
+        """
+        means = [self.errors(candidates[0]).overall]
+        if _EXACT <= means[0] < _MEANINGLESS:
+            for each in candidates[1:]:
+                means.append(self.errors(each).overall)
+                if not means[-1] <= (1.0 + _SAME) * means[0]:
+                    break
+        chosen = len(means) - 1
+        if not means[chosen] <= (1.0 + _SAME) * means[0]:
+            chosen -= 1
+        return self._decision(name, candidates[: len(means)], means, chosen)
+
+    def _decision(
+        self, name: str, candidates: Sequence[Settings], means: Sequence[float], chosen: int
+    ) -> _Decision:
         described = _differences([_description(self.model(each), each) for each in candidates])
         return _Decision(candidates[chosen], Choice(name, described, tuple(means), chosen))
+
+    def knows_bodies(self, settings: Settings) -> bool:
+        """Return whether the description has the masses of this arm."""
+        return not self._reduced(settings).prior.placeholder
 
     def fits_impossible(self, settings: Settings, possible: Settings) -> bool:
         """Return whether bodies that cannot exist fit better than possible ones.
@@ -706,8 +733,8 @@ class _Trial:
             return unknown
 
     def _estimator(self, settings: Settings, reduced: _Reduced) -> Callable[[Factor], Array]:
-        effect = settings.strength.design_effect(self._effect)
-        prior = reduced.prior
+        effect = self._effect
+        prior = reduced.prior.with_weight(settings.strength.weight)
         model = self.model(settings)
         _, of_all = posterior_values(reduced.folds.fitted, prior.gaussian, effect)
 

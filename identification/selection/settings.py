@@ -13,18 +13,13 @@ from identification.signals.samples import Preprocessing
 class Strength:
     """How strongly the prior counts against the data."""
 
-    #: factor of the rows that count as one by the correlation of the residuals
-    weight: float = 1.0
+    weight: float = 1.0  #: of the described bodies, as a multiple of their information
     consistent: bool = False  #: whether parameters that no bodies have are excluded
-
-    def design_effect(self, of_residuals: float) -> float:
-        """Return how many rows count as one."""
-        return max(1.0, self.weight * of_residuals)
 
     def describe(self) -> str:
         """Return the strength as a phrase."""
         bodies = "physically consistent" if self.consistent else "not restricted to possible bodies"
-        return f"prior weighs {self.weight:g} times as the residuals suggest, {bodies}"
+        return f"described bodies weigh {self.weight:g} times, {bodies}"
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,7 @@ from identification.estimators.covariance import block_length, cluster_covarianc
 from identification.estimators.delay import LONGEST_DELAY
 from identification.estimators.losses import Loss
 from identification.estimators.prior import (
+    body_lengths,
     body_prior,
     design_effect_of,
     fit_posterior,
@@ -73,6 +74,7 @@ from tests.identification.two_link import (
     URDF,
     P,
     a_motion,
+    as_samples,
     coloured,
     four_sines,
     gaussian,
@@ -614,6 +616,45 @@ class TestPosterior:
         assert np.nanmax(np.abs(others)) < 4.0
 
 
+class TestWeightOfBodies:
+    """A stronger prior on the described bodies, whose deviations are believed as before."""
+
+    PRIOR = body_prior(MODEL, Factor.of(MODEL, noisy()))
+
+    def test_an_infinite_one_keeps_them(self):
+        samples = simulated(MODEL, 1.2 * truth(), a_motion(), NOISE)
+        factor = Factor.by_time(MODEL, samples)
+        prior = self.PRIOR.with_weight(1e8).gaussian
+        values, _ = posterior_values(factor, prior)
+        nominal = values_of(MODEL, np.zeros(4))
+        bodies = [k for k, name in enumerate(MODEL.parameter_names) if name.startswith("mc")]
+        np.testing.assert_allclose(values[bodies], nominal[bodies], rtol=1e-3, atol=1e-4)
+
+    def test_friction_and_rotors_are_as_free_as_before(self):
+        stronger = self.PRIOR.with_weight(100.0)
+        ratio = stronger.std / self.PRIOR.std
+        links = MODEL.layout.links.ravel()
+        np.testing.assert_allclose(ratio[links], 0.1)
+        np.testing.assert_allclose(np.delete(ratio, links), 1.0)
+
+    def test_intervals_hold_for_bodies_as_uncertain_as_is_believed(self):
+        """Arms drawn from the prior, fitted as if their bodies were nearly the described ones."""
+        rng, motion = np.random.default_rng(4), a_motion(5.0)
+        stronger = self.PRIOR.with_weight(100.0).gaussian
+        inside = []
+        for _ in range(30):
+            spread = self.PRIOR.combinations @ (
+                self.PRIOR.std * rng.standard_normal(len(self.PRIOR.std))
+            )
+            values = self.PRIOR.gaussian.mean + spread
+            torque = MODEL.torque(values, *motion[1:]) + gaussian(rng, motion)
+            factor = Factor.by_time(MODEL, as_samples(MODEL, motion, torque))
+            estimate = fit_posterior(MODEL, factor, stronger).estimate
+            half = estimate.interval_factor * estimate.std
+            inside.append(np.abs(estimate.values - values) < half)
+        assert np.mean(inside) > 0.9
+
+
 class TestDesignEffect:
     """Rows that count as one."""
 
@@ -677,14 +718,15 @@ class TestBodyPrior:
         assert np.abs((np.cov(base.T) - covariance) / scale).max() < np.sqrt(2.0) * error
         np.testing.assert_allclose(prior.std[rank:], [2.0, 1.0, 1.0, 0.5])
 
-    def test_rotors_are_of_the_size_of_the_stretched_arm(self):
-        """Or of what makes half of the scatter of their joint's torque, if that is larger."""
+    def test_rotors_are_of_the_size_of_the_links_outboard(self):
+        """Over all angles between them, or of what makes half of the torque."""
         factor = Factor.of(MODEL, noisy())
         prior = body_prior(MODEL, factor)
         rotors = MODEL.layout.rotors
         assert not prior.mean[rotors].any()
-        outboard = 3.0 * float(np.sum(self.LENGTHS[1] ** 2))
-        assert prior.std[rotors[1]] >= outboard
+        upper, lower = body_lengths(MODEL) ** 2
+        assert prior.std[rotors[0]] == pytest.approx(6.0 * upper + 3.0 * (upper + lower))
+        assert prior.std[rotors[1]] >= 3.0 * lower
         samples = noisy()
         column = MODEL.parameter_names.index("I2m")
         turning = samples.regressor(MODEL).dense(P)[:, 1, column][samples.usable[:, 1]]
@@ -703,6 +745,25 @@ class TestBodyPrior:
             alone = np.sqrt(np.mean((std * columns[rows, joint, k]) ** 2))
             torque = np.sqrt(np.mean(samples.torque[rows, joint] ** 2))
             assert alone == pytest.approx(0.5 * torque, rel=1e-9)
+
+    def test_what_opposes_a_motion_in_one_direction_is_friction(self):
+        """Where friction and offset are one column, most of it is not called an offset."""
+        law = replace(MODEL.friction.laws[0], offset=True)
+        model = RobotModel.from_urdf(URDF, friction=law)
+        motion = a_motion()
+        drift = 1.1 * np.abs(motion.velocity).max(axis=0)
+        motion = motion._replace(
+            position=motion.position + drift * motion.time[:, None],
+            velocity=motion.velocity + drift,
+        )
+        planted = {"f0": (4.0, 1.5), "f1": (2.0, 0.8), "fo": (0.0, 0.0)}
+        friction = [planted[term.symbol][term.owner] for term in model.friction.terms]
+        samples = simulated(model, values_of(model, friction, (0.4, 0.1)), motion, NOISE)
+        factor = Factor.by_time(model, samples)
+        estimate = fit_posterior(model, factor, body_prior(model, factor).gaussian).estimate
+        values = dict(zip(model.parameter_names, estimate.values, strict=True))
+        for joint in ("1", "2"):
+            assert values[f"f0_{joint}"] > 5.0 * abs(values[f"fo_{joint}"])
 
     def test_shares_of_load_are_those_of_gears(self):
         model = MODEL.with_friction(load=True)

@@ -27,6 +27,7 @@ from identification.selection.inner_prediction import (
     LOW_PASS,
     SHORT,
     STRENGTH,
+    STRENGTHS,
     TERM_WORTHWHILE,
     WORTHWHILE,
     Errors,
@@ -393,13 +394,21 @@ class TestChosenSettings:
         assert decision.errors[1] < 0.9 * decision.errors[0]
         assert not settings.friction["load"]
 
-    def test_the_prior_keeps_the_strength_of_the_residuals(self):
-        """White noise, and a description that is right: no candidate is clearly better."""
+    def test_described_bodies_count_where_they_predict_no_worse(self):
+        """White noise, and a description that is right."""
         settings, choices = chosen(a_recording(duration=LONG), {"estimator"})
-        assert settings.strength.weight == 1.0
+        assert settings.strength.weight > 1.0
         # That bodies can exist is no question where they fit as well.
         assert [choice.name for choice in choices] == [STRENGTH]
         assert settings.strength.consistent
+
+    @pytest.mark.parametrize(("mass", "described"), [("9", False), ("6", True)])
+    def test_only_the_described_bodies_are_kept_as_they_are(self, mass, described):
+        other = URDF.replace('<mass value="6"/>', f'<mass value="{mass}"/>')
+        other = other.replace('<mass value="3"/>', f'<mass value="{0.5 * float(mass)}"/>')
+        model = RobotModel.from_urdf(other, friction=FrictionLaw(third=None))
+        settings, _ = chosen(a_recording(duration=LONG, noise=1.0), {"estimator"}, model=model)
+        assert (settings.strength.weight == STRENGTHS[-1]) == described
 
     def test_a_negative_friction_is_not_made_possible(self):
         """Constraints that predict clearly worse are given up."""
@@ -411,14 +420,19 @@ class TestChosenSettings:
         assert decision.errors[1] < (1.0 - WORTHWHILE) * decision.errors[0]
 
     def test_a_short_recording_asks_fewer_questions(self):
-        """The first candidates stay."""
-        asked = {"bandwidth", "presliding", "rows", "velocity", "friction", "estimator"}
-        names = {
-            duration: {choice.name for choice in chosen(a_recording(duration=duration), asked)[1]}
+        """It is not asked for a narrower bandwidth."""
+        asked = {"bandwidth", "rows", "estimator"}
+        candidates = {
+            duration: {
+                choice.name: choice.candidates
+                for choice in chosen(a_recording(duration=duration), asked)[1]
+            }
             for duration in (0.9 * SHORT, LONG)
         }
-        assert names[LONG] - names[0.9 * SHORT] == {STRENGTH}
-        assert "rows that are left out" in names[0.9 * SHORT]
+        short, long = candidates[0.9 * SHORT], candidates[LONG]
+        assert short.keys() == long.keys()
+        width = "bandwidth of the motion"
+        assert set(long[width]) - set(short[width]) == {"10 Hz"}
 
     def test_rests_that_no_law_predicts_are_not_fitted(self):
         """They decide the error over all rows, and say nothing of the friction in motion."""
@@ -494,10 +508,26 @@ class TestClearlyBetter:
         assert decided(self.FIRST, nothing).chosen == 0
 
 
-class TestStrength:
-    def test_it_multiplies_the_rows_that_count_as_one(self):
-        assert Strength(4.0).design_effect(10.0) == 40.0
-        assert Strength(0.25).design_effect(2.0) == 1.0  # no row counts more than once
+class TestLast:
+    @pytest.mark.parametrize(
+        ("means", "chosen"),
+        [
+            ((0.1, 0.1, 0.09, 0.1), 3),
+            ((0.1, 0.09, 0.11, 0.05), 1),
+            ((0.1, 0.2), 0),
+            ((2.0, 1.5), 0),
+        ],
+    )
+    def test_none_behind_a_worse_one_is_chosen(self, means, chosen):
+        trial = _Trial(MODEL, lambda *_: [])
+        weights = range(len(means))
+        candidates = [Settings(Preprocessing(), strength=Strength(weight)) for weight in weights]
+        trial.errors = lambda each: Errors(
+            np.full((10, 1), means[each.strength.weight] ** 2), np.ones((10, 1))
+        )
+        decision = trial.decide_last("", candidates)
+        assert decision.choice.chosen == chosen
+        assert decision.settings is candidates[chosen]
 
 
 class TestFolds:
