@@ -190,7 +190,11 @@ def _ended(cell: Cell, plan: CampaignPlan, requirements: Sequence[Requirement]) 
         drift[term.owner] if term.term.is_friction else 1.0 for term in model.friction.terms
     ]
     quantities = measured.wanted.quantities
-    truth = quantities.directions @ (scale * planted_values(cell))
+    planted = dict(zip(model.parameter_names, scale * planted_values(cell), strict=True))
+    estimate = measured.estimate
+    # A chosen effect, such as torque ripple, has no planted parameters: it counts as estimated.
+    true = map(planted.get, estimate.names, estimate.values.tolist())
+    truth = quantities.directions @ np.array(list(true))
     error = np.abs(measured.values - truth)
     within = error <= quantities.allowed
     return _Ended(
