@@ -82,7 +82,7 @@ _TAILS: Final = (0.05, 0.5, 0.95)
 _MOST: Final = 12  # repetitions of a simulated rule
 
 
-def campaigns(count: int, required: str) -> dict[str, Any]:
+def campaigns(count: int, required: str, first_seed: int) -> dict[str, Any]:
     """Run campaigns of the NS 16 with effects until they are precise."""
     requirements = requirements_from([required])
     cell = Cell.load(CELL_PATH).with_campaign(validation_runs=2, repetitions=_THIRTY)
@@ -94,7 +94,7 @@ def campaigns(count: int, required: str) -> dict[str, Any]:
     excitation = run_search(cell, settings, Silent(), problem=problem).excitation
     plan = plan_around(cell, excitation)
     done = list[_Ended]()
-    for seed in range(1, count + 1):
+    for seed in range(first_seed, first_seed + count):
         done.append(_ended(cell.with_campaign(simulation_seed=seed), plan, requirements))
         show(done[-1].summary() | {"seed": seed}, only_json=True)
     repetitions = [campaign.repetitions for campaign in done]
@@ -374,6 +374,7 @@ def main() -> None:
     """Print the figures of the parts that were asked for."""
     parser = parser_of(__doc__)
     parser.add_argument("--campaigns", type=int, default=0)
+    parser.add_argument("--first-seed", type=int, default=1, help="of the campaigns")
     parser.add_argument("--require", default="torque 30, friction 10%")
     parser.add_argument("--stops", type=int, default=0)
     parser.add_argument("--weighings", type=int, default=0)
@@ -382,7 +383,7 @@ def main() -> None:
     options = parser.parse_args()
     figures: dict[str, Any] = {}
     if options.campaigns:
-        figures["campaigns"] = campaigns(options.campaigns, options.require)
+        figures["campaigns"] = campaigns(options.campaigns, options.require, options.first_seed)
     if options.stops:
         figures["stops"] = stops(options.stops)
     if options.weighings:

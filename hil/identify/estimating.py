@@ -189,9 +189,7 @@ def estimate_with(
             result = result.with_scatter()
         precision = posterior.precision if name in OF_PRIOR else None
         if variance:
-            if products is None:
-                products = np.asarray(sum(rate_products(model, samples) for samples in fitted))
-            result = _with_uncertain_delay(result, products, variance, precision)
+            result = _with_uncertain_delay(model, result, fitted, products, variance, precision)
         task.advance(1, "prior")
         if name in OF_PRIOR:
             beside = replace(beside, estimate=result.pooled)
@@ -203,8 +201,6 @@ def estimate_with(
         held_out = tuple(Factor.by_time(model, samples) for samples in prepared.held_out)
         task.advance(1)
     stated, notes = _stated(prepared, result, fitted, posterior, precision)
-    if name not in OF_PRIOR:
-        warnings += _poorly_separated(result.pooled)
     return Estimation(
         estimator=name,
         result=result,
@@ -224,15 +220,24 @@ def _without_prior(
     """Fit by an estimator that has no prior; return its warnings as well."""
     model = prepared.sources.cell.model
     if name == "iv":
-        return _instrumental(model, prepared, fitted)
-    if name in _LOSSES:
-        return _robust(model, fitted, name)
-    return _by_factor(model, fitted, name)
+        result, warnings = _instrumental(model, prepared, fitted)
+    elif name in _LOSSES:
+        result, warnings = _robust(model, fitted, name)
+    else:
+        result, warnings = _by_factor(model, fitted, name)
+    return result, warnings + _poorly_separated(result.pooled)
 
 
 def _with_uncertain_delay(
-    result: RepeatedEstimate, products: Array, variance: float, precision: Array | None
+    model: RobotModel,
+    result: RepeatedEstimate,
+    fitted: Sequence[Samples],
+    products: Array | None,
+    variance: float,
+    precision: Array | None,
 ) -> RepeatedEstimate:
+    if products is None:
+        products = np.asarray(sum(rate_products(model, samples) for samples in fitted))
     pooled = with_uncertain_delay(result.pooled, result.factor, products, variance, precision)
     return replace(result, pooled=pooled)
 
