@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, Final, cast, get_args
 from hil.archive import Archive
 from hil.errors import InputError
 from hil.files import json_digest
-from hil.identify.estimating import fit_with_transmitted_load
+from hil.identify.estimating import with_loading
 from hil.identify.options import Options
-from hil.identify.prepared import MAX_RECORDINGS, carried_over, decide, samples_of
-from hil.identify.sources import Source, Sources, all_fitted
+from hil.identify.prepared import MAX_RECORDINGS, carried_over, decide
+from hil.identify.sources import Source, all_fitted
 from hil.progress import Reporter, Silent
 from identification.selection.settings import Settings
 
@@ -119,25 +119,12 @@ def decide_settings(
     noise = None if standstill is None else standstill.recording
     sources = all_fitted(cell_in(fitted[0][0]), fitted, noise)
     if arms is None:
-        settings = _with_loading(decide(sources, options, Silent()).settings, sources)
+        settings = with_loading(decide(sources, options, Silent()).settings, sources)
     else:
         settings = carried_over(arms, sources, options)
     if not broken:
         cache.put(refs[0].location, decision_digest(options, arms, refs), settings)
     return settings, broken
-
-
-def _with_loading(settings: Settings, sources: Sources) -> Settings:
-    """Return settings with the parameters that load the gears, if friction grows with the load.
-
-    All archives of an arm have them, so that their factors can be added.
-    """
-    cell = sources.cell.with_friction(**settings.friction)
-    if not cell.model.friction.has_load:
-        return settings
-    fitted = [samples_of(source, cell, settings) for source in sources.training[:MAX_RECORDINGS]]
-    loaded = fit_with_transmitted_load(cell, fitted, settings.strength)
-    return replace(settings, loading=tuple(loaded.result.values.tolist()))
 
 
 # The batch

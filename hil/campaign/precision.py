@@ -1,8 +1,9 @@
 """Precision of a running campaign: measured after each repetition, and when it is enough.
 
-The estimate is the posterior that `hil identify` computes, with the friction law and delay of the
-cell file. Its intervals are cluster-robust: what the model cannot explain in the same place of
-every repetition counts as one error, however often it is repeated. Only the rest falls with them.
+The estimate is the posterior that `hil identify` computes, with the settings that it would choose
+from the first repetition. Its intervals are cluster-robust: what the model cannot explain in the
+same place of every repetition counts as one error, however often it is repeated. Only the rest
+falls with them.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,17 +23,17 @@ from hil.design.result import RESULT
 from hil.design.settings import load_settings
 from hil.design.wanted import ReferenceMotions, Wanted
 from hil.errors import InputError
-from hil.identify.cell_context import torque_scale
-from hil.identify.estimating import Posterior, with_uncertain_scale
-from hil.identify.options import FIXED
-from hil.identify.prepared import samples_of, stated_settings
+from hil.identify.estimating import estimate_with, with_loading
+from hil.identify.options import Options
+from hil.identify.prepared import decide, prepared_with, samples_of
 from hil.identify.sources import Source, gather_sources
-from hil.progress import Reporter
+from hil.progress import Reporter, Silent
 from hil.reading import path_exists
 from hil.terminal_text import plural
+from identification.estimators.delay import rate_products
 from identification.excitation import midpoints
-from identification.factor.factor import Factor, inverse_variance
-from identification.selection.settings import Strength
+from identification.factor.factor import Estimate, Factor, inverse_variance
+from identification.signals.samples import Samples
 
 from .precision_record import IN_A_ROW, Look, PrecisionRecord, Reached
 from .state import CampaignState
@@ -50,6 +51,16 @@ class Measured:
     values: Array  #: (k,)
     half: Array  #: (k,)
     noise: Array  #: share of the variance that differs between repetitions (k,)
+    estimate: Estimate  #: of all parameters, those of chosen effects included
+
+
+class _Reduced(NamedTuple):
+    """A recording by the settings of a campaign."""
+
+    source: Source
+    samples: Samples
+    factor: Factor
+    products: Array | None  #: `rate_products`, if the delay is uncertain
 
 
 class PrecisionMeter:
@@ -67,18 +78,12 @@ class PrecisionMeter:
                 field="--precision",
                 remedy="run it with --payload NAME",
             )
-        self._cell, self._requirements = campaign.cell, tuple(requirements)
-        self._settings = stated_settings(campaign.cell, FIXED)
-        motions = [
-            midpoints(motion.trajectory, _REFERENCE_PERIOD) for motion in campaign.plan.validation
-        ]
-        self._reference = ReferenceMotions(campaign.cell.model, motions)
-        self._factors: dict[Path, Factor] = {}
+        self._campaign, self._requirements = campaign, tuple(requirements)
         paths = given_to(campaign)
-        sources = given_sources(campaign.cell, paths) if paths else ()
-        earlier = [self._reduced(source) for source in sources]
-        self._earlier = sum(earlier[1:], earlier[0]) if earlier else None
-        self.earlier = len(earlier)  #: number of those recordings
+        self._given = given_sources(campaign.cell, paths) if paths else ()
+        self._options = Options()
+        self._first: Path | None = None  # repetition that the settings were chosen from
+        self.earlier = len(self._given)  #: number of earlier recordings
 
     def measure(self, paths: Sequence[Path]) -> Look:
         """Return the precision that some repetitions give together; archives are read once."""
@@ -100,36 +105,87 @@ class PrecisionMeter:
 
     def estimate(self, paths: Sequence[Path]) -> Measured:
         """Return what some repetitions together say of the required quantities."""
+        if self._first != paths[0]:
+            self._choose(paths[0])
         for path in paths:
-            if path not in self._factors:
-                (source,) = gather_sources([path], FIXED.split, in_sample=True).training
-                self._factors[path] = self._reduced(source)
-        factors = [self._factors[path] for path in paths]
-        total = sum(factors[1:], factors[0])
-        if self._earlier is not None:
-            total = total + self._earlier
-        posterior = Posterior.of(self._cell, total, "auto", Strength())
-        estimate = posterior.free(total).estimate
-        scale = torque_scale(self._cell, (), simulated=self._cell.only_simulated)
-        stated = with_uncertain_scale(estimate, total, posterior.precision, scale)
-        weights = inverse_variance(estimate.noise_std**2)
-        information = total.weighted(weights).A + posterior.precision
+            if path not in self._repetitions:
+                (source,) = gather_sources([path], self._options.split, in_sample=True).training
+                self._repetitions[path] = self._reduced(source)
+        repetitions = [self._repetitions[path] for path in paths]
+        recordings = (*self._earlier, *repetitions)
+        sources = replace(
+            self._prepared.sources,
+            training=tuple(recording.source for recording in recordings),
+            same_motion=not self._earlier,
+        )
+        prepared = replace(
+            self._prepared,
+            sources=sources,
+            fitted=tuple(recording.samples for recording in recordings),
+        )
+        factors = [recording.factor for recording in recordings]
+        rates = [each.products for each in recordings if each.products is not None]
+        products = np.sum(rates, axis=0) if rates else None
+        estimation = estimate_with(prepared, self._options, Silent(), factors, products)
+        values, noise_std = estimation.result.pooled.values, estimation.result.pooled.noise_std
+        posterior, stated = estimation.posterior, estimation.stated
+        weights = inverse_variance(noise_std**2)
+        information = estimation.result.factor.weighted(weights).A + posterior.precision
         wanted = self._reference.wanted(
-            self._requirements, estimate.values, information / posterior.design_effect
+            self._requirements, values, information / posterior.design_effect
         )
         directions = wanted.quantities.directions
-        variance = np.einsum("kp,pq,kq->k", directions, stated.covariance, directions)
+        variance = _variances(directions, stated)
+        # The errors of delay, gears and torque scale, which are in it as well, do not fall.
+        of_rows = _variances(directions, posterior.free(estimation.result.factor).estimate)
         moved = np.asarray(np.linalg.solve(information, directions.T))
+        of_repetitions = [repetition.factor for repetition in repetitions]
+        earlier = [recording.factor for recording in self._earlier]
         return Measured(
             wanted=wanted,
-            values=directions @ estimate.values,
+            values=directions @ values,
             half=stated.interval_factor * np.sqrt(variance),
-            noise=noise_shares(factors, weights, estimate.values, moved, self._earlier),
+            noise=np.minimum(of_rows / variance, 1.0)
+            * noise_shares(
+                of_repetitions,
+                weights,
+                values,
+                moved,
+                sum(earlier[1:], earlier[0]) if earlier else None,
+            ),
+            estimate=stated,
         )
 
-    def _reduced(self, source: Source) -> Factor:
-        samples = samples_of(source, self._cell, self._settings)
-        return Factor.by_time(self._cell.model, samples)
+    def _choose(self, path: Path) -> None:
+        """Choose the settings from a repetition, as `hil identify` does, for all looks."""
+        campaign = self._campaign
+        standstill = campaign.folder.completed("standstill")
+        sources = gather_sources([*standstill, path], self._options.split, in_sample=True)
+        # The validation runs, which the campaign holds out, are recorded later.
+        sources = replace(sources, in_sample=False, held_out=())
+        settings = with_loading(decide(sources, self._options, Silent()).settings, sources)
+        self._prepared = prepared_with(sources, settings, Silent())
+        motions = [
+            midpoints(motion.trajectory, _REFERENCE_PERIOD) for motion in campaign.plan.validation
+        ]
+        model = self._prepared.sources.cell.model
+        self._reference = ReferenceMotions(model, motions, campaign.cell.model.parameter_names)
+        self._earlier = [self._reduced(source) for source in self._given]
+        self._repetitions: dict[Path, _Reduced] = {}
+        self._first = path
+
+    def _reduced(self, source: Source) -> _Reduced:
+        cell, settings = self._prepared.sources.cell, self._prepared.settings
+        samples = samples_of(source, cell, settings)
+        if settings.loading is not None:
+            samples = samples.with_load(cell.model, np.array(settings.loading))
+        products = rate_products(cell.model, samples) if settings.delay_variance else None
+        return _Reduced(source, samples, Factor.by_time(cell.model, samples), products)
+
+
+def _variances(directions: Array, estimate: Estimate) -> Array:
+    """Return the variances (k,) of linear functions (k, p) of the parameters."""
+    return np.asarray(np.einsum("kp,pq,kq->k", directions, estimate.covariance, directions))
 
 
 def noise_shares(

@@ -145,7 +145,8 @@ class PrecisionDesign:
                 None,
                 "the mass of a payload and the arm itself need different motions",
                 field="--precision",
-                remedy="for a payload add --for payload, with no other requirement",
+                remedy="for a payload add --for payload, with no other requirement than its mass; "
+                "for the arm omit --for payload, and its mass",
             )
         sampled = [midpoints(motion, _REFERENCE_PERIOD) for motion in motions]
         reference = ReferenceMotions(cell.model, sampled)

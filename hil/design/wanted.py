@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -44,10 +44,16 @@ class Wanted:
 
 
 class ReferenceMotions:
-    """Sampled motions on which torque, friction and the effect of parameters are wanted."""
+    """Sampled motions on which torque, friction and the effect of parameters are wanted.
 
-    def __init__(self, model: RobotModel, motions: Sequence[Motion]) -> None:
+    `names` are the parameters that can be wanted, by default all of the model.
+    """
+
+    def __init__(
+        self, model: RobotModel, motions: Sequence[Motion], names: Collection[str] | None = None
+    ) -> None:
         self.model = model
+        self.names = frozenset(model.parameter_names if names is None else names)
         states = [np.concatenate(parts) for parts in zip(*(m[1:4] for m in motions), strict=True)]
         self.position, self.velocity, self.acceleration = states
         count = len(self.position)
@@ -94,7 +100,7 @@ class ReferenceMotions:
         if requirement.kind in ("parameters", "parameter"):
             size = self.parameter_sizes(values)
             for k, name in enumerate(model.parameter_names):
-                if requirement.name in ("", name):
+                if requirement.name in ("", name) and name in self.names:
                     yield name, np.eye(len(values))[k], requirement.value * size[k]
             return
         joints = range(model.n_joints)

@@ -19,6 +19,11 @@ from identification.estimators.consistent import (
     consistent_values,
 )
 from identification.estimators.delay import rate_products, with_uncertain_delay
+from identification.estimators.elasticity import (
+    ElasticTorque,
+    expected_compliance,
+    with_elastic_gears,
+)
 from identification.estimators.instrumental import (
     estimate_instrumental,
     planned_motion,
@@ -52,7 +57,7 @@ from identification.factor.factor import (
     solve,
     total_factor,
 )
-from identification.selection.settings import Strength
+from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.calibration import Refit
@@ -61,7 +66,8 @@ from identification.validation.finding import joined
 from .cell_context import TorqueScale, torque_scale_of
 from .estimators import OF_PRIOR, Estimator, fit_of, values_of
 from .options import Options
-from .prepared import Prepared, known_parameters, samples_of
+from .prepared import MAX_RECORDINGS, Prepared, known_parameters, samples_of
+from .sources import Sources
 
 # Hz. A narrower smoother removes part of the motion from the regressor, a bias that instruments
 # cannot correct. On simulated NS 16 logs with 100 to 1000 times the encoder noise, instrumental
@@ -70,6 +76,9 @@ from .prepared import Prepared, known_parameters, samples_of
 MIN_IV_BANDWIDTH: Final = 20.0
 # Difference between data and prior, in standard deviations, that is reported.
 _MAX_PRIOR_DEVIATION: Final = 4.0
+
+# Repetitions of a motion in which elastic gears add the same torque: no more are read for it.
+_ALIKE: Final = 3
 
 Array = NDArray[np.float64]
 
@@ -90,8 +99,8 @@ class Estimation:
     with_prior: PosteriorEstimate
     refit: Refit  #: parameters by the estimator from a factor, to predict parts of the fitted rows
     warnings: tuple[str, ...]
-    #: the pooled result, with the uncertainty of the torque's scale in its covariance: no torque
-    #: measured by the same sensors shows that
+    #: the pooled result, with the uncertainty of the torque's scale in its covariance, and that of
+    #: elastic gears: no residual shows what they do to parameters
     stated: Estimate
     notes: tuple[str, ...]  #: what the intervals assume
 
@@ -107,6 +116,19 @@ def fit_with_transmitted_load(
         return Posterior.of(cell, total, "auto", strength).fit(total).estimate
 
     return fit_with_load(model, fitted, fit)
+
+
+def with_loading(settings: Settings, sources: Sources) -> Settings:
+    """Return settings with the parameters that load the gears, if friction grows with the load.
+
+    All recordings have them then, so that their factors can be added.
+    """
+    cell = sources.cell.with_friction(**settings.friction)
+    if not cell.model.friction.has_load:
+        return settings
+    fitted = [samples_of(source, cell, settings) for source in sources.training[:MAX_RECORDINGS]]
+    loaded = fit_with_transmitted_load(cell, fitted, settings.strength)
+    return replace(settings, loading=tuple(loaded.result.values.tolist()))
 
 
 def with_transmitted_load(prepared: Prepared) -> Prepared:
@@ -130,8 +152,17 @@ def with_transmitted_load(prepared: Prepared) -> Prepared:
     return replace(carrying, fitted=loaded.samples, notes=notes)
 
 
-def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> Estimation:
+def estimate_with(
+    prepared: Prepared,
+    options: Options,
+    reporter: Reporter,
+    factors: Sequence[Factor] = (),
+    products: Array | None = None,
+) -> Estimation:
     """Estimate the parameters by `options.estimator`, with all applicable tests.
+
+    `factors` by time of the fitted samples, and the sum of their `rate_products`, are computed
+    unless they are known (not for "iv").
 
     Raises:
         InputError: the archives lack data that the estimator needs.
@@ -145,8 +176,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
     with reporter.task("estimating", 4) as task:
         fitted = smoothed_for_instruments(model, prepared) if name == "iv" else prepared.fitted
         task.advance(1, name)
-        scale = torque_scale_of(prepared.sources)
-        factors = [Factor.by_time(model, samples) for samples in fitted]
+        factors = factors or [Factor.by_time(model, samples) for samples in fitted]
         total = sum(factors, Factor.zero(model))
         posterior = Posterior.of(cell, total, name, prepared.settings.strength)
         posterior, beside, unsolved = posterior.solved(total)
@@ -159,7 +189,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
             result = result.with_scatter()
         precision = posterior.precision if name in OF_PRIOR else None
         if variance:
-            result = _with_uncertain_delay(model, result, fitted, variance, precision)
+            result = _with_uncertain_delay(model, result, fitted, products, variance, precision)
         task.advance(1, "prior")
         if name in OF_PRIOR:
             beside = replace(beside, estimate=result.pooled)
@@ -170,12 +200,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         task.advance(1, "held-out motion")
         held_out = tuple(Factor.by_time(model, samples) for samples in prepared.held_out)
         task.advance(1)
-    pooled = result.pooled
-    if name not in OF_PRIOR and not pooled.undetermined and pooled.condition > QR_CONDITION:
-        warnings.append(
-            f"the scaled condition number is {pooled.condition:.2g}: the motion separates some"
-            " parameters poorly (solved by QR)"
-        )
+    stated, notes = _stated(prepared, result, fitted, posterior, precision)
     return Estimation(
         estimator=name,
         result=result,
@@ -184,8 +209,8 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         with_prior=beside,
         refit=refit_of(model, name, posterior),
         warnings=tuple(warnings),
-        stated=with_uncertain_scale(pooled, result.factor, precision, scale),
-        notes=(f"the intervals of the parameters are computed {scale.message}",),
+        stated=stated,
+        notes=notes,
     )
 
 
@@ -195,22 +220,59 @@ def _without_prior(
     """Fit by an estimator that has no prior; return its warnings as well."""
     model = prepared.sources.cell.model
     if name == "iv":
-        return _instrumental(model, prepared, fitted)
-    if name in _LOSSES:
-        return _robust(model, fitted, name)
-    return _by_factor(model, fitted, name)
+        result, warnings = _instrumental(model, prepared, fitted)
+    elif name in _LOSSES:
+        result, warnings = _robust(model, fitted, name)
+    else:
+        result, warnings = _by_factor(model, fitted, name)
+    return result, warnings + _poorly_separated(result.pooled)
 
 
 def _with_uncertain_delay(
     model: RobotModel,
     result: RepeatedEstimate,
     fitted: Sequence[Samples],
+    products: Array | None,
     variance: float,
     precision: Array | None,
 ) -> RepeatedEstimate:
-    products = np.asarray(sum(rate_products(model, samples) for samples in fitted))
+    if products is None:
+        products = np.asarray(sum(rate_products(model, samples) for samples in fitted))
     pooled = with_uncertain_delay(result.pooled, result.factor, products, variance, precision)
     return replace(result, pooled=pooled)
+
+
+def _poorly_separated(estimate: Estimate) -> list[str]:
+    if estimate.undetermined or estimate.condition <= QR_CONDITION:
+        return []
+    return [
+        f"the scaled condition number is {estimate.condition:.2g}: the motion separates some"
+        " parameters poorly (solved by QR)"
+    ]
+
+
+def _stated(
+    prepared: Prepared,
+    result: RepeatedEstimate,
+    fitted: Sequence[Samples],
+    posterior: Posterior,
+    precision: Array | None,
+) -> tuple[Estimate, tuple[str, ...]]:
+    """Return the pooled estimate with what no residual shows in its covariance, and notes on it."""
+    sources = prepared.sources
+    scale = torque_scale_of(sources)
+    estimate = with_uncertain_scale(result.pooled, result.factor, precision, scale)
+    note = f"the intervals of the parameters are computed {scale.message}"
+    if sources.cell.file.drive_train is None:  # positions may be those of links, behind the gears
+        return estimate, (note,)
+    model = posterior.model
+    some = fitted[:_ALIKE] if sources.same_motion else fitted
+    compliance = expected_compliance(model, some[0], estimate.values)
+    torque = ElasticTorque.of(model, some, estimate.values, compliance)
+    torque = torque.times(len(fitted) / len(some))
+    effect = posterior.design_effect
+    estimate = with_elastic_gears(estimate, result.factor, torque, effect, precision)
+    return estimate, (note, "they allow for elastic gears between motors and links")
 
 
 def _require_usable_rows(prepared: Prepared) -> None:

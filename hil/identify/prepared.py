@@ -167,7 +167,10 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
         delay = _DelayChoice.of(_delays(loaded, stated, options, reporter), loaded, stated, options)
         chosen = delay.applied_to(chosen)
     estimate, notes = delay.confirmed_by(chosen.preprocessing)
-    variance = estimate.variance if estimate is not None and notes else 0.0
+    variance = 0.0
+    if estimate is not None:
+        variance = estimate.variance if notes else delay.doubt
+        notes += delay.contradiction if delay.doubt else ()
     return Decided(replace(chosen, delay_variance=variance), estimate, notes)
 
 
@@ -186,6 +189,16 @@ class _DelayChoice:
     assumed: float  # that the choice begins with [s]
     suggested: tuple[SuggestedDelay, ...]  # that it may choose as well
     notes: tuple[str, ...]
+    doubt: float = 0.0  # mean square error of a stated delay that is used, by the estimate [s²]
+
+    @property
+    def contradiction(self) -> tuple[str, ...]:
+        """The note on a stated delay that the estimate contradicts."""
+        assert self.estimate is not None
+        return (
+            f"the intervals allow for a delay of {self.estimate.delay * 1e3:.3g} ms, which the "
+            f"data show, beside the stated {self.assumed * 1e3:.3g} ms",
+        )
 
     @classmethod
     def of(
@@ -205,8 +218,14 @@ class _DelayChoice:
         # different by more than its bias in closed loop.
         far = abs(estimate.delay - estimate.assumed) > Thresholds().delay * estimate.cycle
         has_controller = sources.cell.file.controller is not None
-        if options.delay is not None or (has_controller and not (far and estimate.determined)):
+        if options.delay is not None:
             return unused
+        if has_controller and not (far and estimate.determined):
+            if not (estimate.significant and estimate.determined):
+                return unused
+            return replace(
+                unused, doubt=(estimate.delay - estimate.assumed) ** 2 + estimate.variance
+            )
         delay = SuggestedDelay(estimate.delay, estimate.determined)
         suggested = (delay,) if estimate.significant else ()
         return replace(unused, suggested=suggested, notes=described)

@@ -22,7 +22,7 @@ from hil.identify import Options, identify_archives, identify_campaign
 from hil.identify.estimating import estimate_with
 from hil.identify.estimators import ESTIMATORS
 from hil.identify.options import FIXED, friction_from
-from hil.identify.prepared import prepare_sources
+from hil.identify.prepared import decide, prepare_sources, stated_delay
 from hil.identify.sources import gather_sources
 from hil.identify.summary import _delays
 from hil.importers import Robot
@@ -163,6 +163,18 @@ class TestCampaign:
         warnings = without.results.verdict.warnings
         assert sum("the solver failed" in warning for warning in warnings) == 2
         assert without.results.consistency is without.results.essential is None
+
+
+def test_a_stated_delay_that_data_contradict_widens_intervals(campaign):
+    """By less than a cycle: the estimate is not that accurate, so that the stated one is used."""
+    sources = gather_sources(paths(campaign), 0.7)
+    right = sources.cell.file.controller.current_delay_cycles
+    assert decide(sources, Options(), Silent()).settings.delay_variance == 0.0
+    wrong = sources.cell.with_values({"controller.current_delay_cycles": right - 0.35})
+    chosen = decide(replace(sources, cell=wrong), Options(), Silent())
+    assert chosen.settings.preprocessing.torque_delay == stated_delay(wrong)
+    assert 0.3 < np.sqrt(chosen.settings.delay_variance) / wrong.period < 0.7
+    assert any("allow for a delay of" in note for note in chosen.notes)
 
 
 class TestOutcome:

@@ -195,6 +195,9 @@ class TestDesign:
         text = refusal(*line)
         (options,) = re.findall(r"add (--for payload)", text)
         assert "mass of payload 5 %" in accepted(*line, *options.split())
+        line = (*PRECISE, "--precision", "parameters 50 %", "-o", "c")
+        assert "for the arm omit --for payload" in refusal(*line, "--for", "payload")
+        accepted(*line)
 
     def test_a_torque_of_uncertain_scale(self, here: Path) -> None:
         """Of a load that is weighed see `tests/hil/test_payload_command.py`."""

@@ -15,6 +15,7 @@ from hil.campaign.precision import PrecisionMeter, further, requirements_of
 from hil.campaign.precision_record import Look, PrecisionRecord, Reached
 from hil.cli import app
 from hil.errors import ExecutionError, InputError
+from hil.identified_campaign import identify_campaign
 from hil.progress import Silent
 from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell, pass_rehearsal
 
@@ -69,6 +70,16 @@ class TestEnd:
         steps = {step.name: step for step in campaign.status().steps}
         assert steps["repetitions"].done
         assert "requirements are met" in steps["repetitions"].details[0]
+
+    def test_the_last_look_is_what_identify_finds(self, met) -> None:
+        """Settings that are chosen and errors of the model that are allowed for are the same."""
+        campaign, _ = met
+        identified = identify_campaign(campaign.folder.root, Silent()).estimation
+        meter = PrecisionMeter(campaign, requirements_of(campaign, LOOSE))
+        measured = meter.estimate(campaign.folder.completed("excitation")).estimate
+        assert measured.names == identified.stated.names
+        np.testing.assert_allclose(measured.values, identified.stated.values, rtol=1e-9)
+        np.testing.assert_allclose(measured.std, identified.stated.std, rtol=1e-9)
 
     def test_a_stricter_requirement_continues(self, met) -> None:
         campaign, _ = met

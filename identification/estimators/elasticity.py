@@ -1,0 +1,149 @@
+r"""Uncertainty of an estimate by elastic gears between the measured motors and the links.
+
+A gear of compliance c turns its link back by c times the torque :math:`\tau_l` that it transmits.
+The motors then feel the torque of links at :math:`q - C \tau_l`, whose difference to that of rigid
+gears grows with the square of the frequency, as torques of inertia do at low ones:
+
+.. math:: t = W \pi + E c + e, \quad E_j = \partial \tau_l(q - C \tau_l) / \partial c_j
+
+Parameters take most of that up, so that no residual shows their error. Compliances are fitted
+beside them, about zero with the standard deviation of `RESONANCE`, and their mean square is added
+to the covariance of the parameters, which stay those of rigid gears: a rigid model predicts best
+with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Final, NamedTuple, Self
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from identification.estimators.delay import DELAY_BANDWIDTH
+from identification.factor.factor import (
+    Estimate,
+    Factor,
+    augmented_rows,
+    inverse_variance,
+    solve,
+)
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+
+Array = NDArray[np.float64]
+
+RESONANCE: Final = 2.0 * np.pi * 15.0
+"""Resonance of a joint's links on its gear [rad/s] that compliances are expected at: industrial
+arms have their lowest ones at 5 to 25 Hz."""
+_POSTURES: Final = 20  # in which the inertia of the links is averaged
+_RATE: Final = 125.0  # Hz, at which the torque of elastic gears is computed: it has no more than
+# `DELAY_BANDWIDTH`, as its second derivative would have the noise of accelerations
+_LINEAR: Final = 1e-3  # share of the expected compliances by which it is linearised
+
+
+class ElasticTorque(NamedTuple):
+    """Sums over the rows of each joint with the torque E (m, n) of expected compliances."""
+
+    products: Array  # W' E (n, p, n)
+    squares: Array  # E' E (n, n, n)
+    errors: Array  # E' (t - W pi) (n, n)
+
+    @classmethod
+    def of(
+        cls, model: RobotModel, recordings: Iterable[Samples], values: Array, compliance: Array
+    ) -> Self:
+        """Return the sums over recordings, with parameters (p,) and compliances (n,)."""
+        n, p = model.n_joints, model.n_parameters
+        sums = cls(np.zeros((n, p, n)), np.zeros((n, n, n)), np.zeros((n, n)))
+        for samples in recordings:
+            torque = elastic_torque(model, samples, values, compliance)
+            for part, tables in augmented_rows(model, samples):
+                for joint, (table, used) in enumerate(zip(tables, model.plan.columns, strict=True)):
+                    usable = samples.usable[part, joint]
+                    effect = torque[part][usable, joint]
+                    columns = table[:-1, usable]
+                    error = table[-1, usable] - values[used] @ columns
+                    sums.products[joint][used] += columns @ effect
+                    sums.squares[joint] += effect.T @ effect
+                    sums.errors[joint] += effect.T @ error
+        return sums
+
+    def times(self, factor: float) -> ElasticTorque:
+        """Return the sums over so many times the rows."""
+        return ElasticTorque(*(factor * part for part in self))
+
+
+def expected_compliance(model: RobotModel, samples: Samples, values: Array) -> Array:
+    """Return the compliances (n,) [rad/(N m) or m/N] of gears with the expected resonance.
+
+    Zero for a joint whose links have no inertia by the parameters (p,).
+    """
+    n = model.n_joints
+    rows = np.linspace(0, len(samples.torque) - 1, _POSTURES).astype(int)
+    postures = np.repeat(samples.motion.position[rows], n + 1, axis=0)
+    pushes = np.tile(np.concatenate((np.eye(n), np.zeros((1, n)))), (_POSTURES, 1))
+    still = np.zeros_like(postures)
+    torque = model.gear_torque(values, postures, still, pushes).reshape(_POSTURES, n + 1, n)
+    inertia = np.einsum("bjj->bj", torque[:, :n] - torque[:, n:]).mean(axis=0)
+    return np.where(inertia > 0.0, 1.0 / np.where(inertia > 0.0, inertia, 1.0), 0.0) / RESONANCE**2
+
+
+def elastic_torque(model: RobotModel, samples: Samples, values: Array, compliance: Array) -> Array:
+    """Return what compliances (n,), one by one, add to the torques: (m, n, n), the last theirs."""
+    time = samples.motion.time
+    torque = np.zeros((*samples.torque.shape, model.n_joints))
+    for segment in samples.segments:
+        if segment.stop - segment.start < 2:
+            continue
+        step = float(np.median(np.diff(time[segment])))
+        rows = np.arange(segment.start, segment.stop, max(1, int(1.0 / (_RATE * step))))
+        at = time[rows]
+        states = [np.asarray(part)[rows] for part in samples.motion[1:4]]
+        rigid = model.gear_torque(values, *states)
+        order, rate = 2, len(rows) / max(float(np.ptp(at)), step)
+        if len(rows) <= 3 * (2 * order + 1) or rate <= 2.0 * DELAY_BANDWIDTH:
+            continue
+        low_pass = scipy.signal.butter(order, DELAY_BANDWIDTH, fs=rate, output="sos")
+        sag = _LINEAR * compliance * scipy.signal.sosfiltfilt(low_pass, rigid, axis=0)
+        sags = [sag, np.gradient(sag, at, axis=0)]
+        sags.append(np.gradient(sags[1], at, axis=0))
+        for joint in np.flatnonzero(compliance):
+            only = np.arange(model.n_joints) == joint
+            moved = [state - only * part for state, part in zip(states, sags, strict=True)]
+            change = (model.gear_torque(values, *moved) - rigid) / _LINEAR
+            for row in range(model.n_joints):
+                torque[segment, row, joint] = np.interp(time[segment], at, change[:, row])
+    return torque
+
+
+def with_elastic_gears(
+    estimate: Estimate,
+    factor: Factor,
+    torque: ElasticTorque,
+    design_effect: float,
+    precision: Array | None = None,
+) -> Estimate:
+    """Return the estimate with the mean square of the compliances in its covariance.
+
+    `torque` are the sums of the factor's rows, of which `design_effect` count as one; `precision`
+    (p, p) is that of a prior beside them. No gear has a negative compliance.
+    """
+    weights = inverse_variance(estimate.noise_std**2)
+    products, squares, errors = (np.tensordot(weights, part, axes=1) for part in torque)
+    equations = factor.weighted(weights)
+    if precision is not None:
+        equations = equations._replace(A=equations.A + precision)
+    determined = np.isfinite(np.diag(estimate.covariance))
+    moved = np.where(determined[:, None], solve(equations).inverse @ products, 0.0)
+    beside = (squares - products.T @ moved) / design_effect + np.eye(len(errors))
+    covariance = np.linalg.inv(beside)
+    mean = np.maximum(covariance @ errors / design_effect, 0.0)
+    added = moved @ (np.outer(mean, mean) + covariance) @ moved.T
+    return replace(
+        estimate,
+        covariance=estimate.covariance + added,
+        method=f"{estimate.method}, with elastic gears",
+    )

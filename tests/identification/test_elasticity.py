@@ -1,0 +1,123 @@
+"""Intervals of parameters allow for elastic gears, whose errors no residual shows."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from identification.estimators.elasticity import (
+    RESONANCE,
+    ElasticTorque,
+    elastic_torque,
+    expected_compliance,
+    with_elastic_gears,
+)
+from identification.estimators.least_squares import fit_least_squares
+from identification.factor.factor import Factor
+from tests.identification.two_link import MODEL, NOISE, as_samples, four_sines, truth
+
+STEP = 0.002
+COMPLIANCE = np.array([2e-5, 2e-4])
+"""Of the planted gears [rad/(N m)]: the links resonate at 14 and 12 Hz."""
+
+
+def recorded(compliance, noise=0.0, seed=0):
+    """Samples of an arm whose links lag its motors; the positions are those of the motors."""
+    motor = four_sines(np.arange(0.0, 12.0, STEP))
+    sag = np.zeros_like(motor.position)
+    for _ in range(4):  # a fixed point: what the gears transmit is that of the links
+        rate = np.gradient(sag, STEP, axis=0)
+        bend = np.gradient(rate, STEP, axis=0)
+        states = motor.position - sag, motor.velocity - rate, motor.acceleration - bend
+        transmitted = MODEL.gear_torque(truth(), *states)
+        sag = compliance * transmitted
+    at_motors = MODEL.torque(truth(), *motor[1:4])
+    torque = at_motors + transmitted - MODEL.gear_torque(truth(), *motor[1:4])
+    torque += noise * np.random.default_rng(seed).standard_normal(torque.shape)
+    inside = slice(50, -50)  # differences are one-sided at the ends
+    return as_samples(MODEL, motor.rows(inside), torque[inside])
+
+
+def elastic(samples, compliance):
+    """The same samples with the torque of elastic gears."""
+    each = elastic_torque(MODEL, samples, truth(), compliance)
+    return replace(samples, torque=samples.torque + each.sum(axis=2))
+
+
+def fitted(samples):
+    """The estimate of rigid gears, and the same with elastic ones allowed for."""
+    estimate = fit_least_squares(MODEL, [samples])
+    factor = Factor.by_time(MODEL, samples)
+    expected = expected_compliance(MODEL, samples, estimate.values)
+    torque = ElasticTorque.of(MODEL, [samples], estimate.values, expected)
+    return estimate, with_elastic_gears(estimate, factor, torque, 1.0)
+
+
+def deviation(estimate):
+    """Errors (p,) in halves of 95 % intervals."""
+    return np.abs(estimate.values - truth()) / (estimate.interval_factor * estimate.std)
+
+
+def test_the_torque_is_that_of_links_that_lag_their_motors():
+    elastic, rigid = recorded(COMPLIANCE / 10.0), recorded(np.zeros(2))
+    each = elastic_torque(MODEL, rigid, truth(), COMPLIANCE / 10.0)
+    added = elastic.torque - rigid.torque
+    error = (each.sum(axis=2) - added)[200:-200]  # its low-pass turns round at the ends
+    assert np.linalg.norm(error) < 0.05 * np.linalg.norm(added[200:-200])
+
+
+def test_elastic_gears_mislead_rigid_intervals_alone():
+    estimate, wider = fitted(recorded(COMPLIANCE, NOISE))
+    assert np.max(deviation(estimate)) > 2.0
+    assert np.max(deviation(wider)) < 1.0
+    np.testing.assert_array_equal(wider.values, estimate.values)
+
+
+def test_data_of_rigid_gears_widen_intervals_little():
+    """The expected compliances alone would make them three times as wide."""
+    samples = recorded(np.zeros(2), NOISE)
+    estimate, wider = fitted(samples)
+    expected = expected_compliance(MODEL, samples, estimate.values)
+    alone = fit_least_squares(MODEL, [elastic(samples, expected)]).values - estimate.values
+    assert np.max(np.abs(alone) / estimate.std) > 3.0
+    assert np.max(wider.std / estimate.std) < 1.5
+
+
+def test_repetitions_count_like_more_rows():
+    samples = recorded(COMPLIANCE, NOISE)
+    estimate, _ = fitted(samples)
+    expected = expected_compliance(MODEL, samples, estimate.values)
+    single = ElasticTorque.of(MODEL, [samples], estimate.values, expected)
+    double = ElasticTorque.of(MODEL, [samples, samples], estimate.values, expected)
+    for once, twice in zip(single.times(2.0), double, strict=True):
+        np.testing.assert_allclose(once, twice)
+
+
+def test_links_resonate_on_the_expected_gears():
+    """One joint alone is an inertia on a spring."""
+    samples = recorded(np.zeros(2))
+    still = as_samples(
+        MODEL, samples.motion._replace(position=np.zeros_like(samples.torque)), samples.torque
+    )
+    inertia = MODEL.gear_torque(truth(), np.zeros((2, 2)), np.zeros((2, 2)), np.eye(2))
+    inertia -= MODEL.gear_torque(truth(), *np.zeros((3, 2, 2)))
+    expected = expected_compliance(MODEL, still, truth())
+    np.testing.assert_allclose(1.0 / np.sqrt(expected * np.diag(inertia)), RESONANCE)
+
+
+def test_a_link_without_inertia_has_no_expected_compliance():
+    samples = recorded(np.zeros(2))
+    assert expected_compliance(MODEL, samples, 0.0 * truth()).tolist() == [0.0, 0.0]
+
+
+def test_an_undetermined_parameter_stays_so():
+    samples = recorded(COMPLIANCE, NOISE)
+    estimate, _ = fitted(samples)
+    covariance = estimate.covariance.copy()
+    covariance[0, :] = covariance[:, 0] = 0.0
+    covariance[0, 0] = np.inf
+    unknown = replace(estimate, covariance=covariance)
+    expected = expected_compliance(MODEL, samples, estimate.values)
+    torque = ElasticTorque.of(MODEL, [samples], estimate.values, expected)
+    wider = with_elastic_gears(unknown, Factor.by_time(MODEL, samples), torque, 1.0)
+    assert np.isinf(wider.covariance[0, 0])
+    np.testing.assert_array_equal(wider.covariance[0, 1:], 0.0)
