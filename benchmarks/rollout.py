@@ -16,9 +16,10 @@ With `--sysid` an arm by `hil identify`, and the same polished on windows of one
 the fitted recording, are compared with one that the minimiser of `mujoco.sysid`
 (`benchmarks.sysid_rival`) fits to these windows. All are then simulated in the same held-out
 windows, under the recorded torque and a feedback of 1 Hz. Prints errors, processor time from the
-recording on, and the error of positions that continue at the start velocity; wanted are no larger
-error and a tenth of the time. The recording is that of a simulated NS 16, or those of `--only`. It
-needs what `mujoco.sysid` imports: `pip install 'mujoco[sysid]'`.
+recording on, and the errors of rotors that are too heavy by `MORE_ROTOR` and of positions that
+continue at the start velocity; wanted are no larger error and a tenth of the time. The recording is
+that of a simulated NS 16, or those of `--only`. It needs what `mujoco.sysid` imports:
+`pip install 'mujoco[sysid]'`.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +63,7 @@ from sim_fixtures.ns16 import CELL_PATH
 Array = NDArray[np.float64]
 
 WINDOWS, ARMS = 1000, 50
+MORE_ROTOR = 0.1  # kg·m²
 LARGEST_RATIO = 0.5
 """Error of the identified arm over that of the nominal one at 0.5 s."""
 
@@ -147,6 +150,10 @@ def _print_comparison(name: str, archives: Sequence[Path], iterations: int) -> N
     )
     rows = {
         "hil identify": (simulate(arm, held_out, feedback), seconds),
+        f"rotors + {MORE_ROTOR:g} kg·m²": (
+            simulate(_with_heavier_rotors(arm), held_out, feedback),
+            None,
+        ),
         "the same, polished": (polished_arm.on(held_out).positions(), polished_seconds),
         "mujoco.sysid": (positions_of(rival, nominal, held_out, feedback), rival_seconds),
         "nominal": (simulate(nominal, held_out, feedback), None),
@@ -161,6 +168,16 @@ def _print_comparison(name: str, archives: Sequence[Path], iterations: int) -> N
         print(
             f"{label:30}{figures}" + ("" if spent is None else f"   in {spent:.1f} s"), flush=True
         )
+
+
+def _with_heavier_rotors(arm: Arm) -> Arm:
+    """Return an arm whose rotors are heavier than the identified ones by `MORE_ROTOR`."""
+    model = arm.model
+    standard = arm.standard.copy()
+    standard[model.layout.rotors] += MORE_ROTOR
+    values = arm.values.copy()
+    values[: model.base.rank] = model.base.grouping @ standard
+    return replace(arm, standard=standard, values=values)
 
 
 def _windows_of(

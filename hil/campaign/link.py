@@ -50,9 +50,9 @@ NOT_STARTED: Final = "it had not begun"
 STOPPED: Final = "stopped by the operator"
 WAIT_REPORTED: Final = 2.0  # s after which a controller that is not ready is reported
 READY: Final = frozenset((State.CLOSED, State.OPENING, State.OPEN))
-_COUNT: Final = re.compile(r"\d+ packets?")
 """States with the drive on. A controller may open its axes at once: they are held where they are
 until a motion is requested."""
+_COUNT: Final = re.compile(r"\d+ packets?")
 
 
 @dataclass(frozen=True, eq=False)
