@@ -422,12 +422,7 @@ def body_prior(
     mean = np.zeros(len(names))
     std = np.zeros(len(names))
     whole_torque = _torque_over_columns(model, factor)
-    std[layout.size :] = whole_torque[b:]
-    for k, term in enumerate(model.friction.terms, layout.size):
-        if term.term.of_load:
-            std[k] = LOAD_SHARE
-        elif term.symbol == "fo":
-            std[k] *= OFFSET_SHARE
+    std[layout.size :] = _friction_deviations(model, whole_torque[b:])
     reason = _placeholder(model, factor)
     length = body_lengths(model)
     masses = np.full(model.n_joints, _UNKNOWN_MASS)
@@ -463,6 +458,17 @@ def nominal_deviations(model: RobotModel, share: float = BODY_SHARE) -> Array:
     links = model.layout.links
     std = _body_deviations(share * model.nominal[links][:, _MASS], body_lengths(model))
     return np.asarray(model.base.grouping[:, links.ravel()] * std.ravel())
+
+
+def _friction_deviations(model: RobotModel, whole_torque: Array) -> Array:
+    """Return those of friction and elements (k,), of the coefficients that each may have alone."""
+    std = whole_torque.copy()
+    for k, term in enumerate(model.friction.terms):
+        if term.term.of_load:
+            std[k] = LOAD_SHARE
+        elif term.symbol == "fo":
+            std[k] *= OFFSET_SHARE
+    return std
 
 
 def _body_deviations(mass: Array, length: Array) -> Array:
