@@ -128,10 +128,26 @@ def find_gravity(model: RobotModel, training: Factor, held_out: Factor) -> Gravi
             break
         best = turned
         least = height
+    # In slow motion bodies that push upwards in the opposite gravity fit alike: none of an arm do.
+    if _weight_agreement(training, best, fitted(best)[0], model.nominal) < 0.0:
+        other = fitted(-best)[0]
+        best = -best if _weight_agreement(training, -best, other, model.nominal) > 0.0 else best
     counts = held_out.samples > 0
     change = np.log(unseen(best)) - np.log(unseen(model.gravity))
     ratio = float(np.exp(change[counts].mean())) if counts.any() else 1.0
     return GravityDirection(model.gravity, best, ratio)
+
+
+def _weight_agreement(factor: Factor, gravity: Array, values: Array, nominal: Array) -> float:
+    """Return the product of the torques of gravity of fitted and nominal bodies, over all rows.
+
+    The factor is a :func:`standard_factor`; it is zero for an arm without nominal masses.
+    """
+    s = len(values)
+    bodies = len(nominal)
+    weight = np.kron(np.append(0.0, gravity), np.eye(s)[:bodies]).T  # (4 s, bodies)
+    gram = factor.gram[:, :-1, :-1].sum(axis=0)
+    return float((weight @ values[:bodies]) @ gram @ (weight @ nominal))
 
 
 def _turn(factor: Factor, gravity: Array, values: Array, weights: Array) -> Array:

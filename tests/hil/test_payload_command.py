@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import tomllib
 from dataclasses import replace
@@ -444,3 +445,18 @@ def test_archives_of_a_folder_are_used(currents: Path, tmp_path: Path) -> None:
     (tmp_path / "empty.mcap").symlink_to(currents / "full.mcap")
     loads = gains(currents, "empty.mcap", "--loaded", str(tmp_path), *BOTH[2:])["payload_kg"]
     assert sorted(loads.values(), key=bool) == [None, 4.0]
+
+
+@pytest.mark.long
+def test_gravity_of_a_slow_real_arm_points_down(shared_data: Path, tmp_path: Path) -> None:
+    """Stated to be on a wall, it stands upright; pushed upwards by bodies it would fit alike."""
+    logs = [shared_data / "lwr4" / f"measurements_{number}.npz" for number in (1, 2)]
+    stated = ["--urdf", str(shared_data / "lwr4/kuka_lwr4.urdf"), "--gravity", "9.81", "0", "0"]
+    archives = [str(tmp_path / f"{log.stem}.mcap") for log in logs]
+    for log, archive in zip(logs, archives, strict=True):
+        line = ["import", "log", str(log), *stated, "-o", archive]
+        assert CliRunner().invoke(app, line).exit_code == 0
+    result = CliRunner().invoke(app, ["payload", archives[0], "--loaded", archives[1]])
+    said = re.search(r"with gravity \((.*?)\) m/s² in base axes", str(result.exception))
+    assert said is not None, result.exception
+    assert float(said[1].split(", ")[2]) == pytest.approx(-9.81, abs=0.1)
