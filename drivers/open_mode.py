@@ -238,8 +238,8 @@ class SentSetPoints:
         # Usual case: the set-point sent last.
         if np.abs(target - newest).max() <= standstill:
             # At standstill a target reported late is equal to it as well.
-            step = newest - sent[self._newest - 1]
-            if self.target_latency and not self._resent and np.abs(step).max() > standstill:
+            was_late = self.target_latency and not self._resent
+            if was_late and np.abs(newest - sent[self._newest - 1]).max() > standstill:
                 self.target_latency = 0
             return 0
         rows = sent[(self._newest - self._back) % len(sent)]
@@ -313,6 +313,7 @@ class SetPointGenerator:
         self._slots = wire.joint_slots[wire.opened]
         self._last_reply = builder.floats[self._slots]
         self._continuing = wire.opened.copy()
+        self._all_opened = bool(wire.opened.all())
 
     def reply(self, now: OpenCycle) -> OpenReply:
         """Fill in the reply to the packet of a cycle in open mode."""
@@ -508,9 +509,9 @@ class SetPointGenerator:
 
     def _require_closed_still(self, motor: Array) -> None:
         """Require closed axes to stay where the controller holds them, wrist couplings included."""
-        opened = self._wire.opened
-        if opened.all():
+        if self._all_opened:
             return
+        opened = self._wire.opened
         off = np.abs(motor - self._raw[TARGET]) > self._guard.limits.standstill
         if (off & ~opened).any():
             joint = int(np.argmax(off & ~opened)) + 1
