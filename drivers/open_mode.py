@@ -238,10 +238,9 @@ class SentSetPoints:
         # Usual case: the set-point sent last.
         if np.abs(target - newest).max() <= standstill:
             # At standstill a target reported late is equal to it as well.
-            if self.target_latency and not self._resent:
-                step = newest - sent[self._newest - 1]
-                if np.abs(step).max() > standstill:
-                    self.target_latency = 0
+            was_late = self.target_latency and not self._resent
+            if was_late and np.abs(newest - sent[self._newest - 1]).max() > standstill:
+                self.target_latency = 0
             return 0
         rows = sent[(self._newest - self._back) % len(sent)]
         extrapolated = newest + self._ahead[:missed] * (newest - rows[1])
