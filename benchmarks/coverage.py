@@ -27,7 +27,8 @@ Figures per arm and delay, and of all; a seed is the same arm, motion and noise 
   median half width of an inertial interval over the true value.
 - ``delay_near``: runs whose applied delay is within 0.3 ms of the truth on every joint;
   ``delay_bias_ms``: mean of applied less true; ``delay_half_ms``: median half width of its interval
-  where a run states one.
+  where a run states one, ``delay_intervals`` their number, ``delay_held`` that of those which hold
+  the true delay.
 - ``false_causes``: runs whose verdict blames something, other than a delay that is there, by the
   name of the finding. ``good``: runs whose verdict is good.
 - ``inside``: share of held-out means of torque inside their intervals (`calibration` in
@@ -418,6 +419,8 @@ def figures(draws: Sequence[Sequence[Run]]) -> dict[str, Any]:
     near = [all(abs(error) <= NEAR for error in run.delay_error) for run in runs]
     bias = np.mean([error for run in runs for error in run.delay_error])
     halves = [half for run in runs for half in run.delay_half]
+    stated = [run for run in runs if run.delay_half]
+    held = [abs(run.delay_error[0]) <= run.delay_half[0] for run in stated]
     inside = [run.inside for run in runs if run.inside is not None]
     return {
         "runs": len(runs),
@@ -429,6 +432,8 @@ def figures(draws: Sequence[Sequence[Run]]) -> dict[str, Any]:
         "delay_near": sum(near),
         "delay_bias_ms": _rounded(1e3 * bias),
         "delay_half_ms": _rounded(1e3 * np.median(halves)) if halves else None,
+        "delay_intervals": len(held),
+        "delay_held": sum(held),
         "false_causes": dict(Counter(name for run in runs for name in run.blamed)),
         "good": sum(run.good for run in runs),
         "inside": _rounded(np.mean(inside)) if inside else None,
@@ -507,6 +512,7 @@ def _line(cell: str, row: Mapping[str, Any]) -> str:
         shown.append(f"{name} " + ("-" if share is None else f"{share:.1%}{within}"))
     shown += [f"{name} {row[name]}" for name in ("undetermined", "dropped")]
     shown.append(f"delay near {row['delay_near']} of {row['runs']}, bias {row['delay_bias_ms']} ms")
+    shown.append(f"in {row['delay_held']} of {row['delay_intervals']} intervals")
     shown.append(f"false causes {row['false_causes'] or 'none'}")
     shown.append(f"good {row['good']}")
     shown += [f"{name} {row[name]}" for name in ("width", "inside", "error", "seconds")]

@@ -253,7 +253,9 @@ class _DelayChoice:
         if how.torque_delay != self.assumed:
             return None, (_compensated(how.torque_delay),)
         if self.suggested:
-            return None, (f"{self.notes[0]}; not applied, as it predicts worse",)
+            determined = all(delay.determined for delay in self.suggested)
+            reason = "it predicts worse" if determined else "it is not determined"
+            return None, (f"{self.notes[0]}; not applied, as {reason}",)
         return self.estimate, self.notes
 
 

@@ -429,8 +429,8 @@ def _compare_delays(
 ) -> tuple[Settings, Settings, list[Choice]]:
     """Compensate a significant delay unless it predicts worse, and choose the other settings again.
 
-    Compared on sliding rows, as presliding is similar to a delay. Returns the settings before and
-    after the sweep, and its decisions.
+    Compared on sliding rows, as presliding is similar to a delay, by the geometric mean over the
+    joints. Returns the settings before and after the sweep, and its decisions.
     """
     compared: list[Choice] = []
     for delay in delays:
@@ -439,7 +439,8 @@ def _compare_delays(
         # A short recording has to show that the delay predicts better, and so has a wide interval.
         doubtful = trial.duration(now) < SHORT or not delay.determined
         pair = [sliding, late] if doubtful else [late, sliding]
-        decision = trial.decide(DELAY, pair, 0.0, rows="fitted")
+        # The unknown scale of one torque resembles a delay, but of that joint only.
+        decision = trial.decide(DELAY, pair, 0.0, by_joint=True, rows="fitted")
         compared.append(decision.choice)
         if decision.settings.preprocessing.torque_delay == delay.value:
             first = first.preprocessed(torque_delay=delay.value)

@@ -135,6 +135,7 @@ class TestFigures:
         assert figures["friction"] == 1.0
         assert figures["delay_near"] == 1  # a run with a late axis is not near
         assert figures["delay_bias_ms"] == pytest.approx(0.1)
+        assert (figures["delay_held"], figures["delay_intervals"]) == (1, 2)
         assert figures["false_causes"] == {"friction": 1}
         assert (figures["good"], figures["inside"], figures["seconds"]) == (1, 0.9, 10.0)
 
