@@ -135,7 +135,9 @@ class UnrecordedJointError(SourceError):
         self, count: int, joints: Iterable[str] = (), channels: Iterable[str] = ()
     ) -> UnrecordedJointError:
         """Return this error with what was recorded."""
-        self.count, self.joints, self.channels = count, tuple(joints), tuple(channels)
+        self.count = count
+        self.joints = tuple(joints)
+        self.channels = tuple(channels)
         return self
 
 

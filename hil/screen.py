@@ -544,7 +544,8 @@ class Screen:
             return
         at = (status.phase, status.number)
         if at != self._line_of or time.monotonic() >= self._line_due:
-            self._line_of, self._line_due = at, time.monotonic() + LINE_EVERY
+            self._line_of = at
+            self._line_due = time.monotonic() + LINE_EVERY
             put(self._log, status_line(status))
 
     def _print_messages(self) -> None:

@@ -387,12 +387,12 @@ class _Batch:
             place = campaign.key.campaign
             partitions = campaign.partitions
             estimated = (arm.model, campaign.ready, place)
-            parts = []
             if all(self._has(refs, campaign) for refs in partitions):
                 pair = submit(place, estimate_cached, partitions, self.cache, *estimated)
                 receivers[pair.key] = _advance(advance, sum(map(len, partitions)), place)
                 yield pair
             else:
+                parts = []
                 for refs in partitions:
                     part = submit(place, reduce_archives, refs, campaign.ready, self.cache)
                     receivers[part.key] = _advance(advance, len(refs), place)

@@ -363,7 +363,8 @@ class LivePort:
         if self._request(command, Opened, unsent) is None:
             # Should it be opened after all, it is to be closed at once.
             self.archive.send(Close(self.job, "void", "nothing was sent: it was opened too late"))
-            self.open_path, self._late_path = "", str(spec.path)
+            self.open_path = ""
+            self._late_path = str(spec.path)
             late = f"did not open {spec.path} within {OPEN_TIMEOUT:g} s"
             raise ControllerError(f"the archive process {late}; nothing was sent")
         self._late_path = ""  # commands are executed in order

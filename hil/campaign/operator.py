@@ -224,7 +224,9 @@ class RunWatch:
     def begin(self, kind: str, number: int, total: int, duration: float, most: float) -> None:
         """Begin a motion of `duration` s at full speed, at an override of at most `most`."""
         self.time_left = max(0.0, self.time_left - duration / most - BETWEEN)
-        self._duration, self._most, self.began = duration, most, time.time()
+        self._duration = duration
+        self._most = most
+        self.began = time.time()
         self._show(
             None,
             phase=KIND_NAMES.get(kind, kind),

@@ -74,7 +74,9 @@ class RunArchives:
         self._campaign = campaign
         self.plan_hash = plan_hash
         self.simulated = (campaign.cell if link is None else link).only_simulated
-        self.names, self.notes, self.cycles = list[str](), list[str](), 0
+        self.names = list[str]()
+        self.notes = list[str]()
+        self.cycles = 0
         in_file = link is None and campaign.cell.controller.transport == "simulated"
         virtual = in_file or (link is not None and link.is_virtual)
         self._durable = not virtual if options.durable is None else options.durable

@@ -57,7 +57,8 @@ class Arm:
     joints: tuple[str, ...]
 
     def __str__(self) -> str:
-        first, last = self.joints[0], self.joints[-1]
+        first = self.joints[0]
+        last = self.joints[-1]
         return first if first == last else f"{first} .. {last}"
 
 

@@ -348,19 +348,19 @@ def _at_rest(time: Array, values: Array, at: float) -> tuple[Array, Array]:
     return position, np.zeros(len(position))
 
 
-def _at_stamps(stamp: Stamps, known: Stamps, values: Array) -> Array:
+def _at_stamps(stamp: Stamps, sent: Stamps, values: Array) -> Array:
     """Return values (k, n) at other stamps (m,): linear, NaN outside and in gaps."""
-    known, first = np.unique(known, return_index=True)
+    sent, first = np.unique(sent, return_index=True)
     values = values[first]
-    if len(known) < 2:
+    if len(sent) < 2:
         return np.full((len(stamp), values.shape[1]), np.nan)
-    time = 1e-9 * (known - known[0])
-    at = 1e-9 * (stamp - known[0])
-    after = np.clip(np.searchsorted(known, stamp), 1, len(known) - 1)
+    time = 1e-9 * (sent - sent[0])
+    at = 1e-9 * (stamp - sent[0])
+    after = np.clip(np.searchsorted(sent, stamp), 1, len(sent) - 1)
     gap = np.diff(time)[after - 1] > GAP_STEPS * np.median(np.diff(time))
-    outside = (stamp < known[0]) | (stamp > known[-1]) | gap
+    outside = (stamp < sent[0]) | (stamp > sent[-1]) | gap
     result = np.column_stack([np.interp(at, time, column) for column in values.T])
-    result[outside & ~np.isin(stamp, known)] = np.nan
+    result[outside & ~np.isin(stamp, sent)] = np.nan
     return result
 
 

@@ -183,7 +183,9 @@ class _States:
         effort: Effort,
         clock: Clock,
     ) -> None:
-        self._source, self._joints, self._renamed = source, tuple(joints), renamed
+        self._source = source
+        self._joints = tuple(joints)
+        self._renamed = renamed
         self._effort = effort
         self._asked = clock
         self._parts: dict[tuple[str, ...], _Part] = {}

@@ -553,7 +553,8 @@ class CollisionChecker:
         self._chain = chain = chain_from_urdf(urdf)
         links = link_bodies(pin.buildModelFromXML(urdf), urdf, mesh_folders)
         self._bodies = [*links, *obstacles(workspace)]
-        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
+        self._request = coal.DistanceRequest()
+        self._result = coal.DistanceResult()
         if limits is not None and limits.n_joints != chain.n_joints:
             raise ShapeError("limits", (limits.n_joints,), f"({chain.n_joints},)")
         self._n_links = len(links)
