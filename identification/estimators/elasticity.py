@@ -8,8 +8,7 @@ gears grows with the square of the frequency, as torques of inertia do at low on
 
 Parameters take most of that up, so that no residual shows their error. Compliances are fitted
 beside them, about zero with the standard deviation of `RESONANCE`, and their mean square is added
-to the covariance of the parameters, which stay those of rigid gears: a rigid model predicts best
-with them.
+to the covariance of the parameters, which stay those of rigid gears.
 """
 
 from __future__ import annotations
