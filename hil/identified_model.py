@@ -193,10 +193,8 @@ def ensemble_of(model: IdentifiedModel, count: int, seed: int) -> Ensemble:
     Raises:
         InputError: it has another estimator than a posterior.
     """
-    prior = model.posterior.prior
-    return draw_ensemble(
-        model.cell.model, prior.believed or prior, model.estimate, model.factor, count, seed
-    )
+    belief = model.posterior.prior.belief
+    return draw_ensemble(model.cell.model, belief, model.estimate, model.factor, count, seed)
 
 
 def read_or_identify(

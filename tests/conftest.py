@@ -23,6 +23,10 @@ settings.register_profile(
 )
 settings.load_profile("hil")
 
+# Tests of other folders import them, too, some before those of tests/drivers.
+_OF_DRIVERS = ("transport_contract", "can_bench", "rig", "judge", "oracle")
+pytest.register_assert_rewrite(*(f"tests.drivers.{name}" for name in _OF_DRIVERS))
+
 
 _LONGEST = (
     "test_fault_matrix.py",

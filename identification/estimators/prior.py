@@ -159,6 +159,11 @@ class BodyPrior:
     placeholder: bool = False
     believed: BodyPrior | None = None  #: what is believed, if this prior is a stronger one
 
+    @property
+    def belief(self) -> BodyPrior:
+        """What is believed: this prior, or that of which it is a stronger one."""
+        return self.believed or self
+
     @cached_property
     def gaussian(self) -> GaussianPrior:
         """The prior of the parameters (p,)."""
@@ -176,7 +181,7 @@ class BodyPrior:
         std = self.std.copy()
         std[self.bodies] /= np.sqrt(weight)
         origin = f"{self.origin}, which weigh {weight:g} times"
-        return replace(self, std=std, origin=origin, believed=self.believed or self)
+        return replace(self, std=std, origin=origin, believed=self.belief)
 
     def most_probable(self, values: Array) -> Array:
         """Return the most probable standard and other parameters (s + k,) of parameters (p,)."""

@@ -544,7 +544,7 @@ class TestConsistencyCheck:
         check = consistency_of(runs())
         assert abs(check.cost) < 0.001
         assert not check.costly and not check.impossible
-        assert check.bounds == () and np.all(check.room > 0.5)
+        assert check.bounds == () and np.all(check.room > 0.1)
         assert "consistent parameters predict as well" in check.sentence
 
     def test_the_cost_is_the_rise_of_the_error(self):
