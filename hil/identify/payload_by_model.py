@@ -14,7 +14,7 @@ from hil.progress import Reporter
 from identification.estimators.payload import KnownArm, Run
 
 from .cell_context import torque_scale
-from .estimating import estimate_with
+from .estimating import Estimation, estimate_with
 from .options import Options
 from .payload_run import PayloadFound, doubtful_mounting, flange_of, weighed
 from .prepared import Prepared, prepare_sources, samples_of
@@ -54,13 +54,7 @@ def weigh_by_model(
     prepared = prepare_sources(sources, options, reporter)
     cell = prepared.sources.cell
     _require_usable(cell.model.friction.has_load, "has friction that grows with the load", arm[0])
-    estimation = estimate_with(prepared, options, reporter)
-    known_arm = KnownArm.of(
-        estimation.result.factor,
-        estimation.result.pooled,
-        estimation.posterior.prior.belief.gaussian.information,
-        estimation.posterior.design_effect,
-    )
+    known_arm = _known(estimate_with(prepared, options, reporter))
     frame = frame or flange_of(cell.model)
     runs = _reduced(others.training, prepared, frame, reporter)
     recordings = [source.recording for source in (*prepared.sources.training, *others.training)]
@@ -84,6 +78,13 @@ def weigh_by_model(
         with_currents=all(recording.motor_current is not None for recording in recordings),
         warnings=tuple(dict.fromkeys((*prepared.sources.warnings, *others.warnings))),
     )
+
+
+def _known(arm: Estimation) -> KnownArm:
+    """Return what the identification of the bare arm knows of its parameters."""
+    posterior = arm.posterior
+    information = posterior.prior.belief.gaussian.information
+    return KnownArm.of(arm.result.factor, arm.result.pooled, information, posterior.design_effect)
 
 
 def _reduced(
