@@ -193,9 +193,8 @@ def ensemble_of(model: IdentifiedModel, count: int, seed: int) -> Ensemble:
     Raises:
         InputError: it has another estimator than a posterior.
     """
-    prior = model.posterior.prior
     return draw_ensemble(
-        model.cell.model, prior.believed or prior, model.estimate, model.factor, count, seed
+        model.cell.model, model.posterior.believed, model.estimate, model.factor, count, seed
     )
 
 

@@ -267,6 +267,11 @@ class Posterior:
         return cls(cell.model, prior.with_weight(strength.weight), effect, strength.consistent)
 
     @property
+    def believed(self) -> BodyPrior:
+        """What is believed of the arm, whatever its bodies weigh."""
+        return self.prior.believed or self.prior
+
+    @property
     def precision(self) -> Array:
         """Information of the prior as it counts beside that of all rows (p, p)."""
         return self.design_effect * self.prior.gaussian.information

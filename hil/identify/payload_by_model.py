@@ -55,8 +55,7 @@ def weigh_by_model(
     cell = prepared.sources.cell
     _require_usable(cell.model.friction.has_load, "has friction that grows with the load", arm[0])
     estimation = estimate_with(prepared, options, reporter)
-    prior = estimation.posterior.prior
-    information = (prior.believed or prior).gaussian.information
+    information = estimation.posterior.believed.gaussian.information
     effect = estimation.posterior.design_effect
     known_arm = KnownArm.of(estimation.result.factor, estimation.result.pooled, information, effect)
     frame = frame or flange_of(cell.model)
