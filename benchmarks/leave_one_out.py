@@ -3,11 +3,11 @@
 Run with ``python -m benchmarks.leave_one_out [--data FOLDER] [--only NAME ...]
 [--defaults NAME ...] [--json]``, with FOLDER as in `benchmarks.board`.
 
-Each default of :mod:`identification.selection.inner_prediction` is varied alone. For each robot,
-the value with the least geometric mean of held-out errors over all *other* robots is
-applied to this one: on the first held-out split, all rows, as a ratio to the error of
-`benchmarks.plain_fit`. If a default were fitted to these recordings, the mean of the ratios with a
-robot left out would be larger than that of the present values.
+Each default of :mod:`identification.selection.inner_prediction`, and the offset of the prior, is
+varied alone. For each robot, the value with the least geometric mean of held-out errors over all
+*other* robots is applied to this one: on the first held-out split, all rows, as a ratio to the
+error of `benchmarks.plain_fit`. If a default were fitted to these recordings, the mean of the
+ratios with a robot left out would be larger than that of the present values.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Final
 from unittest.mock import patch
 
@@ -23,6 +24,7 @@ import numpy as np
 from benchmarks import parser_of, show
 from benchmarks.board import DATA, cut, fit_errors, identified_parts, split_logs
 from benchmarks.published import known
+from identification.estimators import prior
 from identification.selection import inner_prediction
 
 ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
@@ -37,11 +39,12 @@ ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
         (1e-4, 1e-6, 1e-5, 3e-5, 3e-4, 1e-3),
         (3e-4, 1e-6, 1e-5, 3e-5, 1e-4, 1e-3),
     ),
-    "STRENGTHS": ((0.25, 1.0, 4.0), (4.0, 1.0, 0.25)),
+    "STRENGTHS": ((1.0,), (1.0, 4.0), (1.0, 4.0, 16.0), (4.0, 16.0, 64.0, 1e4)),
     "FOLDS": (3, 8),
     "SHORT": (0.0, 30.0),
     "CERTAIN": (1.0, 2.0),
     "IMPOSSIBLE_WORTHWHILE": (0.02, 0.1),
+    "OFFSET_SHARE": (0.2, 0.3, 0.5, 1.0),
 }
 """Other values of each default; of a sequence, the first is the one that others have to beat."""
 PRESENT: Final = "present values"
@@ -57,11 +60,15 @@ def ratios(name: str, data: Path, defaults: Sequence[str]) -> dict[tuple[str, st
         errors[PRESENT, ""] = identified_parts(parts, Path(scratch)).error / fit
         for default in defaults:
             for value in ALTERNATIVES[default]:
-                with patch.object(inner_prediction, default, value):
+                with patch.object(_module_of(default), default, value):
                     error = identified_parts(parts, Path(scratch)).error
                 errors[default, str(value)] = error / fit
                 print(f"{name}: {default} = {value}: {error / fit:.3f}", flush=True)
     return errors
+
+
+def _module_of(default: str) -> ModuleType:
+    return next(module for module in (inner_prediction, prior) if hasattr(module, default))
 
 
 def chosen_without(robots: Mapping[str, Mapping[tuple[str, str], float]], default: str) -> Any:
