@@ -270,11 +270,10 @@ class Estimator:
         precision = share * posterior.precision
         weights = posterior.weights(total, share)
         solution = solve_with_prior(total.weighted(weights), precision)
+        covariance = scatter.covariance(solution.root, precision, result.design_effect)
         return replace(
             result.estimate,
-            covariance=scatter.covariance(
-                solution.root, result.design_effect**2 * posterior.prior.gaussian.scatter
-            ),
+            covariance=covariance + np.outer(result.shift, result.shift),
             interval_factor=scatter.interval_factor,
             method=f"{result.estimate.method.partition('; ')[0]}; {scatter.description}",
         )

@@ -341,7 +341,7 @@ def _posterior(cell: Cell, paths: Sequence[Path]) -> tuple[Array, Array, Array]:
     estimate = posterior.free(total).estimate
     weights = inverse_variance(estimate.noise_std**2)
     data = total.weighted(weights).A / posterior.design_effect
-    information = data + posterior.prior.gaussian.information
+    information = data + posterior.prior.belief.gaussian.information
     return estimate.values, information, np.median(errors, axis=0)
 
 

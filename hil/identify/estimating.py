@@ -330,8 +330,8 @@ class Posterior:
 
     @property
     def precision(self) -> Array:
-        """Information of the prior as it counts beside that of all rows (p, p)."""
-        return self.design_effect * self.prior.gaussian.information
+        """Information of what is believed, as it counts beside that of all rows (p, p)."""
+        return self.design_effect * self.prior.belief.gaussian.information
 
     def free(self, factor: Factor, share: float = 1.0) -> PosteriorEstimate:
         """Fit a factor that is this share of the rows, whatever bodies the parameters need."""

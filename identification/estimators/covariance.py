@@ -80,13 +80,12 @@ def block_covariance(
     values: Array,
     prior: Array | None = None,
     design_effect: float = 1.0,
-    prior_scatter: Array | None = None,
 ) -> Clustered:
     """Return the cluster-robust covariance of a weighted least-squares estimate by its factor.
 
     `values` (p,) solve the factor with weights (n,). With the information P (p, p) of a Gaussian
     prior, of which `design_effect` times d counts, H = A + d P replaces A, and the prior's scatter
-    ``d² H^-1 P H^-1`` is added to that of the data; `prior_scatter` (p, p) replaces P in between.
+    ``d² H^-1 P H^-1`` is added to that of the data.
     """
     used = factor.occupied()
     scores = used.scores(weights, values)
@@ -103,9 +102,7 @@ def block_covariance(
         part = slice(start, start + _AT_ONCE)
         information = longer.blocks(part).by_block(weights)[:, :-1, :-1]
         shares[part] = _shares(information, root, root)
-    spread = None
-    if prior is not None:
-        spread = design_effect**2 * (prior if prior_scatter is None else prior_scatter)
+    spread = None if prior is None else design_effect**2 * prior
     return _sandwich(shares, scores, solution, longer.block, spread)
 
 

@@ -126,24 +126,11 @@ class GaussianPrior:
     @cached_property
     def std(self) -> Array:
         """Standard deviations (p,) of what is believed, infinite where it is flat."""
-        solution = (self.believed or self)._solution
+        believed = self.believed or self
+        solution = solve_rows(believed.root, np.zeros(len(believed.root)), _WORST_CONDITION)
         covariance = solution.inverse
         mark_undetermined(covariance, solution.determined)
         return np.sqrt(np.diag(covariance))
-
-    @cached_property
-    def scatter(self) -> Array:
-        """Covariance (p, p) of ``information @ (pi - mean)`` by what is believed.
-
-        That of this prior is its information; a stronger one errs by more than it says.
-        """
-        if self.believed is None:
-            return self.information
-        return np.asarray(self.information @ self.believed._solution.inverse @ self.information)
-
-    @property
-    def _solution(self) -> Solution:
-        return solve_rows(self.root, np.zeros(len(self.root)), _WORST_CONDITION)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,6 +189,7 @@ class PosteriorEstimate:
     prior_std: Array  #: (p,), infinite where unknown
     origin: str  #: of the prior
     design_effect: float  #: rows of data that count as one
+    shift: Array  #: way of the parameters (p,) from those by what is believed
 
     @property
     def ratio(self) -> Array:
@@ -299,7 +287,9 @@ def with_prior(
     if design_effect > 1.0:
         method += f", design effect {design_effect:.3g}"
     estimate = estimate_of(model.units, factor, solution, weights / design_effect, method)
-    return PosteriorEstimate(estimate, prior.mean, prior.std, prior.origin, design_effect)
+    return PosteriorEstimate(
+        estimate, prior.mean, prior.std, prior.origin, design_effect, np.zeros_like(prior.mean)
+    )
 
 
 def fit_posterior(
@@ -309,6 +299,8 @@ def fit_posterior(
 
     `design_effect` rows count as one, by default as many as :func:`design_effect_of` says. The
     covariance has the scatter of the data, cluster-robust, and the prior's of what they leave open.
+    That of a stronger prior is the mean square error by what is believed: the covariance of the
+    believed posterior, and the square of the way from its mean.
 
     Raises:
         IdentificationError: the factor has no rows.
@@ -317,9 +309,18 @@ def fit_posterior(
     if design_effect is None:
         design_effect = design_effect_of(factor, prior)
     values, weights = posterior_values(factor, prior, design_effect)
-    spread = block_covariance(
-        factor, weights, values, prior.information, design_effect, prior.scatter
-    )
+    if prior.believed is not None:
+        base = fit_posterior(model, factor, prior.believed, design_effect)
+        shift = values - base.estimate.values
+        estimate = replace(
+            base.estimate,
+            values=values,
+            covariance=base.estimate.covariance + np.outer(shift, shift),
+            noise_std=factor.residual_rms(values),
+            method=base.estimate.method.replace(prior.believed.origin, prior.origin),
+        )
+        return replace(base, estimate=estimate, origin=prior.origin, shift=shift)
+    spread = block_covariance(factor, weights, values, prior.information, design_effect)
     alone = factor.solve(weights)
     solution = Solution(values, spread.root, alone.condition, alone.determined)
     method = f"posterior of the prior ({prior.origin}), {design_effect:.3g} rows count as one; "
@@ -327,7 +328,9 @@ def fit_posterior(
     estimate = replace(
         estimate, covariance=spread.covariance, interval_factor=spread.interval_factor
     )
-    return PosteriorEstimate(estimate, prior.mean, prior.std, prior.origin, design_effect)
+    return PosteriorEstimate(
+        estimate, prior.mean, prior.std, prior.origin, design_effect, np.zeros_like(prior.mean)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,14 +352,15 @@ class ScoreScatter:
         triangle = np.linalg.qr(spread.scores, mode="r")
         return cls(triangle @ of_parameters, spread.interval_factor, spread.description)
 
-    def covariance(self, root: Array, prior: Array) -> Array:
+    def covariance(self, root: Array, precision: Array, design_effect: float) -> Array:
         """Return the covariance of a posterior (p, p).
 
-        `root` S (p, k) with S S' the inverse of the information of data and prior, and the scatter
-        (p, p) of the prior's scores as it counts, see :func:`block_covariance`.
+        `root` S (p, k) with S S' the inverse of the information of data and prior, of which
+        `precision` (p, p) is the prior's as it counts, see :func:`block_covariance`.
         """
         data = self.rows @ root @ root.T
-        return np.asarray(data.T @ data + root @ (root.T @ prior @ root) @ root.T)
+        prior = root.T @ precision @ root
+        return np.asarray(data.T @ data + design_effect * root @ prior @ root.T)
 
 
 def design_effect_of(factor: Factor, prior: GaussianPrior) -> float:

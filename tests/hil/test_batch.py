@@ -192,8 +192,10 @@ class TestNumbers:
         assert_equal_repetitions(result, identified)
 
     @pytest.mark.parametrize("name", get_args(BatchEstimator))
-    def test_equal_those_with_samples_for_each_estimator(self, name, campaign, prepared):
-        identified = estimate_with(prepared, replace(FIXED, estimator=name), Silent()).result
+    def test_equal_those_with_samples_for_each_estimator(self, name, campaign):
+        options = replace(FIXED, estimator=name)
+        # The strength of its prior is chosen for "auto".
+        identified = estimate_with(prepare(campaign, options), options, Silent()).result
         level = batch(campaign.folder.root, estimator=name).campaigns[0].estimate
         # The program of the consistent estimate stops at its own tolerance.
         rtol, atol = (1e-4, 1e-4) if name == "consistent" else (1e-8, 1e-12)
