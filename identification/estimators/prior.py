@@ -70,13 +70,14 @@ _SETTLED: Final = 1e-3  # relative change of the noise
 # together are the torque of a light wrist, and a fifth of that of a heavy arm.
 _FRICTION_SHARE: Final = 0.5
 OFFSET_SHARE: Final = 0.4
-"""Deviation of an offset over that of Coulomb friction. Of a joint that moves one way both are one
-column, and what opposes its motion is friction rather than an offset. In recordings of six arms of
-the board the median ratio of the two is 0.31, which is that of a Gaussian of 0.46; from 0.3 to 0.5
-the errors of these recordings differ by 1.3 % at most."""
+"""Deviation of an offset over that of Coulomb friction of a joint that moves one way. Both are one
+column then, and what opposes its motion is friction rather than an offset. In recordings of six
+arms of the board the median ratio of the two is 0.31, which is that of a Gaussian of 0.46; from 0.3
+to 0.5 the errors of these recordings differ by 1.3 % at most."""
 # RMS of motions that excite an arm: 0.2 to 4.5 rad/s in the recordings of six arms of the board,
 # half of the joints above 0.45; at a base frequency of 0.1 to 0.2 Hz the acceleration is as large.
 USUAL_SPEED: Final = 0.5  # rad/s or m/s
+_STANDS: Final = 0.02  # share of it below which a joint shows the noise of its velocity
 _USUAL_ACCELERATION: Final = 0.5  # rad/s² or m/s²
 _SPEEDS: Final = 20  # up to the usual one
 LOAD_SHARE: Final = 0.1
@@ -417,8 +418,8 @@ def body_prior(
     its square. Without masses in the description, or with masses that have no relation to the
     torque of the factor: zero with bodies that could make all of the torque. Rotors: zero, with the
     inertia of the links outboard or, if larger, what makes half of the torque's scatter. Friction
-    and elements: zero, with a coefficient that makes half of it; offsets `OFFSET_SHARE` of that.
-    `stated` replaces mean and standard deviation by name:
+    and elements: zero, with a coefficient that makes half of it; offsets less of a joint that moves
+    one way (`OFFSET_SHARE`). `stated` replaces mean and standard deviation by name:
     ``{"I3m": (1.2, 0.2), "f0_1": (40.0, 40.0)}``.
     """
     layout = model.layout
@@ -431,7 +432,7 @@ def body_prior(
     mean = np.zeros(len(names))
     std = np.zeros(len(names))
     whole_torque = _torque_over_columns(model, factor)
-    std[layout.size :] = _friction_deviations(model, whole_torque[b:])
+    std[layout.size :] = _friction_deviations(model, factor, whole_torque[b:])
     reason = _placeholder(model, factor)
     length = body_lengths(model)
     masses = np.full(model.n_joints, _UNKNOWN_MASS)
@@ -469,15 +470,37 @@ def nominal_deviations(model: RobotModel, share: float = BODY_SHARE) -> Array:
     return np.asarray(model.base.grouping[:, links.ravel()] * std.ravel())
 
 
-def _friction_deviations(model: RobotModel, whole_torque: Array) -> Array:
+def _friction_deviations(model: RobotModel, factor: Factor, whole_torque: Array) -> Array:
     """Return those of friction and elements (k,), of the coefficients that each may have alone."""
     std = whole_torque.copy()
+    one_way = _one_way(model, factor)
     for k, term in enumerate(model.friction.terms):
         if term.term.of_load:
             std[k] = LOAD_SHARE
         elif term.symbol == "fo":
-            std[k] *= OFFSET_SHARE
+            std[k] *= 1.0 - (1.0 - OFFSET_SHARE) * one_way[term.owner]
     return std
+
+
+def _one_way(model: RobotModel, factor: Factor) -> Array:
+    """Return how far Coulomb friction and offset of each joint are one column (n,), 0 to 1.
+
+    Zero for a joint that stands, whose offset holds its torque, and without these three terms.
+    """
+    columns = dict[int, dict[str, int]]()
+    for k, term in enumerate(model.friction.terms, model.base.rank):
+        columns.setdefault(term.owner, {})[term.symbol] = k
+    gram = factor.gram.sum(axis=0)
+    alike = np.zeros(model.n_joints)
+    for joint, column in columns.items():
+        if not column.keys() >= {"f0", "f1", "fo"}:
+            continue
+        dry, viscous, offset = (column[symbol] for symbol in ("f0", "f1", "fo"))
+        speed = np.sqrt(gram[viscous, viscous] / max(1.0, gram[offset, offset]))
+        if speed > _STANDS * USUAL_SPEED:
+            product = np.sqrt(gram[dry, dry] * gram[offset, offset])
+            alike[joint] = abs(gram[dry, offset]) / product
+    return alike
 
 
 def _body_deviations(mass: Array, length: Array) -> Array:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import clarabel
 import numpy as np
@@ -41,11 +42,13 @@ from identification import (
     with_uncertain_delay,
     write_urdf,
 )
+from identification.estimators import prior as prior_module
 from identification.estimators.consistent import consistent_values, is_consistent
 from identification.estimators.covariance import block_length, cluster_covariance, spread
 from identification.estimators.delay import LONGEST_DELAY
 from identification.estimators.losses import Loss
 from identification.estimators.prior import (
+    OFFSET_SHARE,
     body_lengths,
     body_prior,
     design_effect_of,
@@ -764,6 +767,28 @@ class TestBodyPrior:
         values = dict(zip(model.parameter_names, estimate.values, strict=True))
         for joint in ("1", "2"):
             assert values[f"f0_{joint}"] > 5.0 * abs(values[f"fo_{joint}"])
+
+    @pytest.mark.parametrize(
+        ("speed", "share"), [(0.0, 1.0), (1.1, OFFSET_SHARE)], ids=["stands", "moves one way"]
+    )
+    def test_an_offset_is_as_free_as_its_joint_needs(self, speed, share):
+        """A joint that stands shows no friction, and what holds it is its offset."""
+        law = replace(MODEL.friction.laws[0], offset=True)
+        model = RobotModel.from_urdf(URDF, friction=law)
+        motion = a_motion()
+        position, velocity, acceleration = (np.array(part) for part in motion[1:4])
+        position[:, 1] = 0.3 + speed * motion.time
+        velocity[:, 1] = speed
+        acceleration[:, 1] = 0.0
+        motion = motion._replace(position=position, velocity=velocity, acceleration=acceleration)
+        torque = MODEL.torque(truth(), *motion[1:]) + gaussian(np.random.default_rng(1), motion)
+        factor = Factor.of(model, as_samples(model, motion, torque))
+        with patch.object(prior_module, "OFFSET_SHARE", 1.0):
+            free = body_prior(model, factor)
+        offset = model.layout.size + [
+            (term.symbol, term.owner) for term in model.friction.terms
+        ].index(("fo", 1))
+        assert body_prior(model, factor).std[offset] / free.std[offset] == pytest.approx(share)
 
     def test_shares_of_load_are_those_of_gears(self):
         model = MODEL.with_friction(load=True)
