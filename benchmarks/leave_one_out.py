@@ -60,14 +60,15 @@ def ratios(name: str, data: Path, defaults: Sequence[str]) -> dict[tuple[str, st
         errors[PRESENT, ""] = identified_parts(parts, Path(scratch)).error / fit
         for default in defaults:
             for value in ALTERNATIVES[default]:
-                with patch.object(_module_of(default), default, value):
+                with patch.object(module_of(default), default, value):
                     error = identified_parts(parts, Path(scratch)).error
                 errors[default, str(value)] = error / fit
                 print(f"{name}: {default} = {value}: {error / fit:.3f}", flush=True)
     return errors
 
 
-def _module_of(default: str) -> ModuleType:
+def module_of(default: str) -> ModuleType:
+    """Return the module that has a default."""
     return next(module for module in (inner_prediction, prior) if hasattr(module, default))
 
 

@@ -6,15 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.leave_one_out import ALTERNATIVES, PRESENT, chosen_without, main
-from identification.selection import inner_prediction
+from benchmarks.leave_one_out import ALTERNATIVES, PRESENT, chosen_without, main, module_of
 
 pytestmark = pytest.mark.long
 
 
 def test_every_default_is_there_and_has_other_values() -> None:
     for name, values in ALTERNATIVES.items():
-        assert getattr(inner_prediction, name) not in values
+        assert getattr(module_of(name), name) not in values
 
 
 def test_a_robot_is_judged_by_what_the_others_prefer() -> None:
