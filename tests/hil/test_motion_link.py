@@ -137,6 +137,17 @@ def run(cell: Cell, port: ScriptedPort, stop: Stop | None = None) -> MotionEnded
     return link.run(object(), spec, stop or Stop())  # type: ignore[arg-type]
 
 
+def said_until_ended(cell: Cell, port: ScriptedPort, stop: Stop) -> list[str]:
+    """What is said of a connection that waits until the operator ends it."""
+    port.state = State.SYNC
+    link = MotionLink(cell, port)  # type: ignore[arg-type]
+    lines: list[str] = []
+    link.connection.report = lines.append
+    with pytest.raises(ControllerError, match="ended by the operator"):
+        link.connect(stop)
+    return lines
+
+
 def test_what_a_connection_waits_for_is_reported_once(cell: Cell) -> None:
     stop = Stop()
     port = ScriptedPort(
@@ -144,12 +155,7 @@ def test_what_a_connection_waits_for_is_reported_once(cell: Cell) -> None:
         (8.0, is_set("state", State.DRIVING_ON)),
         (9.0, lambda _: setattr(stop, "requested", True)),
     )
-    port.state = State.SYNC
-    link = MotionLink(cell, port)  # type: ignore[arg-type]
-    lines: list[str] = []
-    link.connection.report = lines.append
-    with pytest.raises(ControllerError, match="ended by the operator"):
-        link.connect(stop)
+    lines = said_until_ended(cell, port, stop)
     nothing = "no packet from the controller (0 packets from other addresses)"
     start = "waiting up to 60 s for the controller: "
     assert lines == [
@@ -168,12 +174,7 @@ def test_a_count_that_grows_is_no_other_reason(cell: Cell) -> None:
 
     end = (5.0, lambda _: setattr(stop, "requested", True))
     port = ScriptedPort((1.0, came(290)), (3.0, came(1)), (4.0, came(11)), end)
-    port.state = State.SYNC
-    link = MotionLink(cell, port)  # type: ignore[arg-type]
-    lines: list[str] = []
-    link.connection.report = lines.append
-    with pytest.raises(ControllerError, match="ended by the operator"):
-        link.connect(stop)
+    lines = said_until_ended(cell, port, stop)
     (line,) = lines
     assert "290 packets came" in line
 
