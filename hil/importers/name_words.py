@@ -29,6 +29,12 @@ _QUANTITIES: Final[Mapping[Kind, frozenset[str]]] = {
     ),
     "motor_current": frozenset({"current", "currents", "cur", "curr", "amp", "strom"}),
 }
+_ALONE: Final = frozenset(
+    {"sec", "secs", "second", "seconds", "ms", "msec", "msecs", "millis", "milliseconds"}
+    | {"us", "usec", "usecs", "micros", "microseconds", "ns", "nano", "nanosec", "nanosecs"}
+    | {"nsec", "nsecs", "nanoseconds", "elapsed", "uhrzeit"}
+)
+"""Words that say a time where a name has no others: ``velocity_per_sec`` is none."""
 _WANTED: Final = """
 target targets cmd command commanded desired des d setpoint setpoints ref reference goal soll
 planned plan model feedforward ff error err delta predicted estimated est nominal"""
@@ -80,4 +86,7 @@ def kind_by_words(name: str) -> Kind | None:
     kinds = kinds_said(name.rpartition(".")[2])  # positions.timestamps
     if len(kinds) != 1:
         kinds = kinds_said(name)
+    words = set(words_of(name))
+    if words and words <= _ALONE:
+        return "time"
     return kinds[0] if len(kinds) == 1 and not is_other(name, kinds[0]) else None

@@ -337,6 +337,8 @@ class _Search:
         single = [g for g in named if g.size == 1]
         stamps = [g for g in single if {"header", "stamp"} <= set(words_of(g.pattern))]
         single = stamps or single
+        if len(single) > 1:  # a time of day beside its date, and without it where it wraps
+            single = [g for g in single if "date" not in words_of(g.pattern)] or single
         parts = [g for g in single if _NANO & set(words_of(g.pattern))]
         if len(single) == 2 and len(parts) == 1:
             single.remove(parts[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -420,14 +420,9 @@ def _layout(numbered: list[tuple[int, str]], dialect: Dialect, path: Path, form:
     last = filled[-1][0]
     rows = [entry for entry in numbered if filled[begin][0] <= entry[0] <= last]
     above = {line.strip() for _, line in filled[:begin]}
-    repeats = [number for number, line in rows if line.strip() in above]
-    if repeats:  # a logger that was started again writes its head again, with its empty lines
-        rows = [
-            (number, line)
-            for number, line in rows
-            if line.strip() not in above
-            and (line.strip() or not {number - 1, number + 1} & set(repeats))
-        ]
+    repeats = sum(line.strip() in above for _, line in rows)
+    if repeats:
+        rows = _without_heads(rows, above)
     if form.skip_empty:
         rows = [entry for entry in rows if entry[1].strip()]
     empty = next((number for number, line in rows if not line.strip()), None)
@@ -438,7 +433,27 @@ def _layout(numbered: list[tuple[int, str]], dialect: Dialect, path: Path, form:
             "skip_empty = true; to skip lines of a header: [format] skip_rows"
         )
         raise SourceError(path, problem, remedy=remedy)
-    return _Layout(tuple(names), tuple(units), rows, len(repeats))
+    return _Layout(tuple(names), tuple(units), rows, repeats)
+
+
+def _without_heads(
+    rows: Sequence[tuple[int, str]], head: Collection[str]
+) -> list[tuple[int, str]]:
+    """Return rows without the lines of the head that a logger wrote again when it was restarted.
+
+    Empty lines before and after them belong to the head.
+    """
+    data: list[tuple[int, str]] = []
+    follows_head = False
+    for number, line in rows:
+        if line.strip() in head:
+            while data and not data[-1][1].strip():
+                data.pop()
+            follows_head = True
+        elif line.strip() or not follows_head:
+            data.append((number, line))
+            follows_head = False
+    return data
 
 
 def _first_row(lines: Sequence[tuple[int, str]], dialect: Dialect) -> int:

@@ -175,6 +175,9 @@ READ: dict[str, tuple[str | bytes, dict[str, Any]]] = {
         PREAMBLE + text(rows()[:100], delimiter=";") + PREAMBLE
         + text(rows()[100:], delimiter=";"), {},
     ),
+    "comments, an empty line and the head once more": (
+        "# scope 1\n" + text(rows()[:100]) + "\n# scope 1\n\n" + text(rows()[100:]), {},
+    ),
     "names in a comment": ("# " + text(), {}),
     "ISO 8601": (text(rows(time=dates("%Y-%m-%dT%H:%M:%S{f}"))), {}),
     "ISO 8601 with a zone": (text(rows(time=dates("%Y-%m-%d %H:%M:%S{f}+01:00"))), {}),

@@ -83,6 +83,26 @@ class TestProposedMap:
         columns = open_archive(imported.archive).columns
         assert np.allclose(columns["position"], POSITION, rtol=0.0, atol=1e-8)
 
+    @pytest.mark.parametrize(
+        ("names", "columns"),
+        [
+            (["ms"], [1e3 * TIME]),
+            (["elapsed_ms"], [1e3 * TIME]),
+            (["secs", "nsecs"], [TIME // 0.5, np.rint(1e9 * (TIME % 0.5)) * 2.0]),
+            (["Date", "Time"], [np.full(len(TIME), 20261112.0), TIME]),
+        ],
+    )
+    def test_names_of_the_time(
+        self, tmp_path: Path, urdf: Path, names: list[str], columns: list[Floats]
+    ) -> None:
+        """A unit as the name, seconds beside nanoseconds, a time of day beside its date."""
+        head = [*names, "q{}", "rad_per_sec{}", "tau{}"]
+        path = log(tmp_path / "a.csv", head, *columns, POSITION, SLOPE, TORQUE)
+        imported = import_recording(path, tmp_path / "a.mcap", lambda _: Robot.from_urdf(urdf))
+        stamp = open_archive(imported.archive).columns["stamp"]
+        scale = 2.0 if "nsecs" in names else 1.0
+        assert np.allclose((stamp - stamp[0]) * 1e-9, scale * TIME, rtol=0.0, atol=1e-6)
+
     @pytest.mark.parametrize("pattern", ["{kind}_{joint}", "{joint}/{kind}"])
     def test_joints_in_names_put_columns_in_order(
         self, tmp_path: Path, urdf: Path, pattern: str
