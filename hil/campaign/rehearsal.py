@@ -362,14 +362,22 @@ def criterion(
 
 
 def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> Criterion:
-    """Judge the largest current of any motor, as a share of its limit."""
+    """Judge the largest current of any motor, as a share of its limit.
+
+    The two cycles after a lost packet, in which the controller comes back from its extrapolation to
+    the set-points, count only if a motor is saturated: `bound` is the margin of the motion.
+    """
     worst = 0.0
     motor = 0
     where = ""
     limit = cell.drive_train.current_limit
     for entry in folder.manifest():
-        current = np.abs(open_archive(folder.archives / entry.name).columns["target_current"])
-        share = np.nan_to_num(current).max(axis=0, initial=0.0) / limit
+        columns = open_archive(folder.archives / entry.name).columns
+        shares = np.nan_to_num(np.abs(columns["target_current"])) / limit
+        after_loss = columns["gap"] > 0
+        after_loss[1:] |= after_loss[:-1].copy()
+        shares[after_loss[:, None] & (shares <= SATURATED)] = 0.0
+        share = shares.max(axis=0, initial=0.0)
         if share.max() > worst:
             worst = float(share.max())
             motor = int(share.argmax())

@@ -436,9 +436,7 @@ def _layout(numbered: list[tuple[int, str]], dialect: Dialect, path: Path, form:
     return _Layout(tuple(names), tuple(units), rows, repeats)
 
 
-def _without_heads(
-    rows: Sequence[tuple[int, str]], head: Collection[str]
-) -> list[tuple[int, str]]:
+def _without_heads(rows: Sequence[tuple[int, str]], head: Collection[str]) -> list[tuple[int, str]]:
     """Return rows without the lines of the head that a logger wrote again when it was restarted.
 
     Empty lines before and after them belong to the head.

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from drivers.drive_train import DriveTrain
 from drivers.transports.simulated import Lose
 from hil.archive import open_archive
 from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop
+from hil.campaign import rehearsal as rehearsal_module
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.rehearsal import (
@@ -27,6 +29,7 @@ from hil.campaign.rehearsal import (
     Rehearsal,
     Twin,
     link_faults,
+    of_currents,
     of_motions,
     too_far_without_a_packet,
 )
@@ -184,6 +187,26 @@ def test_packets_are_lost_where_a_motion_survives_it(
         assert sentence is not None
         assert "motor of shoulder turns by 0.44 revolutions in a cycle of 4 ms" in sentence
         assert sentence in Twin.of(cell, seed=1, repetitions=3).assumed
+
+
+@pytest.mark.parametrize(
+    ("row", "share", "passed"), [(1, 0.9, True), (1, 0.995, False), (2, 0.9, False)]
+)
+def test_a_lost_packet_is_not_the_motion(
+    designed: Campaign, monkeypatch: pytest.MonkeyPatch, row: int, share: float, passed: bool
+) -> None:
+    """The current with which the controller comes back in two cycles counts if it saturates."""
+    twin = Campaign.open(designed.folder.rehearsed / "plain")
+    limit = twin.cell.drive_train.current_limit
+
+    def with_a_loss(path: Path) -> SimpleNamespace:
+        columns = {name: values.copy() for name, values in open_archive(path).columns.items()}
+        columns["gap"][100] = 1
+        columns["target_current"][100 + row] = share * limit
+        return SimpleNamespace(columns=columns)
+
+    monkeypatch.setattr(rehearsal_module, "open_archive", with_a_loss)
+    assert of_currents(twin.cell, twin.folder, "as modelled", 0.8).passed is passed
 
 
 @pytest.mark.parametrize(
