@@ -1,7 +1,6 @@
 """`python -m hil`, and the console script.
 
-Linear algebra uses one thread unless the environment sets another number: the matrices are small,
-and the rounding of sums would depend on the number of threads.
+Linear algebra uses one thread, see :mod:`hil.threads`; set here, before numpy is loaded.
 """
 
 from __future__ import annotations
@@ -9,11 +8,12 @@ from __future__ import annotations
 import os
 
 from hil.importing import leave_if_interrupted
+from hil.threads import VARIABLES
 
 
 def main() -> None:
     """Run the command line."""
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    for variable in VARIABLES:
         os.environ.setdefault(variable, "1")
     with leave_if_interrupted():
         from hil.cli import main as command_line  # after the threads are settled

@@ -30,6 +30,7 @@ from hil.output_folder import SOURCES, folder_beside, sources_text
 from hil.progress import Reporter, Silent
 from hil.report.figures import MEASURED, NOMINAL, PREDICTED, RESIDUAL, joints_of, torque_charts
 from hil.results import Results
+from hil.threads import one_thread
 from identification.text import percentage
 from identification.validation.verdict import Verdict
 
@@ -198,6 +199,7 @@ class IdentifiedArm:
         )
 
 
+@one_thread()
 def identify(
     recordings: PathOrPaths,
     *,

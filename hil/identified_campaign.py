@@ -12,8 +12,10 @@ from hil.identify.options import Options
 from hil.identify.run import Identification, identify_archives
 from hil.progress import Reporter
 from hil.reading import path_exists
+from hil.threads import one_thread
 
 
+@one_thread()
 def identify_paths(
     paths: Sequence[Path],
     reporter: Reporter,
@@ -42,6 +44,7 @@ def identify_paths(
     return identify_archives(archives, reporter, options, predict=predict)
 
 
+@one_thread()
 def identify_campaign(
     root: Path, reporter: Reporter, options: Options = Options(), *, predict: Sequence[Path] = ()
 ) -> Identification:

@@ -22,6 +22,7 @@ from uuid import uuid4
 
 from hil.errors import HilError, InputError
 from hil.progress import Reporter, Silent
+from hil.threads import VARIABLES
 from hil.version import software
 from identification import IdentificationError
 
@@ -45,7 +46,7 @@ _LOGGERS: Final = ("distributed", "tornado.application")
 _THIS_PC: Final = "127.0.0.1:0"  # by default the dashboard is open to the network
 _CONFIGURATION: Final = {
     "distributed.nanny.pre-spawn-environ": {
-        **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), 1),
+        **dict.fromkeys(VARIABLES, 1),
         # Memory of arrays is used again: returned to the system after each, as Dask sets it, its
         # pages cost a third of the time of an archive.
         "MALLOC_TRIM_THRESHOLD_": 1 << 28,

@@ -20,6 +20,7 @@ from hil.identify.options import Options
 from hil.identify.prepared import MAX_RECORDINGS, carried_over, decide
 from hil.identify.sources import Source, all_fitted
 from hil.progress import Reporter, Silent
+from hil.threads import one_thread
 from identification.selection.settings import Settings
 
 from .cache import CacheLocation, code_digest
@@ -146,6 +147,7 @@ class BatchResult:
     code: str  #: digest of the programs
 
 
+@one_thread()
 def reidentify(
     roots: Sequence[str],
     options: Options,

@@ -11,6 +11,7 @@ from hil.cell import Cell
 from hil.progress import Reporter
 from hil.report import ReportSeries
 from hil.results import Results
+from hil.threads import one_thread
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.selection.essential import Elimination
 from identification.validation.plausibility import ConsistencyCheck
@@ -66,6 +67,7 @@ class Identification:
         return report_series(self.prepared, self.estimate)
 
 
+@one_thread()
 def identify_archives(
     paths: Sequence[Path],
     reporter: Reporter,

@@ -20,6 +20,7 @@ from hil.report.chart import Caption, Chart, Plot, Trace
 from hil.report.numbers import significant
 from hil.report.rendering import environment, page_bytes
 from hil.simulation import planted_values, simulated_link, simulated_provenance
+from hil.threads import one_thread
 from hil.version import software
 from sim_fixtures.ns16 import CELL_PATH
 
@@ -34,6 +35,7 @@ _WORDS: Final = {
 }
 
 
+@one_thread()
 def run_study(
     root: Path,
     settings: StudySettings,
