@@ -164,8 +164,11 @@ def similar_path(path: Path) -> Path | None:
         names = [entry.name for entry in islice(folder.iterdir(), _MOST_SIBLINGS)]
     except OSError:
         return None
+    matches = get_close_matches(path.name, names)
+    # Of log.txt, log.csv rather than the folder log.
+    matches.sort(key=lambda name: bool(Path(name).suffix) is not bool(path.suffix))
     # Names with a common suffix alone are not alike.
-    for name in get_close_matches(path.name, names):
+    for name in matches:
         if get_close_matches(path.stem, [Path(name).stem]):
             return folder / name
     return None

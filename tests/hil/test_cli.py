@@ -283,6 +283,12 @@ class TestMistypedPaths:
         assert done.returncode == 2
         assert f"; there is {folder}\n" in done.stderr
 
+    def test_a_file_is_meant_by_a_name_with_a_suffix(self, folder: Path) -> None:
+        """Not the folder of the results, which has the name of the log."""
+        (folder / "first").mkdir()
+        done = hil("identify", folder / "first.bag")
+        assert f"there is {folder / 'first.mcap'}" in done.stderr
+
     def test_nothing_alike(self, tmp_path: Path) -> None:
         done = hil("archive", "check", tmp_path / "x.mcap")
         assert "check whether it was moved or removed" in done.stderr
