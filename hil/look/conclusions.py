@@ -194,6 +194,8 @@ def undecided(
         said = "; ".join(contradictions.sentences)
         problem = f"may not be of the arm of the URDF: {said}; and {problem}"
         return SourceError(source, problem, field="--urdf", remedy=f"{_REMEDY}; or {remedy}")
+    if choices[0].aspect in _OF_AXES:
+        remedy += "; if none of these is so, give the URDF of this arm"
     return SourceError(source, problem, field=choices[0].aspect, remedy=remedy)
 
 

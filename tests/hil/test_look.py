@@ -405,6 +405,14 @@ class TestOtherArm:
         assert "may not be of the arm of the URDF: a moves 75°" in refusal.problem
         assert "two readings fit alike" in refusal.problem
 
+    def test_readings_of_an_axis_that_are_not_so_are_another_arm(self, tmp_path: Path) -> None:
+        none = Contradictions("", "", "", "", "")
+        for aspect, said in (("zero", True), ("side", False)):
+            choices = (Choice(aspect, "as planted", 0.13, "--gravity 0 0 0"),) * 2
+            remedy = undecided(tmp_path / "a.csv", choices, none).remedy
+            assert remedy is not None
+            assert ("if none of these is so, give the URDF of this arm" in remedy) == said
+
     @staticmethod
     def contradictions(log: Path, urdf: Path) -> Contradictions:
         imported = hil("import", "log", log, "--urdf", urdf, "--outside-limits")
