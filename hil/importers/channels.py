@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.bags import SUFFIXES, open_bag
 from hil.importers.column_map import Format
 from hil.importers.commands import as_joint_state, measured_topics
-from hil.importers.name_words import is_other
+from hil.importers.name_words import is_other, kind_by_words
 from hil.importers.rosbag2 import joint_state_topics
 from hil.importers.stamps import concluded_unit
 from hil.importers.table import Table, is_date
@@ -80,6 +80,8 @@ class Channel:
         joints: that the log names, in the order of the numbers of a sample.
         text: of the first and the last row of a table, where it is the same and no number.
         first: of the first row of a table, where it is no number.
+        is_repeated: whether it is a time that a channel before has as well, as where a log has the
+            time beside each quantity.
     """
 
     name: str
@@ -93,6 +95,7 @@ class Channel:
     joints: tuple[str, ...] = ()
     text: str | None = None
     first: str | None = None
+    is_repeated: bool = False
 
 
 def channels_of(path: Path, form: Format | None = None) -> tuple[Channel, ...]:
@@ -140,6 +143,9 @@ def _of_table(table: Table) -> Iterator[Channel]:
     texts = table.texts
     if names[0] == "" and all(kind != "time" for kind, _ in kinds) and is_date(first[0]):
         kinds[0] = "time", None  # an index of dates, which pandas writes without a name
+    repeated = _repeated_times(
+        table, [k for k, name in enumerate(names) if _is_time(name, kinds[k][0])]
+    )
     for place, (kind, _) in enumerate(kinds):
         if kind == "time" and rate is None:
             rate = _rate(table, place)
@@ -150,6 +156,7 @@ def _of_table(table: Table) -> Iterator[Channel]:
             name, 1, len(table.lines), table.unit(place), "text", rate, kind, number,
             text=texts[place],
             first=None if not beginning or table.is_number(beginning) else beginning,
+            is_repeated=place in repeated,
         )  # fmt: skip
 
 
@@ -163,6 +170,29 @@ def _rate(table: Table | ArrayFile, place: int | str) -> float | None:
     except SourceError:
         return None
     return rate_of([time for time in times if time is not None])
+
+
+def _is_time(name: str, kind: Kind | None) -> bool:
+    """Return whether a name, or a word in it, says a time; `kind` is what the whole name says."""
+    return kind == "time" or (kind is None and kind_by_words(name) == "time")
+
+
+_Place = TypeVar("_Place", int, str)
+
+
+def _repeated_times(table: Table | ArrayFile, places: Sequence[_Place]) -> set[_Place]:
+    """Return the columns of times that are all those of a column before."""
+    repeated = set()
+    earlier: list[list[int | None]] = []
+    for place in places if len(places) > 1 else ():
+        try:
+            times = table.times(place, 0)
+        except SourceError:  # no time
+            continue
+        if times in earlier:
+            repeated.add(place)
+        earlier.append(times)
+    return repeated
 
 
 def rate_of(stamps: Sequence[int] | NDArray[np.int64]) -> float | None:
@@ -179,12 +209,21 @@ def _of_arrays(file: ArrayFile) -> Iterator[Channel]:
         for name, (kind, _) in kinds.items()
         if kind == "time" and math.prod(file.shape(name)) == max(file.shape(name))
     }
+    times = [
+        name
+        for name, (kind, _) in kinds.items()
+        if _is_time(name, kind) and math.prod(file.shape(name)) == max(file.shape(name))
+    ]
+    repeated = _repeated_times(file, times)
     for name, (kind, number) in kinds.items():
         shape = file.shape(name)
         samples = max(shape)
         size = math.prod(shape) // max(shape)
         rate = rates.get(samples)
-        yield Channel(name, size, samples, None, file.dtype(name), rate, kind, number)
+        yield Channel(
+            name, size, samples, None, file.dtype(name), rate, kind, number,
+            is_repeated=name in repeated,
+        )  # fmt: skip
 
 
 def _of_bag(path: Path) -> tuple[Channel, ...]:

@@ -125,7 +125,7 @@ def proposed_map(
     form = Format(missing="drop") if drop_missing else None
     channels = channels_of(log, form)
     _refuse_row_for_each_joint(log, channels, joints)
-    groups = _groups(channels, joints)
+    groups = _groups([channel for channel in channels if not channel.is_repeated], joints)
     names = row_names([channel.text for channel in channels], joints)
     recorded = () if names.joints == tuple(joints) else names.joints
     nanoseconds = None

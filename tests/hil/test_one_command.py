@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.io
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
@@ -87,6 +88,7 @@ class TestProposedMap:
         ("names", "columns"),
         [
             (["ms"], [1e3 * TIME]),
+            (["t", "stamp"], [TIME, TIME]),
             (["elapsed_ms"], [1e3 * TIME]),
             (["secs", "nsecs"], [TIME // 0.5, np.rint(1e9 * (TIME % 0.5)) * 2.0]),
             (["Date", "Time"], [np.full(len(TIME), 20261112.0), TIME]),
@@ -95,7 +97,7 @@ class TestProposedMap:
     def test_names_of_the_time(
         self, tmp_path: Path, urdf: Path, names: list[str], columns: list[Floats]
     ) -> None:
-        """A unit as the name, seconds beside nanoseconds, a time of day beside its date."""
+        """A unit, one time twice, seconds beside nanoseconds, a time of day beside its date."""
         head = [*names, "q{}", "rad_per_sec{}", "tau{}"]
         path = log(tmp_path / "a.csv", head, *columns, POSITION, SLOPE, TORQUE)
         imported = import_recording(path, tmp_path / "a.mcap", lambda _: Robot.from_urdf(urdf))
@@ -135,6 +137,18 @@ class TestProposedMap:
         assert proposal.columns.torque.columns == "torques"
         assert proposal.lines[-1] == "not used: target_positions"
 
+    def test_arrays_with_the_time_beside_each(self, tmp_path: Path, urdf: Path) -> None:
+        """As Simulink writes its structures with time."""
+        signals = {
+            name: {"time": TIME, "signals": {"values": values}}
+            for name, values in (("q", POSITION), ("tau", TORQUE))
+        }
+        scipy.io.savemat(tmp_path / "a.mat", {"out": signals})
+        proposal = proposed_map(tmp_path / "a.mat", Robot.from_urdf(urdf))
+        assert proposal.columns.time is not None
+        assert proposal.columns.time.column == "out.q.time"
+        assert proposal.columns.position.columns == "out.q.signals.values"
+
     def test_channels_can_be_given(self, tmp_path: Path, urdf: Path) -> None:
         path = log(tmp_path / "a.csv", ["q{}", "load{}"], POSITION, TORQUE)
         chosen = {"torque": "load1,load2,load3"}
@@ -160,7 +174,7 @@ REFUSED: Mapping[str, tuple[list[str], list[Floats], str, str]] = {
     ),
     "two clocks": (
         ["t", "stamp", "q{}", "tau{}"],
-        [TIME, TIME, POSITION, TORQUE],
+        [TIME, 1.001 * TIME, POSITION, TORQUE],
         "t and stamp are all named as time",
         "--columns 'time=t' or --columns 'time=stamp'",
     ),
