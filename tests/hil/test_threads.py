@@ -1,4 +1,4 @@
-"""Linear algebra has one thread, whatever loaded numpy before, or as many as the environment says."""
+"""Linear algebra has one thread, whatever loaded numpy before; the environment can set others."""
 
 from __future__ import annotations
 
