@@ -23,6 +23,7 @@ from hil.importers import mcap_messages
 from hil.importers.mcap_messages import Topic
 from hil.importers.ros_messages import MessageError, decoded, definitions_of, typestore_of
 from hil.reading import open_file, read_text
+from hil.terminal_text import typed
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -33,6 +34,7 @@ _LONGEST_MESSAGE: Final = 1 << 24  # bytes
 _LONGEST_ROW: Final = 1 << 28  # bytes
 _SLACK: Final = 1 << 20  # bytes
 _SQLITE: Final = b"SQLite format 3\0"
+_ROS_1: Final = b"#ROSBAG V2.0\n"
 _ZSTD: Final = b"\x28\xb5\x2f\xfd"  # begins no CDR message
 
 
@@ -260,13 +262,19 @@ def _not_a_bag(file: Path, error: Exception) -> SourceError:
     remedy = "name the .db3, .mcap or .bag file, or the bag's folder"
     if _is_database(file):
         remedy = "copy it again, with the file that ends in -wal beside it, if there is one"
+    elif _starts_with(file, _ROS_1):
+        remedy = f"copy it again; or, if its recorder was killed: rosbag reindex {typed(file.name)}"
     return SourceError(file, problem, remedy=remedy)
 
 
 def _is_database(file: Path) -> bool:
+    return _starts_with(file, _SQLITE)
+
+
+def _starts_with(file: Path, signature: bytes) -> bool:
     try:
         with file.open("rb") as stream:
-            return stream.read(len(_SQLITE)) == _SQLITE
+            return stream.read(len(signature)) == signature
     except OSError:
         return False
 

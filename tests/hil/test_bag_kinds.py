@@ -59,12 +59,19 @@ def urdf(tmp_path: Path) -> Path:
     return path
 
 
-def ros_1_bag(path: Path, messages: Sequence[Message]) -> Path:
+def ros_1_bag(
+    path: Path,
+    messages: Sequence[Message],
+    compression: Ros1Writer.CompressionFormat | None = None,
+) -> Path:
     """Write joint states of ROS 2 to a bag of ROS 1."""
     new, old = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
     kinds = (STATE, "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
     state, header, clock = (old.types[kind] for kind in kinds)
-    with Ros1Writer(path) as writer:
+    writer = Ros1Writer(path)
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer:
         connection = writer.add_connection("/joint_states", STATE, typestore=old)
         for k, (received, data) in enumerate(messages):
             content = new.deserialize_cdr(data, STATE)
@@ -124,6 +131,28 @@ def assert_right(archive: Archive, *, rows: slice = slice(None), tolerance: floa
 def each_kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bags of ROS 2 in a database, and of ROS 1."""
     monkeypatch.setattr(Typed, "suffix", request.param)
+
+
+class TestRos1:
+    @pytest.mark.parametrize("compression", Ros1Writer.CompressionFormat)
+    def test_compressed(
+        self, urdf: Path, compression: Ros1Writer.CompressionFormat, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(Typed, "suffix", "bag")
+        bag = Typed(urdf, WHOLE)
+        bag.path.unlink()
+        ros_1_bag(bag.path, WHOLE, compression)
+        assert_right(bag.again().archive)
+
+    def test_one_that_was_not_closed_names_the_program_that_mends_it(
+        self, urdf: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(Typed, "suffix", "bag")
+        bag = Typed(urdf, WHOLE)
+        content = bag.path.read_bytes()
+        bag.path.write_bytes(content[: len(content) // 2])
+        assert bag.again().refused
+        assert "if its recorder was killed: rosbag reindex bag.bag" in bag.message
 
 
 @pytest.mark.usefixtures("each_kind")
