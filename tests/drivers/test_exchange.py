@@ -22,6 +22,7 @@ from drivers import (
 )
 from drivers.exchange.loop import MAX_KINDS
 from tests.drivers.rig import MOVE, PERIOD, START, Cruise, N, Rig, closed, moving, smooth_move
+from tests.messages import LEFT_TOO_LATE
 
 pytestmark = pytest.mark.safety
 
@@ -444,7 +445,7 @@ class TestLateness:
         link, session = self.run([cost] * 50, stamped=stamped)
         assert session.discards["replied to late"] >= 49
         if stamped:
-            assert session.stops[0] == "3 consecutive replies left too late"
+            assert session.stops[0] == f"3 {LEFT_TOO_LATE}"
         else:
             assert session.stops == [], "when a packet arrived was only guessed"
         # And the answers do not fall behind: each is to what came within the last cycle.

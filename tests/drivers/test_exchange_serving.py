@@ -45,6 +45,7 @@ from drivers.exchange.loop import POLL
 from drivers.exchange.serving import DETACHED_LINGER, MAX_LINGER, CommandHandler, EventLimiter
 from drivers.record import CycleRing
 from tests.drivers.rig import Cruise, N, still
+from tests.messages import MISSED_IN_A_ROW
 
 pytestmark = pytest.mark.safety
 
@@ -141,7 +142,7 @@ class TestEventLimiter:
     def test_sums_precede_the_end_of_a_motion(self):
         limiter = EventLimiter()
         limiter.filter([GapSeen(1, 7)], 0.0)
-        ended = MotionEnded("stopped", "5 packets were missed in a row", 0, 9)
+        ended = MotionEnded("stopped", f"5 {MISSED_IN_A_ROW}", 0, 9)
         assert limiter.filter([GapSeen(5, 9), ended], 0.01) == [GapSeen(5, 9), ended]
 
 
