@@ -744,6 +744,19 @@ class TestSentAgain:
                 sent.set_points.resend()
                 sent.check(0.0)
 
+    def test_a_target_reported_late_is_so_after_a_repetition(self):
+        """A target that is the set-point sent twice does not show that it is reported in time."""
+        sent = Sent(SENT_STEP)
+        assert sent.check(-1.0) == 1
+        for behind, lost in ((-3.0, 0), (-6.0, 1)):
+            sent.add(3.0)
+            assert sent.check(behind) == lost
+        sent.set_points.resend()
+        assert sent.check(0.0) == 0
+        sent.add(3.0)
+        assert sent.check(-3.0) == 0
+        assert not sent.set_points.resend_needed
+
     @pytest.mark.parametrize("cycles", [0, 1])
     def test_after_a_resumption_nothing_was_repeated(self, cycles):
         """A stop after it counts the first target behind as a loss."""
