@@ -159,7 +159,7 @@ class TestLosses:
         assert tracker.instead_of_packets == ""
         tracker.stale = 3
         assert tracker.instead_of_packets == "only packets that do not follow the last one came (3)"
-        tracker.restarting = 1
+        tracker.restarting = True
         assert tracker.instead_of_packets == RESTARTED_WITH_SYNC
 
 
