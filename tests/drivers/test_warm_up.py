@@ -58,7 +58,7 @@ def test_it_holds_the_middle_of_the_range_in_open_mode(period):
     np.testing.assert_allclose(reported, 0.5 * (lower + upper), atol=1e-6)
 
 
-def test_it_is_open_without_an_event_when_the_numbers_begin_again(warm_up):
+def test_it_stays_open_when_the_numbers_begin_again(warm_up):
     for _ in range(LAST_NUMBER + 10):
         warm_up.cycle()
     assert warm_up.session.state is State.OPEN
@@ -78,7 +78,7 @@ def test_a_packet_that_comes_early_finds_no_cycle_begun(warm_up, cycles):
     assert cycles() == 0
 
 
-def test_after_a_reply_that_took_long_the_packet_is_awaited_at_once(warm_up, cycles):
+def test_after_a_long_reply_the_packet_is_awaited_at_once(warm_up, cycles):
     link = Link(now=ARRIVED + PERIOD - 0.5 * LEAD)
     warm_up.before_packet(link, moving()[0].session, ARRIVED)
     assert cycles() == 0
