@@ -66,7 +66,6 @@ class _Clock:
         self.now = [0] * len(STAGES)
         self.stack: list[int] = []
         self.since = 0
-        self.active = False
 
     def enter(self, stage: int) -> None:
         now = time.perf_counter_ns()
