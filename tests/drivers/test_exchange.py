@@ -424,7 +424,7 @@ def test_last_rejections_of_the_link_are_counted(end):
     assert session.discards["foreign"] == 1  # at the end: fewer packets than between two readings
 
 
-def test_rejections_of_the_link_are_counted_every_hundred_packets():
+def test_rejections_are_counted_every_hundred_packets():
     link, session = Paced([0.1] * 250), EchoSession()
     readings = []
     link.rejected = lambda: readings.append(link.number) or {}
