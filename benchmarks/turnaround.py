@@ -4,10 +4,11 @@ The controller is paced by absolute deadlines; the exchange runs a long motion o
 the guard while an ordinary process drains its ring. In the same run, in blocks that alternate, a
 bare echo process with the same scheduling shows what this machine can do at all (the floor).
 
-    python -m benchmarks.turnaround [--cycles N] [--busy] [--json]
+    python -m benchmarks.turnaround [--cycles N] [--busy] [--stages] [--json]
 
 A reply later than one cycle after its request is missed; the output says where the time of each
-went. With `--busy` everything is repeated beside a process that keeps a processor busy.
+went. With `--busy` everything is repeated beside a process that keeps a processor busy. With
+`--stages` the time of the exchange process is printed by stage, each median and 99 % in us.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import parser_of, show
+from benchmarks import parser_of, show, turnaround_stages
 from benchmarks.session import Sinusoids, drive_train, limits
 from benchmarks.turnaround_ends import (
     HOST,
@@ -58,7 +59,7 @@ def exchange_settings(port: int, realtime: RealTimeSettings) -> ExchangeSettings
         session,
         realtime=realtime,
         needs_archive=False,
-        preload=("benchmarks.session",),
+        preload=("benchmarks.session", "benchmarks.turnaround_stages"),
         max_late=1_000_000,
     )
 
@@ -213,15 +214,33 @@ def run(cycles: int, blocks: int, *, busy: bool) -> dict[str, Any]:
             load.kill()
 
 
+def stage_figures(times: NDArray[np.int64]) -> dict[str, Any]:
+    """Median and 99 % of each stage, and of their sum, us; `times` (cycles, stages) ns."""
+    columns = dict(zip(turnaround_stages.NAMES, times.T, strict=True))
+    columns["all"] = times.sum(axis=1)
+    return {
+        f"{name}_us": [_us(1e-9 * float(p)) for p in np.percentile(column, (50.0, 99.0))]
+        for name, column in columns.items()
+    }
+
+
 def main() -> None:
     """Measure and print."""
     parser = parser_of(__doc__)
     parser.add_argument("--cycles", type=int, default=100_000)
     parser.add_argument("--blocks", type=int, default=10)
     parser.add_argument("--busy", action="store_true", help="once more beside a busy processor")
+    parser.add_argument("--stages", action="store_true", help="where the exchange spends the time")
     options = parser.parse_args()
     begin = time.monotonic()
-    result = run(options.cycles, options.blocks, busy=False)
+    with tempfile.TemporaryDirectory() as folder:
+        stages = Path(folder) / "stages.npy"
+        if options.stages:
+            os.environ[turnaround_stages.FILE] = str(stages)
+        result = run(options.cycles, options.blocks, busy=False)
+        os.environ.pop(turnaround_stages.FILE, None)
+        if options.stages:
+            result |= stage_figures(np.load(stages)[WARM_UP:])
     if options.busy:
         beside = run(options.cycles, options.blocks, busy=True)
         result |= {f"busy_{name}": value for name, value in beside.items()}

@@ -35,6 +35,11 @@ def require(where: Joints, values: Array, bounds: Array, check: Check, cycle: in
         raise GuardError(check, joint, float(values[joint]), float(bounds[joint]), cycle)
 
 
+def all_true(flags: NDArray[np.bool_]) -> bool:
+    """Whether all flags are true, in a fifth of the time of `flags.all()`."""
+    return b"\0" not in flags.tobytes()
+
+
 def require_finite(values: Array, where: Joints, cycle: int) -> None:
     """Raise for the first joint of `where` (n,) whose value (n,) is not finite."""
     offending = np.where(np.isfinite(values), 0.0, values)
@@ -334,7 +339,7 @@ class Guard:
         np.abs(deviations, out=deviations)
         if where is not None:
             deviations[:, ~where] = 0.0
-        if not (deviations <= self._feedback_bounds).all():
+        if not all_true(deviations <= self._feedback_bounds):
             raise_first(deviations, self._feedback_bounds, _FEEDBACK_CHECKS, cycle)
 
     def check_after_gap(
@@ -388,8 +393,8 @@ class Guard:
         history[3] = q
         history[4] = qd
         quantities = self._quantities
-        np.matmul(self._differences, history, out=quantities)
+        self._differences.dot(history, quantities)
         quantities[0] -= self._middle
         allowed = self._sets[self._active.update(bounds)]
-        if not (np.abs(quantities) <= allowed).all():
+        if not all_true(np.abs(quantities) <= allowed):
             raise_first(quantities, allowed, _SET_POINT_CHECKS, cycle, self._middle)

@@ -47,7 +47,7 @@ from drivers.errors import (
     as_refusal,
 )
 from drivers.execution import Execution
-from drivers.guard import FIRST_FRACTION, Array, Guard, Joints, require
+from drivers.guard import FIRST_FRACTION, Array, Guard, Joints, all_true, require
 from drivers.packets import Mode
 from drivers.safe_reply import D1, D2, PacketStatus, ReplyBuilder
 from drivers.states import LossTracker, State
@@ -236,7 +236,7 @@ class SentSetPoints:
         newest = sent[self._newest]
         self.resend_needed = False
         # Usual case: the set-point sent last.
-        if np.abs(target - newest).max() <= standstill:
+        if all_true(np.abs(target - newest) <= standstill):
             # At standstill a target reported late is equal to it as well.
             was_late = self.target_latency and not self._resent
             if was_late and np.abs(newest - sent[self._newest - 1]).max() > standstill:

@@ -403,7 +403,7 @@ class Session:
                     return self._sync(packet, number, now, powered)
                 if number < INIT_NUMBER and not powered and self._sequence.is_stale(number):
                     # It gets a reply once silence has ended the session before.
-                    self.losses.restarting += 1
+                    self.losses.restarting = True
                 return self._cyclic(packet, number, now)
         except PacketError as error:
             self.counters.malformed += 1
@@ -685,7 +685,7 @@ class Session:
 
     def _finish(self, packet: bytes, reply: bytes, now: float) -> bytes:
         self.counters.replied += 1
-        self.losses.restarting = 0
+        self.losses.restarting = False
         self._last_packet = packet
         self._last_reply = reply
         self._arrived_at = now

@@ -199,7 +199,7 @@ class LossTracker:
         max_gap: packets that may be missed in a row without stopping a motion.
         missed, stale, late, rejected: as in the table.
         gap: cycles before this packet without a reply: missed and stale ones.
-        restarting: sync packets since the last reply, of a controller that restarted.
+        restarting: sync packets came since the last reply, of a controller that restarted.
     """
 
     def __init__(self, max_gap: int, period: float) -> None:
@@ -209,7 +209,7 @@ class LossTracker:
         self.late = 0.0
         self.rejected = 0
         self.gap = 0
-        self.restarting = 0
+        self.restarting = False
         self._period = period
         self._rejections: deque[tuple[int, int]] = deque()
 

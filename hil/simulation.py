@@ -14,6 +14,7 @@ from drivers.transports.simulated import SimulatedTransport
 from hil.campaign.virtual_link import VirtualLink
 from hil.cell import Cell, CellError
 from hil.motion_checks import collision_checker
+from hil.own_moves import InterpolatedMoves
 from identification.model.payload import Payload
 from identification.model.pseudo_inertia import body
 from identification.text import percentage
@@ -32,6 +33,8 @@ Array = NDArray[np.float64]
 
 STEP = 0.0005
 """Step of a simulated arm with effects that the model leaves out, s."""
+OWN_SPEED = 0.3
+"""Speed of the controller's own motion, as a share of the velocity limits."""
 _CHECKED = 100
 """Postures checked on each path of the controller's own motion."""
 _POSTURES = 12
@@ -88,18 +91,21 @@ def simulated_controller(
     seed: int | None = None,
     session: int = 0,
     faults: Sequence[InjectedFault] = (),
+    own_speed: float = OWN_SPEED,
 ) -> SimulatedController:
     """Return controller and arm of a cell with any link; arguments as for `simulated_link`.
 
     `settings` are by default `controller_settings(cell)`, `seed` is that of the cell; the init
-    packet states the drive train of the cell, not `drive`.
+    packet states the drive train of the cell, not `drive`. The moves of an own program run at the
+    share `own_speed` of the velocity limits.
     """
     nominal_drive = simulated_drive(cell)
+    settings = settings or controller_settings(cell, effects=effects)
     return SimulatedController(
         cell.urdf,
         drive or nominal_drive,
         truth or planted_truth(cell),
-        settings or controller_settings(cell, effects=effects),
+        settings,
         seed=cell.simulation.seed if seed is None else seed,
         session=session,
         effects=unmodelled_effects(cell) if effects else UnmodelledEffects(),
@@ -108,6 +114,7 @@ def simulated_controller(
         stated=nominal_drive,
         entered=carried(cell, cell.model.payload),
         faults=faults,
+        moves=InterpolatedMoves(cell.joint_limits, settings.period, own_speed),
     )
 
 

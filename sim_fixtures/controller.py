@@ -24,9 +24,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from enum import IntEnum, auto
 from itertools import chain
-from math import ceil, copysign, isfinite, sqrt
+from math import ceil, copysign, isfinite
 from operator import gt
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -440,75 +440,65 @@ class Layout:
 
 Array = NDArray[np.float64]
 
-RUN_UP = 0.4  # time to full speed at the largest acceleration of own moves [s]; assumed
-_PEAK_SPEED = 15.0 / 8.0
-_PEAK_ACCELERATION = 10.0 / sqrt(3.0)
 
+class MoveInterpolator(Protocol):
+    """What generates the set-points of the controller's own moves, from rest to rest."""
 
-def quintic(s: float) -> tuple[float, float]:
-    """Return 10 s^3 - 15 s^4 + 6 s^5, at rest at both ends of [0, 1], and its derivative."""
-    left = 1.0 - s
-    return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * s * s * left * left
+    def begin(self, position: Array) -> None:
+        """Rest at a position, (n,) [rad]."""
 
+    def move_to(self, posture: Array) -> None:
+        """Begin a move to a posture, (n,) [rad]."""
 
-def duration(distance: Array, speed: Array) -> float:
-    """Return the duration [s] of a quintic over `distance` [rad] at up to `speed` [rad/s]."""
-    reach = np.abs(distance)
-    by_speed = float((_PEAK_SPEED * reach / speed).max())
-    by_acceleration = sqrt(float((_PEAK_ACCELERATION * reach * RUN_UP / speed).max()))
-    return max(by_speed, by_acceleration)
+    def advance(self) -> tuple[Array, bool]:
+        """Return the set-point of the next cycle, (n,) [rad], and whether the move ends there."""
 
 
 class OwnMotion:
-    """Moves of the controller's own program through postures (n,) [rad], joints synchronised.
+    """Moves of the controller's own program through postures (n,) [rad].
 
-    The set-point of the present cycle is `position` [rad] and `velocity` [rad/s], (n,).
+    The set-point of the present cycle is `position` [rad] and `velocity` [rad/s], (n,), that of the
+    step to it.
 
     Args:
         postures: joint angles (n,) [rad] each.
-        speed: largest speed of each joint, (n,) [rad/s].
+        moves: interpolates each move.
         period: cycle [s].
         dwell: rest in each posture [s].
         repeats: move back through the list and forth again until `end`.
 
-    Raises:
-        SettingError: a speed that is not finite and positive.
+    Attributes:
+        at_rest: no move is in progress.
     """
 
     def __init__(
         self,
         postures: Sequence[Sequence[float]],
+        moves: MoveInterpolator,
         *,
-        speed: ArrayLike,
         period: float,
         dwell: float = 0.2,
         repeats: bool = False,
     ) -> None:
-        self._speed: Array = np.array(speed, dtype=np.float64)
-        if not (np.isfinite(self._speed).all() and (self._speed > 0.0).all()):
-            raise SettingError("own_motion", self._speed.tolist(), "velocity limits in the URDF")
         self._postures = [np.array(posture, dtype=np.float64) for posture in postures]
+        self._moves = moves
         self._period = period
         self._repeats = repeats
         self._dwell_cycles = max(1, round(dwell / period))
+        self._next = 0
         self._ending = False
-        self.begin(np.zeros_like(self._speed))
+        self.at_rest = True
 
     def begin(self, position: ArrayLike) -> None:
         """Start from a position, (n,) [rad]."""
         self.position: Array = np.array(position, dtype=np.float64)
         self.velocity: Array = np.zeros_like(self.position)
+        self._moves.begin(self.position)
         self._next = 0
         self._stride = 1
-        self._from = self._to = self.position
-        self._cycle = self._cycles = 0
         self._rested = 0
         self._ending = False
-
-    @property
-    def at_rest(self) -> bool:
-        """Whether no move is in progress."""
-        return self._cycle >= self._cycles
+        self.at_rest = True
 
     @property
     def finished(self) -> bool:
@@ -527,25 +517,21 @@ class OwnMotion:
             if self._rested > self._dwell_cycles:
                 self._start_move()
         if not self.at_rest:
-            self._cycle += 1
-            share, rate = quintic(self._cycle / self._cycles)
-            way = self._to - self._from
-            # exactly the target at the end
-            at_end = self._cycle == self._cycles
-            self.position = self._to if at_end else self._from + share * way
-            self.velocity = rate / (self._cycles * self._period) * way
+            before = self.position
+            self.position, self.at_rest = self._moves.advance()
+            step = self.position - before
+            self.velocity = np.zeros_like(step) if self.at_rest else step / self._period
         return self.position, self.velocity
 
     def _start_move(self) -> None:
-        self._from = self.position
-        self._to = self._postures[self._next]
+        self._moves.move_to(self._postures[self._next])
         self._next += self._stride
         at_an_end = not 0 <= self._next < len(self._postures)
         if self._repeats and len(self._postures) > 1 and at_an_end:
             self._stride = -self._stride
             self._next += 2 * self._stride
-        self._cycle = self._rested = 0
-        self._cycles = ceil(duration(self._to - self._from, self._speed) / self._period)
+        self._rested = 0
+        self.at_rest = False
 
 
 Numbers = Sequence[float]
@@ -710,9 +696,11 @@ class SimulatedController:
         stated: drive train in the init packet, in place of `drive`.
         entered: payload that the operator has entered, in the frame of its joint.
         faults: faults of controller and robot, by packet number.
+        moves: interpolates the moves of its own program; none without one.
 
     Raises:
-        SettingError: sizes that do not match, or a fault of an axis that the arm does not have.
+        SettingError: sizes that do not match, a fault of an axis that the arm does not have, or
+            postures of an own program without `moves`.
     """
 
     def __init__(
@@ -730,6 +718,7 @@ class SimulatedController:
         stated: SimulatedDrive | None = None,
         entered: Carried | None = None,
         faults: Sequence[InjectedFault] = (),
+        moves: MoveInterpolator | None = None,
     ) -> None:
         n = drive.n_axes
         if truth.n_joints != n or n > AXES_PER_ARM:
@@ -758,7 +747,7 @@ class SimulatedController:
         )
         self.servo.start_at(self._arm.encoders())
         self._layout = Layout(n, settings, tail_rng)
-        self._targets = Targets(drive, settings, self._own_motion())
+        self._targets = Targets(drive, settings, self._own_motion(moves))
         self._targets.release(self.servo)
         self._faults = self._schedule(faults)
         self._cycle = 0
@@ -768,14 +757,15 @@ class SimulatedController:
         self._nothing: Wanted = (None,) * n
         self._awaiting = False
 
-    def _own_motion(self) -> OwnMotion | None:
+    def _own_motion(self, moves: MoveInterpolator | None) -> OwnMotion | None:
         settings = self.settings
         if not settings.own_motion:
             return None
-        speed = settings.own_speed * np.array(self.plant.model.velocityLimit)
+        if moves is None:
+            raise SettingError("own_motion", settings.own_motion, "those with `moves` between them")
         return OwnMotion(
             settings.own_motion,
-            speed=speed,
+            moves,
             period=settings.period,
             repeats=settings.own_motion_repeats,
         )

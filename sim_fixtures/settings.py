@@ -97,7 +97,6 @@ class ControllerSettings:
     long_packets: bool = False  # 732 bytes for any number of axes; random bytes follow the axes
     own_motion: tuple[tuple[float, ...], ...] = ()
     own_motion_repeats: bool = False  # move back and forth through the postures until `finish`
-    own_speed: float = 0.3  # of those moves, as a fraction of the URDF's velocity limits
     version: tuple[int, int, int] = (3, 20, 305)  # major, minor, build in the init packet
 
     def __post_init__(self) -> None:

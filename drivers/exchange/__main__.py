@@ -12,89 +12,22 @@ import traceback
 from collections.abc import Sequence
 from typing import Final
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-from drivers.drive_train import DriveTrain
 from drivers.exchange import realtime
 from drivers.exchange.control import SharedState
 from drivers.exchange.event_log import EventWriter, ExchangeEnded, ExchangeFailed, ExchangeStarted
 from drivers.exchange.loop import MAX_LATE, exchange
 from drivers.exchange.process import ExchangeSettings
 from drivers.exchange.serving import CommandHandler, portable
-from drivers.guard import Guard, GuardLimits
-from drivers.motion_source import BoundsName
-from drivers.packets import (
-    DRIVE_ON,
-    INIT_NUMBER,
-    N_ARMS,
-    CyclicPacket,
-    InitPacket,
-    Mode,
-    next_number,
-)
+from drivers.exchange.warm_up import WarmUp
+from drivers.guard import Guard
 from drivers.record import CycleRing
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport
 
-Array = NDArray[np.float64]
-
 LINK_FAILED: Final = 1
 NOT_STARTED: Final = 2
 CRASHED: Final = 70
-
-
-class _Rest:
-    """A motion source at rest."""
-
-    finished = False
-    bounds: BoundsName = "plan"
-
-    def __init__(self, position: Array) -> None:
-        self.start = position
-        self._velocity = np.zeros_like(position)
-
-    def begin(self, position: Array) -> None:
-        self.start = position
-
-    def advance(self) -> tuple[Array, Array]:
-        return self.start, self._velocity
-
-    def stop(self) -> None:
-        self.finished = True
-
-
-def warm_up(
-    drives: DriveTrain, limits: GuardLimits, period: float, cycles: int = 200
-) -> tuple[State, bytes | None]:
-    """Run a motion at rest in a separate session: the first cycles of a process are slow.
-
-    Returns the state of that session, open unless something is wrong, and its last reply.
-    """
-    n = drives.n_joints
-    position = 0.5 * (limits.lower + limits.upper)
-    session = Session(drives, Guard(limits, period), CycleRing(n, 16))
-    axes = CyclicPacket.zeros(1, n).axes
-    axes["d"][:, 0] = axes["d"][:, 2] = drives.motor_revolutions(position)
-    values: dict[str, ArrayLike] = {
-        "gear_ratio": drives.gear_ratio,
-        "calibration": drives.calibration,
-        "kinematic_influence": [0.0, 0.0, 0.0, drives.k54, drives.k64, drives.k65],
-        "current_limit": limits.current,
-        "following_error": limits.following_error,
-    }
-    session.reply(InitPacket.build(n, round(1000.0 * period), values).encode(), 0.0)
-    session.request(_Rest(position))
-    status = bytes((DRIVE_ON, 0, 0, 0))
-    number = INIT_NUMBER
-    reply: bytes | None = None
-    for cycle in range(cycles):
-        number = next_number(number)
-        axes["mode"] = Mode.POSITION if cycle else Mode.CLOSED
-        packet = CyclicPacket(number, status, bytes(N_ARMS), axes).encode()
-        reply = session.reply(packet, 0.0)
-    return session.state, reply
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -128,7 +61,9 @@ def main(arguments: Sequence[str]) -> int:
             needs_archive=settings.needs_archive,
         )
         report = realtime.enter(settings.realtime)
-        warm_up(settings.drive_train, settings.guard_limits, settings.period)
+        warm_up = WarmUp(settings.drive_train, settings.guard_limits, settings.period)
+        # Without priority it would lose its turn by that, and the only processor is for all.
+        warm_up.polls = report.scheduling.startswith("SCHED_FIFO") and (os.cpu_count() or 1) > 1
     except Exception as error:
         traceback.print_exc()
         channel.send(portable(error))
@@ -139,14 +74,26 @@ def main(arguments: Sequence[str]) -> int:
     max_late = settings.max_late
     if max_late is None:
         max_late = settings.session.get("max_gap", MAX_LATE)
-    status = _serve(transport, session, server, max_late)
+    status = _serve(transport, session, server, max_late, warm_up)
     control.finished = int(status == 0)
     return status
 
 
-def _serve(transport: Transport, session: Session, server: CommandHandler, max_late: int) -> int:
+def _serve(
+    transport: Transport,
+    session: Session,
+    server: CommandHandler,
+    max_late: int,
+    warm_up: WarmUp,
+) -> int:
     try:
-        exchange(transport, session, ends_when=server, max_late=max_late)
+        exchange(
+            transport,
+            session,
+            ends_when=server,
+            max_late=max_late,
+            before_packet=warm_up.before_packet,
+        )
         server.conclude()
     except Exception:
         traceback.print_exc()

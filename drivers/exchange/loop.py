@@ -279,6 +279,7 @@ def exchange(
     *,
     ends_when: Callable[[], bool],
     max_late: int = MAX_LATE,
+    before_packet: Callable[[Transport, Session, float], None] | None = None,
 ) -> None:
     """Reply to packets until the session ends, the link closes, or `ends_when()` is true.
 
@@ -286,6 +287,8 @@ def exchange(
     it is the place for work that can wait. Of a backlog only the newest packets get a reply
     (`ReceiveQueue`). A closed link counts as permanent silence, which ends a motion. More than
     `max_late` consecutive late replies, each overtaken by the next packet, stop a motion.
+    `before_packet` is called with the time at which the last packet arrived, before the next one
+    is received.
     """
     queue = ReceiveQueue(transport, session)
     peers = _PeerSelection(transport, session)
@@ -293,8 +296,11 @@ def exchange(
     handled = 0
     send = transport.send
     reply_to = session.reply
+    arrivals: tuple[Arrival, ...] = ()
     while session.state is not State.ENDED and not ends_when():
         try:
+            if before_packet is not None and arrivals:
+                before_packet(transport, session, arrivals[-1].arrived)
             arrivals = queue.receive()
             if not arrivals:
                 session.tick(transport.now)

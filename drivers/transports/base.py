@@ -27,7 +27,8 @@ class Transport(Protocol):
 
     Optional attributes: `arrived`, the time at which the packet received last arrived, s on the
     clock of `now`, None if unknown, never in the future nor before that of the previous packet;
-    `notes`, options refused by the system.
+    `notes`, options refused by the system; `wait(timeout)`, whether a packet comes within that
+    time, s, which it leaves there.
     """
 
     @property

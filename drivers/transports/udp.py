@@ -1,7 +1,7 @@
 """The link over UDP/IPv4: the controller sends first, one datagram per packet.
 
 A cycle costs two system calls, `recvmsg` and `sendto`: the time-out is stored in the socket, and
-the kernel attaches the time of arrival to each datagram.
+the kernel attaches the time of arrival to each datagram. `wait` is for work before a packet comes.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import ipaddress
 import math
+import select
 import socket
 import struct
 import time
@@ -142,6 +143,13 @@ class UdpTransport:
                 foreign += 1
                 if foreign > MAX_FOREIGN:
                     return None
+
+    def wait(self, timeout: float) -> bool:
+        """Whether a datagram, of any host, comes within `timeout` s; to the precision of timers.
+
+        The time-out of `receive` is one of scheduler ticks, which may be longer than a cycle.
+        """
+        return self._closed or bool(select.select((self._socket,), (), (), timeout)[0])
 
     def send(self, packet: bytes) -> None:
         """Send to the peer; a datagram that the system does not accept is counted as "unsent".

@@ -17,7 +17,12 @@ from hil.errors import InputError
 from hil.move import joint_index
 from hil.progress import say_at_once
 from hil.serving import Served, buttons, open_controller_link, realtime_process, serve_session
-from hil.simulation import controller_settings, own_postures, simulated_controller
+from hil.simulation import (
+    OWN_SPEED,
+    controller_settings,
+    own_postures,
+    simulated_controller,
+)
 from hil.terminal_text import plural, printable
 from sim_fixtures import ControllerSettings, Phase, SimulatedController
 from sim_fixtures.faults import parse_fault, split_faults
@@ -119,7 +124,7 @@ def simulate(
     warm_start: bool = False,
     intervals: Annotated[int | None, typer.Option(min=1)] = None,
     own_motion: bool = False,
-    own_speed: Annotated[float, typer.Option(min=0.01, max=1.0)] = 0.3,
+    own_speed: Annotated[float, typer.Option(min=0.01, max=1.0)] = OWN_SPEED,
     effects: bool = False,
     fault: Annotated[list[str] | None, typer.Option(metavar="SPEC")] = None,
     seed: Annotated[int | None, typer.Option(min=0)] = None,
@@ -166,8 +171,9 @@ def simulate(
             drive-off.
         warm_start: Start with the init packet, as after 506.
         intervals: Number of intervals of open mode before the session ends. Default: unlimited.
-        own_motion: In mode 0 the controller's own program moves the arm.
-        own_speed: Speed of that motion, as a fraction of full speed.
+        own_motion: In mode 0 the controller's own program moves the arm, within the limits of
+            the cell.
+        own_speed: Speed of that motion, as a fraction of the velocity limits.
         effects: Simulate effects that the identified model does not contain.
         fault: Fault of the controller to inject (repeatable).
         seed: Seed of noise and model errors.
@@ -193,7 +199,6 @@ def simulate(
         open_intervals=intervals,
         own_motion=_postures(loaded) if own_motion else (),
         own_motion_repeats=True,
-        own_speed=own_speed,
     )
     on_link, in_controller = split_faults(map(parse_fault, fault or ()))
     if on_link:
@@ -202,7 +207,12 @@ def simulate(
 
     def build() -> SimulatedController:
         return simulated_controller(
-            loaded, effects=effects, settings=settings, seed=seed, faults=in_controller
+            loaded,
+            effects=effects,
+            settings=settings,
+            seed=seed,
+            faults=in_controller,
+            own_speed=own_speed,
         )
 
     addresses = {"--udp": udp, "--can": can, "--link": link}

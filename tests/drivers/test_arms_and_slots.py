@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from drivers import CycleRing, Guard, InitPacket, InitReceived, RequestError, Session, State
 from tests.drivers import oracle
 from tests.drivers.rig import PERIOD, Table, limits, train_of
+from tests.messages import AXIS_NOT_OPEN
 
 pytestmark = pytest.mark.safety
 
@@ -163,7 +164,7 @@ def test_drive_of_one_arm_goes_off(arm, state):
 def test_arm_without_all_its_joints_is_not_moved(layout):
     bench = Bench(*layout)
     for joint in bench.missing:
-        assert f"axis {joint} of arm {layout[1]} is not open in the controller" in bench.unusable
+        assert f"axis {joint} of arm {layout[1]} {AXIS_NOT_OPEN}" in bench.unusable
     for mode in (CLOSED, OPEN, 5, 501, CLOSED):
         bench.modes = [mode] * len(bench.slots)
         received, answer = bench.cycle()

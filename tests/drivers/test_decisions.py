@@ -28,6 +28,7 @@ from drivers.states import (
 )
 from drivers.transports.udp import UdpSpec
 from tests.drivers.rig import PERIOD, Cruise, Rig, moving
+from tests.messages import MISSED_IN_A_ROW, RESTARTED_WITH_SYNC
 
 pytestmark = pytest.mark.safety
 
@@ -104,7 +105,7 @@ class TestDecision:
     def test_missed_and_stale_packets_stop_a_motion_together(self, missed, stale):
         tracker = losses(missed, stale)
         decision = decide(State.OPEN, Input.OPEN, tracker, Motion(), Axes())
-        assert decision.stop == f"{GAP + 1} packets were missed in a row"
+        assert decision.stop == f"{GAP + 1} {MISSED_IN_A_ROW}"
         assert decide(State.OPEN, Input.OPEN, losses(GAP), Motion(), Axes()).stop is None
         assert decide(State.OPENING, Input.OPEN, tracker, Motion(), Axes()).stop is None
         assert decide(State.OPEN, Input.OPEN, tracker, None, Axes()).stop is None
@@ -158,8 +159,8 @@ class TestLosses:
         assert tracker.instead_of_packets == ""
         tracker.stale = 3
         assert tracker.instead_of_packets == "only packets that do not follow the last one came (3)"
-        tracker.restarting = 1
-        assert tracker.instead_of_packets == "the controller restarted: it sent sync packets"
+        tracker.restarting = True
+        assert tracker.instead_of_packets == RESTARTED_WITH_SYNC
 
 
 class TestOwner:

@@ -22,6 +22,7 @@ from drivers import (
 )
 from drivers.exchange.loop import MAX_KINDS
 from tests.drivers.rig import MOVE, PERIOD, START, Cruise, N, Rig, closed, moving, smooth_move
+from tests.messages import LEFT_TOO_LATE
 
 pytestmark = pytest.mark.safety
 
@@ -423,6 +424,15 @@ def test_last_rejections_of_the_link_are_counted(end):
     assert session.discards["foreign"] == 1  # at the end: fewer packets than between two readings
 
 
+def test_rejections_are_counted_every_hundred_packets():
+    link, session = Paced([0.1] * 250), EchoSession()
+    readings = []
+    link.rejected = lambda: readings.append(link.number) or {}
+    session.reply = link.reply
+    exchange(link, session, ends_when=lambda: not link.costs)
+    assert readings == [100, 200, 250]
+
+
 @pytest.mark.parametrize("stamped", [True, False], ids=["stamped", "unstamped"])
 class TestLateness:
     def run(self, costs, *, state=State.OPEN, stamped=True, patient=False, max_late=2):
@@ -444,7 +454,7 @@ class TestLateness:
         link, session = self.run([cost] * 50, stamped=stamped)
         assert session.discards["replied to late"] >= 49
         if stamped:
-            assert session.stops[0] == "3 consecutive replies left too late"
+            assert session.stops[0] == f"3 {LEFT_TOO_LATE}"
         else:
             assert session.stops == [], "when a packet arrived was only guessed"
         # And the answers do not fall behind: each is to what came within the last cycle.
@@ -454,6 +464,19 @@ class TestLateness:
     def test_late_replies_are_counted_in_every_state(self, state, stamped):
         _, session = self.run([1.2] * 50, state=state, stamped=stamped)
         assert session.discards["replied to late"] >= 49
+        assert session.stops == []
+
+    def test_packets_without_a_reply_are_not_replied_to_late(self, stamped):
+        link, session = Paced([1.2] + [0.1] * 10, stamped=stamped), EchoSession()
+        session.state = State.OPEN
+
+        def reply(packet, now):
+            echo = link.reply(packet, now)
+            return echo if link.number == 1 else None
+
+        session.reply = reply
+        exchange(link, session, ends_when=lambda: False)
+        assert session.discards["replied to late"] == 1
         assert session.stops == []
 
     def test_controller_that_waits_for_replies_is_not_stopped(self, stamped):

@@ -52,6 +52,7 @@ from tests.drivers.rig import (
     smooth_move,
     still,
 )
+from tests.messages import ARCHIVE_SILENT, END_REQUESTED, EXCHANGE_SILENT, LEFT_TOO_LATE
 
 pytestmark = pytest.mark.safety
 
@@ -94,7 +95,7 @@ class UdpController:
                 assert len(self.socket.recv(2048)) == 1200
                 break
             except (TimeoutError, ConnectionError):
-                assert time.monotonic() < end, "the exchange does not answer"
+                assert time.monotonic() < end, EXCHANGE_SILENT
         while not self.silent(0.0):
             self.socket.recv(2048)  # to an init packet that was sent again
         self.cycle()
@@ -257,7 +258,7 @@ def test_motion_is_run_and_recorded():
         events = run_to_the_end(exchange, controller)
         assert exchange.wait(30.0) == 0
         assert exchange.status().finished
-        assert the(ExchangeEnded, events).reason == "the supervisor requested the end"
+        assert the(ExchangeEnded, events).reason == END_REQUESTED
         assert exchange.log == ""
 
 
@@ -308,7 +309,7 @@ class TestRefusedMotions:
                 exchange.submit(still(10))
             control = SharedState(exchange.control_fd)
             control.archive_state = ArchiveState.READY
-            with pytest.raises(RequestError, match="archive process sends no heartbeat"):
+            with pytest.raises(RequestError, match=ARCHIVE_SILENT):
                 exchange.submit(still(10))
 
             def confirm():
@@ -471,7 +472,7 @@ def test_consecutive_late_replies_stop_the_motion():
                 controller._follow(controller.socket.recv(2048))
             ended = [event for event in exchange.events() if isinstance(event, MotionEnded)]
         assert ended[0].outcome == "stopped", ended[0].reason
-        assert "consecutive replies left too late" in ended[0].reason
+        assert LEFT_TOO_LATE in ended[0].reason
         assert exchange.status().worst_turnaround_us > 1e6 * Slow.COST
 
 
@@ -501,7 +502,7 @@ class TestStops:
         [
             (ExchangeProcess.stop, "a stop was requested", False),
             (ExchangeProcess.terminate, "asked to terminate", True),
-            (ExchangeProcess.finish, "the supervisor requested the end", True),
+            (ExchangeProcess.finish, END_REQUESTED, True),
         ],
     )
     def test_requested(self, ask, reason, ends):

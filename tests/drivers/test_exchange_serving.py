@@ -16,11 +16,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import CyclicPacket, GapSeen, Mode, MotionEnded, State, StateChanged
+from drivers import GapSeen, MotionEnded, State, StateChanged
 from drivers.errors import RequestError
 from drivers.events import Counters, Outcome, PacketRejected, RepliesLost
 from drivers.exchange import control, event_log, motion_transfer
-from drivers.exchange.__main__ import warm_up
 from drivers.exchange.control import (
     BINS,
     HEARTBEAT_TIMEOUT,
@@ -45,7 +44,8 @@ from drivers.exchange.event_log import (
 from drivers.exchange.loop import POLL
 from drivers.exchange.serving import DETACHED_LINGER, MAX_LINGER, CommandHandler, EventLimiter
 from drivers.record import CycleRing
-from tests.drivers.rig import Cruise, N, drive_train, limits, still
+from tests.drivers.rig import Cruise, N, still
+from tests.messages import MISSED_IN_A_ROW
 
 pytestmark = pytest.mark.safety
 
@@ -142,7 +142,7 @@ class TestEventLimiter:
     def test_sums_precede_the_end_of_a_motion(self):
         limiter = EventLimiter()
         limiter.filter([GapSeen(1, 7)], 0.0)
-        ended = MotionEnded("stopped", "5 packets were missed in a row", 0, 9)
+        ended = MotionEnded("stopped", f"5 {MISSED_IN_A_ROW}", 0, 9)
         assert limiter.filter([GapSeen(5, 9), ended], 0.01) == [GapSeen(5, 9), ended]
 
 
@@ -504,14 +504,3 @@ class TestPublished:
         bench.session.counters.discarded = {"late": 4, "replied to late": 3}
         bench.serving.conclude()
         assert (bench.control.late, bench.control.replied_late) == (7, 3)
-
-
-@pytest.mark.parametrize("period", [0.001, 0.002])
-def test_warm_up_reaches_open_mode_in_the_middle_of_the_range(period):
-    lower, upper = np.linspace(-3.0, -1.0, N), np.linspace(1.0, 2.5, N)
-    state, reply = warm_up(drive_train(), limits(lower=lower, upper=upper), period)
-    assert state is State.OPEN
-    answer = CyclicPacket.decode(reply, N)
-    assert (answer.axes["mode"] == Mode.POSITION).all()
-    reported = drive_train().joint_position(answer.axes["d"][:, 0].astype(float))
-    np.testing.assert_allclose(reported, 0.5 * (lower + upper), atol=1e-6)

@@ -7,6 +7,7 @@ import pytest
 
 from drivers import SourceFailed
 from drivers.execution import Execution, execution_of
+from tests.messages import DID_NOT_COME_TO_REST, MOTION_BEING_STOPPED
 
 pytestmark = pytest.mark.safety
 
@@ -92,7 +93,7 @@ class TestEnd:
         assert source.calls == ["stop"]
         assert execution.hold(0) is None
         assert not execution.held
-        assert execution.resume() == "the motion is being stopped"
+        assert execution.resume() == MOTION_BEING_STOPPED
 
     def test_values_of_another_shape_are_named(self):
         names = ("position", "velocity")
@@ -120,7 +121,7 @@ class TestEnd:
             execution.hold(1 + cycle)  # a second request does not extend the time
         execution.advance(9)
         assert execution.outcome == "stopped"
-        assert execution.reason == f"it did not come to rest in {STOP} cycles of a hold"
+        assert execution.reason == f"{DID_NOT_COME_TO_REST} {STOP} cycles of a hold"
 
 
 class Careless(Motion):

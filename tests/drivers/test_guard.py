@@ -24,6 +24,7 @@ from tests.drivers.rig import (
     refused,
     signs,
 )
+from tests.messages import NUMBER_NEEDED
 
 T = PERIOD
 EVERY = np.ones(N, dtype=bool)
@@ -115,7 +116,7 @@ def test_values_that_are_not_finite_are_refused(joint, value):
         with np.errstate(invalid="ignore"):
             error = refused(Check.FINITE, check, *arguments, 5)
         assert (error.joint, error.cycle, error.check) == (joint, 5, Check.FINITE)
-        assert "where a number must be" in str(error)
+        assert NUMBER_NEEDED in str(error)
     others = np.arange(N) != joint
     guard.check_hold(np.where(others, 0.0, value), REST, others, 5)
 

@@ -33,6 +33,12 @@ from tests.drivers.rig import (
     smooth_move,
     still,
 )
+from tests.messages import (
+    CONTROLLER_CLOSED,
+    NOTHING_RECEIVED,
+    RESTARTED_WITH_SYNC,
+    SWITCHED_ON_AGAIN,
+)
 
 pytestmark = pytest.mark.safety
 
@@ -46,8 +52,8 @@ class TestLostMotion:
         ("change", "state", "reason"),
         [
             ({"status": 0}, State.DRIVE_OFF, OFF),
-            ({"mode": Mode.CLOSED}, State.CLOSED, "the controller closed open mode"),
-            ({"mode": Mode.DRIVING_ON}, State.DRIVING_ON, "the drive was switched on again"),
+            ({"mode": Mode.CLOSED}, State.CLOSED, CONTROLLER_CLOSED),
+            ({"mode": Mode.DRIVING_ON}, State.DRIVING_ON, SWITCHED_ON_AGAIN),
             ({"mode": Mode.PAUSE_BY_PC}, State.FREEZING, PAUSED),
             ({"mode": Mode.PAUSE_BY_CONTROLLER}, State.FREEZING, PAUSED),
             ({"mode": Mode.FOLLOWING_ERROR}, State.FAULTED, ""),
@@ -91,7 +97,7 @@ class TestLostMotion:
         rig.session.tick(rig.now + 1.0)
         rig.events += rig.session.events()
         assert rig.ended.outcome == "lost"
-        assert rig.ended.reason == "the controller restarted: it sent sync packets"
+        assert rig.ended.reason == RESTARTED_WITH_SYNC
         assert rig.sync(1) is not None
         assert rig.state is State.SYNC
 
@@ -103,14 +109,14 @@ class TestLostMotion:
         rig.session.tick(rig.now + 1.0)
         rig.events += rig.session.events()
         assert source.advances == advances + 1
-        assert rig.ended.reason == "nothing was received from the controller"
+        assert rig.ended.reason == NOTHING_RECEIVED
 
     @pytest.mark.parametrize(
         ("waits", "change", "reason"),
         [
             (Mode.CLOSED, {"status": 0}, OFF),
             (Mode.DRIVING_ON, {"status": 0}, OFF),
-            (Mode.CLOSED, {"mode": Mode.DRIVING_ON}, "the drive was switched on again"),
+            (Mode.CLOSED, {"mode": Mode.DRIVING_ON}, SWITCHED_ON_AGAIN),
             (Mode.CLOSED, {"mode": Mode.PAUSE_BY_PC}, PAUSED),
             (Mode.CLOSED, {"mode": Mode.PAUSE_BY_CONTROLLER}, PAUSED),
         ],
@@ -737,6 +743,19 @@ class TestSentAgain:
             if not stopping:
                 sent.set_points.resend()
                 sent.check(0.0)
+
+    def test_a_target_reported_late_is_so_after_a_repetition(self):
+        """A target that is the set-point sent twice does not show that it is reported in time."""
+        sent = Sent(SENT_STEP)
+        assert sent.check(-1.0) == 1
+        for behind, lost in ((-3.0, 0), (-6.0, 1)):
+            sent.add(3.0)
+            assert sent.check(behind) == lost
+        sent.set_points.resend()
+        assert sent.check(0.0) == 0
+        sent.add(3.0)
+        assert sent.check(-3.0) == 0
+        assert not sent.set_points.resend_needed
 
     @pytest.mark.parametrize("cycles", [0, 1])
     def test_after_a_resumption_nothing_was_repeated(self, cycles):

@@ -32,6 +32,7 @@ from tests.drivers.rig import (
     opened,
     running,
 )
+from tests.messages import MOTION_BEING_STOPPED
 
 pytestmark = pytest.mark.safety
 
@@ -297,7 +298,7 @@ def test_override_and_its_bounds():
             assert rig.state is State.OPEN
 
 
-STOPPING = "the motion is being stopped"
+STOPPING = MOTION_BEING_STOPPED
 WHAT = {"override": "change of override", "hold": "hold", "resume": "resumption"}
 NOT_FITTING = [
     (lambda: Rig(), "override", "no motion was requested"),

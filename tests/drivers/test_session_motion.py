@@ -22,6 +22,7 @@ from tests.drivers.rig import (
     smooth_move,
     still,
 )
+from tests.messages import CONTROLLER_CLOSED
 
 
 class TestMotion:
@@ -102,7 +103,7 @@ class TestStaggeredOpening:
     @pytest.mark.parametrize(
         ("mode", "modes", "outcome", "reason"),
         [
-            (Mode.POSITION, Mode.CLOSED, "lost", "the controller closed open mode"),
+            (Mode.POSITION, Mode.CLOSED, "lost", CONTROLLER_CLOSED),
             (Mode.POSITION_RELATIVE, None, "refused", "joint 3 is in mode 5"),
         ],
     )

@@ -46,6 +46,7 @@ from tests.drivers.rig import (
     started,
     still,
 )
+from tests.messages import OPEN_MODE_BEING_LEFT, SOME_DID_NOT_OPEN
 
 pytestmark = pytest.mark.safety
 
@@ -338,7 +339,7 @@ def test_refused_modes(before, modes, message):
     assert (rig.state, rig.ended.outcome, source.index) == (State.FAULTED, "lost", 0)
 
 
-LEFT = "open mode is being left; wait for closed axes"
+LEFT = f"{OPEN_MODE_BEING_LEFT}; wait for closed axes"
 REFUSED_REQUESTS = {
     "closed: another motion was requested before and has not ended":
         lambda rig: rig.session.request(still(3)),
@@ -648,7 +649,7 @@ class TestIncompleteOpening:
         assert (rig.state, rig.exits_asked) == (State.EXITING, 1)
         assert rig.ended.outcome == "stopped"
         hint = ": if axis 1 alone is to open, use --only-axis" if opened == 1 else ""
-        assert rig.ended.reason == f"some axes did not open within {EXIT_TIMEOUT:g} s{hint}"
+        assert rig.ended.reason == f"{SOME_DID_NOT_OPEN} {EXIT_TIMEOUT:g} s{hint}"
         assert source.begun_at is None
         rig.cycle(TIMEOUT - 1)
         assert rig.state is State.EXITING

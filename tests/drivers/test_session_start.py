@@ -33,6 +33,7 @@ from tests.drivers.rig import (
     started,
     still,
 )
+from tests.messages import AXIS_NOT_OPEN, NOTHING_RECEIVED
 
 
 class TestHandShake:
@@ -205,9 +206,7 @@ class TestSilence:
         rig.session.tick(301.0)
         assert not rig.session.requested
         ended = [event for event in rig.session.events() if isinstance(event, MotionEnded)]
-        assert [(event.outcome, event.reason) for event in ended] == [
-            ("lost", "nothing was received from the controller")
-        ]
+        assert [(event.outcome, event.reason) for event in ended] == [("lost", NOTHING_RECEIVED)]
         rig.session.request(still(3))  # a later request waits
         rig.now = 500.0
         rig.close()
@@ -433,8 +432,7 @@ class TestInit:
             assert difference.startswith(name)
         _, event = received(init_packet(n_axes=4, open_axes_map=FOUR_OPEN))
         assert event.differences == tuple(
-            f"axis {axis} of arm 1 is not open in the controller, joint {axis} in the cell"
-            for axis in (2, 5)
+            f"axis {axis} of arm 1 {AXIS_NOT_OPEN}, joint {axis} in the cell" for axis in (2, 5)
         )
 
     @pytest.mark.parametrize(("arm", "axis"), [(1, 7), (2, 1)])

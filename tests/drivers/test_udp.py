@@ -79,6 +79,30 @@ class TestContract(TransportContract):
         return transport, controller
 
 
+class TestWait:
+    def test_it_leaves_the_packet(self, transport, controller):
+        controller.send(bytes(48))
+        assert transport.wait(PATIENCE)
+        assert transport.wait(0.0)
+        assert transport.receive(0.0) == bytes(48)
+        assert not transport.wait(0.0)
+
+    def test_it_is_of_the_precision_of_timers(self, transport):
+        """Once in a hundred times, however busy the computer is: not one scheduler tick."""
+
+        def duration():
+            before = time.monotonic()
+            assert not transport.wait(2e-4)
+            return time.monotonic() - before
+
+        durations = [duration() for _ in range(100)]
+        assert 2e-4 <= min(durations) < 1e-3
+
+    def test_a_closed_link_is_not_waited_for(self, transport):
+        transport.close()
+        assert transport.wait(PATIENCE)
+
+
 class TestPeer:
     def test_first_sender_is_the_peer_until_forgotten(self, transport, controller, another):
         controller.send(b"a" * 48)

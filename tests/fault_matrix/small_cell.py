@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from hil.own_moves import InterpolatedMoves
+from planner import JointLimits
 from sim_fixtures import ControllerSettings, PlantTruth, SimulatedController, SimulatedDrive
 
 N = 2
@@ -67,11 +69,21 @@ QUICK: dict[str, Any] = {
 }
 
 
+def limits() -> JointLimits:
+    """Of the URDF, and accelerations that the motors have."""
+    speed = np.array(SPEED)
+    return JointLimits(np.full(N, -2.0), np.full(N, 2.0), speed, 4.0 * speed, 40.0 * speed)
+
+
 def controller(**changes: Any) -> SimulatedController:
-    """A controller with short phases; `changes` are settings, or arguments of the controller."""
+    """A controller with short phases; `changes` are settings, or arguments of the controller.
+
+    Moves of its own program, if there is one, run at the share `own_speed` of full speed.
+    """
     options: dict[str, Any] = {"seed": 1, "initial_position": HOME}
     options |= {name: changes.pop(name) for name in ("faults", "seed") if name in changes}
     physical = changes.pop("drive", None) or drive()
-    return SimulatedController(
-        URDF, physical, truth(), ControllerSettings(**(QUICK | changes)), **options
-    )
+    own_speed = changes.pop("own_speed", 0.3)
+    settings = ControllerSettings(**(QUICK | changes))
+    moves = InterpolatedMoves(limits(), settings.period, own_speed)
+    return SimulatedController(URDF, physical, truth(), settings, moves=moves, **options)

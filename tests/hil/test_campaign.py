@@ -54,6 +54,7 @@ from planner import (
 from sim_fixtures import SimulatedController
 from tests import messages
 from tests.hil.fast_cell import set_points
+from tests.messages import NO_CAMPAIGN_FOLDER, NO_CAMPAIGN_PLAN
 
 pytestmark = pytest.mark.safety
 
@@ -377,7 +378,7 @@ def test_only_a_move_from_the_arm_asks_for_jogging(cell: Cell, plan: CampaignPla
 
 
 def test_a_folder_without_a_campaign_is_named(tmp_path: Path) -> None:
-    with pytest.raises(CampaignFolderError, match="is not a campaign folder"):
+    with pytest.raises(CampaignFolderError, match=NO_CAMPAIGN_FOLDER):
         Campaign.open(tmp_path)
 
 
@@ -404,9 +405,9 @@ class TestPlan:
         ("change", "message"),
         [
             ({"format_version": 3}, "format version 3"),
-            ({"moves": 7}, "is not a campaign plan"),
-            ({"moves": {"format": "joint motion plan"}}, "is not a campaign plan"),
-            ({"moves": {"format": "other"}}, "is not a campaign plan"),
+            ({"moves": 7}, NO_CAMPAIGN_PLAN),
+            ({"moves": {"format": "joint motion plan"}}, NO_CAMPAIGN_PLAN),
+            ({"moves": {"format": "other"}}, NO_CAMPAIGN_PLAN),
         ],
     )
     def test_other_content_is_refused(

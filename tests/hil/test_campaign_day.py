@@ -36,6 +36,7 @@ from hil.recording import origin_of, with_present_date
 from planner import TrajectoryPlayer
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
+from tests.messages import ANOTHER_CELL_OR_PLAN, HOLDS_RECORDINGS, LEFT_OUT_SIMULATED
 
 pytestmark = pytest.mark.long
 
@@ -127,7 +128,7 @@ def test_a_design_replaces_no_recorded_campaign(
     arguments = ["design", "cell.toml", "-o", str(mine), "--settings", "quick.toml", "--force"]
     refused = CliRunner().invoke(app, arguments)
     assert isinstance(refused.exception, CampaignFolderError)
-    assert "holds a campaign with recordings" in str(refused.exception)
+    assert HOLDS_RECORDINGS in str(refused.exception)
 
     cell, excitation = fast_cell(tmp_path), DesignResult.load(mine).excitation
     root = tmp_path / "made"
@@ -226,7 +227,7 @@ def test_steps_of_another_plan_or_unreadable_are_not_done(folder: CampaignFolder
     pass_rehearsal(folder)
     folder.cell.write_text(folder.cell.read_text() + "\n# another\n")
     step = conduct_of(folder).steps[0]
-    assert not step.done and "another cell, URDF or plan" in step.words
+    assert not step.done and ANOTHER_CELL_OR_PLAN in step.words
     for path in (folder.rehearsal, folder.dry_run, folder.warmup):
         path.write_text("{")
     steps = conduct_of(folder).steps[:3]
@@ -331,7 +332,7 @@ def test_an_arm_beyond_its_limit_is_reported_in_degrees(
 
 def test_a_status_asks_for_gates_as_the_run_does(ran: Campaign, campaign: Campaign) -> None:
     steps = {step.name: step for step in ran.status().steps}
-    assert steps["rehearse"].sentence == "left out, as a simulated arm allows"
+    assert steps["rehearse"].sentence == LEFT_OUT_SIMULATED
     assert steps["dry run"].state == steps["validation"].state == "done"
     assert ran.status().next_command.startswith("hil identify ")
     (name, *_) = [path.name for path in ran.folder.completed("excitation")]

@@ -32,6 +32,7 @@ from identification.excitation import Constraints, Criteria, Excitation, sampled
 from planner import FourierSeries, PiecewiseCubic
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
+from tests.messages import GIVE_A_RAMP
 
 pytestmark = pytest.mark.long
 
@@ -206,7 +207,7 @@ def test_the_model_of_a_swinging_arm_predicts_unseen_motion(finished: Campaign) 
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"ramp": 0.0}, "begin and end at full speed; give them a ramp"),
+        ({"ramp": 0.0}, GIVE_A_RAMP),
         ({"length": 1e300}, "lasts 1e\\+300 s; at most 600 s"),
         ({"length": 1e6}, "lasts 1e\\+06 s; at most 600 s"),
         ({"amplitude": np.full((6, 3), 1e308)}, "velocity of joint 0 is not finite"),

@@ -20,6 +20,7 @@ from hil.cli import COMMANDS, app, as_json, exit_code_of, main
 from hil.errors import ArchiveWriteError, ControllerError, HilError, InputError
 from hil.files import convert_write_errors, make_folder
 from planner import PlannerError
+from tests.messages import NO_CAMPAIGN_FOLDER
 
 NOWHERE = "/nowhere"
 FAILING = {
@@ -146,5 +147,5 @@ def test_the_exit_status_of_the_program_is_the_same_with_json(
         main()
     output = capsys.readouterr()
     assert ended.value.code == 2
-    assert "is not a campaign folder" in output.err
+    assert NO_CAMPAIGN_FOLDER in output.err
     assert bool(output.out) == bool(more)

@@ -42,6 +42,7 @@ from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell, on_path, set_points
 from tests.hil.loopback import loopback_link, on_loopback
 from tests.hil.test_supervision import spec as spec_of
+from tests.messages import LEADS_OUT, NAME_LOCAL_ADDRESS
 
 pytestmark = pytest.mark.safety
 
@@ -100,7 +101,7 @@ def test_a_real_controller_is_not_driven_without_a_rehearsal(
     with LiveLink.open(campaign.cell) as link:
         with pytest.raises(NotRehearsedError, match="hil rehearse") as refused:
             campaign.run(link, Stop(), Silent())
-        with pytest.raises(NotRehearsedError, match="leads out of this computer"):
+        with pytest.raises(NotRehearsedError, match=LEADS_OUT):
             campaign.run(link, Stop(), Silent(), unrehearsed=True)
     assert refused.value.exit_code == 3
     assert not list(campaign.folder.archives.iterdir())
@@ -327,7 +328,7 @@ def test_a_real_transport_makes_a_simulated_cell_a_real_one(cell: Cell) -> None:
 
 def test_a_live_view_that_cannot_be_served_is_refused(cell: Cell, tmp_path: Path) -> None:
     pytest.importorskip("foxglove", reason="the extra 'live' is not installed")
-    with pytest.raises(LiveViewError, match="name an address of this computer"):
+    with pytest.raises(LiveViewError, match=NAME_LOCAL_ADDRESS):
         LiveLink.open(on_loopback(cell), live=LiveView("192.0.2.1", 1))
     with pytest.raises(LiveViewError, match=r"--live nonsense is not HOST:PORT"):
         record(CELL_PATH, output=tmp_path, live="nonsense")

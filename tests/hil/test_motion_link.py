@@ -23,6 +23,7 @@ from hil.campaign.link import REST_TIMEOUT, MotionLink
 from hil.campaign.port import PortStatus
 from hil.cell import Cell
 from hil.errors import ArchiveWriteError, ControllerError
+from tests.messages import DRIVE_IS_OFF, OPEN_MODE_BEING_LEFT, START_OPEN_PROGRAM
 
 TURN = 0.02
 Happens = Callable[["ScriptedPort"], None]
@@ -159,8 +160,8 @@ def test_what_a_connection_waits_for_is_reported_once(cell: Cell) -> None:
     nothing = "no packet from the controller (0 packets from other addresses)"
     start = "waiting up to 60 s for the controller: "
     assert lines == [
-        f"{start}{nothing}; start its Open program",
-        f"{start}its drive is off; switch it on",
+        f"{start}{nothing}; {START_OPEN_PROGRAM}",
+        f"{start}{DRIVE_IS_OFF}",
     ]
 
 
@@ -272,7 +273,7 @@ def test_a_stop_for_want_of_heartbeats_names_the_disk(cell: Cell) -> None:
 @pytest.mark.parametrize(
     ("refuses", "message", "outcome"),
     [
-        (RequestError("closed", "open mode is being left"), "see the outcome of a.mcap", "refused"),
+        (RequestError("closed", OPEN_MODE_BEING_LEFT), "see the outcome of a.mcap", "refused"),
         (ExchangeError("it did not answer within 5 s"), "within 5 s; a.mcap is void", "void"),
     ],
 )

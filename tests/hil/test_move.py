@@ -22,6 +22,7 @@ from sim_fixtures.ns16 import CELL_PATH
 from tests.docs.typed import ROOT, commands
 from tests.hil.fast_cell import set_points
 from tests.hil.screen_rig import on_terminal
+from tests.messages import FASTER_THAN_APPROACH
 
 pytestmark = pytest.mark.safety
 
@@ -175,7 +176,7 @@ def test_a_real_controller_is_not_driven_without_confirmation(
         assert "the path needs confirmation" in str(result.exception)
         result = CliRunner().invoke(app, [*arguments, "--yes", "--speed", "100"])
         assert isinstance(result.exception, UnsafeError)
-        assert "faster than the cell's approach_speed" in str(result.exception)
+        assert FASTER_THAN_APPROACH in str(result.exception)
     assert not (tmp_path / "m").exists()  # nothing moves without an archive
 
 

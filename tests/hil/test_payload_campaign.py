@@ -38,6 +38,7 @@ from hil.simulation import carried, planted_truth, simulated_controller
 from identification.estimators.payload import PayloadError
 from identification.model.payload import Payload
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
+from tests.messages import COPY_OF_LOADED_SIDE, PAYLOAD_NAME_INVALID
 
 pytestmark = pytest.mark.safety
 
@@ -402,7 +403,7 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("words", "sentence"),
         [
-            (("--payload", "../x", "--payload-mass", "2"), "not a valid name of a payload"),
+            (("--payload", "../x", "--payload-mass", "2"), PAYLOAD_NAME_INVALID),
             (("--payload", "new"), "--payload-mass"),
             (("--payload", "new", "--payload-centre", "0,0,1"), "needs the mass"),
             (("--payload", "new", "--payload-mass", "2", "--payload-centre", "1"), "not 3 numbers"),
@@ -419,7 +420,7 @@ class TestCommand:
     def test_a_copy_of_the_loaded_side_is_not_run(self, tmp_path) -> None:
         weighed = begun(campaign_in(tmp_path))
         shutil.copytree(weighed.loaded.folder.root, tmp_path / "copy")
-        with pytest.raises(InputError, match="copy of the loaded side"):
+        with pytest.raises(InputError, match=COPY_OF_LOADED_SIDE):
             invoke(tmp_path / "copy", "--dry-run")
 
     def test_a_campaign_in_the_place_of_a_side_is_to_be_moved(self, tmp_path) -> None:

@@ -35,7 +35,8 @@ from hil.errors import ArchiveError, ControllerError, HilError, InputError
 from hil.identify import identify_archives
 from hil.progress import Silent
 from hil.recording import archive_path, record
-from hil.simulation import controller_settings, own_postures, simulated_controller
+from hil.simulation import OWN_SPEED, controller_settings, own_postures, simulated_controller
+from planner.moves import SEGMENT_VELOCITY
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.loopback import on_loopback
 
@@ -75,11 +76,11 @@ def after(cycles: int) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory, cell: Cell) -> Path:
-    """Forty seconds of the controller's own motion."""
+    """Twenty-eight seconds of the controller's own motion."""
     path = tmp_path_factory.mktemp("record") / NAME
-    done = recording_of(cell, path, duration=40.0)
+    done = recording_of(cell, path, duration=28.0)
     assert (done.outcome, done.records_lost) == ("completed", 0)
-    assert done.seconds == pytest.approx(40.0)  # of the controller's time since its init packet
+    assert done.seconds == pytest.approx(28.0)  # of the controller's time since its init packet
     return path
 
 
@@ -107,6 +108,14 @@ def test_every_cycle_is_archived_with_its_source(recorded: Path) -> None:
     # 95 % of 58 parameters are within two standard deviations where the model is the plant's;
     # what smoothing leaves of the controller's jerk costs some of them.
     assert coverage.within_3 >= 0.9 * coverage.total
+
+
+def test_the_controller_moves_as_its_interpolator_plans(recorded: Path, cell: Cell) -> None:
+    """At a constant share of the joints' speed limits, and never above it."""
+    rate = np.abs(open_archive(recorded).columns["target_velocity"]) / cell.joint_limits.velocity
+    fastest = rate.max(axis=1)
+    assert fastest.max() == pytest.approx(SEGMENT_VELOCITY * OWN_SPEED, rel=1e-3)
+    assert np.mean(fastest > 0.999 * fastest.max()) > 0.2
 
 
 def test_recordings_are_numbered_and_have_their_kind(tmp_path: Path, cell: Cell) -> None:

@@ -18,6 +18,7 @@ from hil.errors import ExecutionError, InputError
 from hil.identified_campaign import identify_campaign
 from hil.progress import Silent
 from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell, pass_rehearsal
+from tests.messages import ALL_REQUIREMENTS_MET
 
 pytestmark = pytest.mark.safety
 
@@ -61,7 +62,7 @@ class TestEnd:
         assert len(campaign.folder.completed("validation")) == 1
         assert campaign.precision.outcome == "met"
         assert [look.met for look in campaign.precision.looks] == [True, True]
-        assert any("all requirements are met, no more" in line for line in heard.lines)
+        assert any(ALL_REQUIREMENTS_MET in line for line in heard.lines)
 
     def test_nothing_is_missing_then(self, met) -> None:
         campaign, _ = met

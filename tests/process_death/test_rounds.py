@@ -23,6 +23,7 @@ from tests.hil.fast_cell import fast_cell
 from tests.laws.evidence import Evidence
 from tests.laws.second_reader import Archived
 from tests.laws.table import LAWS, broken, judged
+from tests.messages import ARCHIVE_SILENT, NOTHING_RECEIVED
 from tests.process_death.controller import ROW
 from tests.process_death.laws import (
     PROMISED,
@@ -102,12 +103,12 @@ def test_only_the_newest_archive_may_be_truncated(
     [
         ("exchange", "the exchange process ended; the controller gets no replies", True),
         ("exchange", "the exchange process is gone: no such process", True),
-        ("exchange", "repetition 1 was lost: nothing was received from the controller", False),
+        ("exchange", f"repetition 1 was lost: {NOTHING_RECEIVED}", False),
         ("exchange", "the controller did not answer the exchange process", False),
         ("archive", "the archive process ended (exit status -9); nothing was sent", True),
-        ("archive", "validation 1 was stopped: the archive process sends no heartbeat", True),
+        ("archive", f"validation 1 was stopped: the {ARCHIVE_SILENT}", True),
         ("archive", "the disk of the archive process is full", False),
-        ("controller", "move 1 was lost: nothing was received from the controller", True),
+        ("controller", f"move 1 was lost: {NOTHING_RECEIVED}", True),
         ("controller", "the exchange process ended", False),
     ],
 )

@@ -21,6 +21,7 @@ from drivers.packets import (
     is_init,
     next_number,
 )
+from hil.own_moves import InterpolatedMoves
 from sim_fixtures import (
     ControllerSettings,
     Phase,
@@ -29,7 +30,7 @@ from sim_fixtures import (
     UnmodelledEffects,
     ns16,
 )
-from sim_fixtures.controller import MISSING, RUN_UP, LoopProgram, OwnMotion, Requests
+from sim_fixtures.controller import MISSING, LoopProgram, OwnMotion, Requests
 from tests.fault_matrix import small_cell
 from tests.sim_fixtures.bench import (
     DRIVE,
@@ -456,20 +457,21 @@ class TestArms:
 
 
 class TestOwnMotion:
-    PERIOD, SPEED = 0.002, np.array([2.0, 3.0])
+    """Its moves are those of `planner.Interpolator`."""
+
+    PERIOD, SPEED = 0.002, 0.5
     angles = st.floats(-2.0, 2.0)
 
     def motion(
         self, *postures: tuple[float, float], start: Any = (0.0, 0.0), repeats: bool = False
     ) -> OwnMotion:
-        made = OwnMotion(
-            postures, speed=self.SPEED, period=self.PERIOD, dwell=0.02, repeats=repeats
-        )
+        moves = InterpolatedMoves(small_cell.limits(), self.PERIOD, self.SPEED)
+        made = OwnMotion(postures, moves, period=self.PERIOD, dwell=0.02, repeats=repeats)
         made.begin(start)
         return made
 
     @given(there=st.tuples(angles, angles), then=st.tuples(angles, angles))
-    def test_it_rests_in_its_postures_within_its_bounds(
+    def test_it_rests_in_its_postures_within_its_limits(
         self, there: tuple[float, float], then: tuple[float, float]
     ) -> None:
         motion, rows = self.motion(there, then), []
@@ -481,14 +483,48 @@ class TestOwnMotion:
         np.testing.assert_array_equal(qd[-1], 0.0)
         resting = np.all(q == there, axis=1)
         assert resting.sum() >= 0.02 / self.PERIOD - 1
-        np.testing.assert_array_equal(qd[resting], 0.0)
-        assert np.all(np.abs(qd) <= self.SPEED * (1.0 + 1e-9))
-        steps = np.diff(np.vstack(([0.0, 0.0], q)), axis=0) / self.PERIOD
-        assert np.all(np.abs(steps) <= self.SPEED * (1.0 + 1e-6))
-        acceleration = np.abs(np.diff(qd, axis=0)) / self.PERIOD
-        assert np.all(acceleration <= self.SPEED / RUN_UP * (1.0 + 1e-6))
-        middle = (q[2:] - q[:-2]) / (2.0 * self.PERIOD)
-        np.testing.assert_allclose(qd[1:-1], middle, atol=4e-3)
+        path = np.vstack((np.zeros((4, 2)), q, np.tile(q[-1], (3, 1))))
+        limits = small_cell.limits()
+        for order, (bound, share) in enumerate(
+            ((limits.velocity, self.SPEED), (limits.acceleration, 1.0), (limits.jerk, 1.0)), 1
+        ):
+            rates = np.abs(np.diff(path, order, axis=0)) / self.PERIOD**order
+            assert np.all(rates <= share * bound * (1.0 + 1e-6))
+        steps = np.diff(path[3:-3], axis=0) / self.PERIOD
+        moving = np.any(qd != 0.0, axis=1)
+        np.testing.assert_array_equal(qd[moving], steps[moving])
+
+    def test_its_path_is_straight(self) -> None:
+        motion = self.motion((1.0, -0.5))
+        q = []
+        while not motion.finished:
+            q.append(motion.advance()[0].copy())
+        np.testing.assert_allclose(np.array(q)[:, 1], -0.5 * np.array(q)[:, 0], atol=1e-12)
+
+    def test_it_moves_back_from_outside_its_range(self) -> None:
+        motion = self.motion((1.9, 0.0), start=(2.1, 0.0))
+        while not motion.finished:
+            motion.advance()
+        np.testing.assert_array_equal(motion.position, (1.9, 0.0))
+
+    @pytest.mark.parametrize(
+        ("posture", "speed", "reason"),
+        [((2.5, 0.0), 0.5, "in the limits"), ((1.0, 0.0), 1.5, "joint speed")],
+    )
+    def test_what_the_interpolator_refuses_is_an_error(
+        self, posture: tuple[float, float], speed: float, reason: str
+    ) -> None:
+        moves = InterpolatedMoves(small_cell.limits(), self.PERIOD, speed)
+        with pytest.raises(SettingError, match=reason):
+            moves.begin(np.zeros(2))
+            moves.move_to(np.array(posture))
+
+    def test_postures_without_moves_between_them_are_refused(self) -> None:
+        settings = ControllerSettings(own_motion=((0.5, 0.0),))
+        with pytest.raises(SettingError, match="moves"):
+            SimulatedController(
+                small_cell.URDF, small_cell.drive(), small_cell.truth(), settings, seed=1
+            )
 
     def test_a_repeated_one_moves_back_and_forth(self) -> None:
         a, b, c = stops = [(0.5, -0.3), (-0.2, 0.4), (0.1, 0.1)]

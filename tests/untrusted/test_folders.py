@@ -51,6 +51,7 @@ from identification.excitation import Journal
 from planner import PlannerError
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_campaign, fast_cell
+from tests.messages import NO_CAMPAIGN_PLAN
 
 pytestmark = pytest.mark.safety
 
@@ -500,7 +501,7 @@ def test_changed_value_is_refused_or_read(
     if (file, place, value) in BROKEN:
         if file == "plan.json":
             (folder / "manifest.json").unlink(missing_ok=True)
-        message = "is not a campaign plan" if file == "plan.json" else f"{file} cannot be read"
+        message = NO_CAMPAIGN_PLAN if file == "plan.json" else f"{file} cannot be read"
         with pytest.raises(InputError, match=re.escape(message)):
             FILES[file](folder)
         if file == "dry_run.json":

@@ -23,6 +23,7 @@ from hil.identify.sources import gather_sources
 from hil.progress import Silent
 from tests.hil.batch_work import Here
 from tests.hil.campaign_runs.rig import Make, Operator, kinds, slowing
+from tests.messages import NOT_IN_CAMPAIGN, NOT_IN_MANIFEST
 
 pytestmark = pytest.mark.safety
 
@@ -65,10 +66,10 @@ def test_an_archive_that_was_not_checked_is_not_pooled(
     discovery = discover([str(campaign.folder.root)], cache, Here(), Silent())
     assert slowed.as_posix() not in {ref.location for ref in discovery.refs}
     (skipped,) = (unused for unused in discovery.skipped if unused.path == slowed.as_posix())
-    assert "not listed in its campaign's manifest.json" in skipped.reason
+    assert NOT_IN_MANIFEST in skipped.reason
     good = campaign.folder.completed("excitation")
     warnings = gather_sources([*good, slowed], 0.5).warnings
-    assert any(text.startswith(f"{slowed.name} is not in its campaign") for text in warnings)
+    assert any(text.startswith(f"{slowed.name} {NOT_IN_CAMPAIGN}") for text in warnings)
     again = campaign.run(unrehearsed=True)
     assert again.repetitions == (2, 2)
     assert [rejection.archive for rejection in again.rejected] == [slowed.name], (

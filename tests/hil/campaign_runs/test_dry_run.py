@@ -24,6 +24,7 @@ from hil.simulation import (
 )
 from tests.hil.campaign_runs.rig import Make, Operator, Real, kinds, peak_speed
 from tests.hil.fast_cell import mirrored, pass_rehearsal
+from tests.messages import AGAINST_GRAVITY, DRY_RUN_NOT_DONE
 
 pytestmark = pytest.mark.safety
 
@@ -32,7 +33,7 @@ pytestmark = pytest.mark.safety
     ("real", "message"),
     [
         (False, r"was not done, and there is no .*--dry-run`"),
-        (True, "cannot be accepted before it was done"),
+        (True, DRY_RUN_NOT_DONE),
     ],
 )
 def test_a_dry_run_that_was_not_done_is_asked_for(make: Make, real: bool, message: str) -> None:
@@ -95,13 +96,13 @@ def test_a_mirrored_joint_is_accepted_by_its_name_only(tmp_path: Path, designed:
     cell, against = mirrored(designed.cell, "[-1, -1]"), ("shoulder",)
     campaign = Campaign.create(tmp_path / "campaign", cell, designed.plan)
     pass_rehearsal(campaign.folder)
-    with pytest.raises(AgainstGravityError, match="runs against the model's gravity") as refused:
+    with pytest.raises(AgainstGravityError, match=AGAINST_GRAVITY) as refused:
         campaign.run(accept_dry_run=True, accept_torque=cell.joint_names)
     assert refused.value.exit_code == 3
     assert refused.value.joints == against, "not accepted before it was measured"
     assert f"--accept-torque {against[0]}" in str(refused.value)
     step = campaign.status().steps[2]
-    assert "runs against the model's gravity" in step.sentence
+    assert AGAINST_GRAVITY in step.sentence
     assert step.command.endswith(f"--accept-torque {against[0]}")
     for wrong in ((), ("elbow",)):
         with pytest.raises(AgainstGravityError):

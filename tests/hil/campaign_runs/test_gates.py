@@ -34,6 +34,7 @@ from hil.simulation import (
 )
 from tests.hil.campaign_runs.rig import Make, Real
 from tests.hil.fast_cell import pass_rehearsal
+from tests.messages import ANOTHER_CELL_OR_PLAN
 
 pytestmark = pytest.mark.safety
 
@@ -51,7 +52,7 @@ def test_a_plan_is_not_run_before_it_was_rehearsed(make: Make) -> None:
     other = text.replace(campaign.folder.plan_hash, "0" * 64)
     assert other != text
     campaign.folder.rehearsal.write_text(other, "utf-8")
-    with pytest.raises(NotRehearsedError, match="with another cell, URDF or plan"):
+    with pytest.raises(NotRehearsedError, match=f"with {ANOTHER_CELL_OR_PLAN}"):
         campaign.run(accept_dry_run=True)
     assert not list(campaign.folder.archives.iterdir())
 

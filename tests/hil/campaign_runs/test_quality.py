@@ -40,6 +40,7 @@ from tests.hil.campaign_runs.rig import (
     slowing,
 )
 from tests.hil.fast_cell import fast_cell, set_points
+from tests.messages import DISTURBED_ALIKE, OTHERS_AGREE
 
 pytestmark = pytest.mark.safety
 
@@ -101,7 +102,7 @@ def test_a_disturbed_first_repetition_rejects_no_others(make: Make, undisturbed:
         "001_a2",
         "000_a1",
     ]
-    assert "agree with each other, not with this" in result.rejected[2].reason
+    assert OTHERS_AGREE in result.rejected[2].reason
     assert any("excitation_000_a1.mcap was the only repetition" in note for note in result.notes)
     good = [path.name[11:-5] for path in campaign.folder.completed("excitation")]
     assert good == ["000_a2", "001_a3", "002_a1"]
@@ -226,7 +227,7 @@ class TestMissedPackets:
             *("002_a1", "002_a2", "000_a1", "001_a1"),
         ]
         assert messages.MISSED_IN_IT_ONLY in result.rejected[-1].reason
-        assert any("disturbed alike, or the arm was changed" in note for note in result.notes)
+        assert any(DISTURBED_ALIKE in note for note in result.notes)
         good = [path.name[11:-5] for path in campaign.folder.completed("excitation")]
         assert good == ["000_a2", "001_a2", "002_a3"]
 

@@ -22,6 +22,7 @@ from hil.errors import HilError, OperatorStopError
 from hil.results import Results
 from tests.hil.fast_cell import mirrored, pass_rehearsal
 from tests.hil.screen_rig import on_terminal
+from tests.messages import AGAINST_GRAVITY
 
 pytestmark = pytest.mark.safety
 
@@ -81,7 +82,7 @@ def test_a_torque_against_the_model_needs_its_own_option(
     pass_rehearsal(campaign.folder)
     slow = hil_run(campaign, "--dry-run", "--quiet")
     assert slow.exit_code == 0, slow.exception
-    assert "elbow: measured torque runs against the model's gravity" in slow.stdout
+    assert f"elbow: measured torque {AGAINST_GRAVITY}" in slow.stdout
     assert "--accept-dry-run --accept-torque elbow" in slow.stdout
     refused = summary_of(hil_run(campaign, "--accept-dry-run", "--json"), 3)
     assert "--accept-torque elbow" in refused["error"]

@@ -1,0 +1,125 @@
+"""Cycles of a session beside the real one, which bring the code of a cycle into the caches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drivers.drive_train import DriveTrain
+from drivers.guard import Guard, GuardLimits
+from drivers.motion_source import BoundsName
+from drivers.packets import (
+    DRIVE_ON,
+    INIT_NUMBER,
+    N_ARMS,
+    CyclicPacket,
+    InitPacket,
+    Mode,
+    next_number,
+)
+from drivers.record import CycleRing
+from drivers.session import Session
+from drivers.states import State
+from drivers.transports.base import Transport
+
+Array = NDArray[np.float64]
+
+_CYCLES: Final = 200
+"""Cycles before the first packet."""
+LEAD: Final = 2e-4
+"""Time before the next packet at which such a cycle begins, s: it takes some 0.1 ms, and the packet
+may come some 0.05 ms early."""
+_STATUS: Final = bytes((DRIVE_ON, 0, 0, 0))
+
+
+class _Rest:
+    """A motion source at rest."""
+
+    finished = False
+    bounds: BoundsName = "plan"
+
+    def __init__(self, position: Array) -> None:
+        self.start = position
+        self._velocity = np.zeros_like(position)
+
+    def begin(self, position: Array) -> None:
+        self.start = position
+
+    def advance(self) -> tuple[Array, Array]:
+        return self.start, self._velocity
+
+    def stop(self) -> None:
+        self.finished = True
+
+
+class WarmUp:
+    """A motion at rest in a session of its own, with packets of its own.
+
+    The first cycles of a process are slow, and so is each cycle for which the code has to come from
+    memory again, because others used the processor's caches: twice as slow at the median.
+
+    Args:
+        drives: of the arm.
+        limits: of the guard.
+        period: the controller's cycle, s.
+
+    Attributes:
+        session: open unless something is wrong.
+        reply: the last one.
+        polls: from this cycle to `LEAD` after the packet is due the link is polled: a processor
+            that slept wakes up slowly, a virtual one most of all. False at first.
+    """
+
+    def __init__(self, drives: DriveTrain, limits: GuardLimits, period: float) -> None:
+        self.polls = False
+        n = drives.n_joints
+        position = 0.5 * (limits.lower + limits.upper)
+        self.session = Session(drives, Guard(limits, period), CycleRing(n, 16))
+        self.reply: bytes | None = None
+        self._period = period
+        self._number = INIT_NUMBER
+        self._axes = CyclicPacket.zeros(1, n).axes
+        self._axes["d"][:, 0] = self._axes["d"][:, 2] = drives.motor_revolutions(position)
+        values: dict[str, ArrayLike] = {
+            "gear_ratio": drives.gear_ratio,
+            "calibration": drives.calibration,
+            "kinematic_influence": [0.0, 0.0, 0.0, drives.k54, drives.k64, drives.k65],
+            "current_limit": limits.current,
+            "following_error": limits.following_error,
+        }
+        self.session.reply(InitPacket.build(n, round(1000.0 * period), values).encode(), 0.0)
+        self.session.request(_Rest(position))
+        self._axes["mode"] = Mode.CLOSED
+        self.cycle()
+        self._axes["mode"] = Mode.POSITION
+        for _ in range(_CYCLES):
+            self.cycle()
+        self.session.events()
+
+    def cycle(self) -> None:
+        """Let the session reply to one more packet."""
+        self._number = next_number(self._number)
+        packet = CyclicPacket(self._number, _STATUS, bytes(N_ARMS), self._axes).encode()
+        self.reply = self.session.reply(packet, 0.0)
+
+    def before_packet(self, transport: Transport, session: Session, arrived: float) -> None:
+        """Run one cycle shortly before the packet that follows one which arrived at this time.
+
+        Only in open mode, and where the link can wait for a packet without reading it: one that
+        comes early is delayed by no more than this cycle.
+        """
+        wait: Callable[[float], bool] | None = getattr(transport, "wait", None)
+        if wait is None or session.state is not State.OPEN:
+            return
+        due = arrived + self._period
+        left = due - LEAD - transport.now
+        if left <= 0.0 or wait(left):
+            return
+        with suppress(Exception):  # whatever it may be, the real session goes on
+            self.cycle()
+        while self.polls and transport.now < due + LEAD and not wait(0.0):
+            pass
