@@ -24,16 +24,8 @@ from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples
 from identification.text import percentage
 from identification.validation.plausibility import nominal_scale
-from identification.validation.readings import (
-    COUPLED,
-    EXPLAINED,
-    SEPARATE,
-    Axes,
-    Change,
-    Meaning,
-    Readings,
-    Step,
-)
+from identification.validation.reading_changes import COUPLED, Axes, Change, Meaning
+from identification.validation.readings import EXPLAINED, SEPARATE, Readings, Step
 
 Array = NDArray[np.float64]
 
