@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples
-from identification.validation.causes import Fault, corrected
+from identification.validation.faults import Fault, corrected
 
 Array = NDArray[np.float64]
-
-
 Meaning = Literal[
     "torque sign",
     "position sign",

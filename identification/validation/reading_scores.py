@@ -16,7 +16,6 @@ from identification.validation.finding import little_torque
 
 Array = NDArray[np.float64]
 
-
 DISSIPATES: Final = 4.0  # standard errors of a friction that drives a joint
 _LEAST_FRICTION: Final = 0.02  # of the torque of a joint
 _BLOCKS: Final = 20

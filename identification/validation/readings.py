@@ -1,11 +1,11 @@
 """Other readings of a recording: sign, order, unit and zero of its joints, gravity in its torque.
 
 All readings are fitted to few rows first. For those of least error the torque of every fifth block
-is predicted from the others, as in :mod:`identification.validation.causes`, whose corrections are
-used, and the errors are compared block by block. Parameters have the prior of
-:mod:`identification.estimators.prior`, so that geometry alone is enough and masses help where they
-are known. Among readings that predict alike, those in which friction takes energy from every joint
-come first. The best reading is adopted if it is significant, and the search is repeated with it.
+is predicted from the others, and the errors are compared block by block. Parameters have the prior
+of :mod:`identification.estimators.prior`, so that geometry alone is enough and masses help where
+they are known. Among readings that predict alike, those in which friction takes energy from every
+joint come first. The best reading is adopted if it is significant, and the search is repeated with
+it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from identification.factor.columns import every_torque_factor, of_torques
 from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.causes import coupled_pairs
+from identification.validation.faults import coupled_pairs
 from identification.validation.finding import little_torque
 from identification.validation.reading_changes import (
     COUPLED,

@@ -15,9 +15,10 @@ from identification.model.motion import Motion
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.text import percentage
-from identification.validation.causes import Cause, Fault, Kind, find_causes
+from identification.validation.causes import Cause, find_causes
 from identification.validation.changes import Change
 from identification.validation.evidence import CarriedLoad, CellContext, Evidence, gather
+from identification.validation.faults import Fault, Kind
 from identification.validation.finding import Thresholds
 from identification.validation.plausibility import Dissipation, Implausible, NominalScale
 from identification.validation.prediction import PredictionError
