@@ -18,7 +18,7 @@ from hil.look.result import Certainty, Choice, Group, Row
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.prior import LEARNED, body_prior, fit_posterior
 from identification.factor.factor import Factor
-from identification.model.regressor import LINK_SYMBOLS
+from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples

@@ -35,6 +35,7 @@ from identification.factor.factor import (
     no_rows_message,
     solve,
 )
+from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.pseudo_inertia import (
     Body,
     body,
@@ -43,7 +44,7 @@ from identification.model.pseudo_inertia import (
     pseudo_inertia,
     pseudo_inertia_map,
 )
-from identification.model.regressor import LINK_SYMBOLS, RegressorPlan
+from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 

@@ -15,7 +15,7 @@ from identification.estimators.least_squares import RepeatedEstimate
 from identification.estimators.payload import Run, mass_difference
 from identification.factor.columns import standard_factor, under_gravity
 from identification.factor.factor import Estimate, Factor, solve_with_ridge, total_factor
-from identification.model.regressor import LINK_SYMBOLS
+from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.causes import Cause, find_causes

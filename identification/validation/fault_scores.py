@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.factor.factor import solve_with_ridge
-from identification.model.regressor import LINK_SYMBOLS
+from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.validation.fault_tables import FOLDS, FaultTables, folded
 from identification.validation.faults import Fault
 

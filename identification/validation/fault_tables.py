@@ -11,7 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.model.regressor import LINK_SYMBOLS, RegressorPlan
+from identification.model.link_wrenches import LINK_SYMBOLS
+from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.faults import Fault
