@@ -23,7 +23,8 @@ from hil.identify.options import FIXED
 from hil.identify.payload_run import flange_of
 from hil.identify.prepared import samples_of, stated_settings
 from hil.terminal_text import plural
-from identification.estimators.payload import DRIFT, parameter_change
+from identification.estimators.payload import parameter_change
+from identification.estimators.payload_problem import DRIFT
 from identification.excitation import Excitation, LoadQuantities, Objective, midpoints
 from identification.excitation.precision import Precision
 from identification.factor.factor import Factor, inverse_variance

@@ -15,14 +15,13 @@ from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification.estimators.payload import (
     NAMES,
-    KnownArm,
     PayloadEstimate,
-    Run,
     contradiction,
     figures_of,
     identify_payload,
     reach,
 )
+from identification.estimators.payload_problem import KnownArm, Run
 from identification.factor.columns import standard_factor
 from identification.model.pseudo_inertia import Body
 from identification.model.robot import RobotModel

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.least_squares import RepeatedEstimate
-from identification.estimators.payload import Run, mass_difference
+from identification.estimators.payload import mass_difference
+from identification.estimators.payload_problem import Run
 from identification.factor.columns import standard_factor, under_gravity
 from identification.factor.factor import Estimate, Factor, solve_with_ridge, total_factor
 from identification.model.link_wrenches import LINK_SYMBOLS
