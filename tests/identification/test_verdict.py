@@ -17,9 +17,10 @@ from identification.model.robot import RobotModel
 from identification.text import percentage
 from identification.validation.causes import Cause, find_causes
 from identification.validation.changes import Change
-from identification.validation.evidence import CarriedLoad, CellContext, Evidence, gather
+from identification.validation.evidence import CellContext, Evidence, gather
 from identification.validation.faults import Fault, Kind
 from identification.validation.finding import Thresholds
+from identification.validation.gravity import CarriedLoad
 from identification.validation.plausibility import Dissipation, Implausible, NominalScale
 from identification.validation.prediction import PredictionError
 from identification.validation.residuals import (
