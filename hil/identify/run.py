@@ -13,7 +13,7 @@ from hil.report import ReportSeries
 from hil.results import Results
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.selection.essential import Elimination
-from identification.validation.plausibility import ConsistencyCheck
+from identification.validation.consistency import ConsistencyCheck
 from identification.validation.verdict import Verdict
 
 from .estimating import Estimation, estimate_with, with_transmitted_load

@@ -17,18 +17,17 @@ from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.causes import Cause, find_causes
 from identification.validation.changes import Change, find_changes
+from identification.validation.consistency import ConsistencyCheck
 from identification.validation.finding import Finding
 from identification.validation.gravity import CarriedLoad, GravityDirection, find_gravity, find_load
-from identification.validation.plausibility import (
-    ConsistencyCheck,
+from identification.validation.nominal_scale import InertiaRatio, NominalScale
+from identification.validation.physical_signs import (
     Dissipation,
     Implausible,
-    InertiaRatio,
-    NominalScale,
-    PositionJump,
     dissipation_of,
     implausibilities,
 )
+from identification.validation.position_jumps import PositionJump
 from identification.validation.prediction import (
     SLOW,
     PredictionError,

@@ -21,7 +21,8 @@ from identification.validation.evidence import CellContext, Evidence, gather
 from identification.validation.faults import Fault, Kind
 from identification.validation.finding import Thresholds
 from identification.validation.gravity import CarriedLoad
-from identification.validation.plausibility import Dissipation, Implausible, NominalScale
+from identification.validation.nominal_scale import NominalScale
+from identification.validation.physical_signs import Dissipation, Implausible
 from identification.validation.prediction import PredictionError
 from identification.validation.residuals import (
     HARMONICS,
