@@ -23,8 +23,9 @@ from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples
 from identification.text import percentage
+from identification.validation.faults import COUPLED
 from identification.validation.nominal_scale import nominal_scale
-from identification.validation.reading_changes import COUPLED, Axes, Change, Meaning
+from identification.validation.reading_changes import Axes, Change, Meaning
 from identification.validation.readings import EXPLAINED, SEPARATE, Readings, Step
 
 Array = NDArray[np.float64]

@@ -30,7 +30,7 @@ from identification.validation.fault_scores import (
 )
 from identification.validation.fault_tables import BLOCKS, FaultTables, columns_of_fault, row_step
 from identification.validation.faults import (
-    COUPLED_ANGLES,
+    COUPLED,
     OF_MOTION,
     Fault,
     Kind,
@@ -235,7 +235,7 @@ class _Search:
         if np.all(usual.fitted <= _LITTLE_MORE**2 * noise):
             return OF_MOTION
         in_order = np.all(usual.shares(usual.fitted) < _SMALL_ERROR**2)
-        return ("position order", "joint order", *COUPLED_ANGLES) if in_order else ()
+        return ("position order", "joint order", *COUPLED) if in_order else ()
 
     def resized(self, trial: _Trial) -> Cause:
         """Return the cause of a trial; the load of friction is that of the parameters beside it."""
@@ -259,7 +259,7 @@ class _Search:
         # What a joint that stands still does says nothing about its order, sign or gain.
         moved = self._moved.tolist()
         for pair in coupled_pairs(self._model, moved):
-            yield from (Fault(kind, pair) for kind in COUPLED_ANGLES)
+            yield from (Fault(kind, pair) for kind in COUPLED)
         for j in moved:
             yield from (Fault(kind, (j,)) for kind in kinds)
             yield from (Fault(kind, (k, j)) for k in moved if k < j for kind in orders)

@@ -33,8 +33,12 @@ Kind = Literal[
 # An angle contains that of one of these joints before it: parallel axes are neighbours, or have one
 # across them in between.
 _JOINTS_BEFORE: Final = 2
-COUPLED_ANGLES: Final[tuple[Kind, ...]] = ("angle sum", "angle difference")
-OF_MOTION: Final[tuple[Kind, ...]] = ("axis sign", "position order", "joint order", *COUPLED_ANGLES)
+COUPLED: Final[tuple[Literal["angle sum", "angle difference"], ...]] = (
+    "angle sum",
+    "angle difference",
+)
+"""The recorded angle of the first joint contains that of the second, added or taken off."""
+OF_MOTION: Final[tuple[Kind, ...]] = ("axis sign", "position order", "joint order", *COUPLED)
 _OF_TORQUE: Final = ("torque sign", "torque order")
 
 
@@ -74,7 +78,7 @@ def corrected(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
     sign = np.ones(n)
     order = np.arange(n)
     relative = np.eye(n)
-    if fault.kind in COUPLED_ANGLES:
+    if fault.kind in COUPLED:
         relative[fault.joints] = -1.0 if fault.kind == "angle sum" else 1.0
     elif fault.kind.endswith("sign"):
         sign[list(fault.joints)] = -1.0
@@ -89,7 +93,7 @@ def corrected(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
         motion = Motion(motion.time, *(part @ read for part in motion[1:4]))
         motion = motion._replace(load=load)
         usable = usable[:, order]
-    if fault.kind not in ("position order", *COUPLED_ANGLES):
+    if fault.kind not in ("position order", *COUPLED):
         torque = torque[:, order] * sign
     result = replace(samples, motion=motion, torque=torque, usable=usable, mask=None)
     if samples.parent is not None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples
-from identification.validation.faults import Fault, corrected
+from identification.validation.faults import COUPLED, Fault, corrected
 
 Array = NDArray[np.float64]
 Meaning = Literal[
@@ -33,8 +33,6 @@ Meaning = Literal[
 DEGREE: Final = np.pi / 180.0
 SIGNS: Final[tuple[Meaning, ...]] = ("torque sign", "position sign", "axis sign")
 IN_ORDER: Final[tuple[Meaning, ...]] = ("torque order", "position order", "joint order")
-COUPLED: Final[tuple[Meaning, ...]] = ("angle sum", "angle difference")
-"""The recorded angle of the first joint contains that of the second, added or taken off."""
 _GRAVITIES: Final[tuple[Meaning, ...]] = ("mounting", "no gravity")
 
 

@@ -23,10 +23,9 @@ from identification.factor.columns import every_torque_factor, of_torques
 from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.faults import coupled_pairs
+from identification.validation.faults import COUPLED, coupled_pairs
 from identification.validation.finding import little_torque
 from identification.validation.reading_changes import (
-    COUPLED,
     DEGREE,
     IN_ORDER,
     SIGNS,
