@@ -193,7 +193,8 @@ class PrecisionDesign:
         That is so if random motions of that length do not meet all requirements. Via points are
         added at equal density, up to `MOST_VIA_POINTS`.
         """
-        points, longest = settings.via_points, settings.constraints.max_duration
+        points = settings.via_points
+        longest = settings.constraints.max_duration
         if points is None:
             return settings
         precision = self.precision(repetitions)

@@ -301,5 +301,6 @@ def _weights(grams: Sequence[_Rows], values: Array, rows: NDArray[np.intp]) -> A
 def about_frame(rotation: Array, translation: Array) -> Array:
     """Return the map of inertial parameters (10, 10) to a frame in which theirs has this pose."""
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, translation
+    pose[:3, :3] = rotation
+    pose[:3, 3] = translation
     return np.asarray(inertial_from_pseudo(pose @ pseudo_inertia_map() @ pose.T).T)

@@ -76,7 +76,8 @@ def placed(bodies: Sequence[Body], at: Frames) -> Bodies:
         centres = np.array([hull.centre for hull in hulls])
         axes = np.array([hull.axis for hull in hulls])
         if joint < 0:
-            centre[:, rows], axis[:, rows] = centres.T[:, :, None], axes.T[:, :, None]
+            centre[:, rows] = centres.T[:, :, None]
+            axis[:, rows] = axes.T[:, :, None]
             continue
         part = slice(rows[0], rows[-1] + 1)
         rotation = at.rotation[joint + 1]
