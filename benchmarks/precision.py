@@ -61,7 +61,8 @@ from hil.simulation import (
     simulated_link,
     simulated_provenance,
 )
-from identification.estimators.payload import NAMES, KnownArm, Run, figures_of, identify_payload
+from identification.estimators.payload import NAMES, figures_of, identify_payload
+from identification.estimators.payload_problem import KnownArm, Run
 from identification.estimators.prior import body_prior, design_effect_of, fit_posterior
 from identification.excitation import ViaPointMotion
 from identification.factor.factor import Estimate, Factor

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from benchmarks import parser_of, show, timed
 from identification import Factor, Motion, RobotModel
 from identification.model.kinematics import FROM_PINOCCHIO
-from identification.model.regressor import LINK_SYMBOLS
+from identification.model.link_wrenches import LINK_SYMBOLS
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hil.annotate import annotate as write_annotated
 from hil.errors import InputError
+from hil.exporting import pinocchio_of
 from hil.files import make_folder, write_output
 from hil.identified_campaign import identify_paths
 from hil.identify.options import Options
@@ -126,8 +128,6 @@ class IdentifiedArm:
         Raises:
             InputError: there are no physically consistent parameters.
         """
-        from hil.exporting import pinocchio_of  # its formats take time to load
-
         return pinocchio_of(self.identification)
 
     def plot(self) -> Figure:
@@ -303,8 +303,6 @@ def write_arm(
         )
     results = write_outcome(place, identification, reporter)
     if annotate:
-        from hil.annotate import annotate as write_annotated  # only for these copies
-
         copies = write_annotated(identification, place)
         reporter.say(f"annotated for viewers: {', '.join(map(str, copies))}")
     if sources is not None:

@@ -38,8 +38,8 @@ from identification.export.arm import Arm, Ranges
 from identification.export.friction import median_load
 from identification.export.parameters import estimate_in
 from identification.factor.factor import FINE_BLOCK, fine_blocks, total_factor
+from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.pseudo_inertia import margin
-from identification.model.regressor import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import FOLDS
 

@@ -103,7 +103,8 @@ def single_keys(fd: int) -> Iterator[None]:
     settings: list[Any] = [part[:] if isinstance(part, list) else part for part in before]
     settings[_LOCAL] &= ~(termios.ICANON | termios.ECHO)
     settings[_INPUT] &= ~termios.IXON
-    settings[_CONTROL][termios.VMIN], settings[_CONTROL][termios.VTIME] = 1, 0
+    settings[_CONTROL][termios.VMIN] = 1
+    settings[_CONTROL][termios.VTIME] = 0
     settings[_CONTROL][termios.VSUSP] = os.fpathconf(fd, "PC_VDISABLE").to_bytes(1, "little")
     termios.tcsetattr(fd, termios.TCSADRAIN, settings)
     try:

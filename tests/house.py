@@ -19,9 +19,9 @@ ROOT: Final = Path(__file__).resolve().parents[1]
 PACKAGES: Final = ("drivers", "planner", "identification", "sim_fixtures", "hil")
 CEILINGS: Final[Mapping[str, int]] = {
     "import circles": 0,
-    "imports inside functions": 25,
+    "imports inside functions": 21,
     "banned names": 0,
-    "functions over 60 lines": 13,
+    "functions over 60 lines": 9,
     "long names of tests": 0,
 }
 """Figures that no change may exceed. Size has none: features are not traded for lines."""

@@ -19,8 +19,9 @@ from hil.archive.header import (
     is_supported,
     motion_name,
 )
-from hil.archive.reader import Archive, Scan, open_archive, scan_archive, scan_file
+from hil.archive.reader import Archive, open_archive, scan_archive, scan_file
 from hil.archive.repair import is_intact
+from hil.archive.scan import Scan
 from hil.errors import InputError
 
 OUTCOMES = ("completed", REJECTED, "stopped", "refused", "lost", "void", "interrupted", "unknown")

@@ -191,7 +191,8 @@ class ChunkParser:
         new = [*zip(channels, map(slice, begins, ends), strict=True)]
         if len(set(channels)) < len(channels) or new == self._round:
             return False
-        self._round, self._begin = new, bytes(heads[0])
+        self._round = new
+        self._begin = bytes(heads[0])
         self._fixed = np.add.outer(begins, np.arange(_FIXED.size)).ravel()
         self._expected = np.frombuffer(b"".join(heads), np.uint8)
         return True

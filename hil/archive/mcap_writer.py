@@ -61,7 +61,8 @@ def entries_of(by_channel: Mapping[int, Messages]) -> Entries:
 
 def _entries(stamp: NDArray[np.int64], offset: NDArray[np.int64]) -> NDArray[np.void]:
     entries = np.empty(len(stamp), _ENTRY)
-    entries["stamp"], entries["offset"] = stamp, offset
+    entries["stamp"] = stamp
+    entries["offset"] = offset
     return entries
 
 

@@ -309,7 +309,9 @@ class ArchiveProcess:
 
     def _fill_buffer(self) -> None:
         """Buffer what has come while no archive is open."""
-        events, records = self._events.drain(), self._ring.drain()  # rows up to the newest event
+        # rows up to the newest event
+        events = self._events.drain()
+        records = self._ring.drain()
         if self._live is not None:
             self._live.publish(records, events)
         self._buffer.add(records, events)

@@ -1,6 +1,6 @@
 """Repair of truncated or damaged archives.
 
-What `hil.archive.reader` finds whole is copied, also behind damage; message indexes and summary are
+What `hil.archive.scan` finds whole is copied, also behind damage; message indexes and summary are
 regenerated, and the outcome states what is lost.
 """
 
@@ -21,7 +21,8 @@ from hil.archive import container, header, schema
 from hil.archive.chunk import ChunkParser
 from hil.archive.header import METADATA, OUTCOME, ArchiveOutcome
 from hil.archive.mcap_writer import McapWriter, entries_of, span
-from hil.archive.reader import Scan, open_archive, scan_archive
+from hil.archive.reader import open_archive, scan_archive
+from hil.archive.scan import Scan
 from hil.errors import ArchiveError, ArchiveWriteError
 from hil.files import replace_file, sync_folder
 from hil.reading import open_file

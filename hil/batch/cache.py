@@ -37,7 +37,8 @@ Arrays = dict[str, NDArray[Any]]
 
 BESIDE: Final = ".hil-cache"  # folder beside the archives
 HEADER: Final = "header"  # array with the JSON text, as bytes
-NPZ, JSON = ".npz", ".json"  # suffixes of entries with and without arrays
+NPZ: Final = ".npz"  # suffix of entries with arrays
+JSON: Final = ".json"  # suffix of entries without
 
 LIBRARIES: Final = ("numpy", "scipy", "pin")  # that determine the numbers
 

@@ -1,8 +1,8 @@
-"""Dask clusters that execute the tasks of a batch.
+"""Clusters that execute the tasks of a batch.
 
-Few tasks run in a thread of this process, others on a local cluster of one process per core, or on
-the cluster of a scheduler. Linear algebra has one thread in the processes of a local cluster, so
-that the bits do not depend on their number.
+Those of few archives run in a thread of this process, others on a local Dask cluster of one process
+per core, or on the cluster of a scheduler. Linear algebra has one thread in the processes of a
+local cluster, so that the bits do not depend on their number.
 """
 
 from __future__ import annotations
@@ -10,14 +10,13 @@ from __future__ import annotations
 import logging
 import os
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self, TypeAlias, TypeVar
 from uuid import uuid4
 
 from hil.errors import HilError, InputError
@@ -27,10 +26,12 @@ from hil.version import software
 from identification import IdentificationError
 
 from .cache import CacheError, code_digest
+from .thread import ThreadClient, ThreadFuture
 
 if TYPE_CHECKING:  # half a second, only for those who use it
     from distributed import Client, Future, Worker
 
+AnyFuture: TypeAlias = "Future | ThreadFuture"
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
 
@@ -86,7 +87,7 @@ class Task(Generic[T_co]):
 
 
 class Cluster:
-    """A Dask cluster, started when it is needed.
+    """A thread of this process or a Dask cluster, started when it is needed.
 
     Args:
         workers: number of local processes; by default one for each core that this process may use,
@@ -113,8 +114,7 @@ class Cluster:
         self._scheduler = scheduler
         self._reporter = Silent() if reporter is None else reporter
         self._open = ExitStack()
-        self._client: Client | None = None
-        self._in_process = False
+        self._client: Client | ThreadClient | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -129,7 +129,7 @@ class Cluster:
 
     # Clients
 
-    def client(self, archives: int) -> Client:
+    def client(self, archives: int) -> Client | ThreadClient:
         """Return a client of the cluster for work that reads so many archives.
 
         Raises:
@@ -137,49 +137,43 @@ class Cluster:
             ClusterError: the scheduler has no worker, or one of another version.
         """
         few = archives <= FEW and self._workers is None and self._scheduler is None
-        if self._client is not None and self._in_process and not few:
+        if isinstance(self._client, ThreadClient) and not few:
             self._close()
         if self._client is None:
-            for logger in map(logging.getLogger, _LOGGERS):
-                self._open.callback(logger.setLevel, logger.level)
-                logger.setLevel(logging.CRITICAL)
-            self._in_process = few
-            if self._scheduler is not None:
-                self._client = self._connected(self._scheduler)
+            if few:
+                self._client = ThreadClient()
+                self._open.callback(self._client.close)
             else:
-                self._client = self._started(few)
+                self._client = self._started()
         return self._client
 
-    def _started(self, few: bool) -> Client:
+    def _started(self) -> Client:
+        for logger in map(logging.getLogger, _LOGGERS):
+            self._open.callback(logger.setLevel, logger.level)
+            logger.setLevel(logging.CRITICAL)
+        return self._local() if self._scheduler is None else self._connected(self._scheduler)
+
+    def _local(self) -> Client:
         import dask
-        from distributed import Client, LocalCluster, Scheduler, SpecCluster, Worker
+        from distributed import Client, LocalCluster
 
         count = self._workers or len(os.sched_getaffinity(0))
         self._open.enter_context(dask.config.set(_CONFIGURATION))
-        if few:
-            options = {"dashboard": False, "dashboard_address": _THIS_PC}
-            cluster = SpecCluster(
-                scheduler={"cls": Scheduler, "options": {"protocol": "inproc://", **options}},
-                workers={0: {"cls": Worker, "options": {"nthreads": 1, **options}}},
+        try:
+            cluster = LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                dashboard_address=_THIS_PC,
                 silence_logs=logging.CRITICAL,
             )
-        else:
-            try:
-                cluster = LocalCluster(
-                    n_workers=count,
-                    threads_per_worker=1,
-                    dashboard_address=_THIS_PC,
-                    silence_logs=logging.CRITICAL,
-                )
-            except RuntimeError as error:
-                raise ClusterError(
-                    f"{count} workers of Dask did not start ({error}); try fewer with --workers"
-                ) from error
+        except RuntimeError as error:
+            raise ClusterError(
+                f"{count} workers of Dask did not start ({error}); try fewer with --workers"
+            ) from error
         self._open.enter_context(cluster)
         client = Client(cluster, set_as_default=False)
         self._open.callback(client.close)
-        if not few:
-            self._reporter.step(f"{count} workers on this PC; dashboard {cluster.dashboard_link}")
+        self._reporter.step(f"{count} workers on this PC; dashboard {cluster.dashboard_link}")
         return client
 
     def _connected(self, address: str) -> Client:
@@ -224,22 +218,22 @@ class Cluster:
 
     # Tasks
 
-    def submit(self, task: Task[Any], *, archives: int) -> Future:
+    def submit(self, task: Task[Any], *, archives: int) -> AnyFuture:
         """Submit a task whose work reads so many archives."""
         key = f"{task.function.__name__}-{uuid4().hex}"
         arguments = (code_digest(), task.path, task.function, *task.arguments)
         return self.client(archives).submit(run_task, *arguments, key=key, pure=False)
 
-    def completed(self, futures: Iterable[Future]) -> Iterator[Future]:
+    def completed(self, futures: Iterable[AnyFuture]) -> Iterator[AnyFuture]:
         """Yield futures when they are done, in any order, and keep none of them.
 
         Raises:
             ClusterError: the scheduler does not answer any more, or has no worker left.
             CacheError: the cache cannot be written.
         """
-        done: SimpleQueue[Future] = SimpleQueue()
+        done: SimpleQueue[AnyFuture] = SimpleQueue()
         count = 0
-        future: Future | None = None
+        future: AnyFuture | None = None
         for future in futures:
             future.add_done_callback(done.put)
             count += 1
@@ -255,12 +249,13 @@ class Cluster:
             count -= 1
             if future.cancelled():
                 raise self._without_scheduler()
-            if future.status == "error" and not _died(future):
-                raise _unexpected(future.exception())
+            error = future.exception() if future.status == "error" else None
+            if error is not None and not _is_death(error):
+                raise _unexpected(error)
             yield future
             del future
 
-    def outcome_of(self, future: Future) -> Any:
+    def outcome_of(self, future: AnyFuture) -> Any:
         """Return the result of a task that is done, or a `Death`.
 
         A result that is lost with its worker is computed again, which may end in one, too.
@@ -268,16 +263,16 @@ class Cluster:
         Raises:
             ClusterError: the scheduler ended before the result was fetched from it.
         """
-        from distributed import KilledWorker
-
         try:
             return future.result()
-        except KilledWorker:
-            return Death()
         except HilError:
             raise
-        except (OSError, RuntimeError, CancelledError) as error:
-            raise self._without_scheduler() from error
+        except Exception as error:
+            if _is_death(error):
+                return Death()
+            if isinstance(error, OSError | RuntimeError | CancelledError):
+                raise self._without_scheduler() from error
+            raise
 
     def _without_scheduler(self) -> ClusterError:
         place = self._scheduler or "of this PC"
@@ -288,9 +283,10 @@ class Cluster:
 
     def _watch(self, since: float) -> float:
         """Return since when there is a worker, or raise a `ClusterError` after `PATIENCE`."""
-        if self._client is None or self._scheduler is None:
+        client = self._client
+        if self._scheduler is None or client is None or isinstance(client, ThreadClient):
             return time.monotonic()  # processes of this PC are started again
-        if self._client.scheduler_info(n_workers=-1)["workers"]:
+        if client.scheduler_info(n_workers=-1)["workers"]:
             return time.monotonic()
         if time.monotonic() - since > PATIENCE:
             raise self._without_workers()
@@ -320,7 +316,7 @@ class Cluster:
         results: dict[int, T | SkippedArchive] = {}
         deaths: list[int] = []
 
-        def submitted() -> Iterator[Future]:
+        def submitted() -> Iterator[AnyFuture]:
             for number, task in enumerate(tasks):
                 future = self.submit(task, archives=count)
                 places[future.key] = number
@@ -361,19 +357,18 @@ class Death:
     """In place of a result: the task, or one that it depends on, ended its process repeatedly."""
 
 
-def _died(future: Future) -> bool:
+def _is_death(error: BaseException) -> bool:
     from distributed import KilledWorker
 
-    return isinstance(future.exception(), KilledWorker)
+    return isinstance(error, KilledWorker)
 
 
 def dask_setup(worker: Worker) -> None:
     """Leave Ctrl-C and errors to the client; called in the workers that a `Cluster` starts."""
     del worker
-    if threading.current_thread() is threading.main_thread():  # else it is in the client's process
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        for logger in map(logging.getLogger, _LOGGERS):
-            logger.setLevel(logging.CRITICAL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for logger in map(logging.getLogger, _LOGGERS):
+        logger.setLevel(logging.CRITICAL)
 
 
 def run_task(

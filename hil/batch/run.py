@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, Final, cast, get_args
+from typing import Any, Final, cast, get_args
 
 from hil.archive import Archive
 from hil.errors import InputError
@@ -24,7 +24,7 @@ from hil.threads import one_thread
 from identification.selection.settings import Settings
 
 from .cache import CacheLocation, code_digest
-from .cluster import Cluster, Death, SkippedArchive, Task, reason_of
+from .cluster import AnyFuture, Cluster, Death, SkippedArchive, Task, reason_of
 from .discovery import (
     ArchiveRef,
     CellTexts,
@@ -48,9 +48,6 @@ from .estimates import (
     result_of,
 )
 from .reduction import ensure_reduced, load_source, reduce_archives, reduction_key
-
-if TYPE_CHECKING:
-    from distributed import Future
 
 PARTITION: Final = 16
 """Archives of one task, and campaigns of one sum: Dask takes 2.5 ms for a task, and sums of factors
@@ -354,10 +351,10 @@ class _Batch:
         #: who receives a future that is done, by its key. No reference to one is held, so that the
         #: workers release results that nothing else needs, and only results of campaigns and arms
         #: are fetched: sums are fifty times as large
-        receivers: dict[str, Callable[[Future], None]] = {}
+        receivers: dict[str, Callable[[AnyFuture], None]] = {}
         damaged: list[_ArmWork] = []
 
-        def submitted() -> Iterator[Future]:
+        def submitted() -> Iterator[AnyFuture]:
             for arm in arms:
                 yield from self._submit(arm, receivers, archives, advance)
 
@@ -374,17 +371,17 @@ class _Batch:
     def _submit(
         self,
         arm: _ArmWork,
-        receivers: dict[str, Callable[[Future], None]],
+        receivers: dict[str, Callable[[AnyFuture], None]],
         archives: int,
         advance: Callable[[float, str], None],
-    ) -> Iterator[Future]:
+    ) -> Iterator[AnyFuture]:
         """Submit the graph of an arm; yield the futures to wait for, with their receivers."""
 
-        def submit(path: str, function: Callable[..., Any], *arguments: Any) -> Future:
+        def submit(path: str, function: Callable[..., Any], *arguments: Any) -> AnyFuture:
             return self.cluster.submit(Task(path, function, arguments), archives=archives)
 
         arm.results.clear()
-        campaigns: list[Future] = []
+        campaigns: list[AnyFuture] = []
         for campaign in arm.campaigns:
             place = campaign.key.campaign
             partitions = campaign.partitions
@@ -411,8 +408,8 @@ class _Batch:
             receivers[pooled.key] = self._receive_pooled(arm)
             yield pooled
 
-    def _receive_campaign(self, arm: _ArmWork, key: GroupKey) -> Callable[[Future], None]:
-        def receive(future: Future) -> None:
+    def _receive_campaign(self, arm: _ArmWork, key: GroupKey) -> Callable[[AnyFuture], None]:
+        def receive(future: AnyFuture) -> None:
             result = self.cluster.outcome_of(future)
             if isinstance(result, SkippedArchive):
                 result = CampaignResult((), (result,), 0, 0)
@@ -421,8 +418,8 @@ class _Batch:
 
         return receive
 
-    def _receive_pooled(self, arm: _ArmWork) -> Callable[[Future], None]:
-        def receive(future: Future) -> None:
+    def _receive_pooled(self, arm: _ArmWork) -> Callable[[AnyFuture], None]:
+        def receive(future: AnyFuture) -> None:
             result = self.cluster.outcome_of(future)
             if not isinstance(result, Death):
                 arm.pooled = result
@@ -489,10 +486,10 @@ def _arm_of(model: ArmModel) -> Arm:
 
 def _advance(
     advance: Callable[[float, str], None], count: int, note: str
-) -> Callable[[Future], None]:
+) -> Callable[[AnyFuture], None]:
     """Return what is done when `count` archives are reduced."""
 
-    def receive(future: Future) -> None:
+    def receive(future: AnyFuture) -> None:
         if future.status != "error":
             advance(count, note)
 

@@ -28,6 +28,7 @@ from hil.errors import HilError, InputError, OperatorStopError
 from hil.motion_checks import MotionChecks
 from hil.payload_campaign import assumed_payload, loaded_cell
 from hil.plots import save
+from hil.plots.design_picture import draw_design
 from hil.progress import Reporter, say
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import printable, typed
@@ -57,8 +58,6 @@ def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
 
 def _draw(folder: DesignFolder, done: Designed, cell: Cell) -> None:
     """Draw the picture; a failure is only reported."""
-    from hil.plots.design_picture import draw_design  # matplotlib is slow to import
-
     try:
         save(draw_design(done.design, cell, done.result.settings.unchecked), folder.picture)
     except InputError as error:

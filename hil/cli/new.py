@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from drivers.transports.udp import UdpSpec
 from hil.campaign import stop_on_interrupt
 from hil.cli.arguments import (
     ARM,
@@ -142,8 +143,6 @@ def _asked(
     address: str, bind: str, n_joints: int, arm: int, wait: float, *, quiet: bool
 ) -> CellValues:
     """Read the init packet of the controller at HOST[:PORT]."""
-    from drivers.transports.udp import UdpSpec
-
     host, _, port_text = address.partition(":")
     port = parse_port(port_text or str(PORT))
     if not host or port is None:

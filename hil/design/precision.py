@@ -23,7 +23,8 @@ from hil.identify.options import FIXED
 from hil.identify.payload_run import flange_of
 from hil.identify.prepared import samples_of, stated_settings
 from hil.terminal_text import plural
-from identification.estimators.payload import DRIFT, parameter_change
+from identification.estimators.payload import parameter_change
+from identification.estimators.payload_problem import DRIFT
 from identification.excitation import Excitation, LoadQuantities, Objective, midpoints
 from identification.excitation.precision import Precision
 from identification.factor.factor import Factor, inverse_variance
@@ -192,7 +193,8 @@ class PrecisionDesign:
         That is so if random motions of that length do not meet all requirements. Via points are
         added at equal density, up to `MOST_VIA_POINTS`.
         """
-        points, longest = settings.via_points, settings.constraints.max_duration
+        points = settings.via_points
+        longest = settings.constraints.max_duration
         if points is None:
             return settings
         precision = self.precision(repetitions)

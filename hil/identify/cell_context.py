@@ -26,13 +26,8 @@ from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.evidence import CellContext
 from identification.validation.finding import Finding, joined
-from identification.validation.plausibility import (
-    InertiaRatio,
-    PositionJump,
-    inertia_ratio,
-    nominal_scale,
-    position_steps,
-)
+from identification.validation.nominal_scale import InertiaRatio, inertia_ratio, nominal_scale
+from identification.validation.position_jumps import PositionJump, position_steps
 from identification.validation.prediction import PredictionError, pooled_error
 from planner.arrays import numbers
 

@@ -144,10 +144,10 @@ def with_transmitted_load(prepared: Prepared) -> Prepared:
     carrying = prepared.with_load(loaded.result.values)
     notes = prepared.notes
     if not loaded.converged:
+        change = percentage(loaded.change, 1)
         notes += (
-            "the friction that grows with load still changed the torque by "
-            f"{percentage(loaded.change, 1)} in"
-            f" pass {loaded.passes}",
+            f"the friction that grows with load still changed the torque by {change} in pass"
+            f" {loaded.passes}",
         )
     return replace(carrying, fitted=loaded.samples, notes=notes)
 
@@ -421,17 +421,16 @@ def _robust(
         fits.append(robust_estimate(model, some, _LOSSES[name], total=total))
         return fits[-1].estimate
 
-    result, robust_fit = estimate_repetitions(model, fitted, fit), fits[-1]  # the last: all samples
+    result = estimate_repetitions(model, fitted, fit)
+    of_all = fits[-1]
     warnings = [
-        f"{percentage(robust_fit.outlying[joint])} of the rows of {model.joint_names[joint]} "
-        f"deviate by "
-        "more "
-        "than four standard deviations: an unmodelled effect rather than outliers, which a robust "
-        "loss would hide; use --estimator wls"
-        for joint in np.flatnonzero(robust_fit.doubtful)
+        f"{percentage(of_all.outlying[joint])} of the rows of {model.joint_names[joint]} deviate by"
+        " more than four standard deviations: an unmodelled effect rather than outliers, which a"
+        " robust loss would hide; use --estimator wls"
+        for joint in np.flatnonzero(of_all.doubtful)
     ]
-    if not robust_fit.converged:
-        warnings.append(f"the reweighting did not converge in {robust_fit.iterations} iterations")
+    if not of_all.converged:
+        warnings.append(f"the reweighting did not converge in {of_all.iterations} iterations")
     return result, warnings
 
 
@@ -487,6 +486,5 @@ def _instrumental(
         remedy = "record the commanded positions as well, or use --estimator wls"
         raise InputError(None, problem, field="--estimator iv", remedy=remedy) from error
     result = RepeatedEstimate.of(model, pooled.estimate, each, total_factor(model, fitted))
-    return result, [
-        f"the instruments are too weak for {joined(pooled.weak)}"
-    ] if pooled.weak else []
+    warnings = [f"the instruments are too weak for {joined(pooled.weak)}"] if pooled.weak else []
+    return result, warnings

@@ -11,7 +11,7 @@ import numpy as np
 from hil.archive import open_archive
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
-from identification.estimators.payload import KnownArm, Run
+from identification.estimators.payload_problem import KnownArm, Run
 
 from .cell_context import torque_scale
 from .estimating import Estimation, estimate_with

@@ -15,21 +15,20 @@ from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification.estimators.payload import (
     NAMES,
-    KnownArm,
     PayloadEstimate,
-    Run,
     contradiction,
     figures_of,
     identify_payload,
     reach,
 )
+from identification.estimators.payload_problem import KnownArm, Run
 from identification.factor.columns import standard_factor
 from identification.model.pseudo_inertia import Body
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.evidence import find_gravity
 from identification.validation.facts.faults import MOUNTING_STEP
 from identification.validation.finding import Thresholds
+from identification.validation.gravity import find_gravity
 
 from .cell_context import TorqueScale, torque_scale
 from .options import Options

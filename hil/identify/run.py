@@ -14,7 +14,7 @@ from hil.results import Results
 from hil.threads import one_thread
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.selection.essential import Elimination
-from identification.validation.plausibility import ConsistencyCheck
+from identification.validation.consistency import ConsistencyCheck
 from identification.validation.verdict import Verdict
 
 from .estimating import Estimation, estimate_with, with_transmitted_load

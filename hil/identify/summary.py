@@ -24,7 +24,7 @@ from identification.excitation import (
 from identification.model.elements import TorqueRipple
 from identification.selection.essential import Elimination
 from identification.signals.samples import Samples
-from identification.validation.plausibility import ConsistencyCheck
+from identification.validation.consistency import ConsistencyCheck
 from identification.validation.prediction import (
     PredictionError,
     pooled_error,

@@ -10,8 +10,8 @@ from hil.progress import Reporter
 from identification import Factor, IdentificationError
 from identification.selection.essential import Elimination, choose_essential
 from identification.validation.calibration import Calibration, TorqueMeans, calibrate
+from identification.validation.consistency import ConsistencyCheck, check_consistency
 from identification.validation.evidence import Evidence, gather
-from identification.validation.plausibility import ConsistencyCheck, check_consistency
 from identification.validation.verdict import Verdict, judge
 
 from .cell_context import Nominal, cell_context_of, nominal_of

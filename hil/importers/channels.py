@@ -20,10 +20,11 @@ from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.bags import SUFFIXES, open_bag
 from hil.importers.column_map import Format
 from hil.importers.commands import as_joint_state, measured_topics
+from hil.importers.dialect import is_date
 from hil.importers.name_words import is_other, kind_by_words
 from hil.importers.rosbag2 import joint_state_topics
 from hil.importers.stamps import concluded_unit
-from hil.importers.table import Table, is_date
+from hil.importers.table import Table
 from hil.importers.units import TIMES, Kind, unit_of, without_unit
 
 _NUMBER: Final = r"[\[(_. ]*(?P<number>\d{1,2})[\])]*"

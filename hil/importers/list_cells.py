@@ -36,7 +36,8 @@ def spread_lists(path: Path, text: str, *, drop: bool) -> str:
         return text
     delimiter = next((mark for mark in _DELIMITERS if mark in head), ",")
     reader = csv.reader(io.StringIO(text), delimiter=delimiter, skipinitialspace=True)
-    names, first = next(reader), next(reader)
+    names = next(reader)
+    first = next(reader)
     if len(names) != len(first):
         return text
     sizes = {place: len(numbers) for place, cell in enumerate(first) if (numbers := _numbers(cell))}

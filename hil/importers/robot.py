@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from os import PathLike
@@ -302,16 +302,7 @@ def write_imported(
     if not outside_limits:
         check_positions(samples.position, robot.joint_names, robot.urdf, source[0])
     _require_joints(held_joints, robot, source[0])
-    nominal = robot.nominal_torque()
-    findings = examine(
-        samples,
-        robot.joint_names,
-        robot.urdf,
-        locked=robot.locked,
-        nominal=nominal,
-        held_joints=held_joints,
-    )
-    findings = Findings(lines=(*notes, *findings.lines), warnings=findings.warnings)
+    findings = _findings(samples, robot, held_joints, notes)
     entries = {
         **metadata,
         "source": json.dumps([path.name for path in source]),
@@ -321,8 +312,9 @@ def write_imported(
         "findings": json.dumps(findings.model_dump()),
     }
 
-    def write(path: Path) -> Path:
-        return write_samples(
+    make_folder(output.parent)
+    with _replaced(output) if force else nullcontext(output) as path:
+        write_samples(
             path,
             samples,
             joint_names=robot.joint_names,
@@ -330,13 +322,22 @@ def write_imported(
             attachments=robot.attachments(),
             period=period,
         )
-
-    make_folder(output.parent)
-    if not force:
-        return write(output)
-    with _replaced(output) as temporary:
-        write(temporary)
     return output
+
+
+def _findings(
+    samples: Samples, robot: Robot, held_joints: Sequence[str], notes: Sequence[str]
+) -> Findings:
+    """Return the findings of an import, `notes` first."""
+    findings = examine(
+        samples,
+        robot.joint_names,
+        robot.urdf,
+        locked=robot.locked,
+        nominal=robot.nominal_torque(),
+        held_joints=held_joints,
+    )
+    return Findings(lines=(*notes, *findings.lines), warnings=findings.warnings)
 
 
 @contextmanager

@@ -15,12 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.errors import SourceError
-from hil.importers.arrays import READERS
 from hil.importers.column_map import HOLE, Column, Format
 from hil.importers.date_stamps import nanoseconds_of_dates
+from hil.importers.dialect import (
+    FORTRAN,
+    MISSING,
+    Dialect,
+    dialect_of,
+    is_written,
+    number_of,
+    thousands_mark,
+    with_points,
+)
 from hil.importers.list_cells import spread_lists
+from hil.importers.log_text import text_of
 from hil.importers.units import unit_of, without_unit
-from hil.reading import open_file, read_text, remedy_for_missing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,98 +37,15 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _COMMENTS = ("#", "%", "//")
-# Tried in this order; the last is that of numbers in quotation marks.
-_WRITTEN = (
-    (",", "."), (";", "."), ("\t", "."), ("|", "."), (None, "."),
-    (";", ","), ("\t", ","), ("|", ","), (None, ","), (",", ","),
-)  # fmt: skip
-_ROSTOPIC = "%time,"  # of `rostopic echo -p`
 _EMPTY: Final = "record again, or name the file that has the samples"
 _PROBED: Final = 100  # lines
-_LONGEST: Final = 1 << 31  # bytes; several times as many in memory
 _LONGEST_TIME: Final = 30  # digits before the point, more than of nanoseconds since 1970
-# 1.0D+03: double precision as Fortran writes it.
-_FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]?\d)")
-_THOUSANDS: Final = ".,'\u2019 \u00a0\u202f"  # of which one may separate groups of three digits
-_MISSING: Final = frozenset(
-    {"", "-", "--", "na", "n/a", "#n/a", "#na", "null", "none", "nan", "-nan", "+nan", "nan(ind)"}
-    | {"-nan(ind)", "1.#ind", "-1.#ind", "1.#qnan", "-1.#qnan", "1.#snan", "#num!", "#value!"}
-    | {"#div/0!", "#ref!", "missing"}
-)
-"""What loggers, spreadsheets and run-time libraries write where there is no number; lower case."""
-_SPELLINGS: Final = sorted({f(text) for text in _MISSING for f in (str, str.upper, str.title)})
-_DAY: Final = r"\d{1,4}([-./])(?:\d{1,2}|[A-Za-z]{3})\1\d{1,4}"
-_CLOCK: Final = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d+)?)?(?:\s*[AaPp][Mm])?\s*(?:Z|[+-]\d{2}:?\d{2})?"
-_DATE: Final = re.compile(rf"(?:{_DAY}(?:[ T]+{_CLOCK})?|{_CLOCK})")
 _QUOTES: Final = "\"'"
-# Cells in apostrophes, or as spreadsheets protect text: ="0.5".
-_OTHER_QUOTES: Final = re.compile(r"""(?<![^\s,;|])(?:'([^'"\n]*)'|="([^"\n]*)")(?![^\s,;|])""")
 # Of columns, as PLCs and programs write them below the names.
 _TYPE: Final = re.compile(
     r"l?real|float(32|64)?|double|single|numeric|number|[usld]{0,2}int(8|16|32|64)?|integer|bool"
     r"(ean)?|l?time|date|datetime|string|text|d?word|byte|[<>]?[fiu][248]"
 )
-_OF_PANDAS: Final = "save its table with pandas: {}(FILE).to_parquet('log.parquet')"
-_BINARY: Final = {
-    b"PK\x03\x04": ("a spreadsheet or a zip file", "save the sheet as CSV, or unpack the file"),
-    b"\xd0\xcf\x11\xe0": ("an Excel file", "save the sheet as CSV"),
-    b"\x1f\x8b": ("compressed by gzip", "unpack it: gunzip FILE"),
-    b"\x28\xb5\x2f\xfd": ("compressed by zstd", "unpack it: unzstd FILE"),
-    b"\x89HDF\r\n": (
-        "HDF5",
-        "save its arrays, of h5py.File(FILE) as f, by names of your choice: "
-        "numpy.savez('log.npz', t=f['t'], q=f['q'], tau=f['tau'])",
-    ),
-    b"ARROW1": ("Feather", _OF_PANDAS.format("pandas.read_feather")),
-    b"\x80\x03": ("a pickle of Python", _OF_PANDAS.format("pandas.read_pickle")),
-    b"\x80\x04": ("a pickle of Python", _OF_PANDAS.format("pandas.read_pickle")),
-    b"\x80\x05": ("a pickle of Python", _OF_PANDAS.format("pandas.read_pickle")),
-    b"PAR1": ("Parquet", "let its name end in .parquet"),
-    b"\x93NUMPY": ("an array of numpy", "let its name end in .npy"),
-    b"MATLAB": ("MATLAB's format", "let its name end in .mat"),
-    b"\x89MCAP0": ("MCAP", "let its name end in .mcap"),
-    b"#ROSBAG": ("a bag of ROS 1", "let its name end in .bag"),
-    b"SQLite format 3": ("a database, as bags of ROS 2 are", "let its name end in .db3"),
-}
-"""Formats by the bytes at their start, each with a remedy."""
-_MARKUP: Final = re.compile(r"\ufeff?\s*(<[?!A-Za-z]|[{\[]\s*[\"{\[]|(?:---\s+)?header:\s)")
-
-
-def _description(path: Path, text: str) -> SourceError:
-    """Return the error for XML, JSON or YAML in place of rows."""
-    start = text.lstrip("\ufeff \t\r\n")
-    if not start.startswith("<"):
-        is_json = start[0] in "{["
-        problem = f"is {'JSON' if is_json else 'YAML of messages'}, not a table of numbers"
-        remedy = "give a table of numbers (CSV), .npz, .mat, .parquet or a bag"
-        if not is_json:
-            remedy = "give the bag, or a table of its joint states (CSV)"
-        return SourceError(path, problem, remedy=remedy)
-    if "<robot" in text:
-        remedy = f"give the recording first: LOG --urdf {path.name}"
-        return SourceError(path, "is a robot description (URDF), not a recording", remedy=remedy)
-    remedy = "give a table of numbers (CSV), .npz, .mat, .parquet or a bag"
-    return SourceError(path, "is XML, not a table of numbers", remedy=remedy)
-
-
-class Dialect(NamedTuple):
-    """How the cells of a line are written."""
-
-    delimiter: str | None  #: between columns; None for white space
-    decimal: str  #: decimal mark
-    thousands: str | None = None  #: between groups of three digits, where the map states it
-
-    def cells(self, line: str) -> list[str]:
-        """Return the cells of a line without quotation marks."""
-        if self.delimiter is None:
-            line = " ".join(line.split())
-            delimiter = " "
-        else:
-            delimiter = self.delimiter
-        if '"' not in line:
-            return [cell.strip() for cell in line.split(delimiter)]
-        parsed = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
-        return [cell.strip() for cell in parsed]
 
 
 class _Layout(NamedTuple):
@@ -152,9 +78,7 @@ class Table:
         Raises:
             SourceError: it cannot be read, or has no row of numbers.
         """
-        text = _text(path, form)
-        if _MARKUP.match(text):
-            raise _description(path, text)
+        text = text_of(path, form)
         text = spread_lists(path, text, drop=form.missing == "drop")
         numbered = [
             (number, line)
@@ -166,12 +90,12 @@ class Table:
         filled = [line for _, line in numbered if line.strip()]
         if not filled:
             raise SourceError(path, "has no row of numbers", remedy=_EMPTY)
-        dialect = _dialect(filled[:_PROBED], form)
+        dialect = dialect_of(filled[:_PROBED], form)
         if form.transposed:
             numbered = _transposed([entry for entry in numbered if entry[1].strip()], dialect, path)
         names, units, rows, repeated = _layout(numbered, dialect, path, form)
-        if _FORTRAN.search(rows[0][1]):
-            rows = [(number, _FORTRAN.sub("e", line)) for number, line in rows]
+        if FORTRAN.search(rows[0][1]):
+            rows = [(number, FORTRAN.sub("e", line)) for number, line in rows]
         width = _width(names, dialect.cells(rows[0][1]), path)
         if not names and form.header is None and comments:
             commented = dialect.cells(comments[-1].lstrip().lstrip("#%/"))
@@ -204,7 +128,7 @@ class Table:
 
     def is_number(self, cell: str) -> bool:
         """Return whether a cell is a number, a missing one, or a date stamp."""
-        return _is_written(cell, self.dialect)
+        return is_written(cell, self.dialect)
 
     def has(self, name: str) -> bool:
         """Return whether a column has this name, with or without its unit."""
@@ -223,7 +147,7 @@ class Table:
                 dtype=np.float64,
                 decimal=self.dialect.decimal,
                 keep_default_na=False,
-                na_values=_SPELLINGS,
+                na_values=MISSING,
             )
             values = frame[indices].to_numpy()
         except ValueError:  # a cell is not a number as written in this dialect
@@ -252,7 +176,7 @@ class Table:
         else:
             texts = self._texts(index)
             numbers = list(self.numbered)
-        numerals = _normalised(texts, self.dialect)
+        numerals = with_points(texts, self.dialect)
         times: list[int | None] = [_nanoseconds(text, decimals) for text in numerals]
         unread = [place for place, time in enumerate(times) if time is None]
         if len(unread) > len(times) / 2:
@@ -267,7 +191,7 @@ class Table:
 
     def _remedy(self, text: str) -> str:
         """Return the remedy for a cell that is not a number."""
-        mark = _grouped(text, self.dialect)
+        mark = thousands_mark(text, self.dialect)
         if mark is None:
             return HOLE
         return f'if {mark!r} separates thousands: [format] thousands = "{mark}"; else {HOLE}'
@@ -329,8 +253,8 @@ class Table:
     def _cell_by_cell(self, index: int, field: str) -> Array:
         """Return a column as numbers, or raise the error that names the first invalid cell."""
         texts = self._texts(index)
-        numerals = _normalised(texts, self.dialect)
-        values = np.array([_number(text) for text in numerals])
+        numerals = with_points(texts, self.dialect)
+        values = np.array([number_of(text) for text in numerals])
         if self.gaps or (not np.isfinite(values).any() and len(set(texts)) == 1):
             values[~np.isfinite(values)] = np.nan
             return values  # of a column without any number the reader knows the joint
@@ -343,60 +267,6 @@ class Table:
         problem = f"line {self.numbered[row]} has {shown} in column {name}, not a number"
         remedy = self._remedy(texts[row])
         raise SourceError(self.path, problem, field=field, remedy=remedy)
-
-
-def _refuse_binary(path: Path) -> None:
-    """Raise SourceError for a file of a format that is no text, whatever its suffix."""
-    with open_file(path) as stream:
-        start = stream.read(_PROBED)
-    for mark, (kind, remedy) in _BINARY.items():
-        if start.startswith(mark):
-            raise SourceError(path, f"is {kind}, not text", remedy=remedy)
-
-
-def _text(path: Path, form: Format) -> str:
-    """Return the text of a file in any usual encoding."""
-    try:
-        _refuse_binary(path)
-        text = read_text(path, _LONGEST, encoding=form.encoding, or_latin=True)
-    except (OSError, ValueError, LookupError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        problem = f"cannot be read ({reason})"
-        remedy = f"name a text file, or one that ends in {', '.join(READERS)}"
-        if isinstance(error, FileNotFoundError):
-            remedy = remedy_for_missing(path, remedy)
-        raise SourceError(path, problem, remedy=remedy) from error
-    text = text.removeprefix("%") if text.startswith(_ROSTOPIC) else text  # a header there
-    return _OTHER_QUOTES.sub(r'"\1\2"', text) if "'" in text or '="' in text else text
-
-
-def _dialect(lines: Sequence[str], form: Format) -> Dialect:
-    """Return the dialect in which most cells of lines are numbers, the first of equal ones."""
-    marks = [form.decimal] if form.decimal else [".", ","]
-    tried = [
-        Dialect(delimiter, mark, form.thousands)
-        for delimiter, mark in _WRITTEN
-        if mark in marks and form.delimiter in (None, delimiter)
-    ]
-    if form.delimiter is not None and not tried:
-        tried = [Dialect(form.delimiter, marks[0], form.thousands)]
-
-    def share(dialect: Dialect) -> float:
-        """Return the share of numbers in lines of the usual length that have any."""
-        rows = [dialect.cells(line) for line in lines]
-        lengths = [len(row) for row in rows]
-        usual = max(sorted(set(lengths)), key=lengths.count)
-        if usual == 1 and dialect.delimiter is not None and form.delimiter is None:
-            return -1.0
-        counts = [
-            sum(_is_written(cell, dialect) for cell in row)
-            for row in rows
-            if abs(len(row) - usual) <= 1
-        ]
-        numeric = [count for count in counts if count]
-        return sum(numeric) / (usual * len(numeric)) if numeric else -1.0
-
-    return max(tried, key=share)
 
 
 def _layout(numbered: list[tuple[int, str]], dialect: Dialect, path: Path, form: Format) -> _Layout:
@@ -460,7 +330,7 @@ def _first_row(lines: Sequence[tuple[int, str]], dialect: Dialect) -> int:
     A line above it without any number is a name, a unit or a note.
     """
     probed = [dialect.cells(line) for _, line in lines[: 5 * _PROBED]]
-    numeric = [any(_is_written(cell, dialect) and cell for cell in row) for row in probed]
+    numeric = [any(is_written(cell, dialect) and cell for cell in row) for row in probed]
     lengths = [len(row) for row, some in zip(probed, numeric, strict=True) if some]
     if not lengths:
         return len(lines)
@@ -521,64 +391,3 @@ def _nanoseconds(text: str, decimals: int) -> int | None:
         return int(time.scaleb(9 - decimals).to_integral())
     except (ArithmeticError, ValueError):
         return None
-
-
-def _number(text: str) -> float:
-    """Return the number that a text is, else NaN."""
-    try:
-        return float(text)
-    except ValueError:
-        return np.nan
-
-
-def _grouped(text: str, dialect: Dialect) -> str | None:
-    """Return the mark between groups of three digits: one that is not the decimal mark, or None."""
-    match = _groups(dialect.decimal).fullmatch(text)
-    return None if match is None else match["mark"]
-
-
-def _groups(decimal: str) -> re.Pattern[str]:
-    marks = "".join(mark for mark in _THOUSANDS if mark != decimal)
-    return re.compile(
-        rf"[+-]?[1-9]\d{{0,2}}(?P<mark>[{re.escape(marks)}])\d{{3}}(?:(?P=mark)\d{{3}})*"
-        rf"(?P<part>{re.escape(decimal)}\d*)?(?:[eE][+-]?\d+)?"
-    )
-
-
-def _normalised(texts: Sequence[str], dialect: Dialect) -> list[str]:
-    """Return cells of a column with a decimal point and without marks between thousands.
-
-    Such marks are taken for what they are where the map states them, or where the column proves
-    them: a number with both marks, or with two groups.
-    """
-    mark = dialect.thousands
-    if mark is None:
-        matches = [match for match in map(_groups(dialect.decimal).fullmatch, texts) if match]
-        marks = {match["mark"] for match in matches}
-        proved = any(match["part"] or match[0].count(match["mark"]) > 1 for match in matches)
-        mark = marks.pop() if proved and len(marks) == 1 else None
-    if mark is not None:
-        pattern = _groups(dialect.decimal)
-        texts = [text.replace(mark, "") if pattern.fullmatch(text) else text for text in texts]
-    if dialect.decimal == ".":
-        return list(texts)
-    return [text.replace(dialect.decimal, ".") if "." not in text else text for text in texts]
-
-
-def is_date(cell: str) -> bool:
-    """Return whether a cell is a date stamp with the time of a day."""
-    return bool(_DATE.fullmatch(cell)) and ":" in cell
-
-
-def _is_written(cell: str, dialect: Dialect) -> bool:
-    """Return whether a cell is a number in this dialect, a missing one, or a date stamp."""
-    if cell.lower() in _MISSING or _DATE.fullmatch(cell):
-        return True
-    if dialect.decimal == "," and "." in cell:
-        return _grouped(cell, dialect) is not None
-    numeral = cell.replace(dialect.decimal, ".")
-    is_number = np.isfinite(_number(_FORTRAN.sub("e", numeral))) or numeral.lower() in (
-        "inf",
-        "-inf",
-    )
-    return bool(is_number) or _grouped(cell, dialect) is not None

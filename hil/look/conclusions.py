@@ -21,7 +21,8 @@ from hil.terminal_text import typed
 from identification.errors import IdentificationError
 from identification.signals.samples import Samples, prepare
 from identification.text import percentage
-from identification.validation.readings import SURE, Score, compare, score_of
+from identification.validation.reading_scores import Score, compare, score_of
+from identification.validation.readings import SURE
 
 _SUSPECT: Final = 0.15
 """Error of the torque, predicted from other parts, above which a log is looked at closely. Right

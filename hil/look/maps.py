@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hil.importers.channels import channels_of
 from hil.reading import parse_toml
 from hil.toml_text import to_text
-from identification.validation.readings import Axes
+from identification.validation.reading_changes import Axes
 
 _COMMENT = "Proposed by hil from names, units, the URDF and the motion of the recording"
 

@@ -22,15 +22,8 @@ from hil.look.result import Row
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.text import percentage
-from identification.validation.readings import (
-    EXPLAINED,
-    SEPARATE,
-    SURE,
-    Comparison,
-    Score,
-    compare,
-    score_of,
-)
+from identification.validation.reading_scores import Comparison, Score, compare, score_of
+from identification.validation.readings import EXPLAINED, SEPARATE, SURE
 
 Array = NDArray[np.float64]
 

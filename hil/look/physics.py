@@ -18,22 +18,15 @@ from hil.look.result import Certainty, Choice, Group, Row
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.prior import LEARNED, body_prior, fit_posterior
 from identification.factor.factor import Factor
-from identification.model.regressor import LINK_SYMBOLS
+from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples
 from identification.text import percentage
-from identification.validation.plausibility import nominal_scale
-from identification.validation.readings import (
-    COUPLED,
-    EXPLAINED,
-    SEPARATE,
-    Axes,
-    Change,
-    Meaning,
-    Readings,
-    Step,
-)
+from identification.validation.faults import COUPLED
+from identification.validation.nominal_scale import nominal_scale
+from identification.validation.reading_changes import Axes, Change, Meaning
+from identification.validation.readings import EXPLAINED, SEPARATE, Readings, Step
 
 Array = NDArray[np.float64]
 

@@ -27,7 +27,8 @@ from identification.estimators.torque_channel import possible_low_passes
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Preprocessing, prepare
-from identification.validation.readings import Axes, Readings, find_readings
+from identification.validation.reading_changes import Axes
+from identification.validation.readings import Readings, find_readings
 
 SETTINGS: Final = Preprocessing(14.0, left_out="rests")
 """Preparation of a recording whose readings are compared."""

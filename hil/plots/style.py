@@ -14,9 +14,13 @@ import matplotlib as mpl
 
 from hil.report.rendering import template_text
 
-INK, MUTED, RULE = "#1a1a1a", "#666666", "#dddddd"
+INK = "#1a1a1a"
+MUTED = "#666666"
+RULE = "#dddddd"
 LIMIT = "#b3261e"
-POSITION, VELOCITY, ACCELERATION = "#0072b2", "#00795a", "#b0530b"
+POSITION = "#0072b2"
+VELOCITY = "#00795a"
+ACCELERATION = "#b0530b"
 """Colours of what only pictures have; charts have those of the pages, see :func:`colour`."""
 SMALL = 7.5
 TEXT = 9.0

@@ -29,9 +29,16 @@ below another one."""
 
 TICK_SIZE = 10.5
 TEXT_SIZE = 11.0
-_WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 370.0, 46.0, 10.0, 20.0, 40.0  # of a panel, px
+# of a panel, px
+_WIDTH = 370.0
+_LEFT = 46.0
+_RIGHT = 10.0
+_TOP = 20.0
+_BOTTOM = 40.0
 _GAP: Final = 24.0  # between plots above each other, px
-_TICK, _PAD, _THIN = 3.0, 6.5, 0.8  # length and distance of text, width of thin lines, px
+_TICK = 3.0  # length, px
+_PAD = 6.5  # distance of text, px
+_THIN = 0.8  # width of thin lines, px
 _FOOT: Final = 32.0  # from the axis down to the base line of its quantity, px
 _FEWEST_FOR_A_BOX: Final = 5  # values
 _BINS: Final = 300  # of a line over time, which has up to two points in each, some one per px
@@ -320,7 +327,8 @@ def box_panel(
 
 _LABELS: Final = 84.0  # px
 _SIDE: Final = 560.0  # px
-_SMALLEST_CELL, _LARGEST_CELL = 11.0, 26.0  # px
+_SMALLEST_CELL = 11.0  # px
+_LARGEST_CELL = 26.0  # px
 
 
 def matrix_panel(matrix: Array, labels: Sequence[str], key: str, title: str) -> Panel:

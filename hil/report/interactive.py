@@ -25,7 +25,8 @@ Array = NDArray[np.float64]
 _LIBRARY: Final = ("bokeh.min.js", "bokeh-api.min.js")
 _VALUES: Final = 180_000
 """Values of all lines of a page, 480 kB."""
-_FEWEST, _MOST = 400, 4000  # points of a line
+_FEWEST = 400  # points of a line
+_MOST = 4000
 _UNKNOWN: Final = -32768
 """Code of a value that is not finite."""
 

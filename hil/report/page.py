@@ -24,7 +24,8 @@ _MOST_CANDIDATES: Final = 6
 
 _BINS: Final = 2000
 """Intervals of all drawn lines of one kind, with two points in each; a page has at most 3 MB."""
-_FEWEST_BINS, _MOST_BINS = 80, 300  # of one line
+_FEWEST_BINS = 80  # of one line
+_MOST_BINS = 300
 
 _OF_MODEL: Final = "About the model and its prediction"
 _OF_RECORDING: Final = "About the recording"

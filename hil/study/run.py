@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.batch.cluster import Cluster
 from hil.cell import Cell
@@ -29,7 +31,9 @@ from .campaigns import Search
 from .results import ConditionResult, MotionRow, StudyResults
 from .settings import StudyFolder, StudySettings
 
-_WORDS: Final = {
+Array = NDArray[np.float64]
+
+_CONDITIONS: Final = {
     campaigns.NO_EFFECTS: "without unmodelled effects",
     campaigns.EFFECTS: "with unmodelled effects",
 }
@@ -69,21 +73,17 @@ def run_study(
         searches = campaigns.run_searches(folder, cell, wanted, reporter, workers)
         best = campaigns.chosen(searches)
         plans = campaigns.plan_study(folder, cell, settings, best)
-        runs = [
-            (execution.root, (execution,)) for some in plans.values() for execution in some.values()
-        ]
+        executions = chain.from_iterable(methods.values() for methods in plans.values())
+        runs = [(execution.root, (execution,)) for execution in executions]
         campaigns.in_children(campaigns.execute, runs, "running campaigns", reporter, processes)
-        calls = []
-        for key, some in plans.items():
-            provenance = simulated_provenance(cell, key == campaigns.EFFECTS)
-            roots = {name: execution.root for name, execution in some.items()}
-            effects = json.loads(provenance["effects"])
-            calls.append((folder.campaign(key, ""), (key, _WORDS[key], effects, roots, truth)))
+        calls = [
+            (folder.campaign(key, ""), _condition(cell, key, methods, truth))
+            for key, methods in plans.items()
+        ]
         conditions = campaigns.in_children(
             results.condition_result, calls, "estimating and predicting", reporter, processes
         )
-        sizes = preset("b").search
-        quick = settings.effort_b.tried < sizes.population * sizes.generations
+        quick = _is_quick(settings)
         study = StudyResults(
             name=root.resolve().name,
             cell=cell.name,
@@ -100,6 +100,21 @@ def run_study(
         write_files(root, {"results.json": study.to_json(), "report.html": study_page(study)})
         reporter.say(f"report: {root / 'report.html'}")
     return study
+
+
+def _is_quick(settings: StudySettings) -> bool:
+    """Return whether less is searched than by the preset of method B."""
+    sizes = preset("b").search
+    return settings.effort_b.tried < sizes.population * sizes.generations
+
+
+def _condition(
+    cell: Cell, key: str, executions: Mapping[str, campaigns.Execution], truth: Array
+) -> tuple[str, str, Any, dict[str, Path], Array]:
+    """Return the arguments of `results.condition_result`."""
+    effects = json.loads(simulated_provenance(cell, key == campaigns.EFFECTS)["effects"])
+    roots = {name: execution.root for name, execution in executions.items()}
+    return key, _CONDITIONS[key], effects, roots, truth
 
 
 def _rows(

@@ -35,13 +35,13 @@ from identification.factor.factor import (
     rows_of,
 )
 from identification.model.friction import dissipation
+from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.pseudo_inertia import (
     ReferenceBodies,
     inertial_from_pseudo,
     margin,
     reference_bodies,
 )
-from identification.model.regressor import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]

@@ -59,7 +59,8 @@ _BIN: Final = 0.01  # s
 # Minima of the profile are wider.
 _PROFILE_STEP: Final = 0.01  # s
 _ITERATIONS: Final = 12
-_CONVERGED, _OF_STD = 1e-6, 0.02  # s, and share of the standard deviation
+_CONVERGED = 1e-6  # s
+_OF_STD = 0.02  # share of the standard deviation
 _MODEL_ERROR: Final = 0.05  # difference of log variance up to which two minima are equally good
 _REVERSAL_PERIODS: Final = 0.5  # periods of the smoothing's bandwidth beside a velocity reversal
 _FOLDS: Final = 5

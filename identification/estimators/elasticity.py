@@ -102,7 +102,8 @@ def elastic_torque(model: RobotModel, samples: Samples, values: Array, complianc
         at = time[rows]
         states = [np.asarray(part)[rows] for part in samples.motion[1:4]]
         rigid = model.gear_torque(values, *states)
-        order, rate = 2, len(rows) / max(float(np.ptp(at)), step)
+        order = 2
+        rate = len(rows) / max(float(np.ptp(at)), step)
         if len(rows) <= 3 * (2 * order + 1) or rate <= 2.0 * DELAY_BANDWIDTH:
             continue
         low_pass = scipy.signal.butter(order, DELAY_BANDWIDTH, fs=rate, output="sos")

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.covariance import Clustered, cluster_covariance
-from identification.estimators.payload import DRIFT, OFFSET, STRETCH
+from identification.estimators.payload_problem import DRIFT, OFFSET, STRETCH
 from identification.factor.factor import (
     FINE_BLOCK,
     Factor,

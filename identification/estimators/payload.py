@@ -22,48 +22,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.estimators.covariance import Clustered, cluster_covariance
-from identification.estimators.torque_scale import scale_covariance, scale_sensitivity
-from identification.factor.factor import (
-    FINE_BLOCK,
-    Estimate,
-    Factor,
-    NormalEquations,
-    count_by_block,
-    fine_blocks,
-    inverse_variance,
-    no_rows_message,
-    solve,
+from identification.estimators.payload_problem import (
+    N_BODY,
+    PARTICIPATION,
+    ROUNDING,
+    KnownArm,
+    Run,
+    about_frame,
+    fit_body,
 )
+from identification.estimators.torque_scale import scale_covariance
 from identification.model.pseudo_inertia import (
     Body,
     body,
     inertial_from_pseudo,
     inertial_parameters,
     pseudo_inertia,
-    pseudo_inertia_map,
 )
-from identification.model.regressor import LINK_SYMBOLS, RegressorPlan
 from identification.model.robot import RobotModel
-from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]
 
-DRIFT: Final = 0.1
-"""Prior standard deviation of the relative change of friction between recordings."""
-OFFSET: Final = 1.0
-"""Prior standard deviation of offset changes, as a share of the friction."""
-_BODY: Final = len(LINK_SYMBOLS)
 _INERTIA: Final = np.arange(6)
 _DIAGONAL: Final = [4, 7, 9]  # of a tensor, among `NAMES`
-_ROUNDS: Final = 4  # iterations of weights and friction
-_MOST_BLOCKS: Final = 500
-# Longer blocks: with noise correlated over 50 ms nominal 95 % intervals cover 93 and 95 %,
-# otherwise 90 and 93 %.
-STRETCH: Final = 2
-_LEAST_NOISE: Final = 1e-6  # rounding of the Gram matrix, as a share of the torque
-_PARTICIPATION: Final = 1e-3
-_ROUNDING: Final = 1e-9
 _DENSITY: Final = 1000.0  # kg/m³; a ball of it is the least inertia worth determining
 
 CONTRADICTION_SIGMAS: Final = 5.0
@@ -88,50 +69,6 @@ class PayloadError(IdentificationError):
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
-    """Reduced recording."""
-
-    name: str
-    factor: Factor  # parameters of the arm, of the body (10), and offsets of the joints (n)
-    loaded: bool  # whether the arm carried the body
-
-    @classmethod
-    def of(
-        cls, name: str, model: RobotModel, samples: Samples, frame: str | None, *, loaded: bool
-    ) -> Run:
-        """Reduce a recording of an arm without payload; the body is at a frame or the last joint.
-
-        Raises:
-            ModelError: the description has no such frame, or it is fixed to the base.
-        """
-        joint, rotation, translation = model.chain.frame(frame)
-        moved = _moved(rotation, translation)
-        p = model.n_parameters
-        plan = RegressorPlan.of_bodies(model.chain, model.gravity, joint)
-        blocks, columns = samples.regressor(model)
-        loads = plan.evaluate(*samples.motion[1:4])
-        index = fine_blocks(samples)
-        tables = []
-        places = []
-        for j, block in enumerate(blocks):
-            load = loads.blocks[j] @ moved[loads.columns[j]]
-            beside = np.column_stack([load, np.ones(len(block))])
-            rows = [block, samples.as_measured(j, beside), samples.torque[:, [j]]]
-            tables.append(np.concatenate(rows, axis=1).T)
-            tables[-1][:, ~samples.usable[:, j]] = 0.0
-            body_columns = p + np.arange(load.shape[1])
-            places.append(np.concatenate([columns[j], body_columns, [p + _BODY + j]]))
-        names = (
-            *model.parameter_names,
-            *LINK_SYMBOLS,
-            *(f"offset of {joint}" for joint in model.joint_names),
-        )
-        counts = count_by_block(index, samples.usable)
-        factor = Factor.of_rows([(index, tables)], counts, tuple(places), names)
-        return cls(name, factor, loaded)
-
-
-@dataclass(frozen=True, eq=False)
 class PayloadEstimate:
     """Payload of the arm at a frame."""
 
@@ -151,32 +88,6 @@ class PayloadEstimate:
     scale_share: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class KnownArm:
-    """Parameters of an arm without payload, as an earlier identification left them.
-
-    It stands for bare recordings: friction of the loaded ones may have drifted from it.
-    """
-
-    values: Array  #: (p,)
-    information: Array  #: inverse of their covariance (p, p)
-    sensitivity: Array  #: change per relative change of each joint's torques (p, n)
-
-    @classmethod
-    def of(cls, factor: Factor, estimate: Estimate, prior: Array, design_effect: float) -> KnownArm:
-        """Return the posterior of a factor and the information of a prior (p, p).
-
-        Its information is that of the rows that count, one of `design_effect`, and of the prior:
-        the covariance from few blocks cannot be inverted.
-        """
-        weights = inverse_variance(estimate.noise_std**2) / design_effect
-        information = factor.weighted(weights).A + prior
-        scale = 1.0 / np.sqrt(np.diag(information))
-        unit = np.linalg.inv(information * scale[:, None] * scale)
-        sensitivity = scale_sensitivity(factor, weights, unit * scale[:, None] * scale)
-        return cls(estimate.values, information, sensitivity)
-
-
 def identify_payload(
     model: RobotModel,
     runs: Sequence[Run],
@@ -194,7 +105,7 @@ def identify_payload(
     """
     estimate = _body_estimate(model, runs, scale_std, arm)
     mass, low, high = _determined_mass(estimate)
-    intervals = np.tile([-np.inf, np.inf], (_BODY, 1))
+    intervals = np.tile([-np.inf, np.inf], (N_BODY, 1))
     intervals[0] = max(0.0, low), high
     if low <= 0.0:
         undetermined = NAMES[1:]
@@ -207,12 +118,12 @@ def identify_payload(
     intervals[1:4] = estimate.centre_intervals
     open_ended = np.isinf(intervals[:, 1])
     centre = np.where(open_ended[1:4], 0.0, estimate.values[6:9] / mass)
-    to_centre = _moved(np.eye(3), -centre)[_INERTIA]
+    to_centre = about_frame(np.eye(3), -centre)[_INERTIA]
     six = to_centre @ estimate.values
     halves = estimate.factor * estimate.std(to_centre)
     lower, upper = _off_centre(mass, (intervals[1:4, 1] - intervals[1:4, 0]) / 2.0)
     intervals[4:] = np.column_stack([six - halves - lower, six + halves + upper])
-    negative = _impossible(intervals, _ROUNDING * mass * (1.0 + float(centre @ centre)))
+    negative = _impossible(intervals, ROUNDING * mass * (1.0 + float(centre @ centre)))
     if negative.any():  # nor is a tensor with such an entry that of a body
         intervals[4:] = [-np.inf, np.inf]
     intervals[_DIAGONAL] = np.maximum(intervals[_DIAGONAL], 0.0)
@@ -254,7 +165,7 @@ def _determined_mass(estimate: _BodyEstimate) -> tuple[float, float, float]:
 
 def _impossible(intervals: Array, rounding: float) -> NDArray[np.bool_]:
     """Return which figures (10,) are moments of inertia that are negative beyond rounding."""
-    negative = np.zeros(_BODY, dtype=np.bool_)
+    negative = np.zeros(N_BODY, dtype=np.bool_)
     negative[_DIAGONAL] = intervals[_DIAGONAL, 1] < -rounding
     return negative
 
@@ -301,7 +212,7 @@ def contradiction(
 
 def _differs(first: _BodyEstimate | None, second: _BodyEstimate, limits: Array) -> bool:
     """Return whether first moments and mass (4,) differ, beyond chance and limits; None is zero."""
-    rows = np.eye(_BODY)[6:]
+    rows = np.eye(N_BODY)[6:]
     change = rows @ second.values
     variance = second.std(rows) ** 2
     if first is not None:
@@ -313,7 +224,7 @@ def _differs(first: _BodyEstimate | None, second: _BodyEstimate, limits: Array) 
 
 
 def _weighing(name: str, estimate: _BodyEstimate) -> Weighing:
-    determined = np.isfinite(estimate.std(np.eye(_BODY)[6:]))
+    determined = np.isfinite(estimate.std(np.eye(N_BODY)[6:]))
     centre = (
         estimate.values[6:9] / estimate.values[9]
         if estimate.values[9] != 0.0
@@ -369,147 +280,6 @@ def _off_centre(mass: float, reach: Array) -> tuple[Array, Array]:
     return off_diagonal + np.array([yy + zz, 0.0, 0.0, xx + zz, 0.0, xx + yy]), off_diagonal
 
 
-# Joint index in one run, Gram matrices (B, c + 1, c + 1), and indices of the unknowns.
-_Rows = tuple[int, Array, NDArray[np.intp]]
-
-
-class _Fit(NamedTuple):
-    """Solution of the joint problem, and its part of the body."""
-
-    values: Array  # (r,)
-    root: Array  # of the inverse information, determined part (r, k)
-    scale: Array  # length of each column (r,)
-    covariance: Array  # (r, r)
-    sensitivity: Array  # change per relative change of each joint's torques (r, n)
-    clustered: Clustered
-
-    @property
-    def determined(self) -> Array:
-        """Determined combinations (d, r) of the unknowns, in comparable units."""
-        scale = np.where(self.scale > 0.0, self.scale, 1.0)
-        lost, axes = np.linalg.eigh(np.eye(len(scale)) - self.root @ self.root.T)
-        axes = np.where(np.abs(axes) < _ROUNDING, 0.0, axes)
-        return np.asarray(axes[:, lost < _PARTICIPATION**2].T * scale)
-
-
-def _fit(model: RobotModel, runs: Sequence[Run], shape: Array, arm: KnownArm | None = None) -> _Fit:
-    """Solve the joint problem for the r unknowns of the body, ten parameters by shape (10, r)."""
-    rows = np.sum([run.factor.samples for run in runs], axis=0)
-    if not rows.any():
-        raise IdentificationError(no_rows_message(model))
-    p = model.n_parameters
-    n = model.n_joints
-    r = shape.shape[1]
-    part = np.arange(p, p + r)
-    # Offsets and friction scales of the runs (R, 2, n).
-    drifts = p + r + np.arange(2 * n * len(runs)).reshape(len(runs), 2, n)
-    width = p + r + drifts.size
-    weights = np.ones(n)
-    friction = np.zeros(p)
-    values = np.zeros(width)
-
-    def problem_of(length: int | None = None) -> list[_Rows]:
-        """Return Gram matrices over the unknowns, of merged blocks."""
-        rows_of_problem = []
-        for k, run in enumerate(runs):
-            factor = run.factor.merged(length or max(1, len(run.factor)))
-            for joint, (gram, columns) in enumerate(
-                zip(factor.matrices, factor.columns, strict=True)
-            ):
-                c = len(columns)
-                mapping = np.zeros((c + 1, width + 1))
-                mapping[c, -1] = 1.0
-                arm = np.flatnonzero(columns < p)
-                mapping[arm, columns[arm]] = 1.0
-                mapping[arm, drifts[k, 1, joint]] = friction[columns[arm]]
-                mapping[c - 1, drifts[k, 0, joint]] = 1.0
-                if run.loaded and c - 1 > len(arm):
-                    mapping[len(arm) : len(arm) + _BODY, part] = shape
-                used = np.flatnonzero(mapping.any(axis=0))
-                small = mapping[:, used]
-                rows_of_problem.append((joint, small.T @ gram @ small, used))
-        return rows_of_problem
-
-    expected = np.zeros(width)
-    information = np.zeros((width, width))
-    if arm is not None:
-        expected[:p], information[:p, :p] = arm.values, arm.information
-
-    def prior_of(problem: Sequence[_Rows], weights: Array) -> Array:
-        """Return the information on the unknowns, of known arm, offsets and friction scales."""
-        squares = np.zeros(n)
-        for joint, gram, places in problem:
-            at = np.flatnonzero(np.isin(places, drifts[:, 1, joint]))
-            squares[joint] += gram[:, at, at].sum()
-        noise = np.divide(1.0, weights, out=np.zeros(n), where=weights > 0.0)
-        level = OFFSET**2 * np.maximum(squares / np.maximum(rows, 1), noise)
-        prior = np.zeros(width)
-        prior[drifts[:, 0]] = np.divide(1.0, level, out=np.zeros(n), where=level > 0.0)
-        prior[drifts[:, 1]] = 1.0 / DRIFT**2
-        return np.asarray(information + np.diag(prior))
-
-    def blocks_of(problem: Sequence[_Rows], weights: Array) -> Array:
-        """Return weighted Gram matrices of all joints and runs (B, width + 1, width + 1)."""
-        whole = np.zeros((max(len(gram) for _, gram, _ in problem), width + 1, width + 1))
-        for joint, gram, places in problem:
-            whole[: len(gram), places[:, None], places] += weights[joint] * gram
-        return whole
-
-    def equations_of(total: Array, prior: Array) -> NormalEquations:
-        return NormalEquations(total[:-1, :-1] + prior, total[:-1, -1] + information @ expected)
-
-    for _ in range(_ROUNDS):
-        problem = problem_of()
-        total = blocks_of(problem, weights)[0]
-        values = solve(equations_of(total, prior_of(problem, weights))).values
-        weights = _weights(problem, values, rows)
-        friction = np.where(model.friction_columns, values[:p], 0.0)
-    length = max(1, -(-max(len(run.factor) for run in runs) // _MOST_BLOCKS))
-    problem = problem_of(length)
-    # The prior is not scaled; the data are, by the design effect of coloured noise.
-    effect = 1.0
-    for _ in range(2):
-        scaled = weights / effect
-        prior = prior_of(problem, scaled)
-        blocks = blocks_of(problem, scaled)
-        equations = equations_of(blocks.sum(axis=0), prior)
-        solution = solve(equations)
-        scores = blocks[:, :-1] @ np.append(-solution.values, 1.0)
-        clustered = cluster_covariance(
-            blocks[:, :-1, :-1], scores, solution, prior, length * FINE_BLOCK, STRETCH
-        )
-        effect *= max(1.0, clustered.design_effect)
-    scale = np.sqrt(np.diag(equations.A))
-    basis = solution.root * np.where(scale > 0.0, scale, 1.0)[:, None]
-    pulls = np.zeros((width, n))
-    for joint, gram, places in problem:
-        pulls[places[:-1], joint] += scaled[joint] * gram.sum(axis=0)[:-1, -1]
-    if arm is not None:
-        pulls[:p] += arm.information @ arm.sensitivity
-    return _Fit(
-        values=solution.values[part],
-        root=basis[part] / np.linalg.norm(basis, axis=0),
-        scale=scale[part],
-        covariance=clustered.covariance[np.ix_(part, part)],
-        sensitivity=solution.root[part] @ (solution.root.T @ pulls),
-        clustered=clustered,
-    )
-
-
-def _weights(problem: Sequence[_Rows], values: Array, rows: NDArray[np.intp]) -> Array:
-    """Return inverse variances of the residuals (n,), zero without rows."""
-    squares = np.zeros(len(rows))
-    torque = np.zeros(len(rows))
-    augmented = np.append(-values, 1.0)
-    for joint, gram, places in problem:
-        total = gram.sum(axis=0)
-        run_values = augmented[places]
-        squares[joint] += run_values @ total @ run_values
-        torque[joint] += total[-1, -1]
-    squares = np.maximum(squares, _LEAST_NOISE**2 * torque)
-    return np.divide(rows, squares, out=np.zeros(len(rows)), where=squares > 0.0)
-
-
 class _BodyEstimate(NamedTuple):
     """Ten parameters of a body, as far as they are determined."""
 
@@ -533,17 +303,17 @@ class _BodyEstimate(NamedTuple):
     def std(self, rows: Array) -> Array:
         """Return standard deviations of functions (k, 10), infinite if undetermined."""
         scale = np.linalg.norm(self.determined, axis=0)  # for equal units
-        scale = np.where(scale > _ROUNDING * scale.max(initial=0.0), scale, 1.0)
+        scale = np.where(scale > ROUNDING * scale.max(initial=0.0), scale, 1.0)
         lost = (rows - rows @ np.linalg.pinv(self.determined) @ self.determined) / scale
         size = np.linalg.norm(rows / scale, axis=1)
-        determined = np.linalg.norm(lost, axis=1) < _PARTICIPATION * size
+        determined = np.linalg.norm(lost, axis=1) < PARTICIPATION * size
         return np.where(determined, np.sqrt(np.diag(self.covariance(rows))), np.inf)
 
     @property
     def mass(self) -> tuple[float, float, float]:
         """Mass and its interval [kg], infinite if undetermined."""
         value = float(self.values[9])
-        half = self.factor * float(self.std(np.eye(_BODY)[[9]])[0])
+        half = self.factor * float(self.std(np.eye(N_BODY)[[9]])[0])
         return value, value - half, value + half
 
     @property
@@ -551,7 +321,7 @@ class _BodyEstimate(NamedTuple):
         """Length of the first moment and its interval [kg m]."""
         first = self.values[6:9]
         length = float(np.linalg.norm(first))
-        row = np.zeros((1, _BODY))
+        row = np.zeros((1, N_BODY))
         row[0, 6:9] = first / length if length > 0.0 else 1.0 / np.sqrt(3.0)
         half = self.factor * float(self.std(row)[0])
         return length, max(0.0, length - half), length + half
@@ -559,8 +329,8 @@ class _BodyEstimate(NamedTuple):
     @property
     def centre_intervals(self) -> Array:
         """95 % intervals of the centre (3, 2), a ratio (Fieller 1954)."""
-        determined = np.isfinite(self.std(np.eye(_BODY)))
-        covariance = self.factor**2 * self.covariance(np.eye(_BODY))
+        determined = np.isfinite(self.std(np.eye(N_BODY)))
+        covariance = self.factor**2 * self.covariance(np.eye(N_BODY))
         first = self.values[6:9]
         mass = self.values[9]
         a = mass**2 - covariance[9, 9]
@@ -577,12 +347,12 @@ def _body_estimate(
     arm: KnownArm | None = None,
 ) -> _BodyEstimate:
     """Estimate the body of the loaded runs, of least norm where undetermined."""
-    fit = _fit(model, runs, np.eye(_BODY), arm)
-    determined = np.eye(_BODY)
+    fit = fit_body(model, runs, np.eye(N_BODY), arm)
+    determined = np.eye(N_BODY)
     directions = fit.determined
-    if len(directions) < _BODY:
+    if len(directions) < N_BODY:
         determined = directions
-        fit = _fit(model, runs, np.asarray(np.linalg.pinv(determined)), arm)
+        fit = fit_body(model, runs, np.asarray(np.linalg.pinv(determined)), arm)
     std = np.zeros(model.n_joints)
     factor = fit.clustered.interval_factor
     if scale_std is not None:
@@ -605,14 +375,7 @@ def parameter_change(model: RobotModel, frame: str | None) -> Array:
         ModelError: the description has no such frame, or it is fixed to the base.
     """
     joint, rotation, translation = model.chain.frame(frame)
-    change = np.zeros((model.n_parameters, _BODY))
+    change = np.zeros((model.n_parameters, N_BODY))
     links = model.base.grouping[:, model.layout.links[joint]]
-    change[: model.base.rank] = links @ _moved(rotation, translation)
+    change[: model.base.rank] = links @ about_frame(rotation, translation)
     return change
-
-
-def _moved(rotation: Array, translation: Array) -> Array:
-    """Return the map of inertial parameters (10, 10) to a frame in which theirs has this pose."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, translation
-    return np.asarray(inertial_from_pseudo(pose @ pseudo_inertia_map() @ pose.T).T)

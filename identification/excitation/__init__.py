@@ -3,7 +3,8 @@
 # ruff: noqa: F401
 import types
 
-from identification.excitation.collision import Box, CollisionChecker, Contact, Workspace
+from identification.excitation.collision import CollisionChecker, Contact
+from identification.excitation.collision_bodies import Box, Workspace
 from identification.excitation.constraints import (
     SAMPLE_PERIOD,
     Constraints,

@@ -53,66 +53,96 @@ def random_validation_motions(
     Raises:
         NoFeasibleMotionError: 100 attempts in a row without a feasible motion.
     """
-    rejected = Counter[str]()
-    nearest = dict[str, Violation]()
-
-    def reject(violations: Sequence[Violation]) -> None:
-        """Count a motion once per kind of constraint it breaks; update the smallest violations."""
-        for kind in dict.fromkeys(violation.kind for violation in violations):
-            rejected[kind] += 1
-            worst = max((v for v in violations if v.kind == kind), key=lambda v: v.excess)
-            nearest[kind] = min(nearest.get(kind, worst), worst, key=lambda v: v.excess)
-
+    attempts = _Attempts(limits, home, n_via, fly, checker, currents)
     contact = None if checker is None else clearance(checker, home[None])
     if contact is not None:
-        reject([replace(contact, subject=f"{contact.subject} at home")])
-        raise NoFeasibleMotionError(rejected, nearest)
-    half = (limits.upper - limits.lower) / 2.0 * _RANGE_SHARE
-    middle = (limits.upper + limits.lower) / 2.0
+        attempts.reject([replace(contact, subject=f"{contact.subject} at home")])
+        raise NoFeasibleMotionError(attempts.rejected, attempts.nearest)
+    motions = []
+    for k in range(count):
+        for attempt in range(_TRIES_PER_MOTION):
+            motion = attempts.motion(np.random.default_rng([_VALIDATION, seed, k, attempt]))
+            if isinstance(motion, ViaPointMotion):
+                motions.append(motion)
+                break
+            attempts.reject(motion)
+        else:
+            raise NoFeasibleMotionError(attempts.rejected, attempts.nearest)
+    return tuple(motions)
 
-    def next_point(random: np.random.Generator, before: Array, *, last: bool) -> Array | Violation:
-        """Draw a point with a free path to it, or return a contact after too many draws."""
-        draws = 0
-        while True:
-            point = random.uniform(middle - half, middle + half)
-            path = straight_path(before, point)
-            if last:
-                path = np.concatenate((path, straight_path(point, home)))
-            if checker is None or checker.clear(path).all():
-                return point
-            draws += 1
-            blocked = clearance(checker, path) if draws >= _DRAWS_PER_POINT else None
-            if blocked is not None:
-                return blocked
 
-    def draw(random: np.random.Generator) -> ViaPointMotion | Sequence[Violation]:
+class _Attempts:
+    """Random motions, of which some break constraints.
+
+    Attributes:
+        rejected: motions by kind of constraint they break.
+        nearest: the smallest violation of each kind.
+    """
+
+    def __init__(
+        self,
+        limits: JointLimits,
+        home: Array,
+        n_via: int,
+        fly: float,
+        checker: CollisionChecker | None,
+        currents: CurrentModel | None,
+    ) -> None:
+        self._limits = limits
+        self._home = home
+        self._n_via = n_via
+        self._fly = fly
+        self._checker = checker
+        self._currents = currents
+        self._half = (limits.upper - limits.lower) / 2.0 * _RANGE_SHARE
+        self._middle = (limits.upper + limits.lower) / 2.0
+        self.rejected = Counter[str]()
+        self.nearest = dict[str, Violation]()
+
+    def reject(self, violations: Sequence[Violation]) -> None:
+        """Count a motion once per kind of constraint it breaks; update the smallest violations."""
+        for kind in dict.fromkeys(violation.kind for violation in violations):
+            self.rejected[kind] += 1
+            of_kind = [violation for violation in violations if violation.kind == kind]
+            worst = max(of_kind, key=lambda violation: violation.excess)
+            smallest = self.nearest.get(kind, worst)
+            self.nearest[kind] = min(smallest, worst, key=lambda violation: violation.excess)
+
+    def motion(self, random: np.random.Generator) -> ViaPointMotion | Sequence[Violation]:
         """Return a feasible motion, or the violations of an infeasible one."""
-        speed = random.uniform(*_SPEED, limits.n_joints)
-        points = [home]
-        while len(points) <= n_via:
-            point = next_point(random, points[-1], last=len(points) == n_via)
+        speed = random.uniform(*_SPEED, self._limits.n_joints)
+        points = [self._home]
+        while len(points) <= self._n_via:
+            point = self._next_point(random, points[-1], last=len(points) == self._n_via)
             if isinstance(point, Violation):
                 return [point]
             points.append(point)
-        via_points = np.array([*points, home])
+        via_points = np.array([*points, self._home])
         try:
             # in a child, because the solver can crash its process
-            trajectory = plan_in_child(via_points, limits, speed=speed, fly=fly)
+            trajectory = plan_in_child(via_points, self._limits, speed=speed, fly=self._fly)
         except (PlannerCrashed, PlanningError, PlanningTimedOut) as error:
             return [Violation("planning", f"the motion ({error})", 1.0, 0.0, None)]
         if trajectory.duration > _LONGEST:
             return [Violation("duration", "the motion", trajectory.duration, _LONGEST, None)]
-        violations = check_motion(trajectory, limits, checker=checker, currents=currents)
-        return violations or ViaPointMotion(via_points, speed, fly, trajectory)
+        violations = check_motion(
+            trajectory, self._limits, checker=self._checker, currents=self._currents
+        )
+        return violations or ViaPointMotion(via_points, speed, self._fly, trajectory)
 
-    motions = []
-    for k in range(count):
-        for attempt in range(_TRIES_PER_MOTION):
-            motion = draw(np.random.default_rng([_VALIDATION, seed, k, attempt]))
-            if isinstance(motion, ViaPointMotion):
-                motions.append(motion)
-                break
-            reject(motion)
-        else:
-            raise NoFeasibleMotionError(rejected, nearest)
-    return tuple(motions)
+    def _next_point(
+        self, random: np.random.Generator, before: Array, *, last: bool
+    ) -> Array | Violation:
+        """Draw a point with a free path to it, or return a contact after too many draws."""
+        draws = 0
+        while True:
+            point = random.uniform(self._middle - self._half, self._middle + self._half)
+            path = straight_path(before, point)
+            if last:
+                path = np.concatenate((path, straight_path(point, self._home)))
+            if self._checker is None or self._checker.clear(path).all():
+                return point
+            draws += 1
+            blocked = clearance(self._checker, path) if draws >= _DRAWS_PER_POINT else None
+            if blocked is not None:
+                return blocked

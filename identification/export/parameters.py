@@ -17,7 +17,7 @@ from identification.errors import IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
 from identification.export.urdf import not_in_urdf
 from identification.factor.factor import Estimate
-from identification.model.regressor import LINK_SYMBOLS
+from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 
 SCHEMA: Final = "hil-parameters-1"

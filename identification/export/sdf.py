@@ -90,7 +90,9 @@ def drake_torque(text: str, arm: Arm, motion: Motion) -> Array:
     torque = np.empty(motion.position.shape)
     for k, (q, qd, qdd) in enumerate(zip(*motion[1:4], strict=True)):
         position, velocity, acceleration = (np.zeros(len(order)) for _ in range(3))
-        position[order], velocity[order], acceleration[order] = q, qd, qdd
+        position[order] = q
+        velocity[order] = qd
+        acceleration[order] = qdd
         plant.SetPositions(context, position)
         plant.SetVelocities(context, velocity)
         forces = tree.MultibodyForces(plant)

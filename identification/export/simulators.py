@@ -137,7 +137,8 @@ def pinocchio_arm(arm: Arm, name: str) -> pin.Model:
     model.armature[:] = np.diag(arm.rotors)
     model.damping[:] = [row.get("f1", 0.0) for row in arm.friction[: arm.model.n_joints]]
     model.friction[:] = dry
-    model.upperDryFrictionLimit[:], model.lowerDryFrictionLimit[:] = dry, -dry
+    model.upperDryFrictionLimit[:] = dry
+    model.lowerDryFrictionLimit[:] = -dry
     return model
 
 
@@ -418,7 +419,9 @@ def _mujoco_torque(text: str, arm: Arm, motion: Motion, *, friction: bool = Fals
     order = [int(model.joint(name).dofadr[0]) for name in arm.model.joint_names]
     torque = np.empty(motion.position.shape)
     for k, (q, qd, qdd) in enumerate(zip(*motion[1:4], strict=True)):
-        data.qpos[order], data.qvel[order], data.qacc[order] = q, qd, qdd
+        data.qpos[order] = q
+        data.qvel[order] = qd
+        data.qacc[order] = qdd
         mujoco.mj_inverse(model, data)
         torque[k] = data.qfrc_inverse[order]
     return torque

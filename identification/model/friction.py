@@ -338,7 +338,8 @@ def presliding_state(position: Array, distance: float) -> Array:
     value = 0.0
     for start, stop, s, origin in zip(starts, stops, signs, before, strict=True):
         part = s + (value - s) * np.exp((origin - travel[start:stop]) / distance)
-        state[start:stop], value = part, part[-1]
+        state[start:stop] = part
+        value = part[-1]
     return state
 
 

@@ -115,8 +115,8 @@ class Chain:
     translation: Array  # origin of joint frame i in its parent's frame [m], shape (n, 3)
     axis: Array  # unit joint axis in the joint's own frame, shape (n, 3)
     revolute: NDArray[np.bool_]  # False for prismatic joints, shape (n,)
-    # nominal parameters of each link (:data:`identification.model.regressor.LINK_SYMBOLS`) in the
-    # joint frame, shape (n, 10)
+    # nominal parameters of each link (:data:`identification.model.link_wrenches.LINK_SYMBOLS`) in
+    # the joint frame, shape (n, 10)
     inertial: Array
     # of all links of the description by name, fixed ones included
     frames: dict[str, LinkFrame] = field(default_factory=dict, repr=False)

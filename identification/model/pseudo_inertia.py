@@ -1,7 +1,7 @@
 r"""The pseudo-inertia of a body, which is positive definite for consistent inertial parameters.
 
 For inertial parameters about a frame (tensor I, first moment h = mc, mass m; in the order of
-:data:`identification.model.regressor.LINK_SYMBOLS`)
+:data:`identification.model.link_wrenches.LINK_SYMBOLS`)
 
 .. math:: J = \begin{bmatrix} \Sigma & h \\ h^T & m \end{bmatrix}, \qquad
           \Sigma = \tfrac{1}{2}\,\mathrm{tr}(I)\,1 - I

@@ -17,8 +17,9 @@ from identification.model.coupling import Coupling
 from identification.model.elements import Element, ElementError, JointElements, TorqueRipple
 from identification.model.friction import OFFSET, FrictionLaw, JointFriction
 from identification.model.kinematics import Chain, chain_from_urdf
+from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.payload import Load, Payload
-from identification.model.regressor import LINK_SYMBOLS, Regressor, RegressorPlan, joint_arrays
+from identification.model.regressor import Regressor, RegressorPlan, joint_arrays
 
 Array = NDArray[np.float64]
 Places = NDArray[np.intp]

@@ -111,7 +111,8 @@ def _gains_at(stretches: Sequence[Stretch], delay: float, step: float) -> tuple[
         size = np.linalg.norm(columns, axis=0)
         size[size == 0.0] = 1.0
         gains = np.linalg.lstsq(columns / size, torque[:, joint], rcond=None)[0] / size
-        kp[joint], kd[joint] = gains[0], max(0.0, float(gains[1]))
+        kp[joint] = gains[0]
+        kd[joint] = max(0.0, float(gains[1]))
         residual = torque[:, joint] - columns @ gains
         left += float(residual @ residual) / max(float(torque[:, joint] @ torque[:, joint]), 1e-300)
     return left, Servo(kp, kd, delay)

@@ -251,10 +251,12 @@ def smooth(
         at = time - options.torque_delay
         position[segment] = spline(at)
         if speed is None:
-            velocity[segment], acceleration[segment] = spline(at, 1), spline(at, 2)
+            velocity[segment] = spline(at, 1)
+            acceleration[segment] = spline(at, 2)
         else:
             slope = spline_of(time, speed[segment], None)
-            velocity[segment], acceleration[segment] = slope(at), slope(at, 1)
+            velocity[segment] = slope(at)
+            acceleration[segment] = slope(at, 1)
         if len(time) > longest:
             longest = len(time)
             bandwidth = spline.bandwidth

@@ -20,6 +20,9 @@ def text(name: str) -> str:
     return (ROOT / name).read_text("utf-8")
 
 
+VERSIONS = re.findall(r"^## (\S+)( \(unreleased\))?$", text("CHANGELOG.md"), re.MULTILINE)
+
+
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "ARCHITECTURE.md", ROOT / "CONTRIBUTING.md"],
                          ids=lambda page: page.name)  # fmt: skip
 def test_no_row_of_a_table_fills_a_screen(page: Path) -> None:
@@ -48,9 +51,14 @@ def test_contributing_fits_on_two_pages_and_names_every_tier() -> None:
         assert tier in page
 
 
-def test_the_citation_is_of_this_version_and_names_the_paper() -> None:
+def test_the_version_is_that_at_the_top_of_the_changelog() -> None:
+    number, unreleased = VERSIONS[0]
+    assert PROJECT["version"] == (f"{number}.dev0" if unreleased else number)
+
+
+def test_the_citation_is_of_the_newest_release_and_the_paper() -> None:
     citation = yaml.safe_load(text("CITATION.cff"))
-    assert citation["version"] == PROJECT["version"]
+    assert citation["version"] == next(number for number, unreleased in VERSIONS if not unreleased)
     assert citation["license"] == PROJECT["license"]
     (paper,) = citation["references"]
     assert paper["authors"][0]["family-names"] == "Villagrossi" and paper["year"] == 2014

@@ -20,7 +20,7 @@ from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import Factor, estimate, joint_weights
 from identification.selection.essential import Elimination, choose_essential
 from identification.selection.settings import Strength
-from identification.validation.plausibility import ConsistencyCheck, check_consistency
+from identification.validation.consistency import ConsistencyCheck, check_consistency
 from tests.identification.two_link import simulated, sine_motion, values_of
 
 Array = NDArray[np.float64]

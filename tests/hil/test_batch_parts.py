@@ -8,6 +8,9 @@ import json
 import math
 import os
 import re
+import subprocess
+import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -25,11 +28,19 @@ from hil.batch.cache import HEADER, JSON, NPZ, CacheError, CacheLocation, code_d
 from hil.batch.cluster import SkippedArchive
 from hil.batch.discovery import ArchiveRef, arm_digest
 from hil.batch.estimates import Arm
-from hil.batch.reduction import cached_reduction, reduction_key, settings_digest
+from hil.batch.reduction import (
+    _matrices,
+    _triangles,
+    cached_reduction,
+    reduction_key,
+    settings_digest,
+)
 from hil.batch.run import PARTITION, BatchResult, _Campaign
 from hil.batch.table import COLUMNS, write_tables
+from hil.batch.thread import ThreadClient
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, TorsionSpringTable
+from identification.factor.factor import Factor
 from identification.selection.settings import Choice, Settings, Strength
 from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
@@ -58,6 +69,61 @@ def test_partitions_do_not_depend_on_the_order_of_archives(order):
     partitions = _Campaign(refs[0].key, refs).partitions
     assert [len(part) for part in partitions] == [PARTITION, PARTITION, 40 - 2 * PARTITION]
     assert [ref.index for part in partitions for ref in part] == list(range(40))
+
+
+def test_sums_are_stored_without_loss_and_block_by_block():
+    """In another order reading takes five times as long."""
+    rows = np.random.default_rng(1).normal(size=(3, 4, 9))
+    columns = (np.array([0, 1, 2]), np.array([1]))
+    grams = tuple(rows[:, :k] @ rows[:, :k].transpose(0, 2, 1) for k in (4, 2))
+    factor = Factor(grams, columns, np.full((3, 2), 9), ("a", "b", "c"))
+    triangles = _triangles(factor)
+    assert triangles.shape == (3, 10 + 3)
+    assert triangles.flags.c_contiguous
+    for matrices, expected in zip(_matrices(triangles, columns), grams, strict=True):
+        np.testing.assert_array_equal(np.triu(matrices), np.triu(expected))
+        np.testing.assert_array_equal(matrices, matrices.transpose(0, 2, 1))
+
+
+class TestThread:
+    """In place of Dask, for few archives."""
+
+    def test_does_not_import_dask(self):
+        """Which takes half a second."""
+        program = (
+            "import sys\n"
+            "from hil.batch.cluster import Cluster, Task\n"
+            "with Cluster() as cluster:\n"
+            "    print(cluster.results([Task('a', abs, (-3,))]), 'distributed' in sys.modules)"
+        )
+        ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+        assert ran.stdout == "[3] False\n", ran.stderr
+
+    def test_executes_in_order_and_passes_results_on(self):
+        client = ThreadClient()
+        three = client.submit(abs, -3, key="three", pure=False)
+        five = client.submit(max, [three, 5], key="five", pure=False)
+        assert client.submit(pow, three, five, key="power", pure=False).result() == 243
+        assert (three.key, three.status, three.result()) == ("three", "finished", 3)
+        client.close()
+
+    def test_an_error_is_that_of_the_task_and_of_those_that_need_it(self):
+        client = ThreadClient()
+        failed = client.submit(int, "three", key="failed", pure=False)
+        for future in (failed, client.submit(abs, failed, key="needs it", pure=False)):
+            assert isinstance(future.exception(), ValueError)
+            assert future.status == "error"
+        client.close()
+
+    def test_is_waited_for_when_closed_and_begins_no_other_task(self):
+        begun, go = threading.Event(), threading.Event()
+        client = ThreadClient()
+        first = client.submit(lambda: begun.set() or go.wait(), key="first", pure=False)
+        second = client.submit(abs, 1, key="second", pure=False)
+        begun.wait()
+        threading.Timer(0.05, go.set).start()
+        client.close()
+        assert (first.done(), second.done()) == (True, False)
 
 
 class TestCache:

@@ -35,7 +35,8 @@ from hil.look.run import SETTINGS
 from identification.estimators.delay import DelayEstimate
 from identification.model.robot import RobotModel
 from identification.signals.samples import prepare
-from identification.validation.readings import Axes, Change, Score, compare, score_of
+from identification.validation.reading_changes import Axes, Change
+from identification.validation.reading_scores import Score, compare, score_of
 from tests.hil.simulated_logs import write_log, write_moving_log
 from tests.hil.test_importers_rosbag2 import STATE, bag, state, states
 from tests.hil.test_log_kinds import JOINTS, URDF

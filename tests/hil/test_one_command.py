@@ -26,7 +26,7 @@ from hil.importers.proposal import proposed_map
 from hil.importers.recording import ImportOptions, import_recording
 from hil.output_folder import SOURCES, folder_beside, sources_text
 from hil.recordings import open_recording
-from identification.validation.plausibility import position_jumps
+from identification.validation.position_jumps import position_jumps
 from tests.hil.simulated_logs import urdf_path, write_moving_log
 from tests.hil.simulated_logs import write_log as log
 from tests.hil.test_bag_kinds import WHOLE

@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 
 from identification import ShapeError
 from identification.excitation import Box, CollisionChecker, Workspace
-from identification.excitation.collision import link_bodies
+from identification.excitation.collision_bodies import link_bodies
 from planner import FourierSeries, JointLimits, PiecewiseCubic, plan
 from sim_fixtures.ns16 import urdf_text
 from tests.hil.simulated_logs import urdf_path

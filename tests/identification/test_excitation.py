@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from identification.excitation import CRITERIA, validation_motions
-from identification.excitation.collision import CollisionChecker, Workspace
+from identification.excitation.collision import CollisionChecker
+from identification.excitation.collision_bodies import Workspace
 from identification.excitation.constraints import (
     SAMPLE_PERIOD,
     Constraints,

@@ -16,7 +16,8 @@ import pytest
 
 from identification.errors import ModelError, ShapeError
 from identification.estimators.consistent import consistent_estimate
-from identification.excitation.collision import CollisionChecker, Workspace
+from identification.excitation.collision import CollisionChecker
+from identification.excitation.collision_bodies import Workspace
 from identification.excitation.errors import CollisionModelError
 from identification.export.arm import Arm, Ranges
 from identification.export.friction import friction_curve, median_load

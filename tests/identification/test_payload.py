@@ -8,7 +8,8 @@ import pytest
 
 from identification.errors import IdentificationError, ModelError
 from identification.estimators.gains import identify_gains
-from identification.estimators.payload import NAMES, PayloadError, Run, identify_payload
+from identification.estimators.payload import NAMES, PayloadError, identify_payload
+from identification.estimators.payload_problem import Run
 from identification.factor.columns import gain_factor
 from identification.model.friction import FrictionLaw
 from identification.model.payload import Load, Payload

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from identification import Recording, RobotModel
 from identification.signals.samples import Preprocessing, prepare
-from identification.validation.readings import Change, Step, find_readings
+from identification.validation.reading_changes import Change
+from identification.validation.readings import Step, find_readings
 
 Floats = NDArray[np.float64]
 NAMES = ("hip", "knee", "ankle")

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from identification.estimators.payload import NAMES, Run, identify_payload
+from identification.estimators.payload import NAMES, identify_payload
+from identification.estimators.payload_problem import Run
 from identification.estimators.torque_scale import (
     described,
     scale_covariance,

@@ -1,4 +1,4 @@
-"""Prediction errors, intervals of held-out torque, patterns of residuals, and plausibility."""
+"""Prediction errors, intervals of held-out torque, patterns of residuals, signs, consistency."""
 
 from dataclasses import replace
 from functools import cache, partial
@@ -30,17 +30,11 @@ from identification.signals.masks import EDGE, SATURATED, STANDSTILL, RowMask
 from identification.signals.recording import Recording
 from identification.validation.calibration import TorqueMeans, calibrate, inner_errors
 from identification.validation.changes import find_changes
+from identification.validation.consistency import check_consistency
 from identification.validation.evidence import repetition_noise
-from identification.validation.plausibility import (
-    Implausible,
-    check_consistency,
-    implausibilities,
-    inertia_matrices,
-    inertia_ratio,
-    nominal_scale,
-    position_jumps,
-    position_steps,
-)
+from identification.validation.nominal_scale import inertia_matrices, inertia_ratio, nominal_scale
+from identification.validation.physical_signs import Implausible, implausibilities
+from identification.validation.position_jumps import position_jumps, position_steps
 from identification.validation.prediction import (
     PredictionError,
     pooled_error,

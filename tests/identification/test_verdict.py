@@ -15,11 +15,14 @@ from identification.model.motion import Motion
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.text import percentage
-from identification.validation.causes import Cause, Fault, Kind, find_causes
+from identification.validation.causes import Cause, find_causes
 from identification.validation.changes import Change
-from identification.validation.evidence import CarriedLoad, CellContext, Evidence, gather
+from identification.validation.evidence import CellContext, Evidence, gather
+from identification.validation.faults import Fault, Kind
 from identification.validation.finding import Thresholds
-from identification.validation.plausibility import Dissipation, Implausible, NominalScale
+from identification.validation.gravity import CarriedLoad
+from identification.validation.nominal_scale import NominalScale
+from identification.validation.physical_signs import Dissipation, Implausible
 from identification.validation.prediction import PredictionError
 from identification.validation.residuals import (
     HARMONICS,

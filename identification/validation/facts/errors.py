@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.text import percentage
+from identification.validation.consistency import ELEMENTS
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Mask, Naming, Thresholds, little_torque
-from identification.validation.plausibility import ELEMENTS
 
 Array = NDArray[np.float64]
 

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.text import percentage
-from identification.validation.causes import Cause, Kind
+from identification.validation.causes import Cause
 from identification.validation.evidence import Evidence
 from identification.validation.facts.scale import SignFacts
+from identification.validation.faults import Kind
 from identification.validation.finding import Finding, Mask, Naming, Thresholds
 
 Array = NDArray[np.float64]

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.validation.consistency import ELEMENTS
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Mask, Naming
-from identification.validation.plausibility import ELEMENTS
 
 Array = NDArray[np.float64]
 

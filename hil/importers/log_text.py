@@ -1,0 +1,91 @@
+"""Text of a log, in any usual encoding, or what a file is instead."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Final
+
+from hil.errors import SourceError
+from hil.importers.arrays import READERS
+from hil.importers.column_map import Format
+from hil.reading import open_file, read_text, remedy_for_missing
+
+_ROSTOPIC = "%time,"  # of `rostopic echo -p`
+_LONGEST: Final = 1 << 31  # bytes; several times as many in memory
+# Cells in apostrophes, or as spreadsheets protect text: ="0.5".
+_OTHER_QUOTES: Final = re.compile(r"""(?<![^\s,;|])(?:'([^'"\n]*)'|="([^"\n]*)")(?![^\s,;|])""")
+_LONGEST_MARK: Final = 100  # bytes that are read for a mark
+_OF_PANDAS: Final = "save its table with pandas: {}(FILE).to_parquet('log.parquet')"
+_BINARY: Final = {
+    b"PK\x03\x04": ("a spreadsheet or a zip file", "save the sheet as CSV, or unpack the file"),
+    b"\xd0\xcf\x11\xe0": ("an Excel file", "save the sheet as CSV"),
+    b"\x1f\x8b": ("compressed by gzip", "unpack it: gunzip FILE"),
+    b"\x28\xb5\x2f\xfd": ("compressed by zstd", "unpack it: unzstd FILE"),
+    b"\x89HDF\r\n": (
+        "HDF5",
+        "save its arrays, of h5py.File(FILE) as f, by names of your choice: "
+        "numpy.savez('log.npz', t=f['t'], q=f['q'], tau=f['tau'])",
+    ),
+    b"ARROW1": ("Feather", _OF_PANDAS.format("pandas.read_feather")),
+    b"\x80\x03": ("a pickle of Python", _OF_PANDAS.format("pandas.read_pickle")),
+    b"\x80\x04": ("a pickle of Python", _OF_PANDAS.format("pandas.read_pickle")),
+    b"\x80\x05": ("a pickle of Python", _OF_PANDAS.format("pandas.read_pickle")),
+    b"PAR1": ("Parquet", "let its name end in .parquet"),
+    b"\x93NUMPY": ("an array of numpy", "let its name end in .npy"),
+    b"MATLAB": ("MATLAB's format", "let its name end in .mat"),
+    b"\x89MCAP0": ("MCAP", "let its name end in .mcap"),
+    b"#ROSBAG": ("a bag of ROS 1", "let its name end in .bag"),
+    b"SQLite format 3": ("a database, as bags of ROS 2 are", "let its name end in .db3"),
+}
+"""Formats by the bytes at their start, each with a remedy."""
+_MARKUP: Final = re.compile(r"\ufeff?\s*(<[?!A-Za-z]|[{\[]\s*[\"{\[]|(?:---\s+)?header:\s)")
+
+
+def _not_a_table(path: Path, text: str) -> SourceError:
+    """Return the error for XML, JSON or YAML in place of rows."""
+    start = text.lstrip("\ufeff \t\r\n")
+    if not start.startswith("<"):
+        is_json = start[0] in "{["
+        problem = f"is {'JSON' if is_json else 'YAML of messages'}, not a table of numbers"
+        remedy = "give a table of numbers (CSV), .npz, .mat, .parquet or a bag"
+        if not is_json:
+            remedy = "give the bag, or a table of its joint states (CSV)"
+        return SourceError(path, problem, remedy=remedy)
+    if "<robot" in text:
+        remedy = f"give the recording first: LOG --urdf {path.name}"
+        return SourceError(path, "is a robot description (URDF), not a recording", remedy=remedy)
+    remedy = "give a table of numbers (CSV), .npz, .mat, .parquet or a bag"
+    return SourceError(path, "is XML, not a table of numbers", remedy=remedy)
+
+
+def _refuse_binary(path: Path) -> None:
+    """Raise SourceError for a file of a format that is no text, whatever its suffix."""
+    with open_file(path) as stream:
+        start = stream.read(_LONGEST_MARK)
+    for mark, (kind, remedy) in _BINARY.items():
+        if start.startswith(mark):
+            raise SourceError(path, f"is {kind}, not text", remedy=remedy)
+
+
+def text_of(path: Path, form: Format) -> str:
+    """Return the text of a file in any usual encoding.
+
+    Raises:
+        SourceError: it cannot be read, or has another format than a table.
+    """
+    try:
+        _refuse_binary(path)
+        text = read_text(path, _LONGEST, encoding=form.encoding, or_latin=True)
+    except (OSError, ValueError, LookupError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        problem = f"cannot be read ({reason})"
+        remedy = f"name a text file, or one that ends in {', '.join(READERS)}"
+        if isinstance(error, FileNotFoundError):
+            remedy = remedy_for_missing(path, remedy)
+        raise SourceError(path, problem, remedy=remedy) from error
+    text = text.removeprefix("%") if text.startswith(_ROSTOPIC) else text  # a header there
+    text = _OTHER_QUOTES.sub(r'"\1\2"', text) if "'" in text or '="' in text else text
+    if _MARKUP.match(text):
+        raise _not_a_table(path, text)
+    return text

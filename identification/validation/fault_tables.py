@@ -1,0 +1,174 @@
+"""Columns in which faults of recordings are linear, as sums of products by joint and block."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.model.link_wrenches import LINK_SYMBOLS
+from identification.model.regressor import RegressorPlan
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.validation.faults import Fault
+
+Array = NDArray[np.float64]
+
+_MOST_ROWS: Final = 3000  # of all recordings together
+BLOCKS: Final = 10  # of all recordings together
+FOLDS: Final = 5
+_LOAD: Final = len(LINK_SYMBOLS)
+
+
+@dataclass(frozen=True, eq=False)
+class FaultTables:
+    """Sums of products of columns over the rows of B blocks, joint by joint.
+
+    Columns: parameters (p), payload (10), rate of the predicted torque, friction in proportion to
+    the load, torques of all joints (n).
+    """
+
+    gram: Array  # (B, n, q, q)
+    rows: NDArray[np.intp]  # usable rows (B, n)
+    recording: NDArray[np.intp]  # index of the recording of each block (B,)
+    start: Array  # start time of each since its recording began (B,) [s]
+    n_parameters: int  # p
+
+    @property
+    def width(self) -> int:
+        """Number q of columns."""
+        return int(self.gram.shape[-1])
+
+    @property
+    def torques(self) -> Array:
+        """The measured torque of each joint as a combination of the columns (n, q)."""
+        n = self.gram.shape[1]
+        return np.eye(n, self.width, self.width - n)
+
+    @cached_property
+    def of_parameters(self) -> Array:
+        """Sums over the columns of the parameters (B, n, p, p)."""
+        return np.ascontiguousarray(self.gram[..., : self.n_parameters, : self.n_parameters])
+
+    @cached_property
+    def by_fold(self) -> Array:
+        """The same of each fold (F, n, p, p)."""
+        return folded(self.of_parameters)
+
+    @classmethod
+    def of(cls, model: RobotModel, recordings: Sequence[Samples], values: Array) -> FaultTables:
+        """Reduce some thousand rows."""
+        count = -(-BLOCKS // len(recordings))
+        step = row_step(recordings, _MOST_ROWS)
+        grams = []
+        rows = []
+        starts = []
+        for samples in recordings:
+            some = np.arange(step // 2, len(samples.torque), step)
+            tables = _tables(model, samples, values, some)
+            edges = np.linspace(0, len(some), count + 1).round().astype(int)
+            usable = samples.usable[some]
+            tables *= usable.T[:, :, None]
+            for a, b in pairwise(edges):
+                block_rows = tables[:, a:b]
+                grams.append(np.swapaxes(block_rows, 1, 2) @ block_rows)
+                rows.append(np.count_nonzero(usable[a:b], axis=0))
+                starts.append(samples.motion.time[some[a]] - samples.motion.time[0] if a else 0.0)
+        recording = np.repeat(np.arange(len(recordings)), count)
+        return cls(np.array(grams), np.array(rows), recording, np.array(starts), model.n_parameters)
+
+
+def row_step(recordings: Sequence[Samples], rows: int) -> int:
+    """Return the step with which all recordings together have about these rows."""
+    return max(1, sum(len(samples.torque) for samples in recordings) // rows)
+
+
+def _tables(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.intp]) -> Array:
+    """Return the columns of some rows of each joint (n, k, q)."""
+    n = model.n_joints
+    p = model.n_parameters
+    payload = RegressorPlan.of_bodies(model.chain, model.gravity, n - 1)
+    filtered = samples.torque_bandwidth is not None or samples.parent is not None
+    part = np.arange(len(samples.torque)) if filtered else some
+    motion = samples.motion.rows(part)
+    loads = payload.evaluate(*motion[1:4]).blocks
+    if filtered:
+        blocks, columns = samples.regressor(model)
+        blocks = tuple(block[some] for block in blocks)
+        loads = tuple(samples.as_measured(j, block)[some] for j, block in enumerate(loads))
+    else:
+        blocks, columns = model.regressor(*motion[1:])
+    tables = np.zeros((n, len(some), p + _LOAD + 2 + n))
+    for j in range(n):
+        tables[j][:, columns[j]] = blocks[j]
+        tables[j][:, p + payload.columns[j]] = loads[j]
+    tables[:, :, p + _LOAD] = _rate(model, samples, values, some).T
+    tables[:, :, p + _LOAD + 1] = _load_friction(model, samples, values, part, some).T
+    tables[:, :, -n:] = samples.torque[some]
+    return tables
+
+
+def _rate(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.intp]) -> Array:
+    """Return the rate of the predicted torque (k, n) in some rows, from their neighbours."""
+    after = np.minimum(some + 1, len(samples.torque) - 1)
+    before = np.maximum(some - 1, 0)
+    now, first, last = (samples.motion.rows(rows) for rows in (some, before, after))
+    direction = now.direction
+    if direction is None:
+        direction = model.friction.direction(*now[:3])
+    low, high = (model.torque(values, *motion[1:4], direction) for motion in (first, last))
+    return np.asarray((high - low) / np.maximum(last.time - first.time, 1e-9)[:, None])
+
+
+def _load_friction(
+    model: RobotModel,
+    samples: Samples,
+    values: Array,
+    part: NDArray[np.intp],
+    some: NDArray[np.intp],
+) -> Array:
+    """Return the transmitted torque against the direction of motion (k, n) in some rows.
+
+    `part` are the rows that a filter of the torque needs.
+    """
+    motion = samples.motion.rows(part)
+    direction = motion.direction
+    if direction is None:
+        direction = model.friction.direction(*motion[:3])
+    load = np.abs(model.gear_torque(values, *motion[1:4])) * direction[:, : model.n_joints]
+    if len(part) == len(some):
+        return np.asarray(load)
+    columns = [samples.as_measured(j, load[:, j : j + 1])[some] for j in range(model.n_joints)]
+    return np.hstack(columns)
+
+
+def folded(blocks: Array) -> Array:
+    """Return the sum of every fifth block (F, ...) of B (B, ...)."""
+    return np.array([blocks[k::FOLDS].sum(axis=0) for k in range(FOLDS)])
+
+
+def columns_of_fault(tables: FaultTables, model: RobotModel, values: Array, fault: Fault) -> Array:
+    """Return the columns of a fault as combinations of those of a table (B, n, q, r)."""
+    blocks, n, width, _ = tables.gram.shape
+    p = model.n_parameters
+    joints = list(fault.joints or range(model.n_joints))
+    count = {"payload": _LOAD, "changed arm": p, "load friction": n}.get(fault.kind, 1)
+    columns = np.zeros((n, width, count))
+    if fault.kind == "delay":
+        columns[joints, p + _LOAD, 0] = -1.0
+    elif fault.kind == "load friction":
+        columns[joints, p + _LOAD + 1, joints] = 1.0
+    elif fault.kind == "payload":
+        columns[:, p : p + _LOAD] = np.eye(_LOAD)
+    elif fault.kind == "changed arm":
+        columns[:, :p] = np.eye(p)
+    else:
+        friction = fault.kind == "changed friction"
+        columns[joints, :p, 0] = values * model.friction_columns if friction else values
+    mask = np.ones(blocks) if fault.part is None else np.array(fault.part.blocks, dtype=np.float64)
+    return np.asarray(mask[:, None, None, None] * columns)

@@ -1,0 +1,205 @@
+"""Steps of a measured position that an arm cannot make, such as lost encoder counts.
+
+They depart from the steps beside them, and later steps do not reverse them. Departures common to
+the other joints are errors of the clock and are subtracted first. Samples that the log repeats, or
+has late, are recognised by their place on the path of the motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.signals.recording import GAP_STEPS, Recording
+
+Array = NDArray[np.float64]
+
+
+_ROWS_AT_ONCE: Final = 50_000  # that are searched for steps
+_STANDS_OUT: Final = 15.0  # robust standard deviations of a jump
+# The same relative to the frequent large departures (starts, stops, reversals).
+_USUAL: Final = 20  # departures
+_BEYOND_USUAL: Final = 3.0
+# Acceleration within one step of the clock; robots reach a fifth of it.
+_FASTEST: Final = 150.0  # rad/s² or m/s²
+_BESIDE: Final = 4  # steps to either side
+# Standard deviations by which other joints must move for a missing row to be visible.
+_SHOWS: Final = 5.0
+_MOVES: Final = 3.0  # multiples of the usual departure of a joint that moves
+_OFTEN: Final = 3  # departures by a whole step that an encoder does not repeat by chance
+_ON_PATH: Final = 0.25  # distance from the extrapolated path, as a share of the step
+_WHOLE: Final = 0.15  # tolerance of departures by whole steps of the motion, as a share of a step
+# Resolutions by which rounding moves a step: one at its ends, half of one in the speed beside it.
+_ROUNDED: Final = 1.5
+_NORMAL: Final = 1.4826  # standard deviation over median absolute value
+
+
+@dataclass(frozen=True)
+class PositionJump:
+    """One impossible step of a position."""
+
+    recording: str
+    joint: str
+    time: float  # of the sample after the step [s], since the recording began
+    size: float  # [rad or m], without the motion
+
+
+class PositionSteps(NamedTuple):
+    """Lasting steps of the measured positions of a recording that the motion does not have."""
+
+    jumps: tuple[PositionJump, ...]  # of a position, by joint and time
+    logged: tuple[PositionJump, ...]  # of the log: samples repeated or late, rows missing
+
+
+def position_jumps(recording: Recording, name: str = "the recording") -> list[PositionJump]:
+    """Return lasting steps of the measured positions of a named recording, by joint and time."""
+    return list(position_steps(recording, name).jumps)
+
+
+def position_steps(recording: Recording, name: str = "the recording") -> PositionSteps:
+    """Return lasting steps of the positions of a named recording, apart from those of its log."""
+    jumps: list[PositionJump] = []
+    logged: list[PositionJump] = []
+    rounded = _ROUNDED * np.array([_resolution(column) for column in recording.position.T])
+    for parts in _pieces(recording):
+        steps = _steps_of(recording, parts, name, rounded)
+        jumps += steps.jumps
+        logged += steps.logged
+    return PositionSteps(tuple(jumps), tuple(logged))
+
+
+def _pieces(recording: Recording) -> Iterator[list[slice]]:
+    """Yield stretches without a gap, together some `_ROWS_AT_ONCE` rows, with the row before."""
+    parts: list[slice] = []
+    for segment in recording.segments():
+        for start in range(segment.start, segment.stop, _ROWS_AT_ONCE):
+            stop = min(start + _ROWS_AT_ONCE, segment.stop)
+            first = max(segment.start, start - 1)
+            if stop - first <= 2 * _BESIDE + 2:
+                continue
+            parts.append(slice(first, stop))
+            if sum(part.stop - part.start for part in parts) >= _ROWS_AT_ONCE:
+                yield parts
+                parts = []
+    if parts:
+        yield parts
+
+
+def _steps_of(
+    recording: Recording, parts: Sequence[slice], name: str, rounded: Array
+) -> PositionSteps:
+    """Return the lasting steps within stretches of a recording, larger than by rounding (n,)."""
+    time = recording.time
+    position = recording.position
+    pieces = [_departures(time[part], position[part]) for part in parts]
+    departure, speed, change = map(np.concatenate, zip(*pieces, strict=True))
+    steps = np.concatenate([np.diff(time[part]) for part in parts])[:, None]
+    after = np.concatenate([np.arange(part.start + 1, part.stop) for part in parts])
+    departure, shown = _without_clock(departure, speed, steps)
+    size = np.abs(departure)
+    spread = _NORMAL * np.median(size, axis=0)
+    usual = np.partition(size, -_USUAL, axis=0)[-_USUAL] if len(size) > 10 * _USUAL else 0.0
+    least = np.maximum(np.maximum(_STANDS_OUT * spread, _BEYOND_USUAL * usual), _FASTEST * steps**2)
+    least = np.maximum(least, rounded)
+    # Missing or repeated rows cause departures by whole steps of the motion, also beside a gap.
+    motion_step = speed * np.median(steps)
+    count = np.clip(
+        np.rint(departure / np.where(motion_step == 0.0, np.inf, motion_step)), -1.0, GAP_STEPS
+    )
+    apart = np.abs(departure - count * motion_step)
+    whole = apart < np.maximum(least, _WHOLE * np.abs(motion_step))
+    suspect = (size - 0.5 * change > least) & (shown | ~whole)
+    lasting = np.zeros_like(suspect)
+    for joint, k in np.argwhere(suspect.T):
+        around = departure[max(0, k - _BESIDE) : k + _BESIDE + 1, joint]
+        # Otherwise the steps beside it reverse it.
+        lasting[k, joint] = np.abs(around.sum()) > 0.5 * size[k, joint]
+    by_whole_steps = (count != 0.0) & (apart < _WHOLE * np.abs(motion_step))
+    often = np.count_nonzero(lasting & by_whole_steps) >= _OFTEN
+    moving = np.abs(motion_step) > _MOVES * spread
+    together = np.count_nonzero(_nearby(lasting) & moving, axis=1)
+    every = (together >= 2) & (together > 0.5 * np.count_nonzero(moving, axis=1))
+    jumps: list[PositionJump] = []
+    logged: list[PositionJump] = []
+    for joint, k in np.argwhere(lasting.T):
+        row = int(after[k])
+        jump = float(departure[k, joint])
+        position_jump = PositionJump(
+            name, recording.joint_names[joint], float(time[row] - time[0]), jump
+        )
+        by_log = every[k] or (by_whole_steps[k, joint] and often)
+        tolerance = _ON_PATH * abs(jump) + float(rounded[joint])
+        by_log |= _on_path(time, position[:, joint], row, tolerance)
+        (logged if by_log else jumps).append(position_jump)
+    return PositionSteps(tuple(jumps), tuple(logged))
+
+
+def _nearby(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return where a row or one beside it is marked (m, n)."""
+    padded = np.pad(marked, ((1, 1), (0, 0)))
+    return np.asarray(padded[:-2] | padded[1:-1] | padded[2:])
+
+
+def _resolution(position: Array) -> float:
+    """Return the smallest step of a position (m,), zero if it never moves."""
+    steps = np.abs(np.diff(position))
+    return float(np.min(steps, where=steps > 0.0, initial=np.inf)) if steps.any() else 0.0
+
+
+def _on_path(time: Array, position: Array, row: int, tolerance: float) -> bool:
+    """Return whether a step to a row of a position (m,) begins or ends a frozen value, on its path.
+
+    A sample that repeats the one before it exactly, while the joint moves, was not measured anew.
+    """
+    if position[row] == position[row - 1]:
+        return True
+    first = row - 1
+    while first > 0 and position[first - 1] == position[first]:
+        first -= 1
+    if first == row - 1 or first < _BESIDE or row + _BESIDE >= len(time):
+        return False
+    before = (position[first] - position[first - _BESIDE]) / (time[first] - time[first - _BESIDE])
+    behind = (position[row + _BESIDE] - position[row]) / (time[row + _BESIDE] - time[row])
+    expected = position[first] + 0.5 * (before + behind) * (time[row] - time[first])
+    return bool(abs(position[row] - expected) < tolerance)
+
+
+def _departures(time: Array, position: Array) -> tuple[Array, Array, Array]:
+    """Return how much each step departs from the speed beside it (m - 1, n), and that speed."""
+    steps = np.diff(time)[:, None]
+    speed = np.diff(position, axis=0) / steps
+    padded = np.pad(speed, ((_BESIDE, _BESIDE), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BESIDE + 1, axis=0)
+    # One joint at a time, since the windows are copied.
+    sides = slice(None, _BESIDE), slice(_BESIDE + 1, None)
+    before, after = (
+        np.column_stack([np.median(joint[:, side], axis=-1) for joint in windows.swapaxes(0, 1)])
+        for side in sides
+    )
+    # The mean of both sides' medians follows a steady acceleration and ignores single jumps.
+    usual = 0.5 * (before + after)
+    return (speed - usual) * steps, usual, np.abs(after - before) * steps
+
+
+def _without_clock(departure: Array, speed: Array, steps: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Subtract the time error shown by the other joints from departures (m, n)."""
+    # Departures of zero, at rest, do not measure noise.
+    size = np.abs(departure)
+    noise = np.array(
+        [
+            _NORMAL * np.median(some) if (some := column[column > 0.0]).size else np.inf
+            for column in size.T
+        ]
+    )
+    off = departure / noise
+    rate = speed / noise
+    weight = (rate**2).sum(axis=1, keepdims=True) - rate**2
+    # Time error of the other joints, regularised by one step.
+    error = ((rate * off).sum(axis=1, keepdims=True) - rate * off) / (weight + steps**-2)
+    without = departure - speed * error
+    less = np.where(np.abs(without) < size, without, departure)
+    return less, weight * steps**2 > _SHOWS**2

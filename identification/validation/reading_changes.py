@@ -1,0 +1,238 @@
+"""What a reading changes in a recording: sign, order, unit and zero of joints, mounting."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.model.robot import RobotModel
+from identification.signals.recording import Recording
+from identification.signals.samples import Samples
+from identification.validation.faults import COUPLED, Fault, corrected
+
+Array = NDArray[np.float64]
+Meaning = Literal[
+    "torque sign",
+    "position sign",
+    "axis sign",
+    "torque order",
+    "position order",
+    "joint order",
+    "angle sum",
+    "angle difference",
+    "degrees",
+    "radians",
+    "zero",
+    "no gravity",
+    "mounting",
+]
+DEGREE: Final = np.pi / 180.0
+SIGNS: Final[tuple[Meaning, ...]] = ("torque sign", "position sign", "axis sign")
+IN_ORDER: Final[tuple[Meaning, ...]] = ("torque order", "position order", "joint order")
+_GRAVITIES: Final[tuple[Meaning, ...]] = ("mounting", "no gravity")
+
+
+class Change(NamedTuple):
+    """One difference between a reading and what was recorded.
+
+    `size` is an angle [rad] to add to a position; `name` that of a mounting; `order` the recorded
+    place of each of the joints, by default those of a pair exchanged.
+    """
+
+    meaning: Meaning
+    joints: tuple[int, ...] = ()
+    size: float = 0.0
+    name: str = ""
+    order: tuple[int, ...] = ()
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """The joints in whose place those of `joints` are read, for an order."""
+        return self.order or self.joints[::-1]
+
+
+_AS_READ: Final = Change("position order")
+"""No change: an order of no joints."""
+
+
+def change_of_motion(change: Change) -> Change:
+    """Return the change of the motion that is part of a change, or of a mounting."""
+    if change.meaning in ("torque sign", "torque order"):
+        return _AS_READ
+    if change.meaning == "axis sign":
+        return change._replace(meaning="position sign")
+    if change.meaning.endswith("order"):
+        return Change("position order", change.joints, order=change.places)
+    return change
+
+
+def mounted_model(
+    model: RobotModel, change: Change, mountings: Mapping[str, RobotModel]
+) -> RobotModel:
+    """Return the model with the gravity of a change, by the name of its mounting."""
+    return mountings[change.name] if change.meaning in _GRAVITIES else model
+
+
+def changed_samples(model: RobotModel, samples: Samples, change: Change) -> Samples:
+    """Return samples with signs, orders, unit or zero of the joints changed."""
+    meaning = change.meaning
+    joints = change.joints
+    motion = samples.motion
+    if meaning in _GRAVITIES:
+        return samples
+    if meaning.endswith("order"):
+        return _reordered(model, samples, change)
+    if meaning in ("torque sign", "axis sign", "angle sum", "angle difference"):
+        return corrected(model, samples, Fault(meaning, joints))
+    if meaning == "position sign":
+        turned = corrected(model, samples, Fault("axis sign", joints))
+        return corrected(model, turned, Fault("torque sign", joints))
+    if meaning == "zero":
+        position = motion.position.copy()
+        position[:, list(joints)] += change.size
+        motion = motion._replace(position=position)
+    else:
+        factor = DEGREE if meaning == "degrees" else 1.0 / DEGREE
+        motion = motion._replace(
+            position=factor * motion.position,
+            velocity=factor * motion.velocity,
+            acceleration=factor * motion.acceleration,
+        )
+    return replace(samples, motion=motion, mask=None).with_friction_direction(model)
+
+
+def _reordered(model: RobotModel, samples: Samples, change: Change) -> Samples:
+    """Return samples with joints read from other places."""
+    order = np.array(whole_order(change, model.n_joints))
+    motion = samples.motion
+    torque = samples.torque
+    usable = samples.usable
+    if change.meaning != "torque order":
+        load = None if motion.load is None else motion.load[:, order]
+        motion = motion._replace(
+            position=motion.position[:, order],
+            velocity=motion.velocity[:, order],
+            acceleration=motion.acceleration[:, order],
+            direction=None,
+            load=load,
+        )
+        usable = usable[:, order]
+    if change.meaning != "position order":
+        torque = torque[:, order]
+    result = replace(samples, motion=motion, torque=torque, usable=usable, mask=None)
+    return result.with_friction_direction(model)
+
+
+def order_change(meaning: Meaning, order: tuple[int, ...]) -> Change:
+    """Return the change to a whole order of n joints, with those that move alone."""
+    joints = tuple(joint for joint, place in enumerate(order) if joint != place)
+    return Change(meaning, joints, order=tuple(order[joint] for joint in joints))
+
+
+def whole_order(change: Change, joints: int) -> tuple[int, ...]:
+    """Return the places of all n joints under a change of order."""
+    order = list(range(joints))
+    for joint, place in zip(change.joints, change.places, strict=True):
+        order[joint] = place
+    return tuple(order)
+
+
+def differs(change: Change, other: Change) -> bool:
+    """Whether two changes are not angles of one zero."""
+    is_zero = change.meaning == other.meaning == "zero" and change.joints == other.joints
+    return change != other and not is_zero
+
+
+def kind_of(change: Change) -> tuple[Meaning, tuple[int, ...]]:
+    """Return the meaning of a change, with its joints where each has a sign or a zero of its own.
+
+    All joints are one: an arm that hangs weighs as one that stands, all torques negated.
+    """
+    return change.meaning, change.joints if change.meaning in (*SIGNS, "zero") else ()
+
+
+def alternatives_to(change: Change) -> Iterator[Change]:
+    """Yield the changes that may have the same effect as one that was found."""
+    for kinds in (SIGNS[:2], IN_ORDER):
+        if change.meaning in kinds:
+            yield from (change._replace(meaning=kind) for kind in kinds if kind != change.meaning)
+
+
+class Axes(NamedTuple):
+    """Where the joints of a recording are in what was recorded, and how to convert them.
+
+    A quantity as read is ``sign * recorded[:, order]``; positions are multiplied by `factor`, and
+    `zero` [rad] is added: angles that may each contain that of other joints, ``coupling @ angles``.
+    """
+
+    position_order: NDArray[np.intp]
+    position_sign: Array
+    torque_order: NDArray[np.intp]
+    torque_sign: Array
+    factor: float
+    zero: Array
+    coupling: Array  # (n, n)
+
+    @classmethod
+    def of(cls, changes: Iterable[Change], joints: int) -> Axes:
+        """Return the axes after changes, one after the other."""
+        axes = cls(
+            np.arange(joints), np.ones(joints), np.arange(joints), np.ones(joints), 1.0,
+            np.zeros(joints), np.eye(joints),
+        )  # fmt: skip
+        for change in changes:
+            axes = axes._after(change)
+        return axes
+
+    def _after(self, change: Change) -> Axes:
+        meaning = change.meaning
+        joints = list(change.joints)
+        order = np.arange(len(self.zero))
+        sign = np.ones(len(self.zero))
+        if meaning.endswith("order"):
+            order[joints] = change.places
+        elif meaning.endswith("sign"):
+            sign[joints] = -1.0
+        axes = self
+        if meaning in ("position order", "joint order", "position sign", "axis sign"):
+            axes = axes._replace(
+                position_order=axes.position_order[order],
+                position_sign=axes.position_sign[order] * sign,
+                zero=axes.zero[order] * sign,
+                coupling=axes.coupling[np.ix_(order, order)] * np.outer(sign, sign),
+            )
+        if meaning in ("torque order", "joint order", "torque sign", "axis sign"):
+            axes = axes._replace(
+                torque_order=axes.torque_order[order], torque_sign=axes.torque_sign[order] * sign
+            )
+        if meaning in ("degrees", "radians"):
+            factor = DEGREE if meaning == "degrees" else 1.0 / DEGREE
+            axes = axes._replace(factor=axes.factor * factor, zero=axes.zero * factor)
+        if meaning == "zero":
+            zero = np.zeros(len(self.zero))
+            zero[joints] = change.size
+            axes = axes._replace(zero=axes.zero + axes.coupling @ zero)
+        if meaning in COUPLED:
+            with_other = np.eye(len(self.zero))
+            with_other[change.joints] = 1.0 if meaning == "angle sum" else -1.0
+            axes = axes._replace(coupling=axes.coupling @ with_other)
+        return axes
+
+    def read(self, recording: Recording) -> Recording:
+        """Return a recording as read."""
+        scale = self.factor * self.position_sign
+        uncoupled = np.linalg.inv(self.coupling).T
+        velocity = recording.velocity
+        torque = recording.torque
+        return replace(
+            recording,
+            position=(recording.position[:, self.position_order] * scale + self.zero) @ uncoupled,
+            velocity=None
+            if velocity is None
+            else velocity[:, self.position_order] * scale @ uncoupled,
+            torque=None if torque is None else torque[:, self.torque_order] * self.torque_sign,
+        )

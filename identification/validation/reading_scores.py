@@ -1,0 +1,183 @@
+"""Errors of a reading on blocks predicted from the others, and a comparison of two readings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.estimators.prior import body_prior, posterior_values
+from identification.factor.factor import Factor
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.validation.finding import little_torque
+
+Array = NDArray[np.float64]
+
+DISSIPATES: Final = 4.0  # standard errors of a friction that drives a joint
+_LEAST_FRICTION: Final = 0.02  # of the torque of a joint
+_BLOCKS: Final = 20
+_FOLDS: Final = 5
+# Rows that count as one beside the prior. Where other parts are predicted they are seven in all: a
+# wrong reading needs bodies that no arm has, which a weak prior would allow. Of few rows, all of
+# which are fitted, that would be too few to tell orders of a wrist apart.
+ROWS_PER_FACT: Final = 10.0
+_ROWS_PER_FACT_LEFT_OUT: Final = 100.0
+_POSTURES: Final = 35  # at which the inertia about each axis is evaluated
+_SPEED: Final = 0.9  # quantile of the speed at which friction is judged
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """Errors of predicted blocks under one reading.
+
+    Attributes:
+        squares: squared errors (B, n).
+        torque: squared torque (n,).
+        friction: at a usual speed, over its standard error (n,); negative drives the joint.
+        share: that friction over the RMS torque (n,).
+        columns: of the recorded torque, the one that is read as that of each joint (n,).
+    """
+
+    squares: Array
+    torque: Array
+    friction: Array
+    share: Array
+    columns: NDArray[np.intp]
+
+    @property
+    def relative(self) -> Array:
+        """Errors as shares of the torque (n,)."""
+        torque = np.where(self.torque > 0.0, self.torque, 1.0)
+        return np.asarray(np.sqrt(self.squares.sum(axis=0) / torque))
+
+    @property
+    def overall(self) -> float:
+        """Error over all joints as a share of the torque."""
+        return float(np.sqrt(self.squares.sum() / max(self.torque.sum(), 1e-300)))
+
+    @property
+    def driven(self) -> NDArray[np.bool_]:
+        """Whether friction would drive each joint (n,)."""
+        return (self.friction < -DISSIPATES) & (self.share < -_LEAST_FRICTION)
+
+    @property
+    def joints(self) -> NDArray[np.intp]:
+        """The joint that each recorded column of the torque is read as (n,)."""
+        return np.argsort(self.columns)
+
+
+class Comparison(NamedTuple):
+    """Errors of one reading over those of another: mean over the recorded torques, and of each."""
+
+    ratio: float
+    sigmas: float  # negative if the first is better
+    joints: Array  # (n,) by column of the recorded torque
+
+
+def _factor(model: RobotModel, samples: Samples) -> Factor:
+    index = np.arange(len(samples.torque)) * _BLOCKS // max(1, len(samples.torque))
+    return Factor.of(model, samples, index=index)
+
+
+def score_of(model: RobotModel, samples: Samples, columns: NDArray[np.intp] | None = None) -> Score:
+    """Predict every fifth of `_BLOCKS` blocks of samples from the others.
+
+    `columns` are those of the recorded torque that the joints are read from, by default in order.
+    """
+    columns = np.arange(model.n_joints) if columns is None else columns
+    factor = _factor(model, samples)
+    prior = body_prior(model, factor).gaussian
+    squares = np.zeros((len(factor), factor.n_joints))
+    weights: Array | None = None
+    estimates: list[Array] = []
+    for fold in range(_FOLDS):
+        left_out = np.arange(len(factor)) % _FOLDS == fold
+        values, weights = posterior_values(
+            factor.without(left_out), prior, _ROWS_PER_FACT_LEFT_OUT, weights
+        )
+        estimates.append(values)
+        squares[left_out] = _squares(factor, values, left_out)
+    friction = np.array(estimates) @ _friction_columns(model, samples).T
+    deviation = np.sqrt((_FOLDS - 1) * friction.var(axis=0))
+    torque = factor.gram[:, -1, -1]
+    rms = np.maximum(np.sqrt(torque / np.maximum(factor.samples, 1)), 1e-300)
+    mean = friction.mean(axis=0)
+    return Score(squares, torque, mean / np.maximum(deviation, 1e-300), mean / rms, columns)
+
+
+def inertial_torque(model: RobotModel, samples: Samples) -> Array:
+    """Return the torque of each joint's own RMS acceleration (n,) [N·m or N], by a fit.
+
+    It is negative where the fit has a negative inertia about the axis.
+    """
+    factor = Factor.of(model, samples)
+    prior = body_prior(model, factor).gaussian
+    values = posterior_values(factor, prior, ROWS_PER_FACT)[0]
+    motion = samples.motion
+    position = motion.position[:: max(1, len(motion.position) // _POSTURES)]
+    still = np.zeros_like(position)
+    weight = model.torque(values, position, still, still)
+    units = np.eye(model.n_joints)
+    inertia = np.array(
+        [
+            np.mean(
+                model.torque(values, position, still, still + unit)[:, joint] - weight[:, joint]
+            )
+            for joint, unit in enumerate(units)
+        ]
+    )
+    acceleration = np.sqrt(np.mean(motion.acceleration**2, axis=0))
+    return np.asarray(inertia * acceleration)
+
+
+def _squares(factor: Factor, values: Array, blocks: slice | NDArray[np.bool_]) -> Array:
+    """Return the squared errors of parameters in some blocks (B, n)."""
+    squares = []
+    for gram, columns in zip(factor.matrices, factor.columns, strict=True):
+        residual = np.append(-values[columns], 1.0)
+        squares.append((gram[blocks] @ residual) @ residual)
+    return np.asarray(np.maximum(np.column_stack(squares), 0.0))
+
+
+def _friction_columns(model: RobotModel, samples: Samples) -> Array:
+    """Return the friction of each joint at a usual speed as a sum of the parameters (n, p)."""
+    speed = np.quantile(np.abs(samples.motion.velocity), _SPEED, axis=0)
+    columns = np.zeros((model.n_joints, model.n_parameters))
+    for place, (_, term, joint, motor, _) in enumerate(model.friction.terms, model.base.rank):
+        if not motor and term.is_friction and not term.of_load:
+            law = model.friction.laws[joint]
+            here = speed[joint : joint + 1]
+            columns[joint, place] = term.column(here, law.sign(here))[0]
+    return columns
+
+
+def compare(score: Score, other: Score, model: RobotModel) -> Comparison:
+    """Compare two readings, torque by torque and block by block; small torques aside.
+
+    A torque is compared with itself, whichever joint it is read as.
+    """
+    at = other.joints
+    torque = np.sqrt(other.torque)[at]
+    counts = (torque > 0.0) & ~little_torque(torque, ~np.array(model.chain.revolute)[at])
+    mine = score.squares[:, score.joints[counts]]
+    its = other.squares[:, at[counts]]
+    tested = (mine > 0.0) & (its > 0.0)
+    totals = np.where(tested, mine, 0.0).sum(axis=0), np.where(tested, its, 0.0).sum(axis=0)
+    both = (totals[0] > 0.0) & (totals[1] > 0.0)
+    joints = np.ones(len(counts))
+    joints[np.flatnonzero(counts)[both]] = np.sqrt(totals[0][both] / totals[1][both])
+    if not both.any():
+        return Comparison(1.0, 0.0, joints)
+    ratio = float(np.exp(np.log(joints[counts]).mean()))
+    change = np.zeros(tested.shape)
+    change[tested] = 0.5 * np.log(mine[tested] / its[tested])
+    return Comparison(ratio, sigmas_of(change[tested.any(axis=1)].mean(axis=1)), joints)
+
+
+def sigmas_of(changes: Array) -> float:
+    """Return the mean of changes by block over its standard error."""
+    error = float(np.std(changes, ddof=1)) / np.sqrt(len(changes)) if len(changes) > 1 else np.inf
+    return float(changes.mean() / error) if error > 0.0 else 0.0
