@@ -1,9 +1,10 @@
 """What excites the NS 16 best: the paper's method B, the default search, and it with constraints.
 
 Run with ``python -m benchmarks.excitation_study [--seeds 3] [--quick] [--workers 2]
-[--only NAME ...] [--json]``. Every search is that of ``hil design`` with the preset of its method:
-``B (eq. 7)`` and ``front`` with nothing but joint limits to keep, as in the paper; ``+ motor
-currents`` closed at the cell's home, clear of floor and itself, and within 80 % of the currents.
+[--only NAME ...] [--weights OF_LOG_DET OF_I_C] [--json]``. Every search is that of ``hil design``
+with the preset of its method: ``B (eq. 7)`` and ``front`` with nothing but joint limits to keep, as
+in the paper; ``+ motor currents`` closed at the cell's home, clear of floor and itself, and within
+80 % of the currents.
 
 log10 det and I_c are those of the motion sampled every millisecond; ``with_rests`` are both as they
 were counted before, when a joint that rests had dry friction of full size. Seconds are wall clock;
@@ -52,9 +53,19 @@ class _WithRests(Objective):
         return self.model.friction
 
 
-def run(cell: Cell, name: str, seed: int, *, workers: int, quick: bool) -> dict[str, Any]:
+def run(
+    cell: Cell,
+    name: str,
+    seed: int,
+    *,
+    workers: int,
+    quick: bool,
+    weights: Sequence[float] | None = None,
+) -> dict[str, Any]:
     """Search once."""
     settings = CASES[name].replaced(seed=seed)
+    if weights is not None:
+        settings = settings.replaced(search={"weights": tuple(weights)})
     if quick:
         polish = min(settings.search.polish, 50)
         effort = {"population": 24, "generations": 6, "polish": polish}
@@ -87,11 +98,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--quick", action="store_true", help="a handful of individuals only")
     parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), metavar="NAME")
+    parser.add_argument("--weights", nargs=2, type=float, help="instead of those of the preset")
     options = parser.parse_args(arguments)
+    effort = {name: getattr(options, name) for name in ("workers", "quick", "weights")}
     cell, rows = Cell.load(CELL_PATH), []
     for name in options.only:
         for seed in range(1, options.seeds + 1):
-            rows.append(run(cell, name, seed, workers=options.workers, quick=options.quick))
+            rows.append(run(cell, name, seed, **effort))
             if not options.json:
                 print(*(f"{key} {value}" for key, value in rows[-1].items()), sep=", ", flush=True)
     show({"rows": rows}, only_json=True)

@@ -32,7 +32,7 @@ _SECONDS: Final = {"gradient": 30.0, "quick": np.inf, "default": 60.0}
 def _settings(name: str, cell: Cell) -> DesignSettings:
     if name == "quick":
         return quick_settings(cell)
-    return preset("front" if name == "default" else name)
+    return preset("gradient" if name == "gradient" else "front")
 
 
 def _processor_time() -> float:
