@@ -1,11 +1,13 @@
 """What excites the NS 16 best: the paper's method B, the default search, and it with constraints.
 
 Run with ``python -m benchmarks.excitation_study [--seeds 3] [--quick] [--workers 2]
-[--only NAME ...] [--json]``. Every search is that of ``hil design`` with the preset of its method:
-``B (eq. 7)`` and ``front`` with nothing but joint limits to keep, as in the paper; ``+ motor
-currents`` closed at the cell's home, clear of floor and itself, and within 80 % of the currents.
+[--only NAME ...] [--weights OF_LOG_DET OF_I_C] [--json]``. Every search is that of ``hil design``
+with the preset of its method: ``B (eq. 7)`` and ``front`` with nothing but joint limits to keep, as
+in the paper; ``+ motor currents`` closed at the cell's home, clear of floor and itself, and within
+80 % of the currents.
 
-log10 det and I_c are those of the motion sampled every millisecond. Seconds are wall clock;
+log10 det and I_c are those of the motion sampled every millisecond; ``with_rests`` are both as they
+were counted before, when a joint that rests had dry friction of full size. Seconds are wall clock;
 everything else is the same to the last bit for a seed, whatever the number of processes. I_c has
 no units and compares with the paper's 101.2 of method B; log10 det depends on the units of the
 parameters, which the paper does not name. ``--quick`` tries the program, not the methods.
@@ -15,13 +17,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, Final
 
 from benchmarks import parser_of, show
 from hil.cell import Cell
 from hil.design.problem import problem_of, search_settings
 from hil.design.settings import DesignSettings, preset
-from identification.excitation import NoFeasibleMotionError, Population, search
+from identification.excitation import (
+    RESCORE_PERIOD,
+    NoFeasibleMotionError,
+    Objective,
+    Population,
+    search,
+)
+from identification.model.friction import JointFriction
 from sim_fixtures.ns16 import CELL_PATH
 
 CASES: Final[dict[str, DesignSettings]] = {
@@ -35,9 +45,27 @@ CASES: Final[dict[str, DesignSettings]] = {
 }
 
 
-def run(cell: Cell, name: str, seed: int, *, workers: int, quick: bool) -> dict[str, Any]:
+class _WithRests(Objective):
+    """Criteria to which the dry friction of resting joints counts, by the sign of rounding."""
+
+    @cached_property
+    def _friction(self) -> JointFriction:
+        return self.model.friction
+
+
+def run(
+    cell: Cell,
+    name: str,
+    seed: int,
+    *,
+    workers: int,
+    quick: bool,
+    weights: Sequence[float] | None = None,
+) -> dict[str, Any]:
     """Search once."""
     settings = CASES[name].replaced(seed=seed)
+    if weights is not None:
+        settings = settings.replaced(search={"weights": tuple(weights)})
     if quick:
         polish = min(settings.search.polish, 50)
         effort = {"population": 24, "generations": 6, "polish": polish}
@@ -51,9 +79,11 @@ def run(cell: Cell, name: str, seed: int, *, workers: int, quick: bool) -> dict[
         except NoFeasibleMotionError as error:
             return row | {"infeasible": str(error)}
     criteria = design.excitation.criteria
+    former = _WithRests(cell.model).criteria(design.excitation.trajectory, RESCORE_PERIOD)
     return row | {
         "log10_det": round(criteria.log10_det, 2),
         "coupling_index": round(criteria.coupling_index, 2),
+        "with_rests": [round(former.log10_det, 2), round(former.coupling_index, 2)],
         "duration_s": round(design.excitation.trajectory.duration, 2),
         "evaluated": design.excitation.tried,
         "infeasible": dict(design.excitation.rejected),
@@ -68,11 +98,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--quick", action="store_true", help="a handful of individuals only")
     parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), metavar="NAME")
+    parser.add_argument("--weights", nargs=2, type=float, help="instead of those of the preset")
     options = parser.parse_args(arguments)
+    effort = {name: getattr(options, name) for name in ("workers", "quick", "weights")}
     cell, rows = Cell.load(CELL_PATH), []
     for name in options.only:
         for seed in range(1, options.seeds + 1):
-            rows.append(run(cell, name, seed, workers=options.workers, quick=options.quick))
+            rows.append(run(cell, name, seed, **effort))
             if not options.json:
                 print(*(f"{key} {value}" for key, value in rows[-1].items()), sep=", ", flush=True)
     show({"rows": rows}, only_json=True)

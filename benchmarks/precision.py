@@ -19,7 +19,8 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -52,7 +53,7 @@ from hil.payload_campaign import (
     assumed_payload,
     loaded_cell,
 )
-from hil.progress import Silent
+from hil.progress import Silent, Task
 from hil.simulation import (
     controller_settings,
     planted_truth,
@@ -151,15 +152,24 @@ class _Ended:
 
 
 class _Warmth(Silent):
-    """Keeps the factor on the friction after each repetition; simulated friction drifts."""
+    """Keeps the mean factor on the friction in each repetition; simulated friction drifts.
+
+    From a repetition's begin to its end by some thousandths: as much as its interval.
+    """
 
     def __init__(self, controller: SimulatedController) -> None:
         self._plant = controller.plant
+        self._after = [self._plant.friction_scale]  # each motion (n,)
         self.factors: list[Array] = []
+
+    @contextmanager
+    def task(self, title: str, total: float) -> Iterator[Task]:
+        with super().task(title, total):
+            yield Task(lambda *_: self._after.append(self._plant.friction_scale))
 
     def say(self, text: str) -> None:
         if text.startswith("precision after"):
-            self.factors.append(self._plant.friction_scale)
+            self.factors.append(np.mean(self._after[-2:], axis=0))
 
 
 def _ended(cell: Cell, plan: CampaignPlan, requirements: Sequence[Requirement]) -> _Ended:

@@ -21,7 +21,7 @@ from scipy.stats import t as student
 
 from hil.batch import run
 from hil.batch.cluster import Cluster
-from hil.batch.discovery import ArchiveRef, cell_in, open_ref
+from hil.batch.discovery import COPY, ArchiveRef, Discovery, cell_in, open_ref
 from hil.batch.estimates import Arm, BatchEstimate
 from hil.errors import InputError
 from hil.identify.options import Options
@@ -141,9 +141,9 @@ def compare(places: Sequence[str], cluster: Cluster, reporter: Reporter) -> Comp
     roots = [path.parent if path.name == "results.json" else path for path in paths]
     refs: list[ArchiveRef] = []
 
-    def check(archive_refs: Sequence[ArchiveRef]) -> None:
-        _require_campaigns_of_one_arm(archive_refs)
-        refs.extend(archive_refs)
+    def check(discovery: Discovery) -> None:
+        _require_campaigns_of_one_arm(discovery)
+        refs.extend(discovery.refs)
 
     options = Options(estimator="wls")
     result = run.reidentify([str(root) for root in roots], options, cluster, reporter, check=check)
@@ -179,8 +179,8 @@ def compare(places: Sequence[str], cluster: Cluster, reporter: Reporter) -> Comp
     return replace(comparison, simulated=refs[0].simulated, warnings=(*lost, *comparison.warnings))
 
 
-def _require_campaigns_of_one_arm(archive_refs: Sequence[ArchiveRef]) -> None:
-    campaigns = {ref.key: ref for ref in archive_refs if ref.use == "excitation"}
+def _require_campaigns_of_one_arm(discovery: Discovery) -> None:
+    campaigns = {ref.key: ref for ref in discovery.refs if ref.use == "excitation"}
     if not campaigns:
         return  # reidentify raises the error
     first = next(iter(campaigns.values()))
@@ -196,7 +196,14 @@ def _require_campaigns_of_one_arm(archive_refs: Sequence[ArchiveRef]) -> None:
                 remedy="compare campaigns of one arm",
             )
     if len(campaigns) < 2:
-        raise InputError(first.campaign, "is the only campaign given", remedy=_TWO)
+        unused = [
+            f", as {each.path} {each.reason}"
+            for each in discovery.skipped
+            if COPY in each.reason and not Path(each.path).is_relative_to(first.campaign)
+        ]
+        unused += [f"; {each.path}: {each.reason}" for each in discovery.broken]
+        problem = f"is the only campaign given{unused[0] if unused else ''}"
+        raise InputError(first.campaign, problem, remedy=_TWO)
 
 
 def compare_campaigns(

@@ -107,10 +107,10 @@ class Mounting:
         if self._virtual:
             self._reporter.say(f"simulated: {self._name} is {'mounted' if loaded else 'removed'}")
         elif self._ask is None:
-            word = "yes" if loaded else "no"
+            command = " ".join((self._command, self._confirmation(loaded), *option.split()))
             raise MountingError(
-                f"{demand} and change nothing else; then confirm it with `{self._command} "
-                f"{' '.join(['--mounted', word, *option.split()])}` (there is no terminal to ask)."
+                f"{demand} and change nothing else; then confirm it with `{command}` (there is no "
+                "terminal to ask)."
             )
         elif not self._ask(f"{demand} and change nothing else."):
             raise OperatorStopError(
@@ -118,6 +118,17 @@ class Mounting:
                 f"with `{self._command}`."
             )
         self._mounted = loaded
+
+    def confirmed(self, side: Campaign, loaded: bool) -> Campaign:
+        """Return a side whose messages name commands that confirm what `require` required."""
+        if self._virtual or self._ask is not None:
+            return side
+        folder = replace(side.folder, confirmed=self._confirmation(loaded))
+        return replace(side, folder=folder)
+
+    @staticmethod
+    def _confirmation(loaded: bool) -> str:
+        return f"--mounted {'yes' if loaded else 'no'}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +233,7 @@ class PayloadCampaign:
         )
         loaded = next(missing, False)
         mounting.require(loaded, "--dry-run")
-        return execute(self.side(loaded), choices)
+        return execute(mounting.confirmed(self.side(loaded), loaded), choices)
 
     def run(
         self,
@@ -300,7 +311,7 @@ class PayloadCampaign:
         seen = side.cell.only_simulated or path_exists(side.folder.dry_run)
         mounting.require(loaded, "--accept-dry-run" if seen else "--dry-run")
         execute(
-            side,
+            mounting.confirmed(side, loaded),
             {
                 **choices,
                 "accept_dry_run": choices.get("accept_dry_run", False) and seen,

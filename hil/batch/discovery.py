@@ -447,6 +447,9 @@ def _campaign_of(place: str) -> str:
 
 # Selection
 
+COPY: Final = "is a copy"
+"""Begin of the reason why a copy is not used."""
+
 _Attempts = dict[tuple[str, str, int], int]
 """The last attempt by folder, kind and index."""
 
@@ -549,10 +552,10 @@ def _exclusion(ref: ArchiveRef, latest: _Attempts, seen: dict[str, str]) -> str:
     if ref.attempt and ref.attempt < last:
         return f"was replaced by attempt {last}"
     if ref.sha256 in seen and ref.use != "standstill":
-        return f"is a copy of {seen[ref.sha256]}"
+        return f"{COPY} of {seen[ref.sha256]}"
     if ref.attempt:
         first = seen.setdefault(f"{ref.folder} {ref.record}", ref.name)
         if first != ref.name:
-            return f"is a copy or a repaired version of {first}"
+            return f"{COPY} or a repaired version of {first}"
     seen[ref.sha256] = ref.location
     return ""

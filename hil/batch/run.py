@@ -28,6 +28,7 @@ from .cluster import AnyFuture, Cluster, Death, SkippedArchive, Task, reason_of
 from .discovery import (
     ArchiveRef,
     CellTexts,
+    Discovery,
     GroupKey,
     cell_from,
     cell_in,
@@ -152,7 +153,7 @@ def reidentify(
     reporter: Reporter,
     *,
     cache: CacheLocation = CacheLocation(),  # noqa: B008 - frozen
-    check: Callable[[Sequence[ArchiveRef]], None] = lambda _: None,
+    check: Callable[[Discovery], None] = lambda _: None,
 ) -> BatchResult:
     """Identify every arm from all its archives: by repetition, by campaign, and pooled.
 
@@ -173,7 +174,7 @@ def reidentify(
         remedy = f"use {', '.join(estimators)}"
         raise InputError(None, problem, field="estimator", remedy=remedy)
     discovery = discover(roots, cache, cluster, reporter)
-    check(discovery.refs)
+    check(discovery)
     batch = _Batch(options, cluster, cache, reporter, [*discovery.broken])
     campaigns = batch.with_settings(
         [_Campaign(key, list(refs)) for key, refs in groupby(discovery.refs, lambda ref: ref.key)]

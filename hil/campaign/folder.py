@@ -100,8 +100,11 @@ class CampaignFolder(RecordedCampaign):
     """Paths below one campaign folder, and its manifest, which is written here.
 
     Attributes:
+        confirmed: options by which its command confirms what nobody can be asked; "" for none.
         rehearsed: folder of the rehearsal's own campaigns.
     """
+
+    confirmed: str = ""
 
     cell = Below("cell.toml")
     urdf = Below("robot.urdf")
@@ -128,7 +131,8 @@ class CampaignFolder(RecordedCampaign):
         if self.weighs is None:
             return f"hil run {typed(self.root)}"
         campaign, name = self.weighs
-        return f"hil run {typed(os.path.normpath(campaign))} --payload {typed(name)}"
+        command = f"hil run {typed(os.path.normpath(campaign))} --payload {typed(name)}"
+        return f"{command} {self.confirmed}".rstrip()
 
     @property
     def plan_hash(self) -> str:

@@ -1,9 +1,9 @@
 """Precision of a running campaign: measured after each repetition, and when it is enough.
 
 The estimate is the posterior that `hil identify` computes, with the settings that it would choose
-from the first repetition. Its intervals are cluster-robust: what the model cannot explain in the
-same place of every repetition counts as one error, however often it is repeated. Only the rest
-falls with them.
+from the first repetition; the error of their delay is renewed by all of them. Its intervals are
+cluster-robust: what the model cannot explain in the same place of every repetition counts as one
+error, however often it is repeated. Only the rest falls with them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,13 @@ from hil.design.wanted import ReferenceMotions, Wanted
 from hil.errors import InputError
 from hil.identify.estimating import estimate_with, with_loading
 from hil.identify.options import Options
-from hil.identify.prepared import decide, prepared_with, samples_of
+from hil.identify.prepared import (
+    Prepared,
+    decide,
+    prepared_with,
+    renewed_delay_variance,
+    samples_of,
+)
 from hil.identify.sources import Source, gather_sources
 from hil.progress import Reporter, Silent
 from hil.reading import path_exists
@@ -113,16 +119,7 @@ class PrecisionMeter:
                 self._repetitions[path] = self._reduced(source)
         repetitions = [self._repetitions[path] for path in paths]
         recordings = (*self._earlier, *repetitions)
-        sources = replace(
-            self._prepared.sources,
-            training=tuple(recording.source for recording in recordings),
-            same_motion=not self._earlier,
-        )
-        prepared = replace(
-            self._prepared,
-            sources=sources,
-            fitted=tuple(recording.samples for recording in recordings),
-        )
+        prepared = self._prepared_of(recordings)
         factors = [recording.factor for recording in recordings]
         rates = [each.products for each in recordings if each.products is not None]
         products = np.sum(rates, axis=0) if rates else None
@@ -156,6 +153,22 @@ class PrecisionMeter:
             estimate=stated,
         )
 
+    def _prepared_of(self, recordings: Sequence[_Reduced]) -> Prepared:
+        """Return recordings by the settings of all looks, with the error of the delay by them."""
+        training = tuple(recording.source for recording in recordings)
+        settings = self._prepared.settings
+        doubt = renewed_delay_variance(
+            replace(self._sources, training=training), settings, self._options
+        )
+        return replace(
+            self._prepared,
+            sources=replace(
+                self._prepared.sources, training=training, same_motion=not self._earlier
+            ),
+            fitted=tuple(recording.samples for recording in recordings),
+            settings=replace(settings, delay_variance=doubt),
+        )
+
     def _choose(self, path: Path) -> None:
         """Choose the settings from a repetition, as `hil identify` does, for all looks."""
         campaign = self._campaign
@@ -164,6 +177,7 @@ class PrecisionMeter:
         # The validation runs, which the campaign holds out, are recorded later.
         sources = replace(sources, in_sample=False, held_out=())
         settings = with_loading(decide(sources, self._options, Silent()).settings, sources)
+        self._sources = sources
         self._prepared = prepared_with(sources, settings, Silent())
         motions = [
             midpoints(motion.trajectory, _REFERENCE_PERIOD) for motion in campaign.plan.validation

@@ -32,6 +32,7 @@ class RunResult:
     """What a run has done, and the progress of the campaign after it.
 
     Attributes:
+        command: runs the campaign again.
         simulated: whether only a simulated arm can have moved.
         archives: file names made by this run, in order, whatever their outcome.
         rejected: of these, the motions that failed their quality check.
@@ -47,6 +48,7 @@ class RunResult:
     """
 
     campaign: str
+    command: str
     plan_hash: str
     simulated: bool
     archives: tuple[str, ...]
@@ -225,6 +227,7 @@ class _CampaignRun:
         precision = campaign.precision
         return RunResult(
             campaign=str(campaign.folder.root),
+            command=campaign.folder.run_command,
             plan_hash=archives.plan_hash,
             simulated=archives.simulated,
             archives=tuple(archives.names),

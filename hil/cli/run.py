@@ -202,6 +202,5 @@ def _print(result: RunResult, *, json: bool) -> None:
     if result.dry_run == "to be accepted":
         accept_options = "".join(f" --accept-torque {joint}" for joint in result.against_gravity)
         why = "you know why, and " if accept_options else ""
-        run_it = CampaignFolder(Path(result.campaign)).run_command
-        command = f"`{run_it} --accept-dry-run{accept_options}`"
+        command = f"`{result.command} --accept-dry-run{accept_options}`"
         say(f"if {why}the motions looked right, continue with {command}")

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.cell.robot import ripples
 from hil.errors import ArchiveError, InputError
-from hil.progress import Reporter
+from hil.progress import Reporter, Silent
 from identification.errors import IdentificationError
-from identification.estimators.delay import DelayEstimate, estimate_delay
+from identification.estimators.delay import LONGEST_DELAY, DelayEstimate, estimate_delay
 from identification.estimators.torque_channel import possible_low_passes
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
@@ -155,9 +155,7 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
         RecordingError: a recording cannot be prepared.
         IdentificationError: a delay was requested and no row is usable.
     """
-    sources = replace(sources, training=sources.training[:MAX_RECORDINGS])
-    stated = _with_noise_of(stated_settings(sources.cell, options), sources)
-    sources = replace(sources, cell=sources.cell.with_friction(**stated.friction))
+    sources, stated = _as_stated(sources, options)
     delay = _DelayChoice.of(_delays(sources, stated, options, reporter), sources, stated, options)
     started = stated.preprocessed(torque_delay=delay.assumed)
     chosen = _chosen(sources, started, delay.suggested, options, reporter)
@@ -168,10 +166,38 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
         chosen = delay.applied_to(chosen)
     estimate, notes = delay.confirmed_by(chosen.preprocessing)
     variance = 0.0
-    if estimate is not None:
-        variance = estimate.variance if notes else delay.doubt
-        notes += delay.contradiction if delay.doubt else ()
+    if delay.doubt and chosen.preprocessing.torque_delay == stated.stated_delay:
+        variance = delay.doubt
+        notes += delay.contradiction if estimate is not None else ()
+    elif estimate is not None and notes:
+        variance = estimate.variance
     return Decided(replace(chosen, delay_variance=variance), estimate, notes)
+
+
+def renewed_delay_variance(sources: Sources, settings: Settings, options: Options) -> float:
+    """Return the mean square error of the delay in chosen settings by other sources [s²].
+
+    Zero if it is known; unchanged if they do not let it be estimated.
+    """
+    if not settings.delay_variance:
+        return 0.0
+    sources, stated = _as_stated(sources, options)
+    if _adds_load(sources.cell, settings):
+        sources = replace(sources, cell=sources.cell.with_friction(**settings.friction))
+    estimate = _delays(sources, stated, options, Silent())
+    if estimate is None:
+        return settings.delay_variance
+    used = settings.preprocessing.torque_delay
+    is_controllers = sources.cell.file.controller is not None and used == stated.stated_delay
+    bound = Thresholds().delay * estimate.cycle if is_controllers else LONGEST_DELAY
+    return estimate.mean_square_error(used, bound)
+
+
+def _as_stated(sources: Sources, options: Options) -> tuple[Sources, Settings]:
+    """Return at most `MAX_RECORDINGS` sources with the stated friction, and stated settings."""
+    sources = replace(sources, training=sources.training[:MAX_RECORDINGS])
+    stated = _with_noise_of(stated_settings(sources.cell, options), sources)
+    return replace(sources, cell=sources.cell.with_friction(**stated.friction)), stated
 
 
 def _adds_load(cell: Cell, chosen: Settings) -> bool:
@@ -189,14 +215,16 @@ class _DelayChoice:
     assumed: float  # that the choice begins with [s]
     suggested: tuple[SuggestedDelay, ...]  # that it may choose as well
     notes: tuple[str, ...]
-    doubt: float = 0.0  # mean square error of a stated delay that is used, by the estimate [s²]
+    doubt: float = 0.0  # mean square error of a controller's stated delay, by the estimate [s²]
 
     @property
     def contradiction(self) -> tuple[str, ...]:
         """The note on a stated delay that the estimate contradicts."""
-        assert self.estimate is not None
+        estimate = self.estimate
+        if estimate is None or not (estimate.significant and estimate.determined):
+            return ()
         return (
-            f"the intervals allow for a delay of {self.estimate.delay * 1e3:.3g} ms, which the "
+            f"the intervals allow for a delay of {estimate.delay * 1e3:.3g} ms, which the "
             f"data show, beside the stated {self.assumed * 1e3:.3g} ms",
         )
 
@@ -216,16 +244,14 @@ class _DelayChoice:
             return replace(unused, assumed=estimate.delay, notes=notes)
         # A controller's delay is known; the estimate replaces it only if well determined and
         # different by more than its bias in closed loop.
-        far = abs(estimate.delay - estimate.assumed) > Thresholds().delay * estimate.cycle
-        has_controller = sources.cell.file.controller is not None
+        bound = Thresholds().delay * estimate.cycle
+        far = abs(estimate.delay - estimate.assumed) > bound
         if options.delay is not None:
             return unused
-        if has_controller and not (far and estimate.determined):
-            if not (estimate.significant and estimate.determined):
+        if sources.cell.file.controller is not None:
+            unused = replace(unused, doubt=estimate.mean_square_error(unused.assumed, bound))
+            if not (far and estimate.determined):
                 return unused
-            return replace(
-                unused, doubt=(estimate.delay - estimate.assumed) ** 2 + estimate.variance
-            )
         delay = SuggestedDelay(estimate.delay, estimate.determined)
         suggested = (delay,) if estimate.significant else ()
         return replace(unused, suggested=suggested, notes=described)

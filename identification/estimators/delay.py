@@ -177,6 +177,19 @@ class DelayEstimate:
         """
         return float(np.fmin(self.std**2, LONGEST_DELAY**2 / 3.0))
 
+    def mean_square_error(self, used: float, bound: float) -> float:
+        """Return the mean square error of a delay that is used [s²].
+
+        Before the data the true one is as likely anywhere within the bound, either way [s]: a
+        Gaussian of that variance is multiplied by the estimate, whether significant or not. A
+        minimum at a limit, or beside another one, tells nothing.
+        """
+        prior = bound**2 / 3.0
+        if not self.determined and self.half_interval <= WIDEST_INTERVAL:
+            return prior
+        mean = prior / (prior + self.std**2) * (self.delay - used)
+        return mean**2 + 1.0 / (1.0 / prior + 1.0 / self.std**2)
+
     def describe(self) -> str:
         """Return the result as a sentence."""
         if not self.determined and not self.significant:

@@ -317,18 +317,24 @@ class CollisionChecker:
             )
         return nearest.contact
 
-    def clear(self, q: Array) -> NDArray[np.bool_]:
-        """Return which of the postures (m, n) are clear, (m,)."""
+    def clear(self, q: Array, paths: Indices | None = None) -> NDArray[np.bool_]:
+        """Return which of the postures (m, n) are clear, (m,).
+
+        With `paths` (m,), the number of a path from 0 on for each posture, it is which of the paths
+        are: the first contact of one decides, the other postures are not looked at.
+        """
+        paths = np.arange(len(q)) if paths is None else paths
         path = self.path(q)
         pairs, samples = np.indices((len(self.separation.first), len(q))).reshape(2, -1)
         lower = self.separation.bound(path.bodies, pairs, samples)
-        blocked = np.zeros(len(q), dtype=np.bool_)
+        blocked = np.zeros(paths.max(initial=-1) + 1, dtype=np.bool_)
         near = np.flatnonzero(~(lower >= self.required[pairs]))
         for k in near[np.argsort(lower[near], kind="stable")].tolist():
             pair = int(pairs[k])
             sample = int(samples[k])
-            if not blocked[sample]:
-                blocked[sample] = not self.distance(pair, path, sample) >= self.required[pair]
+            if not blocked[paths[sample]]:
+                contact = not self.distance(pair, path, sample) >= self.required[pair]
+                blocked[paths[sample]] = contact
         return np.asarray(~blocked)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,6 +120,11 @@ class TestRecorded:
         monkeypatch.setattr("hil.batch.run._Batch", pytest.fail)
         with pytest.raises(InputError, match=why):
             compared(folders["march"], folders[other])
+
+    def test_a_copy_is_no_second_campaign(self, folders, tmp_path):
+        copy = shutil.copytree(folders["march"], tmp_path / "copy")
+        with pytest.raises(InputError, match=r"only campaign given, as .*mcap is a copy of .*mcap"):
+            compared(folders["march"], copy)
 
 
 def equal(level):

@@ -22,7 +22,12 @@ from hil.identify import Options, identify_archives, identify_campaign
 from hil.identify.estimating import estimate_with
 from hil.identify.estimators import ESTIMATORS
 from hil.identify.options import FIXED, friction_from
-from hil.identify.prepared import decide, prepare_sources, stated_delay
+from hil.identify.prepared import (
+    decide,
+    prepare_sources,
+    renewed_delay_variance,
+    stated_delay,
+)
 from hil.identify.sources import gather_sources
 from hil.identify.summary import _delays
 from hil.importers import Robot
@@ -169,12 +174,27 @@ def test_a_stated_delay_that_data_contradict_widens_intervals(campaign):
     """By less than a cycle: the estimate is not that accurate, so that the stated one is used."""
     sources = gather_sources(paths(campaign), 0.7)
     right = sources.cell.file.controller.current_delay_cycles
-    assert decide(sources, Options(), Silent()).settings.delay_variance == 0.0
+    settings = decide(sources, Options(), Silent()).settings
+    assert 0.0 < np.sqrt(settings.delay_variance) / sources.cell.period < 0.3
     wrong = sources.cell.with_values({"controller.current_delay_cycles": right - 0.35})
     chosen = decide(replace(sources, cell=wrong), Options(), Silent())
     assert chosen.settings.preprocessing.torque_delay == stated_delay(wrong)
     assert 0.3 < np.sqrt(chosen.settings.delay_variance) / wrong.period < 0.7
     assert any("allow for a delay of" in note for note in chosen.notes)
+
+
+def test_other_recordings_renew_the_error_of_a_chosen_delay(campaign):
+    """A look at more repetitions of a campaign: the error is as if chosen from all of them."""
+    sources = gather_sources(paths(campaign), 0.7)
+    first = replace(sources, training=sources.training[:1])
+    settings = decide(first, Options(), Silent()).settings
+    again = renewed_delay_variance(first, settings, Options())
+    assert again == pytest.approx(settings.delay_variance)
+    by_all = decide(sources, Options(), Silent()).settings.delay_variance
+    assert by_all != pytest.approx(again)
+    assert renewed_delay_variance(sources, settings, Options()) == pytest.approx(by_all)
+    known = replace(settings, delay_variance=0.0)
+    assert renewed_delay_variance(sources, known, Options()) == 0.0
 
 
 class TestOutcome:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
@@ -296,6 +298,18 @@ class TestMounting:
             mounting.require(True, "--dry-run")
         assert MountingError.exit_code == 3
 
+    @pytest.mark.parametrize(("asks", "ending"), [(False, "weight --mounted no"), (True, "weight")])
+    def test_messages_of_a_side_confirm_what_nobody_is_asked(self, real, asks, ending) -> None:
+        ask = (lambda _: True) if asks else None
+        mounting = Mounting(real, Silent(), ask=ask, mounted=None if asks else False)
+        commands: list[str] = []
+        real.dry_run(
+            lambda side, _: commands.append(side.folder.run_command),  # type: ignore[arg-type]
+            mounting,
+            {},
+        )
+        assert [command.endswith(ending) for command in commands] == [True]
+
     def test_the_operator_is_asked_only_where_it_changes(self, real) -> None:
         asked: list[str] = []
 
@@ -399,6 +413,35 @@ class TestCommand:
         low, high = found["figures"]["mass"]["interval"]
         assert low < 2.0 < high
         assert found["pairs"] == 2
+
+    def test_without_a_terminal_each_printed_command_leads_on(self, tmp_path, monkeypatch) -> None:
+        """Typed as it is printed, from the first dry run to the weighed payload."""
+
+        class OfRealArm(Mounting):
+            def __init__(self, *arguments, **options) -> None:
+                super().__init__(*arguments, **options)
+                self._virtual = False
+
+        monkeypatch.setattr("hil.cli.weigh.Mounting", OfRealArm)
+        root = campaign_in(tmp_path, repetitions=2).folder.root
+        begun(Campaign.open(root), "gripper")
+        for side in SIDES:
+            pass_rehearsal(CampaignFolder(root / "payload" / "gripper" / side))
+        words = ["--payload", "gripper", "--mounted", "no", "--dry-run"]
+        typed = []
+        while words:
+            typed.append(words[2:])
+            try:
+                printed = invoke(root, *words).output.replace("\n", " ")
+            except MountingError as error:
+                printed = str(error)
+            command = re.search(r"`hil run (\S+) ([^`]*)`", printed)
+            words = [] if command is None else shlex.split(command[2])
+            assert command is None or command[1] == str(root)
+        no, yes = ["--mounted", "no"], ["--mounted", "yes"]
+        accept = "--accept-dry-run"
+        assert typed == [[*no, "--dry-run"], [*no, accept], [*yes, accept], [*no, accept]]
+        assert (root / "payload" / "gripper" / "payload.json").exists()
 
     @pytest.mark.parametrize(
         ("words", "sentence"),

@@ -237,6 +237,9 @@ class TestDistances:
         certain = np.abs(distances - margin) > 1e-5
         clear = checkers(margin).clear(q)
         np.testing.assert_array_equal(clear[certain], (distances >= margin)[certain])
+        paths = np.arange(len(q)) // 60
+        of_paths = [clear[paths == path].all() for path in range(3)]
+        assert checkers(margin).clear(q, paths).tolist() == of_paths
         if distances.min() >= margin:
             assert contact is None
         else:

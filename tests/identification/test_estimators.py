@@ -18,6 +18,7 @@ from scipy.signal import lfilter
 from hil.cell import Cell
 from identification import (
     Coupling,
+    DelayEstimate,
     Factor,
     FrictionLaw,
     GaussianPrior,
@@ -1288,6 +1289,21 @@ class TestDelay:
         every = estimate_delay(in_succession(recordings), MODEL)
         assert every.delay == pytest.approx(1.6e-3, abs=1.5 * every.half_interval)
         assert every.half_interval < 0.7 * single.half_interval
+
+    def test_the_error_of_a_delay_that_is_used_needs_no_significance(self):
+        """Between what the estimate says and what was believed before, as each is certain."""
+        estimate = DelayEstimate(
+            delay=3e-4, std=1e-9, assumed=0.0, cycle=1e-3, interval_factor=2.0, reason=None,
+            significant=False,
+        )  # fmt: skip
+        assert estimate.mean_square_error(0.0, 1e-3) == pytest.approx(3e-4**2)
+        assert estimate.mean_square_error(3e-4, 1e-3) < 1e-17
+        believed = 1e-3**2 / 3.0
+        equal = replace(estimate, std=np.sqrt(believed))
+        assert equal.mean_square_error(0.0, 1e-3) == pytest.approx(1.5e-4**2 + believed / 2.0)
+        for std, reason in ((np.inf, "not separated"), (1e-4, "at a limit")):
+            unknown = replace(estimate, std=std, reason=reason)
+            assert unknown.mean_square_error(0.0, 1e-3) == pytest.approx(believed)
 
     def test_a_delay_beyond_the_range_is_undetermined(self):
         estimate = estimate_delay(delayed(0.06), MODEL)

@@ -55,7 +55,21 @@ def with_friction(log: Logged, arm: Arm, seed: int, joint: int | None = None) ->
     return log._replace(torque=log.torque + added)
 
 
-def identified(name: str, seed: int, fault: str, joint: int, folder: Path) -> Identification:
+def with_rest(log: Logged) -> Logged:
+    """The arm rests after the motion, as long as that takes, under the same noise."""
+    random = np.random.default_rng(len(log.time))
+    noise = np.diff(log.torque, axis=0).std(axis=0) / np.sqrt(2.0)
+    standing = random.standard_normal((2, *log.torque.shape))
+    return Logged(
+        np.append(log.time, log.time + log.time[-1] + log.time[1]),
+        np.concatenate((log.position, log.position[-1] + 1e-5 * standing[0])),
+        np.concatenate((log.torque, log.torque[-50:].mean(axis=0) + noise * standing[1])),
+    )
+
+
+def identified(
+    name: str, seed: int, fault: str, joint: int, folder: Path, *, rests: bool = False
+) -> Identification:
     """Plant a fault, import both logs, fit one and predict the other."""
     kind = ARM_TYPES[name]
     arm = drawn_arm(kind, seed)
@@ -70,6 +84,8 @@ def identified(name: str, seed: int, fault: str, joint: int, folder: Path) -> Id
         held_out = with_friction(held_out, arm, seed, joint)
     else:
         held_out = with_friction(held_out, arm, seed)
+    if rests:
+        fitted, held_out = with_rest(fitted), with_rest(held_out)
     archives = [
         JointLog(robot, log.time, log.position, None, log.torque, kind.rated_payload).imported(
             folder / f"{part}.mcap"
@@ -125,3 +141,19 @@ class TestFaultThatIsHardToSee:
         identification = identified("panda", seed, "friction of one joint", joint, tmp_path)
         (friction,) = findings(identification, "friction")
         assert friction.level == "wrong" and f"panda_joint{joint + 1} +" in friction.words
+
+
+@pytest.mark.parametrize(
+    ("fault", "checks"),
+    [("gain", ("sameness", "torque constant")), ("friction of one joint", ("friction",))],
+    ids=["gain", "friction"],
+)
+@pytest.mark.parametrize("joint", [0, 4, 6])
+def test_rest_hides_no_fault(
+    fault: str, checks: tuple[str, ...], joint: int, tmp_path: Path
+) -> None:
+    """Of the logs, half of the time: a joint is compared while it moves."""
+    identification = identified("panda", 2, fault, joint, tmp_path, rests=True)
+    assert not identification.verdict.good
+    named = findings(identification, *checks)
+    assert any(f"panda_joint{joint + 1} " in finding.words for finding in named)
