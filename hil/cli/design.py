@@ -153,8 +153,7 @@ def design(
     elif settings is not None:
         asked = load_settings(settings)
     else:
-        usual: Method = "gradient" if precision else "front"
-        asked = preset(method or usual) if method or there is None else there
+        asked = preset(method or "gradient") if method or there is None else there
     if given:
         asked = asked.replaced(objective={"given": [str(path.resolve()) for path in given]})
     if precision:

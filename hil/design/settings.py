@@ -275,7 +275,7 @@ def load_settings(path: Path) -> DesignSettings:
 
 def settings_of(raw: Mapping[str, Any], path: Path | None = None) -> DesignSettings:
     """Return settings from the data of a file; see :func:`load_settings`."""
-    method = raw.get("method", "front")
+    method = raw.get("method", "front" if "sines" in raw else "gradient")
     if method not in METHODS:
         raise SettingsError(
             path,

@@ -62,7 +62,7 @@ def test_presets_are_files_with_all_constraints_on(method, tmp_path):
 def test_missing_settings_are_those_of_the_preset():
     """All methods but the gradient can search both kinds of motion."""
     assert settings_of({"method": "b"}) == preset("b")
-    assert settings_of({}) == preset("front")
+    assert settings_of({}) == preset("gradient")
     mine = settings_of({"method": "b", "via_points": {"n_via": 9}})
     assert mine.via_points.n_via == 9
     assert mine.via_points.fly == 0.5 and mine.search == preset("b").search
