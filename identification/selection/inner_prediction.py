@@ -769,15 +769,21 @@ class _Trial:
         return reduced.folds.fitted.relative_error(values)
 
     def fast_error(self, settings: Settings) -> float:
-        """Return the error of fast motion predicted from slower one; zero if there is none."""
+        """Return the error of fast motion predicted from slower one; zero if there is none.
+
+        Infinite if slower motion cannot be fitted.
+        """
         samples = self.samples(settings)
         speeds = [np.abs(each.motion.velocity).max(axis=0) for each in samples]
         fast = _FAST * np.max(speeds, axis=0)
         folds = Folds.of(self.model(settings), samples, fast)
         if not (folds.fitted.samples.any() and folds.predicted.samples.any()):
             return 0.0
-        estimate = self._estimator(settings, self._reduced(settings))
-        return folds.predicted.relative_error(estimate(folds.fitted))
+        try:
+            values = self._estimator(settings, self._reduced(settings))(folds.fitted)
+        except (IdentificationError, np.linalg.LinAlgError):
+            return math.inf
+        return folds.predicted.relative_error(values)
 
     def has_friction(self, settings: Settings) -> bool:
         """Return whether the fitted friction of every joint stays near that at rest at all speeds.
