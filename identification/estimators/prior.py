@@ -72,8 +72,9 @@ _FRICTION_SHARE: Final = 0.5
 OFFSET_SHARE: Final = 0.4
 """Deviation of an offset over that of Coulomb friction of a joint that moves one way. Both are one
 column then, and what opposes its motion is friction rather than an offset. In recordings of six
-arms of the board the median ratio of the two is 0.31, which is that of a Gaussian of 0.46; from 0.3
-to 0.5 the errors of these recordings differ by 1.3 % at most."""
+arms of the board the median ratio of the two is 0.31, which is that of a Gaussian of 0.46; from 0.2
+to 0.5 the errors of these recordings differ by 0.2 % at most, at 1.0 one is 1.4 % larger
+(``benchmarks.leave_one_out``)."""
 # RMS of motions that excite an arm: 0.2 to 4.5 rad/s in the recordings of six arms of the board,
 # half of the joints above 0.45; at a base frequency of 0.1 to 0.2 Hz the acceleration is as large.
 USUAL_SPEED: Final = 0.5  # rad/s or m/s

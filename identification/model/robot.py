@@ -346,6 +346,22 @@ class RobotModel:
             load = self.gear_torque(values, q, qd, qdd)
         return self.plan.torque(values, q, qd, qdd, direction, load)
 
+    def joint_inertia(self, values: Array, q: Array) -> Array:
+        """Return the inertia of the joints (m, n, n) by parameters (p,) at positions (m, n).
+
+        Symmetric; positive definite for bodies and rotors that exist.
+
+        Raises:
+            ShapeError: an array has another shape.
+        """
+        rigid = self._checked(values).copy()
+        rigid[self.base.rank :] = 0.0
+        (q,) = joint_arrays(self.n_joints, q=q)
+        still = np.zeros_like(q)
+        weight = self.plan.torque(rigid, q, still, still)
+        columns = [self.plan.torque(rigid, q, still, still + unit) for unit in np.eye(q.shape[1])]
+        return np.stack([column - weight for column in columns], axis=-1)
+
     def gear_torque(self, values: Array, q: Array, qd: Array, qdd: Array) -> Array:
         """Return the torque [N·m, N] that the gears transmit, of parameters (p,), shape (m, n).
 

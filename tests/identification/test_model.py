@@ -120,6 +120,18 @@ class TestRobotModel:
         expected += rotors * qdd + f0 * np.sign(qd) + f1 * qd + f2 * qd**3 + fo
         assert np.abs(model.torque(values, q, qd, qdd) - expected).max() < 1e-10
 
+    def test_inertia_of_the_joints_is_pinocchios_plus_rotors(self):
+        robot = pin.buildModelFromXML(urdf_text())
+        robot.armature = np.linspace(0.1, 5.0, robot.nv)
+        model = RobotModel.from_urdf(urdf_text(), friction=FrictionLaw(third="cubic", offset=True))
+        standard = model.nominal.reshape(-1, 11)
+        standard[:, 10] = robot.armature
+        values = np.append(model.base.grouping @ standard.reshape(-1), np.ones(4 * robot.nv))
+        positions = np.random.default_rng(5).uniform(-3.0, 3.0, (5, robot.nv))
+        expected = [pin.crba(robot, robot.createData(), position) for position in positions]
+        symmetric = [np.triu(each) + np.triu(each, 1).T for each in expected]
+        np.testing.assert_allclose(model.joint_inertia(values, positions), symmetric, atol=1e-10)
+
     @pytest.mark.parametrize(
         ("text", "locked", "message"),
         [

@@ -23,6 +23,7 @@ from identification.selection.essential import CutRule, choose_essential, elimin
 from identification.selection.inner_prediction import (
     CONSISTENT,
     DELAY,
+    IMPOSSIBLE_WORTHWHILE,
     LOAD,
     LOW_PASS,
     SHORT,
@@ -418,6 +419,25 @@ class TestChosenSettings:
         assert not settings.strength.consistent
         decision = next(choice for choice in choices if choice.name == CONSISTENT)
         assert decision.errors[1] < (1.0 - WORTHWHILE) * decision.errors[0]
+
+    @pytest.mark.parametrize(
+        ("frequencies", "stiffness", "possible"),
+        [(1, 2.0, True), (1, 15.0, False), (3, 15.0, False)],
+    )
+    def test_negative_inertia_needs_several_frequencies(self, frequencies, stiffness, possible):
+        """Of one, position and acceleration are one column, and it is that of a spring.
+
+        One that predicts far better is trusted.
+        """
+        joint = MODEL.joint_names[1]
+        sprung = MODEL.with_elements([TorsionSpring(joint, rest=0.0, identified=True)])
+        paces = np.array([[1.1, 0.9], [2.3, 3.1], [4.7, 5.3]])[:frequencies]
+        motion = sine_motion(np.arange(0.0, 30.0, 0.005), 0.4, paces, paces)
+        recording = a_recording(sprung, np.append(truth(), stiffness), motion=motion, noise=0.3)
+        settings, choices = chosen(recording, {"estimator"})
+        decision = next(choice for choice in choices if choice.name == CONSISTENT)
+        assert decision.errors[1] < (1.0 - IMPOSSIBLE_WORTHWHILE) * decision.errors[0]
+        assert settings.strength.consistent == possible
 
     def test_a_short_recording_asks_fewer_questions(self):
         """It is not asked for a narrower bandwidth."""
