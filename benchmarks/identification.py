@@ -52,7 +52,8 @@ from benchmarks.regressor import SAMPLES, sine_motion
 from identification import Motion, RobotModel
 from identification.estimators.consistent import consistent_estimate
 from identification.estimators.covariance import with_block_covariance
-from identification.factor.factor import Estimate, Factor, estimate, joint_weights
+from identification.factor.estimate import Estimate, estimate, joint_weights
+from identification.factor.factor import Factor
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.signals.recording import Recording

@@ -66,7 +66,8 @@ from identification.estimators.payload import NAMES, figures_of, identify_payloa
 from identification.estimators.payload_problem import KnownArm, Run
 from identification.estimators.prior import body_prior, design_effect_of, fit_posterior
 from identification.excitation import ViaPointMotion
-from identification.factor.factor import Estimate, Factor
+from identification.factor.estimate import Estimate
+from identification.factor.factor import Factor
 from identification.model.pseudo_inertia import Body
 from identification.model.robot import RobotModel
 from sim_fixtures import SimulatedController

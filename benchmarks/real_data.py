@@ -46,14 +46,9 @@ from identification.estimators.losses import Huber, Tukey
 from identification.estimators.prior import body_prior, fit_posterior
 from identification.estimators.robust import robust_estimate
 from identification.estimators.torque_channel import possible_low_passes
-from identification.factor.factor import (
-    Estimate,
-    Factor,
-    NormalEquations,
-    joint_weights,
-    solve,
-    total_factor,
-)
+from identification.factor.estimate import Estimate, joint_weights
+from identification.factor.factor import Factor, total_factor
+from identification.factor.normal_equations import NormalEquations, solve
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel

@@ -37,7 +37,8 @@ from identification.estimators.ensemble import Ensemble, draw_ensemble
 from identification.export.arm import Arm, Ranges
 from identification.export.friction import median_load
 from identification.export.parameters import estimate_in
-from identification.factor.factor import FINE_BLOCK, fine_blocks, total_factor
+from identification.factor.blocks import FINE_BLOCK, fine_blocks
+from identification.factor.factor import total_factor
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.pseudo_inertia import margin
 from identification.model.robot import RobotModel

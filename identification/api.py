@@ -34,7 +34,9 @@ from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.export.parameters import parameters_csv, parameters_json
 from identification.export.urdf import write_urdf
 from identification.factor.columns import instrument_factor
-from identification.factor.factor import Estimate, Factor, NormalEquations, estimate
+from identification.factor.estimate import Estimate, estimate
+from identification.factor.factor import Factor
+from identification.factor.normal_equations import NormalEquations
 from identification.model.base_parameters import BaseParameters
 from identification.model.coupling import Coupling
 from identification.model.elements import (

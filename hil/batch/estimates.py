@@ -19,7 +19,8 @@ from identification.estimators.consistent import SolverError
 from identification.estimators.covariance import solve_with_prior
 from identification.estimators.delay import with_uncertain_delay
 from identification.estimators.least_squares import no_narrower
-from identification.factor.factor import QR_CONDITION, Estimate, Factor, require_rows
+from identification.factor.estimate import Estimate
+from identification.factor.factor import QR_CONDITION, Factor, require_rows
 from identification.selection.settings import Settings
 
 from .cache import CacheLocation

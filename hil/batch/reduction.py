@@ -19,7 +19,8 @@ from hil.identify.sources import Source, known_warnings, source_of
 from identification.estimators.delay import rate_products
 from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.prior import ScoreScatter, body_prior
-from identification.factor.factor import Estimate, Factor
+from identification.factor.estimate import Estimate
+from identification.factor.factor import Factor
 from identification.selection.settings import Settings
 
 from .cache import Arrays, CacheLocation, code_digest

@@ -38,7 +38,8 @@ from hil.reading import path_exists
 from hil.terminal_text import plural
 from identification.estimators.delay import rate_products
 from identification.excitation import midpoints
-from identification.factor.factor import Estimate, Factor, inverse_variance
+from identification.factor.estimate import Estimate, inverse_variance
+from identification.factor.factor import Factor
 from identification.signals.samples import Samples
 
 from .precision_record import IN_A_ROW, Look, PrecisionRecord, Reached

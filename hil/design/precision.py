@@ -27,7 +27,8 @@ from identification.estimators.payload import parameter_change
 from identification.estimators.payload_problem import DRIFT
 from identification.excitation import Excitation, LoadQuantities, Objective, midpoints
 from identification.excitation.precision import Precision
-from identification.factor.factor import Factor, inverse_variance
+from identification.factor.estimate import inverse_variance
+from identification.factor.factor import Factor
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.selection.settings import Strength

@@ -17,7 +17,7 @@ from hil.cell.text import urdf_limits
 from identification.estimators.prior import without_masses
 from identification.estimators.torque_channel import torque_noiseless_above
 from identification.estimators.torque_scale import DATA_SHEET, described
-from identification.factor.factor import Estimate
+from identification.factor.estimate import Estimate
 from identification.model.friction import TERMS, FrictionLaw
 from identification.selection.inner_prediction import LOAD, LOW_PASS, REVERSAL
 from identification.signals.masks import SATURATED

@@ -48,15 +48,9 @@ from identification.estimators.prior import (
 from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.estimators.torque_scale import with_torque_scale
 from identification.factor.columns import instrument_factor
-from identification.factor.factor import (
-    QR_CONDITION,
-    Estimate,
-    Factor,
-    inverse_variance,
-    no_rows_message,
-    solve,
-    total_factor,
-)
+from identification.factor.estimate import Estimate, inverse_variance
+from identification.factor.factor import QR_CONDITION, Factor, no_rows_message, total_factor
+from identification.factor.normal_equations import solve
 from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Samples
 from identification.text import percentage

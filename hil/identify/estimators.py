@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from identification.estimators.consistent import consistent_estimate
 from identification.estimators.least_squares import Fit, Weighting, fit_least_squares
-from identification.factor.factor import Estimate, Factor, joint_weights
+from identification.factor.estimate import Estimate, joint_weights
+from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 

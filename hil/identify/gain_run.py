@@ -15,8 +15,9 @@ from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification.estimators.gains import MOST_BLOCKS, Gains, identify_gains
+from identification.factor.blocks import FINE_BLOCK
 from identification.factor.columns import gain_factor
-from identification.factor.factor import FINE_BLOCK, Factor
+from identification.factor.factor import Factor
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.selection.settings import Settings

@@ -26,14 +26,9 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.prior import BodyPrior, body_prior
-from identification.factor.factor import (
-    Estimate,
-    Factor,
-    NormalEquations,
-    estimate,
-    joint_weights,
-    rows_of,
-)
+from identification.factor.estimate import Estimate, estimate, joint_weights
+from identification.factor.factor import Factor
+from identification.factor.normal_equations import NormalEquations, rows_of
 from identification.model.friction import dissipation
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.pseudo_inertia import (

@@ -25,19 +25,11 @@ from numpy.typing import NDArray
 
 from identification.distributions import student_limit
 from identification.estimators.losses import Loss
-from identification.factor.factor import (
-    FINE_BLOCK,
-    Estimate,
-    Factor,
-    NormalEquations,
-    Solution,
-    augmented_rows,
-    block_slices,
-    fine_blocks,
-    mark_undetermined,
-    merged,
-    solve,
-)
+from identification.factor.blocks import FINE_BLOCK, block_slices, fine_blocks, merged
+from identification.factor.estimate import Estimate, mark_undetermined
+from identification.factor.factor import Factor
+from identification.factor.normal_equations import NormalEquations, Solution, solve
+from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 

@@ -25,19 +25,10 @@ from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread
 from identification.estimators.load_friction import fit_with_load
 from identification.estimators.torque_scale import DATA_SHEET
-from identification.factor.factor import (
-    Estimate,
-    Factor,
-    NormalEquations,
-    Solution,
-    count_by_block,
-    estimate,
-    inverse_variance,
-    merged,
-    no_rows_message,
-    residual_variance,
-    solve,
-)
+from identification.factor.blocks import count_by_block, merged
+from identification.factor.estimate import Estimate, estimate, inverse_variance, residual_variance
+from identification.factor.factor import Factor, no_rows_message
+from identification.factor.normal_equations import NormalEquations, Solution, solve
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.masks import near_any_reversal

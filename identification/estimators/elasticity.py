@@ -22,13 +22,10 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.estimators.delay import DELAY_BANDWIDTH
-from identification.factor.factor import (
-    Estimate,
-    Factor,
-    augmented_rows,
-    inverse_variance,
-    solve,
-)
+from identification.factor.estimate import Estimate, inverse_variance
+from identification.factor.factor import Factor
+from identification.factor.normal_equations import solve
+from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from identification.errors import IdentificationError
 from identification.estimators.consistent import Program, is_consistent, without_rounding
 from identification.estimators.prior import BodyPrior
-from identification.factor.factor import Estimate, Factor
+from identification.factor.estimate import Estimate
+from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]

@@ -26,14 +26,9 @@ from numpy.typing import NDArray
 from identification.errors import IdentificationError
 from identification.estimators.covariance import Clustered, cluster_covariance
 from identification.estimators.payload_problem import DRIFT, OFFSET, STRETCH
-from identification.factor.factor import (
-    FINE_BLOCK,
-    Factor,
-    NormalEquations,
-    Solution,
-    merged,
-    solve,
-)
+from identification.factor.blocks import FINE_BLOCK, merged
+from identification.factor.factor import Factor
+from identification.factor.normal_equations import NormalEquations, Solution, solve
 from identification.model.robot import RobotModel
 from identification.text import percentage
 

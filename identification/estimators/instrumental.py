@@ -23,18 +23,17 @@ from numpy.typing import NDArray
 from identification.distributions import student_limit
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread
+from identification.factor.blocks import FINE_BLOCK, merged
 from identification.factor.columns import measured_part
-from identification.factor.factor import (
-    FINE_BLOCK,
-    WORST_CONDITION,
+from identification.factor.estimate import (
     Estimate,
-    Factor,
     estimate_of,
     inverse_variance,
     joint_weights,
-    merged,
     residual_variance,
 )
+from identification.factor.factor import Factor
+from identification.factor.normal_equations import WORST_CONDITION
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import RIGID_BANDWIDTH, Samples

@@ -11,16 +11,9 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.estimators.covariance import Clustered, block_covariance, clustered_covariance
-from identification.factor.factor import (
-    Estimate,
-    Factor,
-    Solution,
-    estimate,
-    estimate_of,
-    joint_weights,
-    reduced,
-    total_factor,
-)
+from identification.factor.estimate import Estimate, estimate, estimate_of, joint_weights
+from identification.factor.factor import Factor, reduced, total_factor
+from identification.factor.normal_equations import Solution
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 

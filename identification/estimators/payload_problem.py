@@ -15,17 +15,10 @@ from numpy.typing import NDArray
 from identification.errors import IdentificationError
 from identification.estimators.covariance import Clustered, cluster_covariance
 from identification.estimators.torque_scale import scale_sensitivity
-from identification.factor.factor import (
-    FINE_BLOCK,
-    Estimate,
-    Factor,
-    NormalEquations,
-    count_by_block,
-    fine_blocks,
-    inverse_variance,
-    no_rows_message,
-    solve,
-)
+from identification.factor.blocks import FINE_BLOCK, count_by_block, fine_blocks
+from identification.factor.estimate import Estimate, inverse_variance
+from identification.factor.factor import Factor, no_rows_message
+from identification.factor.normal_equations import NormalEquations, solve
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.pseudo_inertia import inertial_from_pseudo, pseudo_inertia_map
 from identification.model.regressor import RegressorPlan

@@ -23,18 +23,15 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_covariance
-from identification.factor.factor import (
+from identification.factor.estimate import (
     Estimate,
-    Factor,
-    Solution,
     estimate_of,
     inverse_variance,
     joint_weights,
     mark_undetermined,
-    require_rows,
-    solve_positive,
-    solve_rows,
 )
+from identification.factor.factor import Factor, require_rows
+from identification.factor.normal_equations import Solution, solve_positive, solve_rows
 from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]

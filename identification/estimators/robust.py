@@ -11,16 +11,10 @@ from numpy.typing import NDArray
 
 from identification.estimators.covariance import clustered_covariance
 from identification.estimators.losses import Huber, Loss, Tukey
-from identification.factor.factor import (
-    Estimate,
-    Factor,
-    Solution,
-    augmented_rows,
-    estimate_of,
-    inverse_variance,
-    reduced,
-    total_factor,
-)
+from identification.factor.estimate import Estimate, estimate_of, inverse_variance
+from identification.factor.factor import Factor, reduced, total_factor
+from identification.factor.normal_equations import Solution
+from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.factor.factor import EqualRuns, add_grams, equal_runs
+from identification.factor.blocks import EqualRuns, add_grams, equal_runs
 from identification.model.robot import RobotModel
 from identification.signals.masks import LONGEST_END, edge_rows
 from identification.signals.recording import Recording
@@ -222,7 +222,7 @@ class _Spectra:
     def misfits(self, filters: Sequence[_Filter]) -> Array:
         """Return the mean log standard deviation of the residual of each of k filters (k,).
 
-        Of weighted least squares, as :func:`identification.factor.factor.estimate`.
+        Of weighted least squares, as :func:`identification.factor.estimate.estimate`.
         """
         responses = [self.response(channel) for channel in filters]
         gain, lag = (np.array(part) for part in zip(*responses, strict=True))

@@ -16,7 +16,7 @@ import numpy as np
 from identification.errors import IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
 from identification.export.urdf import not_in_urdf
-from identification.factor.factor import Estimate
+from identification.factor.estimate import Estimate
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 

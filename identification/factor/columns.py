@@ -13,13 +13,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.factor.factor import (
-    FINE_BLOCK,
-    Factor,
-    augmented_rows,
-    count_by_block,
-    fine_blocks,
-)
+from identification.factor.blocks import FINE_BLOCK, count_by_block, fine_blocks
+from identification.factor.factor import Factor
+from identification.factor.rows import augmented_rows
 from identification.model.motion import Motion
 from identification.model.payload import Load, Payload
 from identification.model.regressor import RegressorPlan

@@ -1,4 +1,4 @@
-"""Reduced samples, and weighted least squares on them (eq. 4 of the paper).
+"""Reduced samples: sums over the rows of recordings.
 
 A :class:`Factor` sums the rows [W | y] joint by joint and by blocks of time, as Gram matrices or
 triangles. Factors add over chunks, repetitions, archives and processes; joint weights are applied
@@ -7,66 +7,45 @@ afterwards. Gram matrices square the condition: from 1e5 on triangles are used.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
-from typing import Final, Literal, NamedTuple, Self, TypeVar
+from typing import Final, Literal, Self
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
+from identification.factor.blocks import (
+    FINE_BLOCK,
+    add_grams,
+    added,
+    block_slices,
+    count_by_block,
+    equal_runs,
+    fine_blocks,
+    merged,
+)
+from identification.factor.normal_equations import (
+    NormalEquations,
+    Solution,
+    rows_of,
+    solve,
+    solve_rows,
+)
+from identification.factor.rows import augmented_rows
 from identification.model.motion import Motion
-from identification.model.regressor import CHUNK, joint_arrays
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Blocks = TypeVar("Blocks", NDArray[np.float64], NDArray[np.intp])
 Storage = Literal["gram", "qr"]
 
-FINE_BLOCK: Final = 0.125  # s
 _COARSEST: Final = 4  # fine blocks in a block of a long recording
 _MANY_BLOCKS: Final = 400  # from which on they are longer: a covariance needs some tens
 
-# Condition 1e6 leaves four digits of a Gram matrix, enough for torque measurements; rank deficiency
-# shows as 1e8 and more.
-WORST_CONDITION: Final = 1e6
-# Condition 1e10 leaves six digits of rows; structural dependence shows as 1e14 and more.
-WORST_ROW_CONDITION: Final = 1e10
 QR_CONDITION: Final = 1e5
-_PARTICIPATION: Final = 1e-3
-_NO_COLUMN: Final = 1e-10  # length of a column that is rounding, over that of the longest
-
-
-class NormalEquations(NamedTuple):
-    """``A pi = b`` of a weighted least-squares problem."""
-
-    A: Array  #: sum of the weighted ``W^T W``, shape (p, p)
-    b: Array  #: sum of the weighted ``W^T y``, shape (p,)
-    yy: float = 0.0  #: sum of the weighted ``y^T y``
-    n: int = 0  #: rows (one joint at one time)
-
-    def part(self, chosen: Indices) -> NormalEquations:
-        """Return the equations of some parameters (k,), the others zero."""
-        return self._replace(A=self.A[np.ix_(chosen, chosen)], b=self.b[chosen])
-
-
-class Solution(NamedTuple):
-    """Solution of a least-squares problem, of normal equations ``A x = b`` or of rows."""
-
-    values: Array  # (p,), of least (scaled) norm where undetermined
-    root: Array  # S (p, k) with S S' the inverse of A on the k determined directions
-    condition: float  # of the regressor with unit columns, infinite without some column
-    determined: NDArray[np.bool_]  # (p,)
-
-    @property
-    def inverse(self) -> Array:
-        """Inverse of A on what is determined, zero elsewhere (p, p)."""
-        return np.asarray(self.root @ self.root.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,9 +300,9 @@ class Factor:
             raise IdentificationError("factors with different joints or parameters cannot be added")
         longest = max((part.block for part in (self, other) if len(part)), default=self.block)
         mine, its = (part.of_blocks(longest) for part in (self, other))
-        add = _added if self.storage == "gram" else _triangles_of_both
+        add = added if self.storage == "gram" else _triangles_of_both
         matrices = tuple(add(a, b) for a, b in zip(mine.matrices, its.matrices, strict=True))
-        counts = _added(mine.counts, its.counts)
+        counts = added(mine.counts, its.counts)
         return replace(mine, matrices=matrices, counts=counts)
 
     def by_block(self, weights: Array) -> Array:
@@ -429,91 +408,11 @@ def total_factor(model: RobotModel, recordings: Iterable[Samples]) -> Factor:
     return sum((Factor.by_time(model, samples) for samples in recordings), Factor.zero(model))
 
 
-# Blocks of time
-
-
-def fine_blocks(samples: Samples) -> Indices:
-    """Return the block of each sample (m,), rising; rows before the origin belong to the first."""
-    since = samples.motion.time - samples.origin
-    return np.maximum(np.floor(since / FINE_BLOCK + 1e-9).astype(np.intp), 0)
-
-
-def block_slices(index: Indices) -> Iterator[tuple[int, slice]]:
-    """Yield each value of a rising index with its slice."""
-    edges = np.flatnonzero(np.diff(index)) + 1
-    for start, stop in pairwise([0, *edges.tolist(), len(index)]):
-        if stop > start:
-            yield int(index[start]), slice(start, stop)
-
-
-class EqualRuns(NamedTuple):
-    """Consecutive blocks of equally many rows."""
-
-    first: int  # block
-    blocks: int
-    start: int  # first row
-    length: int  # rows per block
-
-
-def equal_runs(index: Indices) -> list[EqualRuns]:
-    """Group :func:`block_slices` of a rising index, for few large operations."""
-    groups: list[EqualRuns] = []
-    for block, at in block_slices(index):
-        length = at.stop - at.start
-        last = groups[-1] if groups else None
-        if last is not None and last.length == length and last.first + last.blocks == block:
-            groups[-1] = last._replace(blocks=last.blocks + 1)
-        else:
-            groups.append(EqualRuns(block, 1, at.start, length))
-    return groups
-
-
-def add_grams(total: Array, rows: Array, runs: Iterable[EqualRuns]) -> None:
-    """Add ``rows rows'`` of each block to the total (B, c, c), in place; rows is (c, k)."""
-    for first, count, start, length in runs:
-        run_rows = rows[:, start : start + count * length].reshape(len(rows), count, length)
-        # A product with the own transpose takes half the work.
-        run_rows = run_rows.transpose(1, 0, 2)
-        total[first : first + count] += run_rows @ run_rows.transpose(0, 2, 1)
-
-
-def count_by_block(index: Indices, usable: NDArray[np.bool_]) -> Indices:
-    """Return usable rows per block (B, n) of a mask (m, n), by a rising index (m,)."""
-    if not len(index):
-        return np.zeros((0, usable.shape[1]), dtype=np.intp)
-    ends = np.searchsorted(index, np.arange(int(index[-1]) + 1), side="right")
-    sums = np.cumsum(usable, axis=0, dtype=np.intp)[np.maximum(ends - 1, 0)]
-    sums[ends == 0] = 0
-    return np.diff(sums, axis=0, prepend=0)
-
-
-def merged(blocks: Blocks, length: int) -> Blocks:
-    """Sum runs of `length` blocks along the first axis (B, ...); the last may be shorter."""
-    total = blocks[::length].copy()
-    for later in range(1, length):  # faster than np.add.reduceat
-        addend = blocks[later::length]
-        total[: len(addend)] += addend
-    return total
-
-
-def _added(first: Blocks, second: Blocks) -> Blocks:
-    """Add blocks (B, ...) of possibly different number."""
-    longer, shorter = (first, second) if len(first) >= len(second) else (second, first)
-    if not len(shorter):
-        return longer
-    total = longer.copy()
-    total[: len(shorter)] += shorter
-    return total
-
-
 def _triangles_of_both(first: Array, second: Array) -> Array:
     """Add triangles (B, c, c) of possibly different number."""
     longer, shorter = (first, second) if len(first) >= len(second) else (second, first)
     both = [_triangle(np.concatenate(pair)) for pair in zip(longer, shorter, strict=False)]
     return np.array([*both, *longer[len(shorter) :]]).reshape(longer.shape)
-
-
-# Solutions
 
 
 def _triangle(rows: Array) -> Array:
@@ -522,178 +421,6 @@ def _triangle(rows: Array) -> Array:
     square = np.zeros((rows.shape[1], rows.shape[1]))
     square[: len(triangle)] = triangle
     return square
-
-
-def _unit_columns(length: Array) -> Array:
-    """Return divisors for columns of a length (p,), one for zero."""
-    return np.where(length > 0.0, length, 1.0)
-
-
-def _determined_part(length: Array, size: Array, vectors: Array, worst: float) -> Solution:
-    """Return a solution without values, from singular values (p,) and vectors of unit columns."""
-    significant = (size > size.max(initial=0.0) / worst) & (size > 0.0)
-    lost = np.abs(vectors[:, ~significant]).max(axis=1, initial=0.0)
-    smallest = size.min(initial=np.inf) if np.all(length > 0.0) else 0.0
-    return Solution(
-        values=np.zeros(len(length)),
-        root=vectors[:, significant] / size[significant] / _unit_columns(length)[:, None],
-        condition=float(size.max() / smallest) if smallest > 0.0 else np.inf,
-        determined=np.asarray((length > 0.0) & (lost < _PARTICIPATION)),
-    )
-
-
-def solve(equations: NormalEquations, worst: float = WORST_CONDITION) -> Solution:
-    """Solve ``A x = b`` with unit columns; parameters of a condition above `worst` are open."""
-    length = np.sqrt(np.diag(equations.A))
-    scale = _unit_columns(length)
-    eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
-    part = _determined_part(length, np.sqrt(np.maximum(eigenvalues, 0.0)), vectors, worst)
-    return part._replace(values=part.root @ (part.root.T @ equations.b))
-
-
-def solve_with_ridge(gram: Array, cross: Array, ridge: float) -> Array:
-    """Solve ``G x = b`` (k, k), (k,), with a ridge as a share of each column's information.
-
-    Several times faster than :func:`solve`; columns of zeros, but for rounding, have parameters of
-    zero.
-    """
-    length = np.sqrt(np.maximum(np.diag(gram), 0.0))
-    present = length > _NO_COLUMN * length.max(initial=0.0)
-    scale = np.where(present, length, 1.0)
-    normal = gram / np.outer(scale, scale)
-    np.fill_diagonal(normal, np.where(present, 1.0 + ridge, 1.0))
-    return solve_positive(normal, cross / scale) / scale
-
-
-def solve_positive(matrix: Array, right: Array) -> Array:
-    """Solve ``M x = r`` with a positive definite matrix (k, k), (k,).
-
-    Raises:
-        numpy.linalg.LinAlgError: the matrix is singular.
-    """
-    _, solution, failed = scipy.linalg.lapack.dposv(matrix.T, right)
-    # A matrix that rounding made indefinite.
-    return np.asarray(np.linalg.solve(matrix, right) if failed else solution)
-
-
-def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -> Solution:
-    """Solve ``rows @ x = target`` (k, p), (k,) without squaring the condition.
-
-    By a singular value decomposition (Golub and Van Loan 2013, section 5.3); `worst` as for
-    :func:`solve`.
-    """
-    length = np.linalg.norm(rows, axis=0)
-    left, singular, right = np.linalg.svd(rows / _unit_columns(length), full_matrices=True)
-    size = np.zeros(rows.shape[1])
-    size[: len(singular)] = singular
-    part = _determined_part(length, size, right.T, worst)
-    # Significant values come first.
-    return part._replace(values=part.root @ (left[:, : part.root.shape[1]].T @ target))
-
-
-def rows_of(equations: NormalEquations) -> tuple[Array, Array]:
-    """Return rows (k, p) and target (k,) with ``rows'rows = A`` and ``rows'target = b``."""
-    length = np.sqrt(np.maximum(np.diag(equations.A), 0.0))
-    scale = _unit_columns(length)
-    eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
-    significant = eigenvalues > max(eigenvalues[-1], 0.0) / WORST_CONDITION**2
-    singular = np.sqrt(eigenvalues[significant])
-    basis = vectors[:, significant].T
-    # Exactly zero for columns without data.
-    return singular[:, None] * basis * length, (basis @ (equations.b / scale)) / singular
-
-
-def residual_variance(factor: Factor, values: Array, root: Array, weights: Array) -> Array:
-    """Return the variance of the torque residual per joint (n,), NaN without rows.
-
-    Degrees of freedom are shared by the information trace(w_j S' G_j S) of joints, S = root (p, k).
-    """
-    squares = factor.products(np.append(-values, 1.0)[:, None])[:, 0, 0]
-    spent = weights * np.trace(factor.products(root), axis1=1, axis2=2)
-    variance = np.maximum(squares, 0.0) / np.maximum(factor.samples - spent, 1.0)
-    return np.where(factor.samples > 0, np.maximum(variance, factor.smallest_variance), np.nan)
-
-
-def joint_weights(factor: Factor) -> Array:
-    """Return the inverse residual variance per joint in an ordinary fit (n,), zero without rows."""
-    ordinary = np.ones(factor.n_joints)
-    first = factor.solve(ordinary)
-    return inverse_variance(residual_variance(factor, first.values, first.root, ordinary))
-
-
-def inverse_variance(variance: Array) -> Array:
-    """Return weights (n,) of joints, zero for variances of NaN or infinity."""
-    finite = np.isfinite(variance)
-    return np.where(finite, 1.0 / np.where(finite, variance, 1.0), 0.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """Parameters with their covariance."""
-
-    names: tuple[str, ...]  #: (p,)
-    units: tuple[str, ...]  #: (p,)
-    values: Array  #: (p,)
-    covariance: Array  #: (p, p); the variance of an undetermined parameter is infinite
-    noise_std: Array  #: standard deviation of the torque residual per joint (n,) [N·m or N]
-    samples: Indices  #: rows per joint (n,)
-    method: str  #: description of estimator and covariance
-    condition: float  #: condition number of the weighted regressor with unit columns
-    undetermined: tuple[str, ...] = ()  #: undetermined parameters, alone or in a combination
-    #: standard deviations in half a 95 % interval: 1.96, more for covariances of few data
-    interval_factor: float = 1.96
-
-    @property
-    def std(self) -> Array:
-        """Standard deviations (p,)."""
-        return np.sqrt(np.diag(self.covariance))
-
-    def value(self, name: str) -> float:
-        """Return one parameter by name."""
-        return float(self.values[self.names.index(name)])
-
-
-def estimate(model: RobotModel, factor: Factor, weights: Array | None = None) -> Estimate:
-    """Estimate by weighted least squares (eq. 4); weights (n,) by default from an ordinary fit.
-
-    The covariance is the classical one, A^-1, valid for white residuals; see
-    :mod:`identification.estimators.covariance` for others.
-
-    Raises:
-        IdentificationError: the factor has no rows.
-    """
-    require_rows(model, factor)
-    if weights is None:
-        weights = joint_weights(factor)
-    method = f"weighted least squares{factor.method_suffix}, classical covariance (white residuals)"
-    return estimate_of(model.units, factor, factor.solve(weights), weights, method)
-
-
-def estimate_of(
-    units: Sequence[str],
-    factor: Factor,
-    solution: Solution,
-    weights: Array,
-    method: str,
-    covariance: Array | None = None,
-    interval_factor: float = 1.96,
-) -> Estimate:
-    """Return the estimate of a solution with weights (n,); covariance by default A^-1."""
-    covariance = solution.inverse if covariance is None else covariance.copy()
-    mark_undetermined(covariance, solution.determined)
-    variance = residual_variance(factor, solution.values, solution.root, weights)
-    return Estimate(
-        names=factor.parameter_names,
-        units=tuple(units),
-        values=solution.values,
-        covariance=covariance,
-        noise_std=np.sqrt(variance),
-        samples=factor.samples,
-        method=method,
-        condition=solution.condition,
-        undetermined=undetermined_names(factor.parameter_names, solution.determined),
-        interval_factor=interval_factor,
-    )
 
 
 def require_rows(model: RobotModel, factor: Factor) -> None:
@@ -712,20 +439,6 @@ def no_rows_message(model: RobotModel) -> str:
     )
 
 
-def mark_undetermined(covariance: Array, determined: NDArray[np.bool_]) -> None:
-    """Set infinite variance and zero covariance of undetermined parameters, in place."""
-    covariance[~determined, :] = 0.0
-    covariance[:, ~determined] = 0.0
-    covariance[~determined, ~determined] = np.inf
-
-
-def undetermined_names(names: Sequence[str], determined: NDArray[np.bool_]) -> tuple[str, ...]:
-    """Return the names (p,) of undetermined parameters (p,)."""
-    return tuple(
-        name for name, is_determined in zip(names, determined, strict=True) if not is_determined
-    )
-
-
 def reduced(model: RobotModel, recordings: Sequence[Samples], gram: Factor) -> Factor:
     """Return Gram matrices of recordings, or triangles if the condition exceeds `QR_CONDITION`.
 
@@ -739,53 +452,3 @@ def reduced(model: RobotModel, recordings: Sequence[Samples], gram: Factor) -> F
         return gram
     triangles = (Factor.of(model, samples, "qr") for samples in recordings)
     return sum(triangles, Factor.zero(model, storage="qr"))
-
-
-class Rows(NamedTuple):
-    """Rows of k consecutive samples, joint by joint."""
-
-    part: slice  # of the recording
-    # per joint j its columns and, last, its torque (c_j + 1, k), zero for unusable rows; valid
-    # until the next chunk
-    blocks: list[Array]
-
-
-def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
-    """Yield [W | y] of a recording in chunks, zero for unusable rows.
-
-    ``model.plan.columns[j]`` are the parameters of the columns of joint j.
-
-    Raises:
-        ShapeError: wrong shape of an array.
-    """
-    q, qd, qdd, torque = joint_arrays(
-        model.n_joints,
-        position=samples.motion.position,
-        velocity=samples.motion.velocity,
-        acceleration=samples.motion.acceleration,
-        torque=samples.torque,
-    )
-    chunks: Iterable[tuple[slice, list[Array]]]
-    if samples.torque_bandwidth is None:
-        direction = samples.motion.direction
-        load = samples.motion.load
-        chunks = model.chunks(q, qd, qdd, direction, load, response=torque)
-    else:
-        chunks = _filtered(model, samples)
-    for part, blocks in chunks:
-        for block, lost in zip(blocks, ~samples.usable[part].T, strict=True):
-            if lost.any():
-                # Unusable rows may be NaN.
-                block[:, np.flatnonzero(lost)] = 0.0
-        yield Rows(part, blocks)
-
-
-def _filtered(model: RobotModel, samples: Samples) -> Iterator[tuple[slice, list[Array]]]:
-    blocks, _ = samples.regressor(model)
-    tables = [
-        np.concatenate([block.T, torque[None]])
-        for block, torque in zip(blocks, samples.torque.T, strict=True)
-    ]
-    for start in range(0, len(samples.torque), CHUNK):
-        part = slice(start, min(start + CHUNK, len(samples.torque)))
-        yield part, [table[:, part] for table in tables]

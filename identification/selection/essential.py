@@ -18,16 +18,10 @@ from numpy.typing import NDArray
 from identification.distributions import student_limit
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, with_block_covariance
-from identification.factor.factor import (
-    Estimate,
-    Factor,
-    Solution,
-    estimate_of,
-    joined,
-    joint_weights,
-    merged,
-    solve,
-)
+from identification.factor.blocks import merged
+from identification.factor.estimate import Estimate, estimate_of, joint_weights
+from identification.factor.factor import Factor, joined
+from identification.factor.normal_equations import Solution, solve
 from identification.model.robot import RobotModel
 from identification.text import percentage
 

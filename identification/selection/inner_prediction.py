@@ -27,14 +27,9 @@ from identification.estimators.prior import (
     posterior_values,
     torque_scatter,
 )
-from identification.factor.factor import (
-    Factor,
-    add_grams,
-    augmented_rows,
-    count_by_block,
-    equal_runs,
-    total_factor,
-)
+from identification.factor.blocks import add_grams, count_by_block, equal_runs
+from identification.factor.factor import Factor, total_factor
+from identification.factor.rows import augmented_rows
 from identification.model.elements import Element, TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel

@@ -17,14 +17,10 @@ from numpy.typing import NDArray
 
 from identification.distributions import normal_limit, student_limit
 from identification.errors import IdentificationError
-from identification.factor.factor import (
-    Estimate,
-    Factor,
-    augmented_rows,
-    block_slices,
-    count_by_block,
-    merged,
-)
+from identification.factor.blocks import block_slices, count_by_block, merged
+from identification.factor.estimate import Estimate
+from identification.factor.factor import Factor
+from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import FOLDS
 from identification.signals.masks import EDGE, SATURATED

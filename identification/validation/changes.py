@@ -17,7 +17,8 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.factor.factor import Estimate, Factor
+from identification.factor.estimate import Estimate
+from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.residuals import BlockMean, block_index, block_mean

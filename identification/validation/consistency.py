@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
 from identification.estimators.prior import BodyPrior
-from identification.factor.factor import Estimate, Factor
+from identification.factor.estimate import Estimate
+from identification.factor.factor import Factor
 from identification.model.pseudo_inertia import pseudo_inertia, reference_bodies
 from identification.model.robot import RobotModel
 from identification.validation.finding import joined, little_torque

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.factor.columns import standard_factor
-from identification.factor.factor import Estimate, Factor, total_factor
+from identification.factor.estimate import Estimate
+from identification.factor.factor import Factor, total_factor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.causes import Cause, find_causes

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.factor.factor import solve_with_ridge
+from identification.factor.normal_equations import solve_with_ridge
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.validation.fault_tables import FOLDS, FaultTables, folded
 from identification.validation.faults import Fault

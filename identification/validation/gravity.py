@@ -13,7 +13,8 @@ from identification.errors import IdentificationError
 from identification.estimators.payload import mass_difference
 from identification.estimators.payload_problem import Run
 from identification.factor.columns import under_gravity
-from identification.factor.factor import Factor, solve_with_ridge
+from identification.factor.factor import Factor
+from identification.factor.normal_equations import solve_with_ridge
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples

@@ -9,7 +9,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.factor.factor import Estimate, Factor
+from identification.factor.estimate import Estimate
+from identification.factor.factor import Factor
 from identification.model.friction import COULOMB
 from identification.model.robot import RobotModel
 from identification.validation.finding import little_torque

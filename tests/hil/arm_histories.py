@@ -13,7 +13,8 @@ from scipy.signal import lfilter
 from hil.batch.estimates import BatchEstimate
 from hil.cell import Cell
 from identification.estimators.covariance import with_block_covariance
-from identification.factor.factor import Factor, estimate, joint_weights
+from identification.factor.estimate import estimate, joint_weights
+from identification.factor.factor import Factor
 from sim_fixtures.ns16 import CELL_PATH, urdf_text
 from tests.identification.two_link import as_samples, sine_motion
 

@@ -17,7 +17,8 @@ from hil.identify.estimating import Posterior
 from hil.outcome import Exports, exports_of
 from identification import Estimate
 from identification.estimators.covariance import with_block_covariance
-from identification.factor.factor import Factor, estimate, joint_weights
+from identification.factor.estimate import estimate, joint_weights
+from identification.factor.factor import Factor
 from identification.selection.essential import Elimination, choose_essential
 from identification.selection.settings import Strength
 from identification.validation.consistency import ConsistencyCheck, check_consistency

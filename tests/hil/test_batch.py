@@ -38,6 +38,7 @@ from hil.identify.prepared import decide, prepare_sources
 from hil.identify.sources import gather_sources
 from hil.progress import Silent
 from identification.factor import factor
+from identification.factor.blocks import FINE_BLOCK
 from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Preprocessing
 from tests import messages
@@ -295,7 +296,7 @@ class TestCache:
         cache = CacheLocation(str(tmp_path / "cache"))
         computed = reduce_archives((ref,), SETTINGS, cache).total
         cached = cached_reduction((ref,), SETTINGS, cache).total
-        assert cached.block == computed.block > factor.FINE_BLOCK
+        assert cached.block == computed.block > FINE_BLOCK
         assert [matrix.tobytes() for matrix in cached.matrices] == [
             matrix.tobytes() for matrix in computed.matrices
         ]

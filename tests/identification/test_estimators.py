@@ -58,13 +58,9 @@ from identification.estimators.prior import (
     posterior_values,
 )
 from identification.export.urdf import NotConsistentError
-from identification.factor.factor import (
-    NormalEquations,
-    joint_weights,
-    rows_of,
-    solve,
-    total_factor,
-)
+from identification.factor.estimate import joint_weights
+from identification.factor.factor import total_factor
+from identification.factor.normal_equations import NormalEquations, rows_of, solve
 from identification.model.pseudo_inertia import pseudo_inertia
 from identification.signals.recording import in_succession
 from identification.signals.smoothing import low_pass

@@ -24,7 +24,8 @@ from identification.export.friction import friction_curve, median_load
 from identification.export.parameters import parameters_csv, parameters_json
 from identification.export.simulators import AGREES, FORMATS, compare, mjcf, random_states
 from identification.export.urdf import NotConsistentError, WriteBackError, not_in_urdf, write_urdf
-from identification.factor.factor import Factor, estimate
+from identification.factor.estimate import estimate
+from identification.factor.factor import Factor
 from identification.model.coupling import Coupling
 from identification.model.elements import Anchors, GasCylinder, TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw

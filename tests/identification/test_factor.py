@@ -14,18 +14,10 @@ from identification.errors import IdentificationError
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.robust import robust_estimate
-from identification.factor.factor import (
-    QR_CONDITION,
-    Factor,
-    augmented_rows,
-    estimate,
-    joint_weights,
-    reduced,
-    residual_variance,
-    solve,
-    solve_rows,
-    total_factor,
-)
+from identification.factor.estimate import estimate, joint_weights, residual_variance
+from identification.factor.factor import QR_CONDITION, Factor, reduced, total_factor
+from identification.factor.normal_equations import solve, solve_rows
+from identification.factor.rows import augmented_rows
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from sim_fixtures.ns16 import urdf_text

@@ -17,7 +17,8 @@ import identification
 from identification.errors import ModelError, ShapeError
 from identification.estimators.consistent import consistent_estimate
 from identification.export.urdf import write_urdf
-from identification.factor.factor import Factor, estimate, joined
+from identification.factor.estimate import estimate
+from identification.factor.factor import Factor, joined
 from identification.model.base_parameters import TOLERANCE
 from identification.model.coupling import Coupling
 from identification.model.elements import (

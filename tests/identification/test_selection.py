@@ -13,7 +13,8 @@ from scipy.signal import butter, sosfilt, sosfiltfilt
 
 from identification.errors import IdentificationError
 from identification.estimators.torque_channel import possible_low_passes
-from identification.factor.factor import Factor, estimate
+from identification.factor.estimate import estimate
+from identification.factor.factor import Factor
 from identification.model.elements import TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion

@@ -13,7 +13,8 @@ from identification.estimators.torque_scale import (
     scale_sensitivity,
     with_torque_scale,
 )
-from identification.factor.factor import Factor, estimate, joint_weights
+from identification.factor.estimate import estimate, joint_weights
+from identification.factor.factor import Factor
 from identification.model.payload import Load, Payload
 from tests.identification.two_link import MODEL, a_motion, as_samples, four_sines, truth
 

@@ -14,14 +14,9 @@ from scipy.signal import lfilter
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import estimate_repetitions
 from identification.estimators.prior import NOMINAL_SHARE
-from identification.factor.factor import (
-    Estimate,
-    Factor,
-    estimate,
-    joint_weights,
-    solve,
-    total_factor,
-)
+from identification.factor.estimate import Estimate, estimate, joint_weights
+from identification.factor.factor import Factor, total_factor
+from identification.factor.normal_equations import solve
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel

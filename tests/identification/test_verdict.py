@@ -10,7 +10,8 @@ import pytest
 
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.least_squares import estimate_repetitions
-from identification.factor.factor import Estimate, Factor, estimate
+from identification.factor.estimate import Estimate, estimate
+from identification.factor.factor import Factor
 from identification.model.motion import Motion
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel

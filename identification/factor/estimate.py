@@ -1,0 +1,123 @@
+"""Parameters with their covariance, by weighted least squares on a factor (eq. 4 of the paper)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.factor.factor import Factor, require_rows
+from identification.factor.normal_equations import Solution
+from identification.model.robot import RobotModel
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+def residual_variance(factor: Factor, values: Array, root: Array, weights: Array) -> Array:
+    """Return the variance of the torque residual per joint (n,), NaN without rows.
+
+    Degrees of freedom are shared by the information trace(w_j S' G_j S) of joints, S = root (p, k).
+    """
+    squares = factor.products(np.append(-values, 1.0)[:, None])[:, 0, 0]
+    spent = weights * np.trace(factor.products(root), axis1=1, axis2=2)
+    variance = np.maximum(squares, 0.0) / np.maximum(factor.samples - spent, 1.0)
+    return np.where(factor.samples > 0, np.maximum(variance, factor.smallest_variance), np.nan)
+
+
+def joint_weights(factor: Factor) -> Array:
+    """Return the inverse residual variance per joint in an ordinary fit (n,), zero without rows."""
+    ordinary = np.ones(factor.n_joints)
+    first = factor.solve(ordinary)
+    return inverse_variance(residual_variance(factor, first.values, first.root, ordinary))
+
+
+def inverse_variance(variance: Array) -> Array:
+    """Return weights (n,) of joints, zero for variances of NaN or infinity."""
+    finite = np.isfinite(variance)
+    return np.where(finite, 1.0 / np.where(finite, variance, 1.0), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Parameters with their covariance."""
+
+    names: tuple[str, ...]  #: (p,)
+    units: tuple[str, ...]  #: (p,)
+    values: Array  #: (p,)
+    covariance: Array  #: (p, p); the variance of an undetermined parameter is infinite
+    noise_std: Array  #: standard deviation of the torque residual per joint (n,) [N·m or N]
+    samples: Indices  #: rows per joint (n,)
+    method: str  #: description of estimator and covariance
+    condition: float  #: condition number of the weighted regressor with unit columns
+    undetermined: tuple[str, ...] = ()  #: undetermined parameters, alone or in a combination
+    #: standard deviations in half a 95 % interval: 1.96, more for covariances of few data
+    interval_factor: float = 1.96
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (p,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def value(self, name: str) -> float:
+        """Return one parameter by name."""
+        return float(self.values[self.names.index(name)])
+
+
+def estimate(model: RobotModel, factor: Factor, weights: Array | None = None) -> Estimate:
+    """Estimate by weighted least squares (eq. 4); weights (n,) by default from an ordinary fit.
+
+    The covariance is the classical one, A^-1, valid for white residuals; see
+    :mod:`identification.estimators.covariance` for others.
+
+    Raises:
+        IdentificationError: the factor has no rows.
+    """
+    require_rows(model, factor)
+    if weights is None:
+        weights = joint_weights(factor)
+    method = f"weighted least squares{factor.method_suffix}, classical covariance (white residuals)"
+    return estimate_of(model.units, factor, factor.solve(weights), weights, method)
+
+
+def estimate_of(
+    units: Sequence[str],
+    factor: Factor,
+    solution: Solution,
+    weights: Array,
+    method: str,
+    covariance: Array | None = None,
+    interval_factor: float = 1.96,
+) -> Estimate:
+    """Return the estimate of a solution with weights (n,); covariance by default A^-1."""
+    covariance = solution.inverse if covariance is None else covariance.copy()
+    mark_undetermined(covariance, solution.determined)
+    variance = residual_variance(factor, solution.values, solution.root, weights)
+    return Estimate(
+        names=factor.parameter_names,
+        units=tuple(units),
+        values=solution.values,
+        covariance=covariance,
+        noise_std=np.sqrt(variance),
+        samples=factor.samples,
+        method=method,
+        condition=solution.condition,
+        undetermined=undetermined_names(factor.parameter_names, solution.determined),
+        interval_factor=interval_factor,
+    )
+
+
+def mark_undetermined(covariance: Array, determined: NDArray[np.bool_]) -> None:
+    """Set infinite variance and zero covariance of undetermined parameters, in place."""
+    covariance[~determined, :] = 0.0
+    covariance[:, ~determined] = 0.0
+    covariance[~determined, ~determined] = np.inf
+
+
+def undetermined_names(names: Sequence[str], determined: NDArray[np.bool_]) -> tuple[str, ...]:
+    """Return the names (p,) of undetermined parameters (p,)."""
+    return tuple(
+        name for name, is_determined in zip(names, determined, strict=True) if not is_determined
+    )

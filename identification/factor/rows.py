@@ -1,0 +1,65 @@
+"""Rows [W | y] of a recording, in chunks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.model.regressor import CHUNK, joint_arrays
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+
+Array = NDArray[np.float64]
+
+
+class Rows(NamedTuple):
+    """Rows of k consecutive samples, joint by joint."""
+
+    part: slice  # of the recording
+    # per joint j its columns and, last, its torque (c_j + 1, k), zero for unusable rows; valid
+    # until the next chunk
+    blocks: list[Array]
+
+
+def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
+    """Yield [W | y] of a recording in chunks, zero for unusable rows.
+
+    ``model.plan.columns[j]`` are the parameters of the columns of joint j.
+
+    Raises:
+        ShapeError: wrong shape of an array.
+    """
+    q, qd, qdd, torque = joint_arrays(
+        model.n_joints,
+        position=samples.motion.position,
+        velocity=samples.motion.velocity,
+        acceleration=samples.motion.acceleration,
+        torque=samples.torque,
+    )
+    chunks: Iterable[tuple[slice, list[Array]]]
+    if samples.torque_bandwidth is None:
+        direction = samples.motion.direction
+        load = samples.motion.load
+        chunks = model.chunks(q, qd, qdd, direction, load, response=torque)
+    else:
+        chunks = _filtered(model, samples)
+    for part, blocks in chunks:
+        for block, lost in zip(blocks, ~samples.usable[part].T, strict=True):
+            if lost.any():
+                # Unusable rows may be NaN.
+                block[:, np.flatnonzero(lost)] = 0.0
+        yield Rows(part, blocks)
+
+
+def _filtered(model: RobotModel, samples: Samples) -> Iterator[tuple[slice, list[Array]]]:
+    blocks, _ = samples.regressor(model)
+    tables = [
+        np.concatenate([block.T, torque[None]])
+        for block, torque in zip(blocks, samples.torque.T, strict=True)
+    ]
+    for start in range(0, len(samples.torque), CHUNK):
+        part = slice(start, min(start + CHUNK, len(samples.torque)))
+        yield part, [table[:, part] for table in tables]
