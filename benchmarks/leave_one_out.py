@@ -3,7 +3,7 @@
 Run with ``python -m benchmarks.leave_one_out [--data FOLDER] [--only NAME ...]
 [--defaults NAME ...] [--json]``, with FOLDER as in `benchmarks.board`.
 
-Each default of :mod:`identification.selection.inner_prediction`, and the offset of the prior, is
+Each default of `identification.selection`, and the offset of the prior, is
 varied alone. For each robot, the value with the least geometric mean of held-out errors over all
 *other* robots is applied to this one: on the first held-out split, all rows, as a ratio to the
 error of `benchmarks.plain_fit`. If a default were fitted to these recordings, the mean of the
@@ -13,7 +13,8 @@ ratios with a robot left out would be larger than that of the present values.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
@@ -25,7 +26,7 @@ from benchmarks import parser_of, show
 from benchmarks.board import DATA, cut, fit_errors, identified_parts, split_logs
 from benchmarks.published import known
 from identification.estimators import prior
-from identification.selection import inner_prediction
+from identification.selection import folds, inner_prediction, trial
 
 ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
     "WORTHWHILE": (0.0, 0.03),
@@ -48,6 +49,7 @@ ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
 }
 """Other values of each default; of a sequence, the first is the one that others have to beat."""
 PRESENT: Final = "present values"
+_MODULES: Final = (folds, trial, inner_prediction, prior)
 
 
 def ratios(name: str, data: Path, defaults: Sequence[str]) -> dict[tuple[str, str], float]:
@@ -60,16 +62,25 @@ def ratios(name: str, data: Path, defaults: Sequence[str]) -> dict[tuple[str, st
         errors[PRESENT, ""] = identified_parts(parts, Path(scratch)).error / fit
         for default in defaults:
             for value in ALTERNATIVES[default]:
-                with patch.object(module_of(default), default, value):
+                with default_of(default, value):
                     error = identified_parts(parts, Path(scratch)).error
                 errors[default, str(value)] = error / fit
                 print(f"{name}: {default} = {value}: {error / fit:.3f}", flush=True)
     return errors
 
 
-def module_of(default: str) -> ModuleType:
-    """Return the module that has a default."""
-    return next(module for module in (inner_prediction, prior) if hasattr(module, default))
+def modules_of(default: str) -> list[ModuleType]:
+    """Return the modules that have a default."""
+    return [module for module in _MODULES if hasattr(module, default)]
+
+
+@contextmanager
+def default_of(name: str, value: Any) -> Iterator[None]:
+    """Give a default another value, in each module that has it."""
+    with ExitStack() as stack:
+        for module in modules_of(name):
+            stack.enter_context(patch.object(module, name, value))
+        yield
 
 
 def chosen_without(robots: Mapping[str, Mapping[tuple[str, str], float]], default: str) -> Any:

@@ -42,7 +42,7 @@ from identification.factor.factor import total_factor
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.pseudo_inertia import margin
 from identification.model.robot import RobotModel
-from identification.selection.inner_prediction import FOLDS
+from identification.selection.folds import FOLDS
 
 Array = NDArray[np.float64]
 

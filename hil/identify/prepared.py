@@ -24,12 +24,12 @@ from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import (
     DELAY,
     RATE,
-    Known,
     Question,
     SuggestedDelay,
     choose_settings,
 )
 from identification.selection.settings import Settings
+from identification.selection.trial import Known
 from identification.signals.clock import time_base
 from identification.signals.masks import SHORTEST_STRETCH
 from identification.signals.recording import Recording, in_succession

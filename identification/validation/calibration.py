@@ -22,7 +22,7 @@ from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
 from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
-from identification.selection.inner_prediction import FOLDS
+from identification.selection.folds import FOLDS
 from identification.signals.masks import EDGE, SATURATED
 from identification.signals.samples import Samples
 from identification.validation.residuals import BLOCK, FEWEST_BLOCKS, block_index

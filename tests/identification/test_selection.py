@@ -21,24 +21,21 @@ from identification.model.motion import Motion
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.selection.essential import CutRule, choose_essential, eliminate
+from identification.selection.folds import Errors, Folds
 from identification.selection.inner_prediction import (
     CONSISTENT,
     DELAY,
-    IMPOSSIBLE_WORTHWHILE,
     LOAD,
     LOW_PASS,
     SHORT,
     STRENGTH,
     STRENGTHS,
     TERM_WORTHWHILE,
-    WORTHWHILE,
-    Errors,
-    Folds,
     Question,
-    _Trial,
     choose_settings,
 )
 from identification.selection.settings import Settings, Strength
+from identification.selection.trial import IMPOSSIBLE_WORTHWHILE, WORTHWHILE, Trial
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
 from identification.signals.smoothing import FORWARDS, WITHOUT_PHASE, LowPassShape, low_passed
@@ -480,7 +477,7 @@ class TestChosenSettings:
 
 def decided(*errors):
     """Index of the candidate that is chosen by its errors in segments (k,) with one joint."""
-    trial = _Trial(MODEL, lambda *_: [])
+    trial = Trial(MODEL, lambda *_: [])
     start = Settings(Preprocessing())
     candidates = [
         replace(start, preprocessing=Preprocessing(rigid_bandwidth=10.0 + k))
@@ -540,7 +537,7 @@ class TestLast:
         ],
     )
     def test_none_behind_a_worse_one_is_chosen(self, means, chosen):
-        trial = _Trial(MODEL, lambda *_: [])
+        trial = Trial(MODEL, lambda *_: [])
         weights = range(len(means))
         candidates = [Settings(Preprocessing(), strength=Strength(weight)) for weight in weights]
         trial.errors = lambda each: Errors(

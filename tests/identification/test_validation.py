@@ -20,7 +20,7 @@ from identification.factor.normal_equations import solve
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
-from identification.selection.inner_prediction import FOLDS
+from identification.selection.folds import FOLDS
 from identification.signals.masks import EDGE, SATURATED, STANDSTILL, RowMask
 from identification.signals.recording import Recording
 from identification.validation.calibration import TorqueMeans, calibrate, inner_errors
