@@ -18,7 +18,7 @@ from drivers.exchange.event_log import EventWriter, ExchangeEnded, ExchangeFaile
 from drivers.exchange.loop import MAX_LATE, exchange
 from drivers.exchange.process import ExchangeSettings
 from drivers.exchange.serving import CommandHandler, portable
-from drivers.exchange.warm_up import WarmUp
+from drivers.exchange.warm_up import WarmUp, may_poll
 from drivers.guard import Guard
 from drivers.record import CycleRing
 from drivers.session import Session
@@ -60,10 +60,10 @@ def main(arguments: Sequence[str]) -> int:
             terminated=lambda: bool(terminated),
             needs_archive=settings.needs_archive,
         )
+        processors = os.sched_getaffinity(0)
         report = realtime.enter(settings.realtime)
         warm_up = WarmUp(settings.drive_train, settings.guard_limits, settings.period)
-        # Without priority it would lose its turn by that, and the only processor is for all.
-        warm_up.polls = report.scheduling.startswith("SCHED_FIFO") and (os.cpu_count() or 1) > 1
+        warm_up.polls = may_poll(report.scheduling, processors)
     except Exception as error:
         traceback.print_exc()
         channel.send(portable(error))

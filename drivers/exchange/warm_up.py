@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
@@ -34,6 +35,18 @@ LEAD: Final = 2e-4
 """Time before the next packet at which such a cycle begins, s: it takes some 0.1 ms, and the packet
 may come some 0.05 ms early."""
 _STATUS: Final = bytes((DRIVE_ON, 0, 0, 0))
+
+
+def may_poll(scheduling: str, processors: set[int]) -> bool:
+    """Whether this process may poll: it has priority, and other processes another processor.
+
+    Without priority it would lose its turn by that.
+
+    Args:
+        scheduling: as in `RealTimeReport`.
+        processors: on which the process that started this one, and with it the others, may run.
+    """
+    return scheduling.startswith("SCHED_FIFO") and len(processors | os.sched_getaffinity(0)) > 1
 
 
 class _Rest:
@@ -122,4 +135,6 @@ class WarmUp:
         with suppress(Exception):  # whatever it may be, the real session goes on
             self.cycle()
         while self.polls and transport.now < due + LEAD and not wait(0.0):
-            pass
+            # To threads of the same priority, such as the one that serves the network card's
+            # interrupt in a kernel with PREEMPT_RT: on this processor no packet comes without it.
+            os.sched_yield()

@@ -148,8 +148,12 @@ class UdpTransport:
         """Whether a datagram, of any host, comes within `timeout` s; to the precision of timers.
 
         The time-out of `receive` is one of scheduler ticks, which may be longer than a cycle.
+        Where the system cannot wait so, it is as if one had come: `receive` says what is wrong.
         """
-        return self._closed or bool(select.select((self._socket,), (), (), timeout)[0])
+        try:
+            return self._closed or bool(select.select((self._socket,), (), (), timeout)[0])
+        except (OSError, ValueError):  # closed meanwhile, or a descriptor beyond FD_SETSIZE
+            return True
 
     def send(self, packet: bytes) -> None:
         """Send to the peer; a datagram that the system does not accept is counted as "unsent".

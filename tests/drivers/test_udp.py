@@ -11,6 +11,7 @@ from unittest.mock import patch
 import pytest
 
 from drivers import CycleRing, CyclicPacket, Guard, Session, State, exchange
+from drivers.errors import TransportClosed
 from drivers.transports.base import TransportError
 from drivers.transports.udp import MAX_FOREIGN, UdpSpec, UdpTransport
 from tests.drivers.rig import N, Rig, drive_train, init_packet, limits
@@ -100,6 +101,22 @@ class TestWait:
 
     def test_a_closed_link_is_not_waited_for(self, transport):
         transport.close()
+        assert transport.wait(PATIENCE)
+
+    def test_a_link_closed_meanwhile_is_left_to_receive(self, transport, monkeypatch):
+        kernel = select.select
+
+        def closing(*arguments):
+            transport.close()
+            return kernel(*arguments)
+
+        monkeypatch.setattr(select, "select", closing)
+        assert transport.wait(PATIENCE)
+        with pytest.raises(TransportClosed):
+            transport.receive(PATIENCE)
+
+    def test_a_descriptor_too_high_for_select_is_not_waited_for(self, transport, monkeypatch):
+        monkeypatch.setattr(transport, "_socket", 1024)  # FD_SETSIZE
         assert transport.wait(PATIENCE)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from drivers import CyclicPacket, Mode, State
 from drivers.exchange.loop import exchange
-from drivers.exchange.warm_up import LEAD, WarmUp
+from drivers.exchange.warm_up import LEAD, WarmUp, may_poll
 from drivers.packets import LAST_NUMBER
 from tests.drivers.rig import PERIOD, N, Rig, closed, drive_train, limits, moving
 
@@ -112,6 +113,35 @@ def test_polling_ends_where_no_packet_comes(warm_up):
     warm_up.polls = True
     warm_up.before_packet(link, moving()[0].session, ARRIVED)
     assert link.now == pytest.approx(ARRIVED + PERIOD + LEAD, abs=1e-5)
+
+
+def test_polling_lets_threads_of_its_priority_run(warm_up, monkeypatch):
+    """Such as that of the network card's interrupt, without which no packet comes."""
+    link = Link()
+
+    def deliver():
+        link.comes = link.now
+
+    monkeypatch.setattr(os, "sched_yield", deliver)
+    warm_up.polls = True
+    warm_up.before_packet(link, moving()[0].session, ARRIVED)
+    assert link.now == pytest.approx(ARRIVED + PERIOD - LEAD, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("scheduling", "inherited", "now", "polls"),
+    [
+        ("SCHED_FIFO 50", {0, 1}, {0, 1}, True),
+        ("SCHED_FIFO 50", {0, 1}, {1}, True),
+        ("SCHED_FIFO 50", {0}, {1}, True),
+        ("SCHED_FIFO 50", {0}, {0}, False),
+        ("ordinary", {0, 1}, {0, 1}, False),
+    ],
+    ids=["all", "pinned", "pinned beside the others", "one for all", "no priority"],
+)
+def test_the_only_processor_is_not_used_to_poll(monkeypatch, scheduling, inherited, now, polls):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: now)
+    assert may_poll(scheduling, inherited) is polls
 
 
 def test_whatever_fails_beside_it_the_session_goes_on(warm_up, monkeypatch):
