@@ -69,7 +69,9 @@ def design(
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/design"),
     method: Annotated[
         Method | None,
-        typer.Option(help=f"Search method: {', '.join(METHODS)}. Default: front.", metavar="NAME"),
+        typer.Option(
+            help=f"Search method: {', '.join(METHODS)}. Default: gradient.", metavar="NAME"
+        ),
     ] = None,
     settings: Path | None = None,
     show_settings: Annotated[Method | None, typer.Option(metavar="NAME")] = None,
