@@ -34,6 +34,8 @@ _CYCLES: Final = 200
 LEAD: Final = 2e-4
 """Time before the next packet at which such a cycle begins, s: it takes some 0.1 ms, and the packet
 may come some 0.05 ms early."""
+_MOST_SLOW: Final = 3
+"""Cycles in a row that took longer than `LEAD`: a processor on which they would delay replies."""
 _STATUS: Final = bytes((DRIVE_ON, 0, 0, 0))
 
 
@@ -89,6 +91,7 @@ class WarmUp:
 
     def __init__(self, drives: DriveTrain, limits: GuardLimits, period: float) -> None:
         self.polls = False
+        self._slow = 0
         n = drives.n_joints
         position = 0.5 * (limits.lower + limits.upper)
         self.session = Session(drives, Guard(limits, period), CycleRing(n, 16))
@@ -123,17 +126,20 @@ class WarmUp:
         """Run one cycle shortly before the packet that follows one which arrived at this time.
 
         Only in open mode, and where the link can wait for a packet without reading it: one that
-        comes early is delayed by no more than this cycle.
+        comes early is delayed by no more than this cycle. None is run any more once `_MOST_SLOW` in
+        a row were not at their end when the packet was due.
         """
         wait: Callable[[float], bool] | None = getattr(transport, "wait", None)
-        if wait is None or session.state is not State.OPEN:
+        if wait is None or self._slow == _MOST_SLOW or session.state is not State.OPEN:
             return
         due = arrived + self._period
         left = due - LEAD - transport.now
         if left <= 0.0 or wait(left):
             return
+        begun = transport.now
         with suppress(Exception):  # whatever it may be, the real session goes on
             self.cycle()
+        self._slow = self._slow + 1 if transport.now - begun > LEAD else 0
         while self.polls and transport.now < due + LEAD and not wait(0.0):
             # To threads of the same priority, such as the one that serves the network card's
             # interrupt in a kernel with PREEMPT_RT: on this processor no packet comes without it.

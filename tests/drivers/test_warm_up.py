@@ -144,6 +144,29 @@ def test_the_only_processor_is_not_used_to_poll(monkeypatch, scheduling, inherit
     assert may_poll(scheduling, inherited) is polls
 
 
+@pytest.mark.parametrize(
+    ("shares", "begun"),
+    [([1.5] * 6, 3), ([1.5, 1.5, 0.5] * 2, 6), ([0.5] * 6, 6)],
+    ids=["a slow processor", "lost turns", "a usual one"],
+)
+def test_cycles_that_would_delay_replies_are_given_up(monkeypatch, shares, begun):
+    """Three in a row that take longer than there is time before the packet."""
+    warm_up = WarmUp(drive_train(), limits(), PERIOD)
+    calls = []
+    link = Link(comes=np.inf)
+
+    def lasting():
+        link.now += shares[len(calls)] * LEAD
+        calls.append(link.now)
+
+    monkeypatch.setattr(warm_up, "cycle", lasting)
+    session = moving()[0].session
+    for cycle in range(len(shares)):
+        link.now = ARRIVED + cycle * PERIOD
+        warm_up.before_packet(link, session, ARRIVED + cycle * PERIOD)
+    assert len(calls) == begun
+
+
 def test_whatever_fails_beside_it_the_session_goes_on(warm_up, monkeypatch):
     def fail():
         raise MemoryError
