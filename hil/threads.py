@@ -1,7 +1,7 @@
 """Linear algebra on one thread, unless the environment sets another number.
 
-The matrices of an identification are small: threads would wait for each other for most of the time
-(of two cores, six times the processor time), and the rounding of sums would depend on their number.
+The matrices of an identification are small: threads would wait for each other for most of the time,
+and the rounding of sums would depend on their number.
 """
 
 from __future__ import annotations

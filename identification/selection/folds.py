@@ -1,7 +1,8 @@
 """Parts of the fitted recordings, each predicted from the others, and the errors of that.
 
 Each recording is cut into `FOLDS` segments. Parameters are estimated from all segments but one and
-predict all rows of that one, including rest.
+predict all rows of that one, including rest. An error is ``||e|| / ||tau||`` over all joints,
+geometric mean over the segments, so that no hard one decides alone.
 """
 
 from __future__ import annotations

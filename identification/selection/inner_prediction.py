@@ -1,10 +1,8 @@
 """Settings of an identification, chosen by predicting parts of the fitted data from the rest.
 
-Each recording is cut into `FOLDS` segments. Parameters are estimated from all segments but one and
-predict all rows of that one, including rest. The score of a candidate is ``||e|| / ||tau||`` over
-all joints, geometric mean over the segments, so that no hard one decides alone. A candidate
-replaces the first one only if its error is lower by more than the standard error of the difference
-over the segments (one-standard-error rule, Breiman et al. 1984). Held-out data are not read.
+One question after the other is answered by the errors of its candidates in parts that are predicted
+from the rest (:mod:`~identification.selection.folds`), compared by
+:mod:`~identification.selection.trial`. Held-out data are not read.
 """
 
 from __future__ import annotations
