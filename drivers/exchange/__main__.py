@@ -10,6 +10,7 @@ import socket
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Final
 
 from drivers.exchange import realtime
@@ -23,7 +24,7 @@ from drivers.guard import Guard
 from drivers.record import CycleRing
 from drivers.session import Session
 from drivers.states import State
-from drivers.transports.base import Transport
+from drivers.transports.base import PollingTransport, Transport, TransportError
 
 LINK_FAILED: Final = 1
 NOT_STARTED: Final = 2
@@ -62,7 +63,9 @@ def main(arguments: Sequence[str]) -> int:
         )
         processors = os.sched_getaffinity(0)
         report = realtime.enter(settings.realtime)
-        warm_up = WarmUp(settings.drive_train, settings.guard_limits, settings.period)
+        warm_up = WarmUp(
+            settings.drive_train, settings.guard_limits, settings.period, _loopback(transport)
+        )
         warm_up.polls = may_poll(report.scheduling, processors)
     except Exception as error:
         traceback.print_exc()
@@ -77,6 +80,14 @@ def main(arguments: Sequence[str]) -> int:
     status = _serve(transport, session, server, max_late, warm_up)
     control.finished = int(status == 0)
     return status
+
+
+def _loopback(transport: Transport) -> Transport | None:
+    """Return a link like this one that receives what it sends; None where there is none."""
+    if isinstance(transport, PollingTransport):
+        with suppress(TransportError):  # the loopback device is off: the link may work all the same
+            return transport.loopback()
+    return None
 
 
 def _serve(

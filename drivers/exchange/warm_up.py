@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
 
@@ -25,15 +24,15 @@ from drivers.packets import (
 from drivers.record import CycleRing
 from drivers.session import Session
 from drivers.states import State
-from drivers.transports.base import Transport
+from drivers.transports.base import PollingTransport, Transport
 
 Array = NDArray[np.float64]
 
 _CYCLES: Final = 200
 """Cycles before the first packet."""
-LEAD: Final = 2e-4
-"""Time before the next packet at which such a cycle begins, s: it takes some 0.1 ms, and the packet
-may come some 0.05 ms early."""
+LEAD: Final = 3e-4
+"""Time before the next packet at which such a cycle begins, s: it takes some 0.15 ms, and the
+packet may come some 0.05 ms early."""
 _MOST_SLOW: Final = 3
 """Cycles in a row that took longer than `LEAD`: a processor on which they would delay replies."""
 _STATUS: Final = bytes((DRIVE_ON, 0, 0, 0))
@@ -72,7 +71,7 @@ class _Rest:
 
 
 class WarmUp:
-    """A motion at rest in a session of its own, with packets of its own.
+    """A motion at rest in a session of its own, with packets of its own over a link of its own.
 
     The first cycles of a process are slow, and so is each cycle for which the code has to come from
     memory again, because others used the processor's caches: twice as slow at the median.
@@ -81,16 +80,23 @@ class WarmUp:
         drives: of the arm.
         limits: of the guard.
         period: the controller's cycle, s.
+        link: one that receives what it sends, by the code of the real one; None without.
 
     Attributes:
         session: open unless something is wrong.
         reply: the last one.
-        polls: from this cycle to `LEAD` after the packet is due the link is polled: a processor
-            that slept wakes up slowly, a virtual one most of all. False at first.
+        polls: from this cycle to `LEAD` after the packet is due the link is polled. False at first.
     """
 
-    def __init__(self, drives: DriveTrain, limits: GuardLimits, period: float) -> None:
+    def __init__(
+        self,
+        drives: DriveTrain,
+        limits: GuardLimits,
+        period: float,
+        link: Transport | None = None,
+    ) -> None:
         self.polls = False
+        self._link = link
         self._slow = 0
         n = drives.n_joints
         position = 0.5 * (limits.lower + limits.upper)
@@ -120,7 +126,16 @@ class WarmUp:
         """Let the session reply to one more packet."""
         self._number = next_number(self._number)
         packet = CyclicPacket(self._number, _STATUS, bytes(N_ARMS), self._axes).encode()
+        self._exchange(packet)
         self.reply = self.session.reply(packet, 0.0)
+        if self.reply is not None:
+            self._exchange(self.reply)
+
+    def _exchange(self, packet: bytes) -> None:
+        """Send and receive a packet; what comes does not matter."""
+        if self._link is not None:
+            self._link.send(packet)
+            self._link.receive(0.0)
 
     def before_packet(self, transport: Transport, session: Session, arrived: float) -> None:
         """Run one cycle shortly before the packet that follows one which arrived at this time.
@@ -129,18 +144,17 @@ class WarmUp:
         comes early is delayed by no more than this cycle. None is run any more once `_MOST_SLOW` in
         a row were not at their end when the packet was due.
         """
-        wait: Callable[[float], bool] | None = getattr(transport, "wait", None)
-        if wait is None or self._slow == _MOST_SLOW or session.state is not State.OPEN:
+        if self._slow == _MOST_SLOW or session.state is not State.OPEN:
+            return
+        if not isinstance(transport, PollingTransport):
             return
         due = arrived + self._period
         left = due - LEAD - transport.now
-        if left <= 0.0 or wait(left):
+        if left <= 0.0 or transport.wait(left):
             return
         begun = transport.now
         with suppress(Exception):  # whatever it may be, the real session goes on
             self.cycle()
         self._slow = self._slow + 1 if transport.now - begun > LEAD else 0
-        while self.polls and transport.now < due + LEAD and not wait(0.0):
-            # To threads of the same priority, such as the one that serves the network card's
-            # interrupt in a kernel with PREEMPT_RT: on this processor no packet comes without it.
-            os.sched_yield()
+        if self.polls:
+            transport.polls_until = due + LEAD

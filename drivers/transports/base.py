@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from drivers.errors import DriverError
 
@@ -27,8 +27,7 @@ class Transport(Protocol):
 
     Optional attributes: `arrived`, the time at which the packet received last arrived, s on the
     clock of `now`, None if unknown, never in the future nor before that of the previous packet;
-    `notes`, options refused by the system; `wait(timeout)`, whether a packet comes within that
-    time, s, which it leaves there.
+    `notes`, options refused by the system.
     """
 
     @property
@@ -63,6 +62,23 @@ class Transport(Protocol):
 
     def close(self) -> None:
         """Close the link; may be called again."""
+
+
+@runtime_checkable
+class PollingTransport(Transport, Protocol):
+    """A link that can be prepared for the next packet before it comes.
+
+    Attributes:
+        polls_until: time until which `receive` polls instead of sleeping, on the clock of `now`.
+    """
+
+    polls_until: float
+
+    def wait(self, timeout: float) -> bool:
+        """Whether a packet comes within `timeout` s; it remains to be received."""
+
+    def loopback(self) -> Transport:
+        """Return a link of the same kind that receives what it sends."""
 
 
 @dataclass(frozen=True)

@@ -548,6 +548,19 @@ class FaultyTransport(UdpTransport):
         super().send(packet if self.packets < 5 else None)
 
 
+class WithoutLoopback(UdpSpec):
+    """Opens a link on a computer whose loopback device is off."""
+
+    def open(self):
+        link = UdpTransport(self.peer_host, self.port, self.bind)
+        link.loopback = self.refuse
+        return link
+
+    @staticmethod
+    def refuse():
+        raise TransportError("UDP port 0 on 127.0.0.1", "no such address", "switch it on")
+
+
 class TestProcessEnd:
     def test_killed_process_is_detected(self):
         with running() as (exchange, controller):
@@ -571,6 +584,12 @@ class TestProcessEnd:
 
 
 class TestStart:
+    def test_the_link_to_itself_is_no_condition(self):
+        with running(link=WithoutLoopback) as (exchange, controller):
+            controller.cycle(4)
+            assert exchange.alive
+            assert controller.unanswered == 0
+
     def test_refusals_are_raised(self):
         with running() as (_, controller), pytest.raises(TransportError, match="another program"):
             ExchangeProcess.start(settings(controller.socket.getpeername()[1]))

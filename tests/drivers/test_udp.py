@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 import struct
 import time
+from contextlib import closing
 from unittest.mock import patch
 
 import pytest
@@ -118,6 +120,67 @@ class TestWait:
     def test_a_descriptor_too_high_for_select_is_not_waited_for(self, transport, monkeypatch):
         monkeypatch.setattr(transport, "_socket", 1024)  # FD_SETSIZE
         assert transport.wait(PATIENCE)
+
+
+class TestPolling:
+    @pytest.fixture
+    def yields(self, monkeypatch):
+        """Times at which the processor was left to other threads."""
+        times = []
+        monkeypatch.setattr(os, "sched_yield", lambda: times.append(time.monotonic()))
+        return times
+
+    def test_threads_of_its_priority_run_meanwhile(self, transport, controller, monkeypatch):
+        """Such as that of the network card's interrupt, without which no packet comes."""
+        monkeypatch.setattr(os, "sched_yield", lambda: controller.send(bytes(48)))
+        transport.polls_until = transport.now + PATIENCE
+        assert transport.receive(PATIENCE) == bytes(48)
+
+    def test_it_ends_with_the_time_out(self, transport, yields):
+        transport.polls_until = transport.now + PATIENCE
+        before = transport.now
+        assert transport.receive(0.01) is None
+        assert before < yields[0] <= yields[-1] <= before + 0.02
+
+    def test_once_it_has_ended_the_process_sleeps(self, transport, controller, yields):
+        transport.polls_until = end = transport.now + 0.01
+        assert transport.receive(0.05) is None
+        assert transport.now > end + 0.03
+        assert yields[-1] < end + 0.02
+        controller.send(bytes(48))
+        assert transport.receive(PATIENCE) == bytes(48)
+
+    def test_without_time_a_packet_is_received_at_once_or_not(self, transport, controller):
+        transport.polls_until = transport.now + PATIENCE
+        assert transport.receive(0.0) is None
+        controller.send(bytes(48))
+        assert transport.wait(PATIENCE)
+        assert transport.receive(0.0) == bytes(48)
+
+    def test_other_hosts_do_not_prolong_it(self, transport, other_host, monkeypatch):
+        monkeypatch.setattr(os, "sched_yield", lambda: other_host.send(bytes(48)))
+        transport.polls_until = transport.now + PATIENCE
+        before = transport.now
+        assert transport.receive(0.02) is None
+        assert transport.now < before + 0.2
+
+
+class TestLoopback:
+    @pytest.fixture
+    def loopback(self):
+        with closing(UdpTransport.loopback()) as link:
+            yield link
+
+    def test_it_receives_what_it_sends(self, loopback):
+        for length in (48, 1200):
+            loopback.send(bytes(length))
+            assert loopback.receive(PATIENCE) == bytes(length)
+            assert loopback.arrived <= loopback.now
+
+    def test_it_receives_nothing_else(self, loopback, controller):
+        controller.socket.sendto(bytes(48), loopback.address)
+        assert loopback.receive(0.05) is None
+        assert loopback.rejected() == {"foreign": 1}
 
 
 class TestPeer:
