@@ -10,12 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from hil.archive import ArchiveName
 from hil.errors import CampaignFolderError
 from hil.files import file_digest
 from hil.reading import is_not_a_file, parse_json, path_exists, read_text
+from hil.type_adapter import adapter_of
 
 T = TypeVar("T")
 
@@ -29,7 +30,9 @@ def read_back(kind: type[T], text: str, *, strict: bool = True) -> T:
         ValueError: it is not JSON, or a field is invalid; names the first one.
     """
     try:
-        return TypeAdapter(kind).validate_json(text, strict=strict or None)
+        adapter = adapter_of(kind)  # type: ignore[arg-type]
+        value: T = adapter.validate_json(text, strict=strict or None)
+        return value
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))

@@ -9,15 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from hil.errors import InputError
 from hil.reading import parse_json, read_text
+from hil.type_adapter import adapter_of
 from identification.excitation.criteria import Criteria
 from identification.selection.essential import EliminationStep
 from identification.selection.settings import Choice, Settings
@@ -454,7 +454,7 @@ class SettingsResult(Frozen):
     @classmethod
     def entries(cls, settings: Settings) -> dict[str, Any]:
         """Return the value of `settings`: their choices are in :attr:`Results.choices`."""
-        entries: dict[str, Any] = _settings_adapter().dump_python(
+        entries: dict[str, Any] = adapter_of(Settings).dump_python(
             replace(settings, choices=()), mode="json"
         )
         return entries
@@ -465,12 +465,8 @@ class SettingsResult(Frozen):
         Raises:
             ValueError: they are those of another version.
         """
-        return _settings_adapter().validate_python(self.settings)
-
-
-@cache
-def _settings_adapter() -> TypeAdapter[Settings]:
-    return TypeAdapter(Settings)
+        settings: Settings = adapter_of(Settings).validate_python(self.settings)
+        return settings
 
 
 class Results(Frozen):
