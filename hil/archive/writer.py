@@ -101,7 +101,7 @@ class _Pending:
         """Do nothing: `ArchiveFile` writes whole chunks, each by one call."""
 
     def take(self) -> bytes:
-        """Return the part, which then is nobody's."""
+        """Return the part, and forget it."""
         data = b"".join(self._parts)
         self._parts.clear()
         return data

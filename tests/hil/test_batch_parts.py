@@ -456,6 +456,10 @@ class TestTables:
             table = parquet.read_table(tmp_path / f"{name}.parquet")
             assert table.column_names == list(COLUMNS[name])
             assert table.num_rows == len(rows)
+            for column in COLUMNS[name]:
+                values = table[column].to_pylist()
+                if isinstance(values[0], float | int | str) and column != "determined":
+                    assert [*map(str, values)] == [row[column] for row in rows]
         parameters = parquet.read_table(tmp_path / "parameters.parquet").to_pylist()
         repetition = levels()[0].estimate
         row = parameters[3]
