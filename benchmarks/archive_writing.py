@@ -7,15 +7,12 @@ and writes it to the disk of the present folder with fdatasync, as on a real lin
 time, that of both its threads, from the opening of the archive to its closing is set against the
 time it took: ``writing_share_of_core``.
 
-``encode_us_per_cycle`` is the processor time of our writer for one such archive in memory, in
-batches of a chunk, and ``mcap_us_per_cycle`` that of the `mcap` library's, which adds one message
-at a time; ``mcap_uncompressed_us_per_cycle`` is without the compression of the chunks, which ours
-includes. They take turns, and medians are compared.
+``encode_us_per_cycle`` is the processor time for one such archive that is given in batches of a
+chunk: messages, compression and the calls that write them. The median of several.
 """
 
 from __future__ import annotations
 
-import io
 import os
 import tempfile
 import time
@@ -25,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from benchmarks import parser_of, show, timed
@@ -36,9 +32,9 @@ from drivers.exchange.control import SharedState
 from drivers.exchange.event_log import EventWriter
 from drivers.record import CycleRing
 from hil.archive import ArchiveSpec, open_archive
-from hil.archive.mcap_writer import McapWriter
-from hil.archive.schema import LIBRARY, PROFILE, Batch, cycle_messages, profile
+from hil.archive.schema import Batch, cycle_messages
 from hil.archive.supervised import ArchiveProcessHandle, Close, Closed, Open, Opened
+from hil.archive.writer import ArchiveFile
 
 Array = NDArray[np.float64]
 
@@ -122,54 +118,37 @@ def _processor_time(pid: int) -> float:
     return sum(int((thread / "schedstat").read_text().split()[0]) for thread in threads) * 1e-9
 
 
-def writers(rounds: int) -> dict[str, float]:
-    """Return the processor time [us] of one cycle by our writer and by that of the library."""
+def writing(folder: Path, rounds: int) -> float:
+    """Return the processor time of a cycle [us]."""
     rows = records(0)
     torque = drive_train().joint_torque(rows["target_current"])
     batches = [
         cycle_messages(NAMES, PERIOD, rows[at : at + CHUNK], torque[at : at + CHUNK])
         for at in range(0, len(rows), CHUNK)
     ]
-    methods = {
-        "encode": partial(written_by_us, batches),
-        "mcap": partial(written_by_mcap, batches, CompressionType.ZSTD),
-        "mcap_uncompressed": partial(written_by_mcap, batches, CompressionType.NONE),
-    }
-    times: dict[str, list[float]] = {name: [] for name in methods}
+    path = folder / "excitation_000_a1.mcap"
+    times = []
     for _ in range(rounds):
-        for name, write in methods.items():
-            times[name].append(timed(write) / len(rows) * 1e6)
-    return {name: float(np.median(measured)) for name, measured in times.items()}
+        times.append(timed(partial(write, path, batches)) / len(rows) * 1e6)
+        path.unlink()
+    return float(np.median(times))
 
 
-def written_by_us(batches: Sequence[Batch]) -> None:
-    """Write an archive of these batches, one chunk each, to memory."""
-    writer = McapWriter(io.BytesIO().write, PROFILE, LIBRARY)
-    channels = [writer.register(profile(JOINTS)[topic]) for topic in batches[0].messages]
+def write(path: Path, batches: Sequence[Batch]) -> None:
+    """Write an archive of these batches, one chunk each, which the disk gets in its own time."""
+    file = ArchiveFile(
+        path,
+        joint_names=NAMES,
+        topics=[*batches[0].messages],
+        metadata={},
+        period=PERIOD,
+        attachments={},
+        durable=False,
+    )
     for batch in batches:
-        writer.add_rows(
-            channels, batch.stamp, np.arange(len(batch.stamp)), [*batch.messages.values()]
-        )
-        writer.flush()
-    writer.finish()
-
-
-def written_by_mcap(batches: Sequence[Batch], compression: CompressionType) -> None:
-    """Write the same archive by the library."""
-    writer: Any = Writer(io.BytesIO(), chunk_size=1 << 62, compression=compression)  # not typed
-    writer.start(PROFILE, LIBRARY)
-    channels = []
-    for topic in batches[0].messages:
-        kind = profile(JOINTS)[topic]
-        schema = writer.register_schema(kind.schema, "ros2msg", kind.definition.encode())
-        channels.append(writer.register_channel(topic, "cdr", schema))
-    for batch in batches:
-        messages = [[row.tobytes() for row in rows] for rows in batch.messages.values()]
-        for number, stamp in enumerate(batch.stamp.tolist()):
-            for channel, of_topic in zip(channels, messages, strict=True):
-                writer.add_message(channel, stamp, of_topic[number], stamp, number)
-        writer.flush()
-    writer.finish()
+        file.add(batch)
+        file.flush()
+    file.finish({})
 
 
 def main() -> None:
@@ -178,12 +157,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=SECONDS, help="length of each archive")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:
+        encode = writing(Path(folder), ROUNDS)
         measured = measure(Path(folder), arguments.seconds)
     result = {
         "writing_share_of_core": round(measured["share"], 4),
         "megabytes_per_minute": round(measured["megabytes_per_minute"], 1),
         "records_lost": measured["records_lost"],
-        **{f"{name}_us_per_cycle": round(value, 1) for name, value in writers(ROUNDS).items()},
+        "encode_us_per_cycle": round(encode, 1),
         "seconds": arguments.seconds,
         "cycles_per_second": round(1.0 / PERIOD),
     }

@@ -1,7 +1,7 @@
 """Repair of truncated or damaged archives.
 
-What `hil.archive.scan` finds whole is copied, also behind damage; message indexes and summary are
-regenerated, and the outcome states what is lost.
+What `hil.archive.scan` finds whole is written again, also behind damage, message by message by the
+writer of archives; the outcome states what is lost.
 """
 
 from __future__ import annotations
@@ -9,24 +9,29 @@ from __future__ import annotations
 import json
 import os
 import stat
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, Final
 
-from mcap.records import Metadata
+from mcap.records import Attachment, Header, Metadata
 
 from hil.archive import container, header, schema
 from hil.archive.chunk import ChunkParser
 from hil.archive.header import METADATA, OUTCOME, ArchiveOutcome
-from hil.archive.mcap_writer import McapWriter, entries_of, span
+from hil.archive.index import FileIndex, span
 from hil.archive.reader import open_archive, scan_archive
 from hil.archive.scan import Scan
+from hil.archive.writer import mcap_writer
 from hil.errors import ArchiveError, ArchiveWriteError
 from hil.files import replace_file, sync_folder
 from hil.reading import open_file
 from hil.terminal_text import typed
+
+_MESSAGE: Final = struct.Struct("<HIQQ")
+"""Channel, sequence, log time and publish time in front of the data of a message."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +66,7 @@ def repair(
     """Repair an archive; it is unchanged unless `in_place`.
 
     The output, by default `repaired_name`, must not exist, and gets its name only when it is
-    complete and has been read back. A file that lost only its index is restored to the byte; an
-    intact one is copied where an output is named.
+    complete and has been read back. An intact one is copied where an output is named.
 
     Raises:
         NotAnArchiveError: another kind of file, or its header is lost.
@@ -105,15 +109,34 @@ def is_intact(path: Path, scan: Scan) -> bool:
     """Return whether the file has no damage, and its message indexes and summary fit."""
     if scan.faults:
         return False
-    with open_file(path) as stream, open_file(path) as other:
-        same = True
-
-        def compare(data: bytes) -> None:
-            nonlocal same
-            same = same and other.read(len(data)) == data
-
-        _copy(scan, stream, compare)
-        return same and not other.read(1)
+    begin = container.MAGIC + container.encode(Header(schema.PROFILE, schema.LIBRARY))
+    index = FileIndex()
+    parser = ChunkParser()
+    with open_file(path) as stream:
+        if stream.read(len(begin)) != begin:
+            return False
+        position = len(begin)
+        for head in scan.heads[1:]:
+            if head.offset != position or head.opcode == container.HEADER:
+                return False
+            record = container.read_record(stream, head)
+            position = head.end
+            if head.opcode != container.CHUNK:
+                parser.define(record)
+                index.add(container.parse_item(record), head.offset, head.end - head.offset)
+                continue
+            chunk = container.parse_chunk(record)
+            messages = parser.messages(container.chunk_data(chunk, head.offset), head.offset)
+            for definition in parser.definitions:
+                index.define(definition)
+            indexes = index.add_chunk(chunk, messages, head.offset, head.end - head.offset)
+            times = (chunk.message_start_time, chunk.message_end_time)
+            if times != span(messages) or stream.read(len(indexes)) != indexes:
+                return False
+            position += len(indexes)
+        stream.seek(position)
+        end = index.ended(position)
+        return stream.read(len(end) + 1) == end
 
 
 def _rewrite(
@@ -128,7 +151,7 @@ def _rewrite(
         with path.open("rb") as stream, replace_file(target) as temporary:
             with temporary.open("xb") as output:
                 os.fchmod(output.fileno(), stat.S_IMODE(os.fstat(stream.fileno()).st_mode))
-                _copy(scan, stream, output.write, outcome)
+                _copy(scan, stream, output, outcome)
                 output.flush()
                 os.fsync(output.fileno())
             back = open_archive(temporary, fields=())
@@ -148,41 +171,58 @@ def _rewrite(
 
 
 def _copy(
-    scan: Scan,
-    stream: BinaryIO,
-    write: Callable[[bytes], object],
-    outcome: Mapping[str, str] | None = None,
+    scan: Scan, stream: BinaryIO, output: BinaryIO, outcome: Mapping[str, str] | None = None
 ) -> None:
-    """Write the valid content of an archive as a new one."""
-    writer = McapWriter(write, schema.PROFILE, schema.LIBRARY)
-    parser = ChunkParser()
+    """Write the valid content of an archive as a new one, its chunks and their order as before."""
+    writer = mcap_writer(output)
     described = _description(scan)
-    writer.put(Metadata(METADATA, header.with_checksum(described)))
+    writer.add_metadata(METADATA, header.with_checksum(described))
+    channels = _registered(writer, scan.parser)
     for head in scan.heads:
         if head.opcode == container.HEADER:
             continue
         record = container.read_record(stream, head)
         if head.opcode == container.CHUNK:
-            chunk = container.parse_chunk(record)
-            messages = parser.messages(container.chunk_data(chunk, head.offset), head.offset)
-            if not messages.keys() <= parser.channels.keys():
-                for definition in scan.definitions:
-                    parser.add(definition, head.offset)
-                    writer.put(definition)
-            for definition in parser.definitions:
-                writer.note(definition)
-            entries = entries_of(messages)
-            first, last = span(entries)
-            chunk = replace(chunk, message_start_time=first, message_end_time=last)
-            writer.add_chunk(chunk, entries)
+            data = container.chunk_data(container.parse_chunk(record), head.offset)
+            for item in container.split_records(data, head.offset):
+                if item.opcode == container.MESSAGE:
+                    number, sequence, log_time, publish_time = _MESSAGE.unpack_from(item.body)
+                    message = item.body[_MESSAGE.size :]
+                    channel = channels[number]
+                    writer.add_message(channel, log_time, message, publish_time, sequence)
+            writer.flush()
             continue
-        parser.define(record)
-        item = container.parse_item(record)
-        if not isinstance(item, Metadata) or item.name not in (METADATA, OUTCOME):
-            writer.put(item)
+        content = container.parse_item(record)
+        if isinstance(content, Attachment):
+            writer.add_attachment(
+                content.create_time,
+                content.log_time,
+                content.name,
+                content.media_type,
+                content.data,
+            )
+        elif isinstance(content, Metadata) and content.name not in (METADATA, OUTCOME):
+            writer.add_metadata(content.name, content.metadata)
     stated = {**_outcome(scan, described), **(outcome or {})}
-    writer.put(Metadata(OUTCOME, header.with_checksum(stated)))
+    writer.add_metadata(OUTCOME, header.with_checksum(stated))
     writer.finish()
+
+
+def _registered(writer: Any, parser: ChunkParser) -> dict[int, int]:
+    """Define the channels of an archive; return their new numbers by those in the archive."""
+    schemas: dict[int, int] = {}
+    channels: dict[int, int] = {}
+    for channel in parser.channels.values():
+        definition = parser.schemas.get(channel.schema_id)
+        if definition is not None and definition.id not in schemas:
+            schemas[definition.id] = writer.register_schema(
+                definition.name, definition.encoding, definition.data
+            )
+        schema_number = schemas.get(channel.schema_id, 0)
+        channels[channel.id] = writer.register_channel(
+            channel.topic, channel.message_encoding, schema_number, channel.metadata
+        )
+    return channels
 
 
 def _samples_lost(scan: Scan) -> int | None:

@@ -14,7 +14,7 @@ from pathlib import Path, PurePath
 from typing import Any, Final, Self
 
 import numpy as np
-from mcap.records import Attachment, Metadata
+from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from hil.archive.cdr import Rows
@@ -28,7 +28,6 @@ from hil.archive.header import (
     checksum,
     with_checksum,
 )
-from hil.archive.mcap_writer import McapWriter
 from hil.archive.schema import (
     COMMANDED,
     CYCLE,
@@ -39,6 +38,7 @@ from hil.archive.schema import (
     PROFILE,
     ArchivedEvent,
     Batch,
+    Channel,
     Level,
     cycle_messages,
     description_message,
@@ -55,6 +55,10 @@ Array = NDArray[np.float64]
 FLUSH_PERIOD = 0.1  # s of the controller's time in one chunk; a crash loses at most that
 _SAMPLES_PER_CHUNK: Final = 1000
 _MOST_NUMBERS: Final = 1 << 32  # message numbers are counted modulo this
+_NO_LIMIT: Final = 1 << 62  # bytes of a chunk: it ends at `flush` only
+_COMPRESSION: Final = CompressionType.LZ4
+"""Of chunks. With Zstandard at the only level of the library files are a fifth smaller, and take
+three times as long to decompress (`python -m benchmarks.archive --sizes`)."""
 _MEDIA_TYPES: Final = {
     ".toml": "application/toml",
     ".urdf": "application/xml",
@@ -62,6 +66,45 @@ _MEDIA_TYPES: Final = {
     ".csv": "text/csv",
     ".txt": "text/plain",
 }
+
+
+def mcap_writer(output: Any) -> Any:
+    """Return a begun `mcap.writer.Writer` of the profile, which is not typed.
+
+    Chunks end at its `flush` only; one without messages is not written. `output` has the methods
+    ``write``, ``tell`` and ``flush`` of a binary file.
+    """
+    writer: Any = Writer(output, chunk_size=_NO_LIMIT, compression=_COMPRESSION)
+    writer.start(PROFILE, LIBRARY)
+    return writer
+
+
+class _Pending:
+    """The part of a file that is not written yet, as the output of a `Writer`.
+
+    Its own buffer would be written again where a disk has failed, when it is closed.
+    """
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._end = 0
+
+    def write(self, data: bytes) -> None:
+        self._parts.append(data)
+        self._end += len(data)
+
+    def tell(self) -> int:
+        """Return the size of the file with this part."""
+        return self._end
+
+    def flush(self) -> None:
+        """Do nothing: `ArchiveFile` writes whole chunks, each by one call."""
+
+    def take(self) -> bytes:
+        """Return the part, and forget it."""
+        data = b"".join(self._parts)
+        self._parts.clear()
+        return data
 
 
 class ArchiveFile:
@@ -113,40 +156,51 @@ class ArchiveFile:
         self._durable = durable
         self._description = checksum(described)
         self._descriptor = _create(path)
-        self._parts: list[bytes] = []  # to be written at once
-        self._writer = McapWriter(self._parts.append, PROFILE, LIBRARY)
+        self._pending = _Pending()
+        self._writer = mcap_writer(self._pending)
         with self._guarded():
-            self._writer.put(Metadata(METADATA, with_checksum(described)))
+            self._writer.add_metadata(METADATA, with_checksum(described))
             for name, data in sorted(attachments.items()):
                 media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
-                self._writer.put(Attachment(0, 0, name, media_type, data))
+                self._writer.add_attachment(0, 0, name, media_type, data)
             self._write()
             if durable:  # at last, so that the file is empty for as short a time as possible
                 sync_folder(path.parent)
-        self._numbers = {channel.topic: self._writer.register(channel) for channel in channels}
+        self._numbers = {channel.topic: self._registered(channel) for channel in channels}
+
+    def _registered(self, channel: Channel) -> int:
+        """Define a channel and the schema of its messages; return the channel's number."""
+        definition = channel.definition.encode()
+        number = self._writer.register_schema(channel.schema, "ros2msg", definition)
+        return int(self._writer.register_channel(channel.topic, "cdr", number))
 
     def add(self, batch: Batch) -> None:
-        """Add messages of several channels to the chunk in progress."""
+        """Add messages of several channels to the chunk in progress, one of each at each stamp."""
         topics = [*batch.messages]
         numbers = (self.counts[topics[0]] + np.arange(len(batch.stamp))) % _MOST_NUMBERS
+        stamps = batch.stamp.tolist()
         channels = [self._numbers[topic] for topic in topics]
+        messages = [rows.view(f"V{rows.itemsize}").tolist() for rows in batch.messages.values()]
         with self._guarded():
-            if len(batch.stamp) and self._description_message is not None:
-                number = self._numbers[DESCRIPTION_TOPIC]
-                stamp = int(batch.stamp[0])
-                self._writer.add_message(number, stamp, 0, self._description_message)
-                self.counts[DESCRIPTION_TOPIC] = 1
+            if stamps and self._description_message is not None:
+                self._add_message(DESCRIPTION_TOPIC, stamps[0], self._description_message)
                 self._description_message = None
-            self._writer.add_rows(channels, batch.stamp, numbers, [*batch.messages.values()])
+            add_message = self._writer.add_message
+            for stamp, number, *data in zip(stamps, numbers.tolist(), *messages, strict=True):
+                for channel, message in zip(channels, data, strict=True):
+                    add_message(channel, stamp, message, stamp, number)
         for topic in topics:
-            self.counts[topic] += len(batch.stamp)
+            self.counts[topic] += len(stamps)
 
     def add_event(self, event: ArchivedEvent) -> None:
         """Add an event to the chunk in progress."""
-        number = self.counts[EVENTS] % _MOST_NUMBERS
         with self._guarded():
-            self._writer.add_message(self._numbers[EVENTS], event.stamp, number, event.encode())
-        self.counts[EVENTS] += 1
+            self._add_message(EVENTS, event.stamp, event.encode())
+
+    def _add_message(self, topic: str, stamp: int, data: bytes) -> None:
+        number = self.counts[topic] % _MOST_NUMBERS
+        self._writer.add_message(self._numbers[topic], stamp, data, stamp, number)
+        self.counts[topic] += 1
 
     def flush(self) -> None:
         """End the chunk in progress and write everything to the file."""
@@ -160,17 +214,14 @@ class ArchiveFile:
             return
         with self._guarded():
             self._writer.flush()
-            seals = {
-                DESCRIPTION: self._description,
-            }
-            self._writer.put(Metadata(OUTCOME, with_checksum({**outcome, **seals})))
+            stated = {**outcome, DESCRIPTION: self._description}
+            self._writer.add_metadata(OUTCOME, with_checksum(stated))
             self._writer.finish()
             self._write()
             self._close()  # some file systems report only here that the disk is full
 
     def _write(self) -> None:
-        data = memoryview(b"".join(self._parts))
-        self._parts.clear()
+        data = memoryview(self._pending.take())
         begin = time.monotonic()
         while data:
             data = data[os.write(self._descriptor, data) :]

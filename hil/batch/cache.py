@@ -1,13 +1,14 @@
 """Cache of a batch between runs: `.npz` files with a JSON header, and JSON files without arrays.
 
 A file is named by its key, a digest of everything that the content depends on, so that no entry is
-ever out of date. Files are replaced atomically. An `.npz` has a checksum of each array, a JSON file
-one of its text in the line above; a damaged entry is ignored.
+ever out of date. Files are replaced atomically. An `.npz` has checksums of header and numbers, a
+JSON file one of its text in the line above; a damaged entry is ignored.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import struct
 import zlib
@@ -37,6 +38,7 @@ Arrays = dict[str, NDArray[Any]]
 
 BESIDE: Final = ".hil-cache"  # folder beside the archives
 HEADER: Final = "header"  # array with the JSON text, as bytes
+NUMBERS: Final = "numbers"  # array of all others, one after the other, as bytes
 NPZ: Final = ".npz"  # suffix of entries with arrays
 JSON: Final = ".json"  # suffix of entries without
 
@@ -100,22 +102,30 @@ class CacheLocation:
                 header = json.loads(entry[HEADER].tobytes())
                 if header["key"] != key:
                     return None
-                return header["content"], {name: entry[name] for name in header["arrays"]}
+                return header["content"], _split(entry[NUMBERS], header["arrays"])
         except _UNREADABLE:
             return None
 
-    def write(self, location: str, key: str, content: Any, arrays: Mapping[str, Any]) -> None:
+    def write(self, location: str, key: str, content: Any, arrays: Arrays) -> None:
         """Write an entry: JSON data and arrays by name.
+
+        The arrays are one in the file: `numpy` takes a tenth of a millisecond for each.
 
         Raises:
             CacheError: the file cannot be written.
         """
         if not self.keep:
             return
-        text = json.dumps({"key": key, "content": content, "arrays": [*arrays]}).encode()
-        header = {HEADER: np.frombuffer(text, np.uint8)}
+        layout = {name: (array.dtype.str, array.shape) for name, array in arrays.items()}
+        text = json.dumps({"key": key, "content": content, "arrays": layout}).encode()
+        numbers = b"".join(array.tobytes() for array in arrays.values())
+        members = {HEADER: text, NUMBERS: numbers}
         with _new_file(self.path(location, key)) as file:
-            np.savez(file, allow_pickle=False, **header, **arrays)
+            np.savez(
+                file,
+                allow_pickle=False,
+                **{name: np.frombuffer(data, np.uint8) for name, data in members.items()},
+            )
 
     def get(self, location: str, key: str, kind: type[T]) -> T | None:
         """Return the JSON data of a key as this type; None if there is no intact entry of it."""
@@ -143,6 +153,18 @@ class CacheLocation:
         text = json.dumps(asdict(content) if is_object else content).encode()
         with _new_file(self.path(location, key, JSON)) as file:
             file.write(_checksum(key, text) + b"\n" + text)
+
+
+def _split(numbers: NDArray[np.uint8], layout: Mapping[str, Any]) -> Arrays:
+    """Return the arrays of these types and shapes that lie in `numbers`, as views."""
+    arrays = {}
+    begin = 0
+    for name, (dtype, shape) in layout.items():
+        # which refuses objects, and more than there is
+        values = np.frombuffer(numbers, dtype, math.prod(shape), begin)
+        arrays[name] = values.reshape(shape)
+        begin += values.nbytes
+    return arrays
 
 
 def _checksum(key: str, text: bytes) -> bytes:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from sys import intern
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,6 +191,9 @@ def plus(first: Term | None, second: Term | None) -> Term | None:
 
 # Files
 
+FIT: Final = ("values", "covariance", "noise_std", "samples")
+"""Arrays of the estimate of an archive. It outlives the sum, and so has copies of its own."""
+
 
 def cached_reduction(
     refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation
@@ -211,10 +214,7 @@ def _write(reduction: Reduction, settings: Settings, cache: CacheLocation) -> No
 
 
 def _packed(reduction: Reduction) -> tuple[dict[str, Any], Arrays]:
-    """Return a reduction as JSON data and arrays: each kind in one array for all archives.
-
-    Few arrays, as each takes some tenths of a millisecond to read, whatever its size.
-    """
+    """Return a reduction as JSON data and arrays: each kind in one array for all archives."""
     summaries = reduction.summaries
     first = summaries[0].total
     totals = [_triangles(summary.total) for summary in summaries]
@@ -226,7 +226,7 @@ def _packed(reduction: Reduction) -> tuple[dict[str, Any], Arrays]:
         arrays["sum_counts"] = reduction.total.counts
         arrays["sum"] = _triangles(reduction.total)
     fits = [summary.fit for summary in summaries if summary.fit is not None]
-    for name in ("values", "covariance", "noise_std", "samples"):
+    for name in FIT:
         arrays[name] = np.array([getattr(fit, name) for fit in fits])
     scatters = [summary.scatter for summary in summaries if summary.scatter is not None]
     if scatters:
@@ -323,10 +323,7 @@ def _unpacked(
             fit = Estimate(
                 names=names,
                 units=units,
-                values=arrays["values"][fit_number],
-                covariance=arrays["covariance"][fit_number],
-                noise_std=arrays["noise_std"][fit_number],
-                samples=arrays["samples"][fit_number],
+                **{name: arrays[name][fit_number].copy() for name in FIT},
                 method=intern(stated["method"]),
                 condition=stated["condition"],
                 undetermined=tuple(stated["undetermined"]),

@@ -6,7 +6,6 @@ import csv
 import math
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
-from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -41,7 +40,7 @@ _NUMBERS: Final = frozenset(
     }
 )
 _COUNTS: Final = frozenset(("archives", "samples"))
-_ROWS: Final = 20_000  # of a table in memory at a time
+_BLOCK: Final = 1 << 24  # bytes of a table in memory at a time
 
 
 def write_tables(folder: Path, result: BatchResult) -> list[Path]:
@@ -60,10 +59,12 @@ def write_tables(folder: Path, result: BatchResult) -> list[Path]:
     }
     paths = []
     for name, columns in COLUMNS.items():
-        for suffix, write in (("csv", _write_csv), ("parquet", _write_parquet)):
-            paths.append(folder / f"{name}.{suffix}")
-            with replace_file(paths[-1]) as temporary:
-                write(temporary, columns, rows[name]())
+        tables = [folder / f"{name}.{suffix}" for suffix in ("csv", "parquet")]
+        with replace_file(tables[0]) as temporary:
+            _write_csv(temporary, columns, rows[name]())
+        with replace_file(tables[1]) as temporary:
+            _write_parquet(temporary, columns, tables[0])
+        paths += tables
     return paths
 
 
@@ -74,8 +75,10 @@ def _write_csv(path: Path, columns: Sequence[str], rows: Iterator[Row]) -> None:
         writer.writerows({key: _text(value) for key, value in row.items()} for row in rows)
 
 
-def _write_parquet(path: Path, columns: Sequence[str], rows: Iterator[Row]) -> None:
+def _write_parquet(path: Path, columns: Sequence[str], table: Path) -> None:
+    """Write the rows of a CSV, typed. Arrow would import pandas to take them from Python."""
     import pyarrow  # a tenth of a second, only where tables are written
+    from pyarrow import csv as arrow_csv
     from pyarrow import parquet
 
     def kind(name: str) -> pyarrow.DataType:
@@ -88,10 +91,15 @@ def _write_parquet(path: Path, columns: Sequence[str], rows: Iterator[Row]) -> N
         return pyarrow.timestamp("us", tz="UTC") if name == "when" else pyarrow.string()
 
     schema = pyarrow.schema([(name, kind(name)) for name in columns])
+    parts = arrow_csv.open_csv(
+        table,
+        read_options=arrow_csv.ReadOptions(use_threads=False, block_size=_BLOCK),
+        parse_options=arrow_csv.ParseOptions(newlines_in_values=True),
+        convert_options=arrow_csv.ConvertOptions(column_types=schema, null_values=[""]),
+    )
     with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
-        while part := [*islice(rows, _ROWS)]:
-            table = {name: [_valid_text(row[name]) for row in part] for name in columns}
-            writer.write_table(pyarrow.table(table, schema))
+        for part in parts:
+            writer.write_batch(part)
 
 
 def _unused_rows(result: BatchResult) -> Iterator[Row]:
@@ -175,9 +183,8 @@ def _text(value: Any) -> Any:
     """Return a value for CSV."""
     if isinstance(value, datetime):
         return value.isoformat()
-    return str(value).lower() if isinstance(value, bool) else _valid_text(value)
-
-
-def _valid_text(value: Any) -> Any:
-    """Return a value, a text without the bytes of a file name that are not UTF-8."""
-    return value.encode("utf-8", "replace").decode("utf-8") if isinstance(value, str) else value
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):  # without the bytes of a file name that are not UTF-8
+        return value.encode("utf-8", "replace").decode("utf-8")
+    return value

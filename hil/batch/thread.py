@@ -1,7 +1,8 @@
 """A thread of this process that executes the tasks of few archives, in place of a Dask cluster.
 
 Dask's own cluster in a thread takes half a second to import, to start and to end, which is twice
-as long as a batch of a hundred cached archives.
+as long as a batch of a hundred cached archives. Its scheduler without a cluster, `dask.get`, takes
+0.09 s to import, a quarter of a batch of two hundred.
 """
 
 from __future__ import annotations

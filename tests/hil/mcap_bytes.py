@@ -11,14 +11,14 @@ from typing import NamedTuple, Self
 
 import zstandard
 from mcap.reader import make_reader
-from mcap.records import Attachment, Chunk, Header, Metadata
+from mcap.records import Attachment, Chunk, Metadata
 from mcap.writer import CompressionType, IndexType, Writer
 
 from hil.archive import container
 from hil.archive.chunk import ChunkParser
 from hil.archive.container import Record, encode
 from hil.archive.header import with_checksum
-from hil.archive.mcap_writer import McapWriter, entries_of
+from hil.archive.index import FileIndex
 from hil.archive.schema import CYCLE
 
 
@@ -135,7 +135,7 @@ class Content:
                 attachment.name: attachment.data for attachment in reader.iter_attachments()
             }
         for entries in metadata:
-            entries.pop("checksum")
+            entries.pop("checksum", None)  # those of others have none
         return cls(messages, metadata[0], metadata[1], attachments)
 
     def write(self, path: Path) -> Path:
@@ -170,10 +170,8 @@ class Indexed:
     """A file to which records are appended, completed with a valid index."""
 
     def __init__(self) -> None:
-        self.data = bytearray()
-        self._writer = McapWriter(self.data.extend, "", "")
-        self.data[:] = container.MAGIC  # the header is among the records
-        self._writer.position = len(self.data)
+        self.data = bytearray(container.MAGIC)
+        self._index = FileIndex()
 
     def put(self, data: bytes) -> None:
         """Append a record, given with its head."""
@@ -182,14 +180,12 @@ class Indexed:
             head, parser = container.parse_chunk(item), ChunkParser()
             by_channel = parser.messages(container.chunk_data(head, item.offset), item.offset)
             for definition in parser.definitions:
-                self._writer.note(definition)
-            self._writer.add_chunk(head, entries_of(by_channel))
-        elif item.opcode == container.HEADER:
-            self._writer.put(container.parse(Header, item))
+                self._index.define(definition)
+            data += self._index.add_chunk(head, by_channel, item.offset, len(data))
         else:
-            self._writer.put(container.parse_item(item))
+            self._index.add(container.parse_item(item), item.offset, len(data))
+        self.data += data
 
     def ended(self) -> bytes:
         """Return the complete file."""
-        self._writer.finish()
-        return bytes(self.data)
+        return bytes(self.data) + self._index.ended(len(self.data))

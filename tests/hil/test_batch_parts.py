@@ -24,7 +24,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pyarrow import parquet
 
-from hil.batch.cache import HEADER, JSON, NPZ, CacheError, CacheLocation, code_digest
+from hil.batch.cache import HEADER, JSON, NPZ, NUMBERS, CacheError, CacheLocation, code_digest
 from hil.batch.cluster import SkippedArchive
 from hil.batch.discovery import ArchiveRef, arm_digest
 from hil.batch.estimates import Arm
@@ -191,25 +191,43 @@ class TestCache:
         cache.write(a_ref(0).location, reduction_key([a_ref(0)], stated), content, arrays)
         assert cached_reduction([a_ref(0)], stated, cache) is None
 
-    def test_objects_that_a_pickle_would_make_are_not_read(self, tmp_path):
+    @pytest.mark.parametrize(
+        ("layout", "numbers"),
+        [
+            ({"values": ["|O", [1]]}, np.zeros(8, np.uint8)),
+            ({"values": ["|O", [1]]}, np.array([{"an": "object"}])),
+            ({"values": ["<f8", [2]]}, np.zeros(8, np.uint8)),
+            ({"values": [[["a", "|O"]], [1]]}, np.zeros(8, np.uint8)),
+            ({"values": ["no type", [1]]}, np.zeros(8, np.uint8)),
+            (["values"], np.zeros(8, np.uint8)),
+        ],
+    )
+    def test_forged_arrays_are_not_read(self, tmp_path, layout, numbers):
+        """Objects, of which a pickle would make some, and arrays that are not there."""
         cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
-        header = np.frombuffer(
-            json.dumps({"key": KEY, "content": {}, "arrays": ["values"]}).encode(), np.uint8
-        )
-        path = cache.path(place, KEY)
-        path.parent.mkdir(parents=True)
-        np.savez(path, **{HEADER: header, "values": np.array([{"an": "object"}])})
+        np.savez(self.new(cache, place), **{HEADER: self.header(layout), NUMBERS: numbers})
         assert cache.read(place, KEY) is None
 
     def test_compressed_entries_are_not_read(self, tmp_path):
         """They may be a thousand times as large in memory."""
         cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
-        header = json.dumps({"key": KEY, "content": {}, "arrays": ["values"]}).encode()
+        header = self.header({"values": ["<f8", [100_000]]})
+        arrays = {HEADER: header, NUMBERS: np.zeros(800_000, np.uint8)}
+        np.savez(self.new(cache, place), **arrays)
+        assert cache.read(place, KEY) is not None
+        np.savez_compressed(cache.path(place, KEY), **arrays)
+        assert cache.read(place, KEY) is None
+
+    @staticmethod
+    def header(layout):
+        text = json.dumps({"key": KEY, "content": {}, "arrays": layout})
+        return np.frombuffer(text.encode(), np.uint8)
+
+    @staticmethod
+    def new(cache, place):
         path = cache.path(place, KEY)
         path.parent.mkdir(parents=True)
-        arrays = {HEADER: np.frombuffer(header, np.uint8), "values": np.zeros(100_000)}
-        np.savez_compressed(path, **arrays)
-        assert cache.read(place, KEY) is None
+        return path
 
     def test_entries_of_two_writers_are_intact(self, tmp_path):
         cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
@@ -438,6 +456,10 @@ class TestTables:
             table = parquet.read_table(tmp_path / f"{name}.parquet")
             assert table.column_names == list(COLUMNS[name])
             assert table.num_rows == len(rows)
+            for column in COLUMNS[name]:
+                values = table[column].to_pylist()
+                if isinstance(values[0], float | int | str) and column != "determined":
+                    assert [*map(str, values)] == [row[column] for row in rows]
         parameters = parquet.read_table(tmp_path / "parameters.parquet").to_pylist()
         repetition = levels()[0].estimate
         row = parameters[3]

@@ -387,7 +387,7 @@ def test_what_is_found_is_judged(
     ("trial", "statuses"),
     [
         (DiskTrial("/d", 10**12, (0.001, 0.2)), [OK, OK]),
-        (DiskTrial("/d", 10**9, (0.001, 0.8)), [WARN, WARN]),
+        (DiskTrial("/d", 2 * 10**9, (0.001, 0.8)), [WARN, WARN]),
         (DiskTrial("/d", 10**6, (0.001, 2.6)), [BAD, BAD]),
         (DiskTrial("/d", 10**12, (), "Read-only file system"), [OK, BAD]),
         (None, [BAD]),

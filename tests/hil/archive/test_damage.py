@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import IndexType
+from mcap.records import DataEnd, Metadata
+from mcap.writer import CompressionType, IndexType
 from mcap_ros2.decoder import DecoderFactory
 from typer.testing import CliRunner
 
@@ -23,6 +24,7 @@ from drivers.record import cycle_dtype
 from hil.archive import Archive, Samples, container, header, open_archive, schema, write_samples
 from hil.archive import repair as repairing
 from hil.archive.check import check_archive
+from hil.archive.container import encode
 from hil.archive.repair import Repair, repair
 from hil.cli import app
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
@@ -378,6 +380,34 @@ class TestNothingLost:
         assert open_archive(path).complete
         assert not check_archive(path).conforms
         assert_valid(repair(path), written)
+
+    @pytest.mark.parametrize("compression", [*CompressionType])
+    def test_copy_of_any_compression_is_intact(self, written, path, compression):
+        """Earlier versions wrote Zstandard."""
+        replace(Content.of(written.path), compression=compression).write(path)
+        assert check_archive(path).conforms
+        assert repair(path).output is None
+
+    def test_messages_metadata_and_attachments_are_all_repaired(self, written, path):
+        """Of an archive of an earlier version without index, with channels of others."""
+        content = Content.of(written.path)
+        first = content.messages[0]
+        others = [
+            replace(first, topic="/other", publish_time=first.log_time + 7, sequence=k, data=b"ab")
+            for k in range(3)
+        ]
+        content.messages[5:5] = others
+        data = replace(content, compression=CompressionType.ZSTD).write(path).read_bytes()
+        end = data.rindex(encode(DataEnd(0)))
+        path.write_bytes(data[:end] + mcap_bytes.metadata("note", {"by": "others"}))
+        done = repair(path)
+        assert_valid(done, written)
+        saved = Content.of(done.output)
+        assert saved.messages == content.messages
+        assert saved.attachments == content.attachments
+        with done.output.open("rb") as stream:
+            notes = [*make_reader(stream).iter_metadata()]
+        assert Metadata("note", {"by": "others"}) in notes
 
     @pytest.mark.parametrize("missed", [0, 20, 100])
     def test_chunks_behind_missed_packets_are_whole(self, path, missed):
