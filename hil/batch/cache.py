@@ -24,11 +24,11 @@ from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
 from hil.errors import InputError
 from hil.files import digest, json_digest, replace_file, user_cache
 from hil.reading import open_file
+from hil.type_adapter import adapter_of
 from planner.arrays import DAMAGED
 
 from .places import folder_of, is_url
@@ -136,7 +136,7 @@ class CacheLocation:
                 checksum, _, text = file.read().partition(b"\n")
             if checksum != _checksum(key, text):
                 return None
-            value: T = _adapter(kind).validate_python(json.loads(text))  # type: ignore[arg-type]
+            value: T = adapter_of(kind).validate_python(json.loads(text))  # type: ignore[arg-type]
         except (OSError, MemoryError, ValueError, RecursionError):
             return None
         return value
@@ -188,11 +188,6 @@ def _new_file(path: Path) -> Iterator[BinaryIO]:
         problem = f"cannot be written ({error.strerror})"
         remedy = "make room, or name another folder with --cache, or none"
         raise CacheError(path, problem, remedy=remedy) from error
-
-
-@cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
 
 
 @cache
