@@ -19,6 +19,7 @@ from identification.signals.samples import Samples
 from identification.validation.causes import Cause, find_causes
 from identification.validation.changes import Change, find_changes
 from identification.validation.consistency import ConsistencyCheck
+from identification.validation.fault_scores import ScorePrior
 from identification.validation.finding import Finding
 from identification.validation.gravity import CarriedLoad, GravityDirection, find_gravity, find_load
 from identification.validation.nominal_scale import InertiaRatio, NominalScale
@@ -115,6 +116,9 @@ class Evidence:
     #: largest torque difference of a repetition's estimate to the pooled one, as a share of the
     #: torque (n,); None without repetitions
     disagreement: Array | None = None
+    #: deviation of the predicted unseen torque by the covariance, as a share of the torque over
+    #: all axes; None if parameters are undetermined, or nothing was held out
+    open_share: float | None = None
     causes: tuple[Cause, ...] | None = None  #: faults whose correction reduces errors
     #: joints whose torque or friction on unseen motion differs from the fitted motion
     changes: tuple[Change, ...] = ()
@@ -181,12 +185,14 @@ def gather(
     names: Sequence[str] = (),
     unseen: Factor | None = None,
     consistency: ConsistencyCheck | None = None,
+    prior: ScorePrior | None = None,
 ) -> Evidence:
     """Collect the evidence for a verdict; every recording is read a few times.
 
     With `same_motion` the training recordings, in the order of the result, repeat one motion, and
     noise is measured. `nominal` are parameters (p,); with `in_sample` the held-out motions are the
-    training. `unseen` is the sum of the held-out factors, if known.
+    training. `unseen` is the sum of the held-out factors, if known, and `prior` that of the
+    estimate.
     """
     pooled = result.pooled
     values = pooled.values
@@ -210,8 +216,9 @@ def gather(
         systematic_without_friction=None if slow is None else slow.without_friction,
         friction_change=None if slow is None else slow.friction_change,
         noise_floor=floor,
+        open_share=None if in_sample else _open_share(pooled, unseen),
         disagreement=None if noise is None else _disagreement(result),
-        causes=find_causes(model, training, values, names, noise=floor),
+        causes=find_causes(model, training, values, names, noise=floor, prior=prior),
         changes=find_changes(model, pooled, training, others, unseen) if others else (),
         one_way=_one_way(training),
         gravity=gravity,
@@ -298,6 +305,15 @@ def _disagreement(result: RepeatedEstimate) -> Array:
     torque = np.einsum("ri,jik,rk->rj", differences, gram[:, :-1, :-1], differences)
     share = np.maximum(torque, 0.0) / np.maximum(gram[:, -1, -1], 1e-300)
     return np.asarray(np.sqrt(share.max(axis=0)))
+
+
+def _open_share(estimate: Estimate, unseen: Factor) -> float | None:
+    """Return the deviation of predicted torque by the covariance, over the torque, of all axes."""
+    torque = float(unseen.gram[:, -1, -1].sum())
+    if not torque or not np.all(np.isfinite(estimate.covariance)):
+        return None
+    columns = unseen.gram[:, :-1, :-1].sum(axis=0)
+    return float(np.sqrt(np.vdot(columns, estimate.covariance) / torque))
 
 
 def _estimation_noise(result: RepeatedEstimate, held_out: Factor) -> Array:
