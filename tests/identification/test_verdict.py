@@ -774,15 +774,6 @@ class TestCausesOfWholeRecordings:
 
 
 class TestErrorsWithoutCause:
-    @pytest.mark.parametrize("seed", [1, 3])
-    @pytest.mark.parametrize("stiffness", [200.0, 800.0])
-    def test_a_spring_is_no_turned_sign(self, seed, stiffness):
-        """It makes a torque that no bodies of the prior have."""
-        short = first_rows(recorded(seed), 250)
-        torque = short.torque.copy()
-        torque[:, 1] -= stiffness * short.motion.position[:, 1]
-        assert causes([replace(short, torque=torque)]) == ()
-
     def test_a_load_whose_interval_contains_zero_is_none(self, monkeypatch):
         loaded = [recorded(1, LOAD * (np.arange(1250) >= 625))]
         (cause,) = causes(loaded)
