@@ -63,7 +63,7 @@ def validate(prepared: Prepared, estimation: Estimation, reporter: Reporter) -> 
             names=[source.name for source in sources.training],
             unseen=unseen,
             consistency=None if isinstance(consistency, str) else consistency,
-            prior=ScorePrior(posterior.prior.gaussian, posterior.design_effect),
+            prior=ScorePrior(posterior.prior.belief.gaussian, posterior.design_effect),
         )
         verdict = judge(model.joint_names, evidence, tested_on=sources.tested_on)
         task.advance(1)

@@ -82,7 +82,7 @@ def find_causes(
     """Find faults that explain the error of values (p,) from the recordings, by their effect.
 
     `noise` is the standard deviation of each joint's torque noise (n,) [N·m or N], by default that
-    of the residual at high frequencies. With the prior of the estimate, turned signs and exchanged
+    of the residual at high frequencies. With the prior of the arm, turned signs and exchanged
     joints of a motion that determines little are seen, too.
     """
     if noise is None:

@@ -192,7 +192,7 @@ def gather(
     With `same_motion` the training recordings, in the order of the result, repeat one motion, and
     noise is measured. `nominal` are parameters (p,); with `in_sample` the held-out motions are the
     training. `unseen` is the sum of the held-out factors, if known, and `prior` that of the
-    estimate.
+    arm.
     """
     pooled = result.pooled
     values = pooled.values

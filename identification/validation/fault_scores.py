@@ -34,7 +34,7 @@ MASS: Final = LINK_SYMBOLS.index("m")
 
 
 class ScorePrior(NamedTuple):
-    """Prior of an estimate beside its fitted rows."""
+    """What is believed of an arm, beside fitted rows."""
 
     gaussian: GaussianPrior
     design_effect: float  # rows that count as one
