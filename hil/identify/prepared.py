@@ -284,7 +284,9 @@ class _DelayChoice:
         if self.suggested:
             determined = all(delay.determined for delay in self.suggested)
             reason = "it predicts worse" if determined else "it is not determined"
-            estimate = None if determined else self.estimate
+            # It was estimated without a low-pass of the torque.
+            suspected = not determined and how.torque_bandwidth is None
+            estimate = self.estimate if suspected else None
             return estimate, (f"{self.notes[0]}; not applied, as {reason}",)
         return self.estimate, self.notes
 

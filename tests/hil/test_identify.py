@@ -526,6 +526,8 @@ def test_a_delay_that_predicts_no_better_is_not_applied(reason):
     choice = _DelayChoice(estimate, 0.0, suggested, ("4 ms ± 2 ms",))
     left, (note,) = choice.confirmed_by(Preprocessing(torque_delay=0.0))
     assert left is (estimate if reason else None)
+    filtered = Preprocessing(torque_delay=0.0, torque_bandwidth=5.0)
+    assert choice.confirmed_by(filtered)[0] is None
     assert note.startswith("4 ms ± 2 ms; not applied, as it")
 
 
