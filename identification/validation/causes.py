@@ -127,6 +127,35 @@ class _Trial(NamedTuple):
         )
 
 
+class _Pair(NamedTuple):
+    """Scores with and without the correction of a fault, both without a prior or with it."""
+
+    corrected: FaultScore
+    usual: FaultScore
+
+
+def _trial(
+    fault: Fault, pair: _Pair, tables: FaultTables, added: Array, *, explains: bool
+) -> _Trial | None:
+    """Return the correction by added columns (B, n, q, r); None of a size that no fault has."""
+    score = pair.corrected
+    size, std = size_of_fault(fault, score, tables, added)
+    if fault.kind == "load friction" and (size or 0.0) <= 0.0:
+        return None  # friction dissipates
+    if size is not None and fault.kind == "payload" and abs(size) < _CHANGED * std:
+        return None  # the interval of its mass contains zero
+    ratio, highest = score.ratio_to(pair.usual)
+    shares = score.shares(score.squares.sum(axis=0))[[*fault.joints]]
+    return _Trial(
+        cause=Cause(fault, ratio, size, std),
+        highest=highest,
+        coefficients=added.shape[3],
+        left=float(np.sqrt(shares.max(initial=0.0))),
+        values=score.values.mean(axis=0),
+        explains=explains,
+    )
+
+
 def _best(trials: Sequence[_Trial]) -> _Trial | None:
     """Return the significant trial of least error, with few coefficients preferred."""
     better = [trial for trial in trials if trial.better]
@@ -220,38 +249,24 @@ class _Search:
             decisive = self._decisive(fault, scores, usuals)
             if decisive is None:
                 continue
-            score, base = decisive
-            explains = score.explains(joints, base, noise, separate.get(fault.part))
-            ratio, highest = score.ratio_to(base)
-            size, std = size_of_fault(fault, score, tables, added)
-            worst = float(np.sqrt(score.shares(score.squares.sum(axis=0))[joints].max(initial=0.0)))
-            if fault.kind == "load friction" and (size or 0.0) <= 0.0:
-                continue  # friction dissipates
-            if size is not None and fault.kind == "payload" and abs(size) < _CHANGED * std:
-                continue  # the interval of its mass contains zero
-            trials.append(
-                _Trial(
-                    cause=Cause(fault, ratio, size, std),
-                    highest=highest,
-                    coefficients=added.shape[3],
-                    left=worst,
-                    values=score.values.mean(axis=0),
-                    explains=explains,
-                )
+            explains = decisive.corrected.explains(
+                joints, decisive.usual, noise, separate.get(fault.part)
             )
+            trial = _trial(fault, decisive, tables, added, explains=explains)
+            trials += [] if trial is None else [trial]
         return trials
 
     def _decisive(
         self, fault: Fault, scores: Sequence[FaultScore], usuals: Sequence[FaultScore]
-    ) -> tuple[FaultScore, FaultScore] | None:
-        """Return the score of a correction that shows its effect, and the one without it.
+    ) -> _Pair | None:
+        """Return the scores that show the effect of a correction best.
 
         Bodies that no arm has can make the torque of a turned sign where a motion determines
         little, and those of the prior cannot make that of a spring: neither alone may accuse. None
         if by one of them the error grows, or if friction drives an affected joint.
         """
-        pairs = list(zip(scores, usuals, strict=False))
-        ratios = [score.ratio_to(usual) for score, usual in pairs]
+        pairs = [_Pair(*pair) for pair in zip(scores, usuals, strict=False)]
+        ratios = [pair.corrected.ratio_to(pair.usual) for pair in pairs]
         if len(pairs) == 1:
             return pairs[0]
         if max(ratio for ratio, _ in ratios) > 1.0:

@@ -168,6 +168,8 @@ def _gravity_and_load(
     model: RobotModel, training: Sequence[Samples], held_out: Sequence[Samples]
 ) -> tuple[GravityDirection, CarriedLoad]:
     """Fit gravity and a carried load by sums that are large, and not needed afterwards."""
+    training = training[:_MOST_RECORDINGS]
+    held_out = held_out[:_MOST_RECORDINGS]
     sums = [standard_factor(model, some) for some in (training, held_out)]
     return find_gravity(model, *sums), find_load(model, training, held_out, *sums)
 
@@ -191,18 +193,15 @@ def gather(
 
     With `same_motion` the training recordings, in the order of the result, repeat one motion, and
     noise is measured. `nominal` are parameters (p,); with `in_sample` the held-out motions are the
-    training. `unseen` is the sum of the held-out factors, if known, and `prior` that of the
-    arm.
+    training. `unseen` is the sum of the held-out factors, if known; `prior` is that of the arm.
     """
     pooled = result.pooled
     values = pooled.values
     unseen = total_factor(model, held_out) if unseen is None else unseen
-    few = training[:_MOST_RECORDINGS]
-    few_unseen = held_out[:_MOST_RECORDINGS]
-    gravity, load = _gravity_and_load(model, few, few_unseen)
+    gravity, load = _gravity_and_load(model, training, held_out)
     repeated = same_motion and len(result.repetitions) > 1
     noise = repetition_noise(model, values, training, SLOW) if repeated else None
-    floor = noise_floor(model, values, few, noise)
+    floor = noise_floor(model, values, training[:_MOST_RECORDINGS], noise)
     error = _error(model, values, held_out)
     slow = None if noise is None else _slow_errors(model, result, held_out, error, unseen, noise)
     speed = np.abs(np.concatenate([run.motion.velocity for run in held_out])).max(axis=0)
