@@ -236,7 +236,7 @@ class OpenFacts:
             f" fitted motion leaves them open; the error of {percentage(self.overall, 1)} there"
             " does not tell a fault of such an effect (low sampling rate, coarse resolution, small"
             " payload) from chance",
-            f"{_NOT_COVERED}, in which every joint turns both ways",
+            f"{_NOT_COVERED}, in which every joint moves in both directions",
         )
 
 
