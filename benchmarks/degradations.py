@@ -23,10 +23,9 @@ class Expectation:
     Attributes:
         checks: names of findings; any of them is right.
         silence: whether it is as right to say nothing where the held-out error is not raised, or
-            where what the fitted motion leaves open decides it. The Gen3, 4.7 s of which one joint
-            turns one way only: fitted at 1 kHz and at 94 Hz, parameters fit the recording to 6.74
-            and 6.79 % and predict the other motion to 16.5 and 20.6 %; those drawn from one
-            posterior fit to 6.8 to 6.9 % and predict to 18 to 45 %.
+            where what the fitted motion leaves open decides it: parameters of the Gen3, 4.7 s in
+            which one joint moves in one direction only, that were fitted at 1 kHz and at 94 Hz fit
+            the recording alike, and predict the other motion apart. The verdict says by how much.
     """
 
     checks: frozenset[str]

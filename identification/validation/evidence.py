@@ -312,7 +312,7 @@ def _open_share(estimate: Estimate, unseen: Factor) -> float | None:
     if not torque or not np.all(np.isfinite(estimate.covariance)):
         return None
     columns = unseen.gram[:, :-1, :-1].sum(axis=0)
-    return float(np.sqrt(np.vdot(columns, estimate.covariance) / torque))
+    return float(np.sqrt(max(0.0, np.vdot(columns, estimate.covariance) / torque)))
 
 
 def _estimation_noise(result: RepeatedEstimate, held_out: Factor) -> Array:

@@ -408,6 +408,10 @@ def check_residuals(
     )
 
 
+def _length(segment: slice) -> int:
+    return int(segment.stop - segment.start)
+
+
 class FoldedNoise(NamedTuple):
     """Noise of the torque that reaches half the sampling rate."""
 
@@ -429,10 +433,12 @@ def folded_noise(
         left = np.where(run.usable, run.torque - run.predicted_torque(model, values), 0.0)
         squares += float((left**2).sum())
         power += float((run.torque[run.usable] ** 2).sum())
-        part = max(run.segments, key=lambda segment: int(segment.stop - segment.start))
+        part = max(run.segments, key=_length, default=slice(0, 0))
+        if _length(part) < 2:
+            continue
         step = float(np.median(np.diff(run.motion.time[part])))
         highest = 0.5 / step
-        length = min(part.stop - part.start, round(_RESOLVED / step))
+        length = min(_length(part), round(_RESOLVED / step))
         if highest < 2.0 * bandwidth or length * step * bandwidth < 1.0:
             continue
         frequency, density = power_density(left[part], 1.0 / step, length)
