@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -25,10 +25,11 @@ from identification.signals.recording import UNWRAPPED, Recording
 from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.evidence import CellContext
-from identification.validation.finding import Finding, joined
+from identification.validation.finding import Finding, Thresholds, joined
 from identification.validation.nominal_scale import InertiaRatio, inertia_ratio, nominal_scale
 from identification.validation.position_jumps import PositionJump, position_steps
 from identification.validation.prediction import PredictionError, pooled_error
+from identification.validation.residuals import folded_noise
 from planner.arrays import numbers
 
 from .prepared import Prepared
@@ -100,6 +101,8 @@ _STEP_QUANTILE: Final = 0.01  # of the changes between samples: one step of a co
 _GRID: Final = 0.05  # distance from a multiple of the step, in steps
 _MAX_ROUNDING: Final = 0.02  # of accelerations, as a share
 _EXACT: Final = 1e-4  # relative error below the resolution of any sensor
+_FEW: Final = 3  # recordings that show the noise of the torque
+_MOST: Final = 0.5  # of the squared residual
 _FAST: Final = 2.0  # a low-pass above this multiple of the motion's bandwidth has no effect
 
 
@@ -139,6 +142,7 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
             *_torque_channel(prepared),
             *_friction_law(prepared),
             *_resolution(prepared),
+            *_sampling_rate(prepared, estimate),
         ),
         added_friction=_added_friction(prepared),
         scale_std=torque_scale_of(sources).std,
@@ -264,16 +268,21 @@ def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
 
 
 def _resolution(prepared: Prepared) -> Iterator[Finding]:
-    """Yield a finding if the resolution of the positions is too low for their accelerations.
+    """Yield findings if the resolution of the positions is too low.
 
-    Rounding to a step q is white noise of variance q²/12; after smoothing with a bandwidth B it
-    contributes q²/12 (2 / rate) (2 pi)^4 B^5 / 5 to the variance of the acceleration.
+    For their accelerations: rounding to a step q is white noise of variance q²/12; after smoothing
+    with a bandwidth B it contributes q²/12 (2 / rate) (2 pi)^4 B^5 / 5 to the variance of the
+    acceleration. For friction at rest: it reverses over the presliding displacement, and a larger
+    step of a resting joint makes its direction one of rounding.
     """
     names = prepared.sources.cell.joint_names
+    model = prepared.sources.cell.model
     coarse = dict[str, float]()
+    reversing = dict[str, float]()
     for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
         recording = source.recording
         interval = float(np.median(np.diff(recording.time)))
+        resting = np.any(samples.usable & ~model.moving(samples.motion.velocity), axis=0)
         for j, name in enumerate(names):
             step = grid_step(recording.position[:, j])
             if step is None:
@@ -282,13 +291,47 @@ def _resolution(prepared: Prepared) -> Iterator[Finding]:
             noise = step**2 / 12.0 * 2.0 * interval * (2.0 * np.pi) ** 4 * width**5 / 5.0
             if np.sqrt(noise) > _MAX_ROUNDING * samples.motion.acceleration[:, j].std():
                 coarse[name] = max(step, coarse.get(name, 0.0))
+            law = model.friction.laws[j]
+            if law.coulomb and resting[j] and 0.0 < (law.presliding or 0.0) < step:
+                reversing[name] = max(step, reversing.get(name, 0.0))
     if coarse:
-        each = joined([f"{name} {step:.2g}" for name, step in coarse.items()])
         yield _condition(
             "resolution",
-            f"the positions have a coarse resolution [rad or m]: {each}; more than"
+            f"the positions have a coarse resolution [rad or m]: {_steps(coarse)}; more than"
             f" {percentage(_MAX_ROUNDING)} of the accelerations is rounding error",
             "record positions with more digits, or identify with a lower --bandwidth",
+        )
+    elif reversing:
+        presliding = max(law.presliding or 0.0 for law in model.friction.laws)
+        yield _condition(
+            "resolution",
+            f"the positions have a coarse resolution [rad or m]: {_steps(reversing)}; friction"
+            f" reverses over {presliding:.2g}, so that its direction at rest is that of rounding",
+            "record positions with more digits, or leave slow rows out"
+            " (`hil identify --exclude-rows slow`)",
+        )
+
+
+def _steps(steps: Mapping[str, float]) -> str:
+    return joined([f"{name} {step:.2g}" for name, step in steps.items()])
+
+
+def _sampling_rate(prepared: Prepared, estimate: Estimate) -> Iterator[Finding]:
+    """Yield a finding if most of a large error is noise that sampling folds into the motion's."""
+    how = prepared.settings.preprocessing
+    if how.torque_bandwidth is not None:
+        return
+    few = prepared.training[:_FEW]
+    model = prepared.sources.cell.model
+    noise = folded_noise(model, estimate.values, few, how.rigid_bandwidth)
+    if noise.share > _MOST and noise.error > Thresholds().unexplained:
+        rate = 1.0 / float(np.median(np.diff(few[0].motion.time)))
+        yield _condition(
+            "sampling rate",
+            f"at {rate:.3g} Hz the torque has noise up to half this rate; sampling folds it to"
+            f" below {how.rigid_bandwidth:g} Hz, where it is {percentage(noise.share)} of the"
+            " squared residual",
+            "log at a higher rate, or filter the torque below half the rate before it is sampled",
         )
 
 

@@ -169,7 +169,7 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
     if delay.doubt and chosen.preprocessing.torque_delay == stated.stated_delay:
         variance = delay.doubt
         notes += delay.contradiction if estimate is not None else ()
-    elif estimate is not None and notes:
+    elif estimate is not None and notes and chosen.preprocessing.torque_delay == estimate.applied:
         variance = estimate.variance
     return Decided(replace(chosen, delay_variance=variance), estimate, notes)
 
@@ -265,7 +265,10 @@ class _DelayChoice:
         )
 
     def confirmed_by(self, how: Preprocessing) -> tuple[DelayEstimate | None, tuple[str, ...]]:
-        """Return the estimate if the chosen preprocessing agrees with it, and the notes on it."""
+        """Return the estimate if the chosen preprocessing agrees with it, and the notes on it.
+
+        Also one that is significant and was not applied because its interval is wide.
+        """
         if (
             self.estimate is not None
             and how.torque_bandwidth is not None
@@ -281,7 +284,10 @@ class _DelayChoice:
         if self.suggested:
             determined = all(delay.determined for delay in self.suggested)
             reason = "it predicts worse" if determined else "it is not determined"
-            return None, (f"{self.notes[0]}; not applied, as {reason}",)
+            # It was estimated without a low-pass of the torque.
+            suspected = not determined and how.torque_bandwidth is None
+            estimate = self.estimate if suspected else None
+            return estimate, (f"{self.notes[0]}; not applied, as {reason}",)
         return self.estimate, self.notes
 
 

@@ -12,6 +12,7 @@ from identification.selection.essential import Elimination, choose_essential
 from identification.validation.calibration import Calibration, TorqueMeans, calibrate
 from identification.validation.consistency import ConsistencyCheck, check_consistency
 from identification.validation.evidence import Evidence, gather
+from identification.validation.fault_scores import ScorePrior
 from identification.validation.verdict import Verdict, judge
 
 from .cell_context import Nominal, cell_context_of, nominal_of
@@ -43,6 +44,7 @@ def validate(prepared: Prepared, estimation: Estimation, reporter: Reporter) -> 
     result = estimation.result
     model = sources.cell.model
     nominal = nominal_of(sources.cell)
+    posterior = estimation.posterior
     with reporter.task("validating", 3) as task:
         unseen = sum(estimation.held_out, Factor.zero(model))
         consistency = _consistency(estimation, unseen, in_sample=sources.in_sample)
@@ -61,6 +63,7 @@ def validate(prepared: Prepared, estimation: Estimation, reporter: Reporter) -> 
             names=[source.name for source in sources.training],
             unseen=unseen,
             consistency=None if isinstance(consistency, str) else consistency,
+            prior=ScorePrior(posterior.prior.belief.gaussian, posterior.design_effect),
         )
         verdict = judge(model.joint_names, evidence, tested_on=sources.tested_on)
         task.advance(1)

@@ -30,8 +30,8 @@ _MOST_BINS = 300
 _OF_MODEL: Final = "About the model and its prediction"
 _OF_RECORDING: Final = "About the recording"
 _RECORDING_CHECKS: Final = frozenset(
-    {"torque bandwidth", "resolution", "whiteness", "saturation", "excitation", "delay",
-     "systematic error"}
+    {"torque bandwidth", "sampling rate", "resolution", "whiteness", "saturation", "excitation",
+     "left open by the motion", "delay", "systematic error"}
 )  # fmt: skip
 """Checks whose findings describe how it was recorded."""
 

@@ -25,6 +25,7 @@ from identification.validation.fault_scores import (
     FEWEST_BLOCKS,
     MASS,
     FaultScore,
+    ScorePrior,
     fault_score,
     size_of_fault,
 )
@@ -38,6 +39,7 @@ from identification.validation.faults import (
     corrected,
     coupled_pairs,
 )
+from identification.validation.physical_signs import SIGMAS, friction_at
 from identification.validation.prediction import noise_floor
 
 Array = NDArray[np.float64]
@@ -53,6 +55,7 @@ _SMALL_ERROR: Final = 0.02
 # nearly its own mirror image, which other parameters fit to some per cent.
 _LITTLE_MORE: Final = 1.05
 _NOISE_OF: Final = 3  # recordings
+_CHANGED: Final = 2.0  # standard deviations of a payload that is one
 _MOST_CAUSES: Final = 4
 _FEW_ROWS: Final = 600  # of all recordings together, on which faults of positions are tried first
 
@@ -74,16 +77,18 @@ def find_causes(
     names: Sequence[str] = (),
     *,
     noise: Array | None = None,
+    prior: ScorePrior | None = None,
 ) -> tuple[Cause, ...]:
     """Find faults that explain the error of values (p,) from the recordings, by their effect.
 
     `noise` is the standard deviation of each joint's torque noise (n,) [N·m or N], by default that
-    of the residual at high frequencies.
+    of the residual at high frequencies. With the prior of the arm, turned signs and exchanged
+    joints of a motion that determines little are seen, too.
     """
     if noise is None:
         noise = noise_floor(model, values, recordings[:_NOISE_OF])
     recording_names = tuple(names) or tuple(f"recording {k + 1}" for k in range(len(recordings)))
-    search = _Search(model, recordings, values, recording_names, noise)
+    search = _Search(model, recordings, values, recording_names, noise, prior)
     causes: list[Cause] = []
     while len(causes) < _MOST_CAUSES and (trial := _best(search.trials())) is not None:
         causes.append(search.resized(trial))
@@ -122,6 +127,35 @@ class _Trial(NamedTuple):
         )
 
 
+class _Pair(NamedTuple):
+    """Scores with and without the correction of a fault, both without a prior or with it."""
+
+    corrected: FaultScore
+    usual: FaultScore
+
+
+def _trial(
+    fault: Fault, pair: _Pair, tables: FaultTables, added: Array, *, explains: bool
+) -> _Trial | None:
+    """Return the correction by added columns (B, n, q, r); None of a size that no fault has."""
+    score = pair.corrected
+    size, std = size_of_fault(fault, score, tables, added)
+    if fault.kind == "load friction" and (size or 0.0) <= 0.0:
+        return None  # friction dissipates
+    if size is not None and fault.kind == "payload" and abs(size) < _CHANGED * std:
+        return None  # the interval of its mass contains zero
+    ratio, highest = score.ratio_to(pair.usual)
+    shares = score.shares(score.squares.sum(axis=0))[[*fault.joints]]
+    return _Trial(
+        cause=Cause(fault, ratio, size, std),
+        highest=highest,
+        coefficients=added.shape[3],
+        left=float(np.sqrt(shares.max(initial=0.0))),
+        values=score.values.mean(axis=0),
+        explains=explains,
+    )
+
+
 def _best(trials: Sequence[_Trial]) -> _Trial | None:
     """Return the significant trial of least error, with few coefficients preferred."""
     better = [trial for trial in trials if trial.better]
@@ -141,13 +175,17 @@ class _Search:
         values: Array,
         names: Sequence[str],
         noise: Array | None = None,
+        prior: ScorePrior | None = None,
     ) -> None:
         self._model = model
+        self._priors = (None,) if prior is None else (None, prior)
         self._values = values
         self._names = names
         self._noise = np.zeros(model.n_joints) if noise is None else np.nan_to_num(noise)
         travel = np.max([np.ptp(samples.motion.position, axis=0) for samples in recordings], axis=0)
         self._moved = np.flatnonzero(travel > STUCK_MOVEMENT)
+        speeds = [np.abs(samples.motion.velocity).max(axis=0) for samples in recordings]
+        self._friction = friction_at(model, np.max(speeds, axis=0))
         self._recordings = recordings
         self._few = _Few.of(model, recordings)
         self._known: list[Fault] = []
@@ -173,7 +211,8 @@ class _Search:
         none = np.zeros((*tables.gram.shape[:3], 0))
         corrections = [columns_of_fault(tables, model, values, earlier) for earlier in self._known]
         before = np.concatenate([none, *corrections], axis=3)
-        usual = fault_score(tables, before, target)
+        usuals = [fault_score(tables, before, target, prior) for prior in self._priors]
+        usual = usuals[0]
         noise = self._noise**2 * tables.rows.sum(axis=0)
         separate: dict[Part | None, FaultScore] = {}
         excluded = self._excluded(usual, noise)
@@ -204,24 +243,40 @@ class _Search:
                 added = columns_of_fault(tables, model, values, fault)
                 if not added.any():
                     continue  # such as friction of a frictionless joint
-            score = fault_score(seen, np.concatenate([added, before], axis=3), measured)
-            explains = score.explains(joints, usual, noise, separate.get(fault.part))
-            ratio, highest = score.ratio_to(usual)
-            size, std = size_of_fault(fault, score, tables, added)
-            worst = float(np.sqrt(score.shares(score.squares.sum(axis=0))[joints].max(initial=0.0)))
-            if fault.kind == "load friction" and (size or 0.0) <= 0.0:
-                continue  # friction dissipates
-            trials.append(
-                _Trial(
-                    cause=Cause(fault, ratio, size, std),
-                    highest=highest,
-                    coefficients=added.shape[3],
-                    left=worst,
-                    values=score.values.mean(axis=0),
-                    explains=explains,
-                )
+            columns = np.concatenate([added, before], axis=3)
+            priors = self._priors if fault.discrete else (None,)
+            scores = [fault_score(seen, columns, measured, prior) for prior in priors]
+            decisive = self._decisive(fault, scores, usuals)
+            if decisive is None:
+                continue
+            explains = decisive.corrected.explains(
+                joints, decisive.usual, noise, separate.get(fault.part)
             )
+            trial = _trial(fault, decisive, tables, added, explains=explains)
+            trials += [] if trial is None else [trial]
         return trials
+
+    def _decisive(
+        self, fault: Fault, scores: Sequence[FaultScore], usuals: Sequence[FaultScore]
+    ) -> _Pair | None:
+        """Return the scores that show the effect of a correction best.
+
+        Bodies that no arm has can make the torque of a turned sign where a motion determines
+        little, and those of the prior cannot make that of a spring: neither alone may accuse. None
+        if by one of them the error grows, or if friction drives an affected joint.
+        """
+        pairs = [_Pair(*pair) for pair in zip(scores, usuals, strict=False)]
+        ratios = [pair.corrected.ratio_to(pair.usual) for pair in pairs]
+        if len(pairs) == 1:
+            return pairs[0]
+        if max(ratio for ratio, _ in ratios) > 1.0:
+            return None
+        best = min(range(len(pairs)), key=lambda k: (ratios[k][1] >= 1.0, ratios[k][0]))
+        friction = scores[-1].values @ self._friction[[*fault.joints]].T
+        std = np.sqrt((len(friction) - 1) * friction.var(axis=0))
+        if np.any(friction.mean(axis=0) < -SIGMAS * std):
+            return None
+        return pairs[best]
 
     def _of_motion(self, fault: Fault) -> FaultTables:
         """Return the tables of the recordings with a fault of the motion corrected."""

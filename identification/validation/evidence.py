@@ -19,6 +19,7 @@ from identification.signals.samples import Samples
 from identification.validation.causes import Cause, find_causes
 from identification.validation.changes import Change, find_changes
 from identification.validation.consistency import ConsistencyCheck
+from identification.validation.fault_scores import ScorePrior
 from identification.validation.finding import Finding
 from identification.validation.gravity import CarriedLoad, GravityDirection, find_gravity, find_load
 from identification.validation.nominal_scale import InertiaRatio, NominalScale
@@ -115,6 +116,9 @@ class Evidence:
     #: largest torque difference of a repetition's estimate to the pooled one, as a share of the
     #: torque (n,); None without repetitions
     disagreement: Array | None = None
+    #: deviation of the predicted unseen torque by the covariance, as a share of the torque over
+    #: all axes; None if parameters are undetermined, or nothing was held out
+    open_share: float | None = None
     causes: tuple[Cause, ...] | None = None  #: faults whose correction reduces errors
     #: joints whose torque or friction on unseen motion differs from the fitted motion
     changes: tuple[Change, ...] = ()
@@ -164,6 +168,8 @@ def _gravity_and_load(
     model: RobotModel, training: Sequence[Samples], held_out: Sequence[Samples]
 ) -> tuple[GravityDirection, CarriedLoad]:
     """Fit gravity and a carried load by sums that are large, and not needed afterwards."""
+    training = training[:_MOST_RECORDINGS]
+    held_out = held_out[:_MOST_RECORDINGS]
     sums = [standard_factor(model, some) for some in (training, held_out)]
     return find_gravity(model, *sums), find_load(model, training, held_out, *sums)
 
@@ -181,22 +187,21 @@ def gather(
     names: Sequence[str] = (),
     unseen: Factor | None = None,
     consistency: ConsistencyCheck | None = None,
+    prior: ScorePrior | None = None,
 ) -> Evidence:
     """Collect the evidence for a verdict; every recording is read a few times.
 
     With `same_motion` the training recordings, in the order of the result, repeat one motion, and
     noise is measured. `nominal` are parameters (p,); with `in_sample` the held-out motions are the
-    training. `unseen` is the sum of the held-out factors, if known.
+    training. `unseen` is the sum of the held-out factors, if known; `prior` is that of the arm.
     """
     pooled = result.pooled
     values = pooled.values
     unseen = total_factor(model, held_out) if unseen is None else unseen
-    few = training[:_MOST_RECORDINGS]
-    few_unseen = held_out[:_MOST_RECORDINGS]
-    gravity, load = _gravity_and_load(model, few, few_unseen)
+    gravity, load = _gravity_and_load(model, training, held_out)
     repeated = same_motion and len(result.repetitions) > 1
     noise = repetition_noise(model, values, training, SLOW) if repeated else None
-    floor = noise_floor(model, values, few, noise)
+    floor = noise_floor(model, values, training[:_MOST_RECORDINGS], noise)
     error = _error(model, values, held_out)
     slow = None if noise is None else _slow_errors(model, result, held_out, error, unseen, noise)
     speed = np.abs(np.concatenate([run.motion.velocity for run in held_out])).max(axis=0)
@@ -210,8 +215,9 @@ def gather(
         systematic_without_friction=None if slow is None else slow.without_friction,
         friction_change=None if slow is None else slow.friction_change,
         noise_floor=floor,
+        open_share=None if in_sample else _open_share(pooled, unseen),
         disagreement=None if noise is None else _disagreement(result),
-        causes=find_causes(model, training, values, names, noise=floor),
+        causes=find_causes(model, training, values, names, noise=floor, prior=prior),
         changes=find_changes(model, pooled, training, others, unseen) if others else (),
         one_way=_one_way(training),
         gravity=gravity,
@@ -298,6 +304,15 @@ def _disagreement(result: RepeatedEstimate) -> Array:
     torque = np.einsum("ri,jik,rk->rj", differences, gram[:, :-1, :-1], differences)
     share = np.maximum(torque, 0.0) / np.maximum(gram[:, -1, -1], 1e-300)
     return np.asarray(np.sqrt(share.max(axis=0)))
+
+
+def _open_share(estimate: Estimate, unseen: Factor) -> float | None:
+    """Return the deviation of predicted torque by the covariance, over the torque, of all axes."""
+    torque = float(unseen.gram[:, -1, -1].sum())
+    if not torque or not np.all(np.isfinite(estimate.covariance)):
+        return None
+    columns = unseen.gram[:, :-1, :-1].sum(axis=0)
+    return float(np.sqrt(max(0.0, np.vdot(columns, estimate.covariance) / torque)))
 
 
 def _estimation_noise(result: RepeatedEstimate, held_out: Factor) -> Array:

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.estimators.prior import GaussianPrior
 from identification.factor.normal_equations import solve_with_ridge
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.validation.fault_tables import FOLDS, FaultTables, folded
@@ -30,6 +31,25 @@ FEWEST_BLOCKS: Final = 2
 # Ridge as a share of each column's information, for columns that the motion hardly determines.
 _RIDGE: Final = 1e-6
 MASS: Final = LINK_SYMBOLS.index("m")
+
+
+class ScorePrior(NamedTuple):
+    """What is believed of an arm, beside fitted rows."""
+
+    gaussian: GaussianPrior
+    design_effect: float  # rows that count as one
+
+    def added_to(self, gram: Array, step: int) -> Array:
+        """Return sums of `[W | added | y]` (k + 1, k + 1) of each `step`-th row with the prior.
+
+        Of fewer rows fewer are correlated.
+        """
+        precision = max(1.0, self.design_effect / step) * self.gaussian.information
+        p = len(precision)
+        total = gram.copy()
+        total[:p, :p] += precision
+        total[:p, -1] += precision @ self.gaussian.mean
+        return total
 
 
 class FaultScore(NamedTuple):
@@ -110,12 +130,18 @@ def _geometric_mean(ratios: Array) -> float:
     return float(np.exp(np.mean(np.log(np.maximum(ratios, 1e-12)))))
 
 
-def fault_score(tables: FaultTables, added: Array, target: Array) -> FaultScore:
+def fault_score(
+    tables: FaultTables, added: Array, target: Array, prior: ScorePrior | None = None
+) -> FaultScore:
     """Predict every fifth block from the others.
 
     Of the parameters with `added` columns (B, n, q, r), to the `target` of each joint (n, q), both
-    as combinations of the columns.
+    as combinations of the columns. Without a prior, bodies that no arm has are allowed.
     """
+
+    def solved(gram: Array) -> Array:
+        return _solved(gram if prior is None else prior.added_to(gram, tables.step))
+
     blocks, n = tables.rows.shape
     p = tables.n_parameters
     column = np.broadcast_to(target[:, :, None], (blocks, n, target.shape[1], 1))
@@ -135,11 +161,11 @@ def fault_score(tables: FaultTables, added: Array, target: Array) -> FaultScore:
     coefficients = []
     for k in range(FOLDS):
         fold_blocks = slice(k, None, FOLDS)
-        values = _solved(of_folds[k])
+        values = solved(of_folds[k])
         coefficients.append(values)
         squares[fold_blocks] = _Sums(*(part[fold_blocks] for part in sums)).squares(values)
     squares = np.where(tables.rows >= _FEWEST_ROWS, np.maximum(squares, floor / blocks), 0.0)
-    fitted = np.maximum(whole.squares(_solved(total)), floor)
+    fitted = np.maximum(whole.squares(solved(total)), floor)
     fold_values = np.array(coefficients)
     return FaultScore(squares, fitted, torque, fold_values[:, :p], fold_values[:, p:])
 

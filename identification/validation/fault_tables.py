@@ -38,6 +38,7 @@ class FaultTables:
     recording: NDArray[np.intp]  # index of the recording of each block (B,)
     start: Array  # start time of each since its recording began (B,) [s]
     n_parameters: int  # p
+    step: int = 1  # of all rows only every so many are in the sums
 
     @property
     def width(self) -> int:
@@ -80,7 +81,8 @@ class FaultTables:
                 rows.append(np.count_nonzero(usable[a:b], axis=0))
                 starts.append(samples.motion.time[some[a]] - samples.motion.time[0] if a else 0.0)
         recording = np.repeat(np.arange(len(recordings)), count)
-        return cls(np.array(grams), np.array(rows), recording, np.array(starts), model.n_parameters)
+        p = model.n_parameters
+        return cls(np.array(grams), np.array(rows), recording, np.array(starts), p, step)
 
 
 def row_step(recordings: Sequence[Samples], rows: int) -> int:

@@ -147,22 +147,24 @@ class Dissipation(NamedTuple):
 
 def dissipation_of(model: RobotModel, estimate: Estimate, speed: Array) -> Dissipation:
     """Return the friction of each joint at its highest speed (n,) [rad/s or m/s]."""
-    first = model.base.rank
-    count = len(estimate.values)
-    torque = np.zeros(model.n_joints)
     std = np.full(model.n_joints, np.inf)
     determined = np.isfinite(np.diag(estimate.covariance))
     covariance = np.where(np.outer(determined, determined), estimate.covariance, 0.0)
-    for joint, law in enumerate(model.friction.laws):
-        top = np.zeros(count)
-        top_speed = speed[joint : joint + 1]
-        for k, (_, term, owner, motor, _) in enumerate(model.friction.terms, start=first):
-            if owner == joint and not motor and term.is_friction:
-                top[k] = term.column(top_speed, law.sign(top_speed))[0]
-        torque[joint] = top @ estimate.values
-        if top.any() and not np.any(top[~determined]):
-            std[joint] = float(np.sqrt(top @ covariance @ top))
-    return Dissipation(torque, std)
+    rows = friction_at(model, speed)
+    for joint, row in enumerate(rows):
+        if row.any() and not np.any(row[~determined]):
+            std[joint] = float(np.sqrt(row @ covariance @ row))
+    return Dissipation(rows @ estimate.values, std)
+
+
+def friction_at(model: RobotModel, speed: Array) -> Array:
+    """Return the columns (n, p) of each joint's friction at its speed (n,) [rad/s or m/s]."""
+    rows = np.zeros((model.n_joints, model.n_parameters))
+    for k, (_, term, joint, motor, _) in enumerate(model.friction.terms, start=model.base.rank):
+        if not motor and term.is_friction:
+            along = speed[joint : joint + 1]
+            rows[joint, k] = term.column(along, model.friction.laws[joint].sign(along))[0]
+    return rows
 
 
 _FAR_ABOVE: Final = 4.0  # errors of an axis of little torque; its error is mostly friction

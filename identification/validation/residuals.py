@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from identification.distributions import student_limit
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
+from identification.signals.spectrum import power_density
 from identification.validation.prediction import PredictionError
 
 Array = NDArray[np.float64]
@@ -37,6 +38,7 @@ _NORMAL: Final = 1.4826
 # Longer than the settling of a move.
 LONGEST_LAG: Final = 0.5  # s
 _MOST_LAGS: Final = 1000
+_RESOLVED: Final = 4.0  # s, parts of a spectrum of the residual
 
 
 class BlockMean(NamedTuple):
@@ -404,6 +406,49 @@ def check_residuals(
         friction_share=np.sqrt(friction_power / np.where(seen > 0.0, seen, 1.0)),
         outliers=outliers,
     )
+
+
+def _length(segment: slice) -> int:
+    return int(segment.stop - segment.start)
+
+
+class FoldedNoise(NamedTuple):
+    """Noise of the torque that reaches half the sampling rate."""
+
+    share: float  # of the squared residual at the frequencies of the motion
+    error: float  # residual over measured torque
+
+
+def folded_noise(
+    model: RobotModel, values: Array, recordings: Sequence[Samples], bandwidth: float
+) -> FoldedNoise:
+    """Return what noise without a filter adds to the residual below a bandwidth [Hz].
+
+    Sampling folds the noise above half the rate below it (Shannon 1949), where it is white: below
+    the bandwidth it has at least the smallest density of all octaves above. No share where half
+    the rate is within the first of these.
+    """
+    squares, power, noise, low = np.zeros(4)
+    for run in recordings:
+        left = np.where(run.usable, run.torque - run.predicted_torque(model, values), 0.0)
+        squares += float((left**2).sum())
+        power += float((run.torque[run.usable] ** 2).sum())
+        part = max(run.segments, key=_length, default=slice(0, 0))
+        if _length(part) < 2:
+            continue
+        step = float(np.median(np.diff(run.motion.time[part])))
+        highest = 0.5 / step
+        length = min(_length(part), round(_RESOLVED / step))
+        if highest < 2.0 * bandwidth or length * step * bandwidth < 1.0:
+            continue
+        frequency, density = power_density(left[part], 1.0 / step, length)
+        octave = np.floor(np.log2(frequency / bandwidth)).astype(np.intp)
+        complete = range(int(np.log2(highest / bandwidth)))
+        within = frequency < bandwidth
+        floor = np.min([density[octave == k].mean(axis=0) for k in complete], axis=0)
+        noise += float(floor.sum()) * np.count_nonzero(within)
+        low += float(density[within].sum())
+    return FoldedNoise(noise / low if low else 0.0, np.sqrt(squares / power) if power else 0.0)
 
 
 def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:

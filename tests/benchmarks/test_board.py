@@ -148,6 +148,7 @@ class TestRow:
         lost, loaded = board.degraded_rows("arm", split, logs)
         assert lost.keys() == {
             "data", "case", "hil", "undegraded", "ratio", "named", "words", "expected", "right",
+            "left_open",
         }  # fmt: skip
         assert lost["ratio"] < 1.05 < loaded["ratio"]
         assert lost["right"]
@@ -168,6 +169,11 @@ class TestRow:
         self, case: str, ratio: float, named: list[str], right: bool
     ) -> None:
         assert board.is_right(case, ratio, named) == right
+
+    def test_an_error_that_is_left_open_shows_no_harm(self) -> None:
+        assert board.is_right("12 bits", 1.5, [], left_open=True)
+        assert not board.is_right("12 bits", 1.5, ["position jumps"], left_open=True)
+        assert not board.is_right("delayed torque", 1.5, [], left_open=True)
 
 
 class TestConfiguration:

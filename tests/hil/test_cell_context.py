@@ -5,11 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hil.identify.cell_context import _friction_law, grid_step
+from hil.identify.cell_context import _friction_law, _resolution, _sampling_rate, grid_step
 from identification.model.friction import FrictionLaw
 from identification.selection.inner_prediction import LOAD
 from identification.selection.settings import Choice
 from identification.signals.recording import UNWRAPPED, Recording, unwrap, unwrapped
+from identification.signals.samples import Preprocessing
+from tests.identification.two_link import MODEL, as_samples, one_sine
 
 TIME = np.arange(0.0, 20.0, 0.01)
 TURNING = 2.5 * np.sin(0.4 * TIME) + 2.0 * np.sin(0.13 * TIME)  # rad, beyond half a turn
@@ -92,3 +94,51 @@ class TestResolution:
         assert grid_step(SWINGING) is None
         noise = 1e-4 * np.random.default_rng(1).standard_normal(len(TIME))
         assert grid_step(SWINGING + noise) is None
+
+    @pytest.mark.parametrize(("step", "named"), [(2e-4, True), (5e-5, False)])
+    def test_it_is_coarse_beyond_the_presliding_displacement(self, step, named):
+        """At the ends of a slow motion its rounding decides the direction of friction."""
+        law = FrictionLaw(third=None, offset=True, presliding=1e-4)
+        model = MODEL.with_friction_laws((law, law))
+        time = np.arange(0.0, 20.0, 1e-3)
+        motion = one_sine(time, size=(0.05, 0.05))
+        samples = as_samples(
+            model, motion, np.zeros((len(time), 2)), usable=np.ones((len(time), 2), dtype=np.bool_),
+            position_bandwidth=np.full(2, 0.5),
+        )  # fmt: skip
+        positions = np.rint(motion.position / step) * step
+        recording = Recording(time, positions, ("shoulder", "elbow"))
+        cell = SimpleNamespace(joint_names=("shoulder", "elbow"), model=model)
+        sources = SimpleNamespace(cell=cell, training=[SimpleNamespace(recording=recording)])
+        findings = [*_resolution(SimpleNamespace(sources=sources, fitted=[samples]))]
+        assert [finding.check for finding in findings] == ["resolution"] * named
+        if named:
+            assert "shoulder 0.0002, elbow 0.0002; friction reverses over 0.0001" in (
+                findings[0].words
+            )
+
+
+@pytest.mark.parametrize(
+    ("every", "bandwidth", "named"), [(1, None, False), (20, None, True), (20, 5.0, False)]
+)
+def test_a_sampling_rate_that_folds_noise_is_named(every, bandwidth, named):
+    """At 50 Hz, not at 1 kHz, nor where the torque has a low-pass."""
+    time = np.arange(0.0, 20.0, 1e-3)
+    motion = one_sine(time)
+    torque = MODEL.torque(np.ones(MODEL.n_parameters), *motion[1:])
+    noise = np.random.default_rng(1).standard_normal(torque.shape)
+    torque += 0.5 * torque.std(axis=0) * (2.0 * noise + np.sin(5.0 * time)[:, None])
+    rows = slice(None, None, every)
+    samples = as_samples(MODEL, motion.rows(rows), torque[rows])
+    prepared = SimpleNamespace(
+        settings=SimpleNamespace(
+            preprocessing=Preprocessing(rigid_bandwidth=10.0, torque_bandwidth=bandwidth)
+        ),
+        training=[samples],
+        sources=SimpleNamespace(cell=SimpleNamespace(model=MODEL)),
+    )
+    estimate = SimpleNamespace(values=np.ones(MODEL.n_parameters))
+    findings = [*_sampling_rate(prepared, estimate)]
+    assert [finding.check for finding in findings] == ["sampling rate"] * named
+    if named:
+        assert "at 50 Hz the torque has noise up to half this rate" in findings[0].words

@@ -23,6 +23,7 @@ from hil.identify.estimating import estimate_with
 from hil.identify.estimators import ESTIMATORS
 from hil.identify.options import FIXED, friction_from
 from hil.identify.prepared import (
+    _DelayChoice,
     decide,
     prepare_sources,
     renewed_delay_variance,
@@ -39,7 +40,9 @@ from identification.errors import IdentificationError
 from identification.estimators.consistent import SolverError
 from identification.estimators.delay import DelayEstimate
 from identification.model.friction import FrictionLaw
+from identification.selection.inner_prediction import SuggestedDelay
 from identification.selection.settings import Strength
+from identification.signals.samples import Preprocessing
 from sim_fixtures.ns16 import URDF_PATH
 
 from .simulated_logs import archive_of, simulate
@@ -510,6 +513,22 @@ def test_a_delay_that_was_applied_is_in_the_results(wide, applied, stated):
     )
     delays = _delays(prepared)
     assert (delays.found, delays.applied) == ([stated] * 2, [applied] * 2)
+
+
+@pytest.mark.parametrize("reason", ["95 % interval of ± 2 ms", None])
+def test_a_delay_that_predicts_no_better_is_not_applied(reason):
+    """One with a wide interval stays suspected: inner prediction does not speak against it."""
+    estimate = DelayEstimate(
+        delay=0.004, std=1e-3, assumed=0.0, cycle=1e-3, interval_factor=2.0, reason=reason,
+        significant=True,
+    )  # fmt: skip
+    suggested = (SuggestedDelay(estimate.delay, estimate.determined),)
+    choice = _DelayChoice(estimate, 0.0, suggested, ("4 ms ± 2 ms",))
+    left, (note,) = choice.confirmed_by(Preprocessing(torque_delay=0.0))
+    assert left is (estimate if reason else None)
+    filtered = Preprocessing(torque_delay=0.0, torque_bandwidth=5.0)
+    assert choice.confirmed_by(filtered)[0] is None
+    assert note.startswith("4 ms ± 2 ms; not applied, as it")
 
 
 def test_delays_of_the_torque_are_compensated(log, split):

@@ -42,6 +42,7 @@ from identification.validation.residuals import (
     block_mean,
     check_residuals,
     find_outliers,
+    folded_noise,
 )
 from tests.hil.identified_arm import a_motion as sines
 from tests.hil.identified_arm import packaged_urdf
@@ -67,11 +68,11 @@ from tests.identification.two_link import (
 torques = arrays(np.float64, (20, 2), elements=st.floats(-100, 100, width=32))
 
 
-def samples_with(error, *, origin=0.0):
-    """Return a motion with the torque of unit parameters plus an error (m, 2)."""
-    time = np.arange(len(error)) * 2e-3
+def samples_with(error, *, origin=0.0, time=None, rows=slice(None)):
+    """Return rows of a motion with the torque of unit parameters plus an error (m, 2)."""
+    time = (np.arange(len(error)) * 2e-3 if time is None else time)[rows]
     motion = one_sine(time)._replace(time=time + origin)
-    torque = MODEL.torque(np.ones(MODEL.n_parameters), *motion[1:]) + error
+    torque = MODEL.torque(np.ones(MODEL.n_parameters), *motion[1:]) + error[rows]
     return as_samples(MODEL, motion, torque, origin=origin)
 
 
@@ -339,6 +340,33 @@ class TestCorrelation:
             naive += abs(noise.mean()) < 1.96 * noise.std() / np.sqrt(len(noise))
         assert 0.90 < inside / seeds < 0.98
         assert naive / seeds < 0.6
+
+
+class TestFoldedNoise:
+    BANDWIDTH = 10.0  # Hz
+
+    def measured(self, noise, *, every=1, values=None):
+        """Return what is folded in each `every`-th of 1 kHz rows; model error is below 1 Hz."""
+        time = np.arange(0.0, 20.0, 1e-3)
+        rows = slice(None, None, every)
+        error = noise * np.random.default_rng(1).standard_normal((len(time), 2))
+        error += np.sin(5.0 * time)[:, None]
+        return folded_noise(
+            MODEL, np.ones(MODEL.n_parameters), [samples_with(error, time=time, rows=rows)],
+            self.BANDWIDTH,
+        )  # fmt: skip
+
+    def test_it_grows_with_the_step(self):
+        """Of 50 Hz two fifths are below 10 Hz, of 1 kHz a fiftieth."""
+        fast, slow = self.measured(2.0), self.measured(2.0, every=20)
+        assert slow.share == pytest.approx(4.0 * 0.4 / (4.0 * 0.4 + 0.5), abs=0.1)
+        assert fast.share == pytest.approx(4.0 * 0.02 / (4.0 * 0.02 + 0.5), abs=0.05)
+
+    def test_an_error_of_the_model_has_none(self):
+        assert self.measured(0.0, every=20).share < 0.01
+
+    def test_half_a_rate_below_an_octave_shows_none(self):
+        assert self.measured(2.0, every=60).share == 0.0
 
 
 class TestResidualChecks:

@@ -10,15 +10,19 @@ import pytest
 
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.least_squares import estimate_repetitions
+from identification.estimators.prior import body_prior
 from identification.factor.estimate import Estimate, estimate
 from identification.factor.factor import Factor
 from identification.model.motion import Motion
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.text import percentage
+from identification.validation import causes as causes_module
 from identification.validation.causes import Cause, find_causes
 from identification.validation.changes import Change
 from identification.validation.evidence import CellContext, Evidence, gather
+from identification.validation.facts.errors import LEFT_OPEN
+from identification.validation.fault_scores import ScorePrior
 from identification.validation.faults import Fault, Kind
 from identification.validation.finding import Thresholds
 from identification.validation.gravity import CarriedLoad
@@ -546,6 +550,24 @@ class TestJudgement:
         assert "--delay auto" in verdict.next_steps[0]
         assert "torque constant of one, two" in verdict.next_steps[1]
 
+    def test_a_delay_of_a_wide_interval_is_suspected(self):
+        """It differs significantly, and was not applied."""
+        wide = replace(LATE, delay=0.009, std=1e-3, reason="95 % interval of ± 2 ms")
+        suspected = finding_of("delay", delays=wide)
+        assert suspected.level == "doubtful"
+        assert "probably lags the position by 9 ± 2 ms (0 ms assumed)" in suspected.words
+        for unsure in (replace(wide, significant=False), replace(wide, std=4e-3)):
+            assert not any(finding.check == "delay" for finding in judged(delays=unsure).findings)
+
+    def test_models_of_the_same_fit_that_predict_apart_are_named(self):
+        large = an_error(0.2)
+        left_open = finding_of(LEFT_OPEN, held_out=large, open_share=0.25)
+        assert left_open.level == "doubtful"
+        assert "(to 4.0 %) deviate by 25.0 % of the torque" in left_open.words
+        for error, share in ((large, 0.15), (large, None), (an_error(0.05), 0.25)):
+            findings = judged(held_out=error, open_share=share).findings
+            assert not any(finding.check == LEFT_OPEN for finding in findings)
+
     def test_undetermined_repetitions_are_not_compared(self):
         changes = {"estimate": an_estimate(undetermined=MANY), "disagreement": np.array([0.8, 0.1])}
         assert len(judged(**changes).reasons) == 1
@@ -632,6 +654,7 @@ class TestPatternsOfTheResidual:
 NOISE = 0.02  # of each joint's torque
 LOAD = 6.0  # kg
 DELAY = 0.02  # s
+ROWS_AS_ONE = 5.0
 SLOW = 0.2  # rad/s; rows near a reversal are left out
 
 
@@ -659,11 +682,25 @@ def of_one_kilogram(motion):
     )
 
 
-def causes(recordings):
+def causes(recordings, *, alone=False):
+    """Return the causes beside the prior of the bodies, without it if `alone`."""
     factors = (Factor.of(MODEL, samples) for samples in recordings)
-    values = estimate(MODEL, sum(factors, Factor.zero(MODEL))).values
+    total = sum(factors, Factor.zero(MODEL))
+    prior = ScorePrior(body_prior(MODEL, total).gaussian, ROWS_AS_ONE)
+    values = estimate(MODEL, total).values
     names = [f"{k}.mcap" for k in range(len(recordings))]
-    return find_causes(MODEL, recordings, values, names)
+    return find_causes(MODEL, recordings, values, names, prior=None if alone else prior)
+
+
+def first_rows(samples, stop):
+    part = slice(0, stop)
+    return replace(
+        samples,
+        motion=samples.motion.rows(part),
+        torque=samples.torque[part],
+        usable=samples.usable[part],
+        segments=(part,),
+    )
 
 
 def late(samples):
@@ -725,8 +762,25 @@ class TestCausesOfWholeRecordings:
         if size := SIZES.get(kind):
             assert cause.size == pytest.approx(size, abs=4.0 * cause.std + 0.02 * size)
 
+    @pytest.mark.parametrize("seed", [1, 3])
+    def test_impossible_bodies_do_not_hide_a_turned_torque(self, seed):
+        """Two seconds leave them open; the prior of the estimate does not."""
+        _, turn = FAULTS["torque sign"]
+        short = first_rows(recorded(seed), 250)
+        assert causes([short]) == ()
+        (cause,) = causes([turn(short)])
+        assert (cause.fault.kind, cause.fault.joints) == ("torque sign", (2,))
+        assert causes([turn(short)], alone=True) == ()
+
 
 class TestErrorsWithoutCause:
+    def test_a_load_whose_interval_contains_zero_is_none(self, monkeypatch):
+        loaded = [recorded(1, LOAD * (np.arange(1250) >= 625))]
+        (cause,) = causes(loaded)
+        assert cause.fault.kind == "payload"
+        monkeypatch.setattr(causes_module, "size_of_fault", lambda *_: (cause.size, cause.size))
+        assert not any(each.fault.kind == "payload" for each in causes(loaded))
+
     def test_a_joint_that_stands_is_not_interchanged(self):
         """Not with joint 5, whose torque is small noise, either."""
         motion = a_motion(1, duration=10.0, step=8e-3)

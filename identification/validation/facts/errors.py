@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 
 UNEXPLAINED: Final = "unexplained error"
 """Name of the check whether any fault explains the error."""
+LEFT_OPEN: Final = "left open by the motion"
+"""Name of the check whether models of the same fit predict alike."""
 # Ratio of torque errors that is no chance: three standard deviations of 24 blocks, as in 12 s.
 _GROWN: Final = 1.5
 # A wrong sign would increase the error of the fitted motion as well.
@@ -205,6 +207,37 @@ class UnexplainedFacts:
                 " temperature",
                 "symptom",
             )
+
+
+@dataclass(frozen=True)
+class OpenFacts:
+    """Error on unseen motion that comes from what the fitted motion leaves open."""
+
+    share: float  # deviation of the predicted torque by the posterior, of the torque
+    overall: float
+    fitted: float
+
+    @classmethod
+    def of(cls, evidence: Evidence, limits: Thresholds) -> OpenFacts | None:
+        """Compare it with the error; None if that is small, or less is open."""
+        share = evidence.open_share
+        overall = evidence.held_out.overall
+        if share is None or not share >= overall > limits.unexplained:
+            return None
+        return cls(share, overall, evidence.training.overall)
+
+    def findings(self, naming: Naming) -> Iterator[Finding]:
+        """Yield that the error does not tell models of the same fit apart."""
+        yield Finding(
+            LEFT_OPEN,
+            "doubtful",
+            f"parameters that fit the recording equally well (to {percentage(self.fitted, 1)})"
+            f" deviate by {percentage(self.share, 1)} of the torque on {naming.motion}, since the"
+            f" fitted motion leaves them open; the error of {percentage(self.overall, 1)} there"
+            " does not tell a fault of such an effect (low sampling rate, coarse resolution, small"
+            " payload) from chance",
+            f"{_NOT_COVERED}, in which every joint moves in both directions",
+        )
 
 
 @dataclass(frozen=True, eq=False)

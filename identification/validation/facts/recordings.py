@@ -116,6 +116,9 @@ class CorrectionFacts:
         yield from self.corrections
 
 
+_DelayOutcome = Literal["compensated", "differs", "suspected", "as assumed"]
+
+
 @dataclass(frozen=True)
 class DelayFacts:
     """Delay of the torque behind the position [ms]."""
@@ -124,7 +127,7 @@ class DelayFacts:
     half_interval: float  # of 95 %
     stated: float
     assumed: float  # in the fit
-    outcome: Literal["compensated", "differs", "as assumed"] | None  # None: not determined
+    outcome: _DelayOutcome | None  # None: not determined
 
     @classmethod
     def of(cls, evidence: Evidence, limits: Thresholds) -> DelayFacts | None:
@@ -137,11 +140,14 @@ class DelayFacts:
         estimate = evidence.estimate
         poor = bool(estimate.undetermined) or estimate.condition > limits.condition
         beyond = max(limits.delay * delays.cycle, SIGMAS * delays.std)
-        outcome: Literal["compensated", "differs", "as assumed"] | None = None
+        differs = abs(delays.delay - assumed) > beyond
+        outcome: _DelayOutcome | None = None
         if delays.significant and assumed == delays.applied:
             outcome = "compensated"
         elif delays.determined and not poor:
-            outcome = "differs" if abs(delays.delay - assumed) > beyond else "as assumed"
+            outcome = "differs" if differs else "as assumed"
+        elif delays.significant and differs:
+            outcome = "suspected"
         return cls(
             delay=1e3 * delays.delay,
             half_interval=1e3 * delays.half_interval,
@@ -160,6 +166,16 @@ class DelayFacts:
                 f"the torque lags the position by {estimate} ({self.stated:.3g} ms stated); this"
                 " was compensated",
                 "state it (`hil identify --delay SECONDS`), or correct it at its source",
+            )
+        elif self.outcome == "suspected":
+            yield Finding(
+                "delay",
+                "doubtful",
+                f"the torque probably lags the position by {estimate} ({self.assumed:.3g} ms"
+                " assumed); this was not compensated, as the interval is wide and parts of the"
+                " fitted motion are not predicted clearly better",
+                "compare with `hil identify --delay auto`, or state the delay if it is known"
+                " (`--delay SECONDS`)",
             )
         elif self.outcome == "differs":
             yield Finding(
