@@ -130,7 +130,7 @@ def test_a_link_that_cannot_wait_without_reading_is_read_at_once(warm_up, cycles
 
 
 @pytest.mark.parametrize("polls", [True, False])
-def test_the_link_polls_from_the_cycle_until_the_packet_is_overdue(warm_up, polls):
+def test_the_link_polls_until_the_packet_is_overdue(warm_up, polls):
     link = Link()
     warm_up.polls = polls
     warm_up.before_packet(link, moving()[0].session, ARRIVED)
