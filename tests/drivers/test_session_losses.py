@@ -111,6 +111,16 @@ class TestLostMotion:
         assert source.advances == advances + 1
         assert rig.ended.reason == NOTHING_RECEIVED
 
+    @pytest.mark.parametrize(("change", "reason"), [({"status": 0}, OFF), ("init", RESTARTED)])
+    def test_a_late_sync_packet_is_no_cause_of_what_follows(self, change, reason):
+        rig, _ = moving()
+        assert rig.sync(1) is None
+        if change == "init":
+            rig.start()
+        else:
+            rig.cycle(**change)
+        assert (rig.ended.outcome, rig.ended.reason) == ("lost", reason)
+
     @pytest.mark.parametrize(
         ("waits", "change", "reason"),
         [

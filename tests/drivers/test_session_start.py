@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,15 +19,17 @@ from drivers import (
     RequestError,
     State,
 )
-from drivers.init_check import is_narrower
+from drivers.init_check import float32_text, is_narrower, verify_controller
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
 from drivers.safe_reply import D1, PacketClassifier, safe_reply
 from tests.drivers.rig import (
+    PERIOD,
     START,
     N,
     Rig,
     all_drive_off,
     closed,
+    drive_train,
     init_packet,
     opened,
     running,
@@ -420,6 +423,11 @@ class TestInit:
             _, event = received(packet)
             assert (event.differences, event.unusable) == ((), None)
 
+    def test_a_wrist_without_coupling_is_no_difference(self):
+        train = replace(drive_train(), k54=0.0, k64=0.0, k65=0.0)
+        init = init_packet(arm_1={"kinematic_influence": np.zeros(N)})
+        assert verify_controller(train, PERIOD, init, 1).differences == ()
+
     def test_every_difference_is_named(self):
         changes = (("gear_ratio", 0, 119.5), ("kinematic_influence", 5, 0.04))
         _, event = received(described(*changes, sample_time=4, open_axes_map=NOWHERE))
@@ -466,3 +474,8 @@ class TestNextInit:
 )
 def test_limit_rounded_to_six_digits_is_not_narrower(theirs, ours, below):
     assert is_narrower(np.array([theirs], dtype=np.float64), np.array([ours])).tolist() == [below]
+
+
+@pytest.mark.parametrize(("value", "text"), [(18.4, "18.4"), (20.0, "20"), (0.1, "0.1")])
+def test_a_float32_is_written_with_the_digits_it_was_given(value, text):
+    assert float32_text(np.float32(value)) == text
