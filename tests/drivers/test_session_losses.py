@@ -101,6 +101,14 @@ class TestLostMotion:
         assert rig.sync(1) is not None
         assert rig.state is State.SYNC
 
+    def test_a_stale_number_10_is_said_to_be_none(self):
+        """Sync packets are numbered 1 to 9; 10 is the init packet, by its length."""
+        rig, _ = moving()
+        assert rig.sync(10) is None
+        rig.session.tick(rig.now + 1.0)
+        rig.events += rig.session.events()
+        assert rig.ended.reason == "only packets that do not follow the last one came (1)"
+
     def test_a_late_sync_packet_is_no_restart(self):
         rig, source = moving()
         advances = source.advances

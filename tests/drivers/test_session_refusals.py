@@ -720,6 +720,12 @@ class TestOtherAxes:
         rig.lose_target(value)
         assert rig.session.counters.refused == 2
 
+    def test_in_the_first_cycle(self, arm, value):
+        rig = OtherAxis(arm)
+        rig.start()
+        rig.axes["mode"][6] = Mode.POSITION
+        rig.lose_target(value)
+
     def test_no_motion_begins(self, arm, value):
         rig = OtherAxis(arm)
         rig.close()

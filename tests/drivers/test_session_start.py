@@ -253,6 +253,15 @@ class TestSilence:
         assert rig.ended.reason == "only packets that do not follow the last one came (30)"
 
 
+def test_a_new_session_is_nowhere_yet():
+    session = Rig().session
+    assert (session.state, session.cycle, session.entered_at) == (State.SYNC, 0, 0)
+    assert (session.interval, session.in_interval) == (-1, False)
+    assert (session.execution, session.stop_reason) == (None, None)
+    assert (session.init, session.deadline) == (None, np.inf)
+    assert session.losses.instead_of_packets == ""
+
+
 class TestConstruction:
     @pytest.mark.parametrize(
         ("options", "message"),
@@ -300,7 +309,9 @@ def test_discarded_packets_are_reported_once():
     assert counts == {"foreign": 5, "torn": 1, "malformed": 4}
     assert session.events() == []
     session.discarded("foreign", 1)
-    assert session.events() == [PacketRejected("foreign", 1)]
+    (event,) = session.events()
+    assert event == PacketRejected("foreign", 1)
+    assert event.reason == "", "the link did not say why"
     assert session.counters.discarded["foreign"] == 6
     assert Rig().session.counters.discarded == {}
 
