@@ -26,6 +26,7 @@ from tests.drivers.rig import (
     kind_of,
     limits,
     moving,
+    only,
     opened,
     refused,
     resumptions,
@@ -185,7 +186,7 @@ FAR = {"lower": np.full(N, -9.0), "upper": np.full(N, 9.0)}
 def at_speed(cycles: int = 600, speed: float = 1.9, **options) -> Rig:
     """An arm whose first joint moves at this speed, rad/s."""
     source = type("AtSpeed", (Cruise,), {"SPEED": speed, "RAMP": 1.0})()
-    rig = running(source, guard_limits=limits(**FAR), **options)
+    rig = running(source, **{"guard_limits": limits(**FAR), **options})
     rig.cycle(cycles)
     assert rig.state is State.OPEN
     return rig
@@ -275,6 +276,18 @@ class TestLostReplies:
     def test_controller_that_accepts_no_reply_is_refused(self):
         rig = at_speed()
         answer = lose(rig, REPETITIONS + 2)
+        assert assert_refused(rig, answer, Check.ACCEPTED).joint == 0
+
+    @pytest.mark.parametrize("max_gap", [0, 1])
+    def test_a_target_older_than_may_be_missed_is_refused(self, max_gap):
+        """At a speed whose steps are more than a tenth of the threshold."""
+        for behind in (max_gap, max_gap + 1):
+            rig = at_speed(speed=6.0, max_gap=max_gap, guard_limits=only(**FAR))
+            target = rig.axes["d"].copy()
+            rig.cycle(behind)
+            rig.axes["d"][:] = target
+            answer = rig.cycle()
+            assert rig.session.counters.rejected == (behind if behind <= max_gap else 0)
         assert assert_refused(rig, answer, Check.ACCEPTED).joint == 0
 
     @pytest.mark.parametrize(("max_gap", "pattern"), [(2, 3), (2, 40), (0, 40), (5, 9)])
@@ -668,7 +681,9 @@ class TestTargets:
     def test_begin_resets_the_history(self):
         sent = Sent(SLOW)
         assert sent.check(-1.0) == 1
+        assert sent.set_points.is_resent
         sent.set_points.begin(TURNS)
+        assert not sent.set_points.is_resent
         sent.last = TURNS
         sent.add(1.0)
         assert sent.check(-1.0) == 1
@@ -783,6 +798,7 @@ class TestSentAgain:
         sent.set_points.resend()
         sent.add(1.0)
         sent.set_points.resume_from(sent.last, sent.step)
+        assert not sent.set_points.is_resent
         for _ in range(cycles):
             sent.add(1.0)
         assert sent.check(-1.0, stopping=True) == 1

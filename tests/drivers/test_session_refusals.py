@@ -640,6 +640,15 @@ class TestIncompleteOpening:
         rig.cycle(mode=Mode.CLOSED)
         assert rig.state is State.CLOSED
 
+    def test_axis_in_another_position_mode_is_held_near_its_target(self):
+        rig = self.opening()
+        rig.modes[2] = Mode.POSITION_RELATIVE
+        rig.cycle()
+        assert rig.state is State.OPENING
+        rig.axes["d"][2, 2] += 2.01
+        assert rig.cycle().axes["mode"][2] == Mode.FOLLOWING_ERROR
+        assert kind_of(rig.refusal) is Check.FOLLOWING_ERROR
+
     @pytest.mark.parametrize("opened", [1, N - 1])
     def test_motion_that_waits_too_long_is_dropped(self, opened):
         rig = self.opening(source := Cruise(), opened)

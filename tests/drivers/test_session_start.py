@@ -420,6 +420,7 @@ class TestInit:
         assert rig.cycle() is not None
         for _ in range(2):
             assert all_drive_off(rig.cycle(mode=Mode.POSITION))
+        assert event.unusable in str(rig.refusal)
         rig.cycle(mode=Mode.CLOSED)
         with pytest.raises(RequestError, match=difference):
             rig.session.request(still(3))
