@@ -439,10 +439,16 @@ class TestLongGaps:
         assert rig.state is State.OPEN
 
     @pytest.mark.parametrize(
-        ("speed", "factor", "expected"),
-        [(0.5, 1.2, 0.6), (0.5, 0.8, 0.4), (0.01, 1.2, 0.01), (0.01, 0.0, 0.01)],
+        ("speed", "factor", "arm", "expected"),
+        [
+            *((0.5, factor, 0.9, 0.5 * factor) for factor in (1.2, 0.8)),
+            *((0.01, factor, 0.9, 0.01) for factor in (1.2, 0.0)),
+            (0.02, 1.2, 0.6, 0.024),  # the arm alone is below standstill
+        ],
     )
-    def test_the_motion_continues_with_the_velocity_of_its_target(self, speed, factor, expected):
+    def test_the_motion_continues_with_the_velocity_of_its_target(
+        self, speed, factor, arm, expected
+    ):
         """Not that of the arm; below standstill, where a velocity says little, with its own."""
         rig = at_speed(1200, speed=speed)
         resumed = resumptions(rig)
@@ -450,7 +456,7 @@ class TestLongGaps:
         d = rig.axes["d"]
         d[:, [0, 2]] += 5 * d[:, [1]]
         d[:, 1] *= factor
-        d[:, 3] *= 0.9
+        d[:, 3] *= arm
         rig.cycle()
         ((_, velocity, _),) = resumed
         np.testing.assert_allclose(velocity, expected * np.eye(N)[0], rtol=1e-4, atol=1e-6)
