@@ -157,8 +157,8 @@ def test_the_joint_that_slowed_down_least_says_how_fast():
 
 
 @pytest.mark.parametrize(("waits", "passes"), [(0, True), (1, False)])
-def test_only_the_first_step_of_a_stop_may_be_a_jump_of_acceleration(waits, passes):
-    """From the arm's speed, here none, to that of the source."""
+def test_only_the_first_step_of_a_stop_may_be_a_jump(waits, passes):
+    """Of acceleration: from the speed of the arm, here none, to that of the source."""
     far = limits(**FAR, acceleration=np.full(N, 80.0))
     rig = at_speed(1200, speed=0.2, guard_limits=far)
     source, resumed, calls = rig.session.execution._source, resumptions(rig), []
