@@ -362,6 +362,7 @@ def test_request_is_refused_by_state(text):
         rig.session.request(still(3))
     assert f"{caught.value.state}: {caught.value.reason}" == text
     assert caught.value.state == rig.state.name.lower()
+    assert str(caught.value).startswith("no motion can be requested in state ")
 
 
 class TestNumbers:
