@@ -339,6 +339,15 @@ class TestBacklog:
         assert rig.session.counters.missed == 2
         assert rig.session.counters.stale == (place is not None)
 
+    @pytest.mark.parametrize(("apart", "dropped"), [(1000, 1), (1001, 0)])
+    @pytest.mark.parametrize("turned", [False, True])
+    def test_numbers_far_apart_are_of_two_sessions(self, apart, dropped, turned):
+        rig, _ = moving()
+        on_time, first = self.on_time(rig), rig.packet()
+        second = (rig.number + apart).to_bytes(4, "little") + first[4:]
+        self.serve(rig, on_time, [second, first] if turned else [first, second])
+        assert rig.session.counters.discarded.get("late", 0) == dropped
+
     @given(st.lists(st.integers(0, 255), max_size=400))
     @example([*range(200)])
     def test_newest_of_the_kinds_seen_last_are_answered(self, statuses):

@@ -573,6 +573,8 @@ class TestNumbers:
             assert not sequence.is_stale(number)
 
     def test_before_the_init_packet_half_of_them_count_as_missed(self):
+        sequence = PacketSequence()
+        assert (sequence.last, sequence.cycle, sequence.broken) == (0, 0, False)
         assert PacketSequence().accept(self.HALF) == self.HALF - 1
         assert PacketSequence().accept(self.HALF + 1) == 0
 

@@ -328,6 +328,14 @@ def test_drive_off_has_zeros_for_values_not_finite():
     np.testing.assert_array_equal(answer.axes["d"][:, 1:], 0.0)
 
 
+def test_packets_with_the_same_modes_are_classified_once():
+    classifier, modes = PacketClassifier(np.arange(2), (1, 1), 1, 4), np.array([4, 4], np.int32)
+    first = classifier.classify(bytes(4), modes)
+    assert classifier.classify(bytes(4), modes.copy()) is first
+    modes[1] = 0
+    assert classifier.classify(bytes(4), modes) is not first
+
+
 @pytest.mark.parametrize(
     ("arms", "status", "powered", "back"),
     [
