@@ -174,6 +174,11 @@ class TestInitPacket:
             InitPacket.decode(packet)
         assert caught.value.field == "n_axes"
 
+    @pytest.mark.parametrize("n_axes", [1, 20])
+    def test_one_axis_or_twenty_may_be_open(self, n_axes):
+        packet = struct.pack("<iiii", 10, 3, 9, n_axes) + bytes(1184)
+        assert InitPacket.decode(packet).n_axes == n_axes
+
     @pytest.mark.parametrize("not_open", [NO_SLOT, -1])
     def test_axes_of_two_arms_in_any_slot(self, not_open):
         axes_map = np.full((4, 10), not_open)
