@@ -102,7 +102,7 @@ class TestLostMotion:
         assert rig.sync(1) is not None
         assert rig.state is State.SYNC
 
-    def test_a_stale_number_10_is_said_to_be_none(self):
+    def test_a_stale_number_10_is_no_restart(self):
         """Sync packets are numbered 1 to 9; 10 is the init packet, by its length."""
         rig, _ = moving()
         assert rig.sync(10) is None

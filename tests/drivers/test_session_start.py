@@ -253,7 +253,7 @@ class TestSilence:
         assert rig.ended.reason == "only packets that do not follow the last one came (30)"
 
 
-def test_a_new_session_is_nowhere_yet():
+def test_a_new_session_has_no_controller_and_no_motion():
     session = Rig().session
     assert (session.state, session.cycle, session.entered_at) == (State.SYNC, 0, 0)
     assert (session.interval, session.in_interval) == (-1, False)
