@@ -66,10 +66,9 @@ coverage: $(STAMP)  ## lines and branches of drivers, planner and identification
 	COVERAGE_FILE="$(CURDIR)/build/coverage/data" $(BIN)/coverage report
 	$(BIN)/python -m tests.coverage_figures build/coverage/data.json drivers planner identification
 
-mutants: $(STAMP)  ## changes to what decides an answer, one by one, that no test finds; hours, resumable
+mutants: $(STAMP)  ## changes to what decides a reply, one by one, that no test finds; MODULES=drivers/guard.py for one file
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt mutmut==3.8.1
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/mutmut run --max-children 2
-	$(BIN)/mutmut results
+	$(BIN)/python -m tests.mutants $(MODULES)
 
 audit: $(STAMP)  ## known vulnerabilities of every pinned dependency (asks the Python Package Index)
 	$(BIN)/python -m pip check
@@ -87,4 +86,4 @@ bench: $(STAMP)  ## every benchmark that needs no data beside the project
 	$(BIN)/python -m benchmarks.turnaround --busy
 
 clean:  ## remove .venv, runs, mutants and caches
-	rm -rf $(VENV) runs build dist mutants *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -351,7 +351,7 @@ def decide(
     if axes is not None and motion is not None:
         joint = axes.misplaced(motion.started and state is State.OPEN)
         if joint is not None:
-            return Decision(TRANSITIONS[state][Input.REFUSAL], stop, misplaced=joint)
+            return Decision(TRANSITIONS[state][Input.REFUSAL], misplaced=joint)
     after = TRANSITIONS[state][cause]
     ending = None if motion is None else _ending(state, cause, after, losses, motion)
     if after is state and stop is None and ending is None:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import os
 import signal
 from pathlib import Path
@@ -49,10 +48,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     rank = {name: place for place, name in enumerate(_LONGEST)}
     # Within a file as it was.
     items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
-    # mutmut, which measures the tests, ends a mutant at the first that fails: the shortest first.
-    if (measured := Path("mutmut-stats.json")).exists():
-        seconds = json.loads(measured.read_text())["duration_by_test"]
-        items.sort(key=lambda item: seconds.get(item.nodeid, 0.0))
 
 
 @pytest.fixture(scope="session")

@@ -131,6 +131,11 @@ class TestDecision:
 
 
 class TestLosses:
+    def test_at_first_nothing_is_lost(self):
+        tracker = LossTracker(GAP, PERIOD)
+        assert (tracker.missed, tracker.stale, tracker.late) == (0, 0, 0.0)
+        assert (tracker.rejected, tracker.gap, tracker.restarting) == (0, 0, False)
+
     def test_stale_packets_count_once(self):
         tracker = losses(missed=1, stale=2)
         assert (tracker.missed, tracker.gap, tracker.stale) == (1, 3, 0)

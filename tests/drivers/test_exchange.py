@@ -228,7 +228,12 @@ class TestBacklog:
         """Some controllers send 732 bytes whatever the number of axes; the rest is garbage."""
         chance = np.random.default_rng(5178)
         rig, source = moving()
-        packets = [rig.packet() + chance.bytes(length - 228) for _ in range(waiting + 1)]
+        packets = []
+        for _ in range(waiting + 1):
+            rig.axes["d"][:, 4] = chance.uniform(-1.0, 1.0, N)
+            packet = rig.packet()
+            functionality = chance.bytes(4)
+            packets.append(packet[:8] + functionality + packet[12:] + chance.bytes(length - 228))
         advances = source.advances
         sent = self.serve(rig, packets[0], packets[1:])
         assert len(sent) == 2
@@ -252,6 +257,17 @@ class TestBacklog:
         assert len(link.sent) == (3 if after else 2)
         assert link.sent[-1][:4] == self.number_after(rig)
 
+    def test_packets_that_are_read_in_time_get_their_replies(self):
+        """In each cycle a second follows closely; the first is read a third of a cycle later."""
+        rig, _ = moving()
+        times = rig.now + PERIOD * np.array([1.0, 1.05, 2.0, 2.05])
+        packets = [self.on_time(rig) for _ in times]
+        link = Bunched(zip(times, packets, strict=True), rig.now + 1.3 * PERIOD)
+        exchange(link, rig.session, ends_when=lambda: False)
+        assert len(link.sent) == 4
+        assert rig.session.counters.discarded == {}
+        np.testing.assert_array_equal(rig.records["arrival"][-4:], times)
+
     def test_axes_that_open_within_a_backlog_do_not_run_ahead(self):
         rig = Rig()
         source = Cruise()
@@ -264,36 +280,39 @@ class TestBacklog:
         assert len(self.serve(rig, on_time, late)) == 3
         assert source.advances <= 1
 
-    def test_axes_that_closed_within_a_backlog_are_detected(self):
+    @pytest.mark.parametrize(
+        ("axes", "state"), [(slice(N), State.CLOSED), (slice(N - 1, N), State.FAULTED)]
+    )
+    def test_axes_that_closed_within_a_backlog_are_detected(self, axes, state):
         rig, source = moving()
         on_time = rig.packet()
         late = []
-        for modes in (Mode.POSITION, Mode.CLOSED, Mode.POSITION):
-            rig.modes = modes
+        for mode in (Mode.POSITION, Mode.CLOSED, Mode.POSITION):
+            rig.modes[axes] = mode
             late += [rig.packet() for _ in range(5)]
         advances = source.advances
         assert len(self.serve(rig, on_time, late)) == 3
         assert source.advances <= advances + 1
-        assert State.CLOSED in self.states(rig)
+        assert state in self.states(rig)
 
-    def test_overtaken_packet_of_a_backlog_is_dropped(self):
+    def test_overtaken_packets_of_a_backlog_are_dropped(self):
         rig, source = moving()
-        on_time, second, third = self.on_time(rig), rig.packet(), rig.packet()
+        on_time, *overtaken = self.on_time(rig), rig.packet(), rig.packet()
         advances = source.advances
-        sent = self.serve(rig, on_time, [third, second])
+        sent = self.serve(rig, on_time, [rig.packet(), *overtaken])
         assert [reply[:4] for reply in sent][1:] == [self.number_after(rig)]
         assert source.advances == advances + 2
         counters = rig.session.counters
-        assert (counters.discarded, counters.missed, counters.stale) == ({"late": 1}, 1, 0)
+        assert (counters.discarded, counters.missed, counters.stale) == ({"late": 2}, 2, 0)
 
     def test_packet_after_an_init_packet_is_not_one_before_it(self):
         """Its number, which is low, would make it look overtaken."""
         rig, _ = moving()
         on_time, late, init = self.on_time(rig), rig.packet(), rig.init.encode()
         rig.number = 10
-        sent = self.serve(rig, on_time, [late, init, rig.packet()])
-        assert len(sent) == 4
-        assert sent[-1][:4] == self.number_after(rig)
+        again = [init, rig.packet(), rig.packet()]
+        sent = self.serve(rig, on_time, [late, *again, init, again[1]])
+        assert [int.from_bytes(reply[:4], "little") for reply in sent[2:]] == [11, 13, 11, 12]
 
     def test_each_packet_gets_a_reply_while_any_peer_may_start(self):
         """They may be of several peers."""
@@ -319,6 +338,15 @@ class TestBacklog:
         assert rig.session.counters.discarded == {"late": 2}
         assert rig.session.counters.missed == 2
         assert rig.session.counters.stale == (place is not None)
+
+    @pytest.mark.parametrize(("apart", "dropped"), [(1000, 1), (1001, 0)])
+    @pytest.mark.parametrize("turned", [False, True])
+    def test_numbers_far_apart_are_of_two_sessions(self, apart, dropped, turned):
+        rig, _ = moving()
+        on_time, first = self.on_time(rig), rig.packet()
+        second = (rig.number + apart).to_bytes(4, "little") + first[4:]
+        self.serve(rig, on_time, [second, first] if turned else [first, second])
+        assert rig.session.counters.discarded.get("late", 0) == dropped
 
     @given(st.lists(st.integers(0, 255), max_size=400))
     @example([*range(200)])
@@ -573,7 +601,8 @@ class TestPeerSelection:
         ids=["no reply", "short silence", "silence"],
     )
     def test_peer_is_forgotten_without_reply_or_after_a_silence(self, batches, silence, forgotten):
-        link = Backlogged(batches, silence=silence)
+        days = 5e5  # of the computer's clock, s
+        link = Backlogged(batches, days, silence)
         exchange(link, Rig().session, ends_when=lambda: False)
         assert link.forgotten[:1] == forgotten
 

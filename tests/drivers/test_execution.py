@@ -103,6 +103,12 @@ class TestEnd:
             source.advance = lambda rows=rows: rows
             fails(begun(source), rf"source failed: ValueError: a {name} of shape \(1,\), not \(2,")
 
+    @pytest.mark.parametrize("values", [["east", "west"], [0.5j, 0.0]])
+    def test_values_that_are_no_numbers_are_refused(self, values):
+        source = Motion()
+        source.advance = lambda: (values, np.zeros(N))
+        fails(begun(source), "source failed: ")
+
     def test_end_of_a_stop_is_held_without_limit(self):
         execution = begun(source := Motion())
         execution.hold(0)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from drivers import Guard, GuardLimits
 from drivers.errors import Check
+from drivers.guard import RANK, ActiveBounds
 from tests.drivers import rig
 from tests.drivers.rig import (
     FACTORS,
@@ -221,6 +222,9 @@ class TestRates:
 
         toggle(1.0)
         refused(RATES[name], toggle, 24.0, stated=1.0)
+
+    def test_the_bounds_of_a_plan_apply_at_first(self):
+        assert ActiveBounds().rank == ActiveBounds().update("plan") == RANK["plan"]
 
     @pytest.mark.parametrize(
         ("bounds", "jerk"),

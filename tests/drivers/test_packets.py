@@ -37,6 +37,34 @@ def test_numbers_outside_the_range_are_refused(number):
     assert caught.value.value == number
 
 
+INIT = struct.pack("<iiii", 10, 3, 9, 6) + bytes(1184)
+MAP_OF_ONE = np.where(np.arange(40).reshape(4, 10) == 0, 0, NO_SLOT)
+
+
+@pytest.mark.parametrize(
+    ("decode", "field", "value", "expected"),
+    [
+        (lambda: packet_number(bytes(11)), "length", 11, "12 bytes of a header"),
+        (lambda: packet_number(bytes(12)), "number", 0, "1..32767"),
+        (lambda: CyclicPacket.decode(bytes(227), 6), "length", 227, "228 bytes for 6 axes"),
+        (lambda: CyclicPacket.decode(bytes(228), 6), "number", 0, "1..32767"),
+        (lambda: InitPacket.decode(INIT[:-1]), "length", 1199, "1200 bytes"),
+        (lambda: InitPacket.decode(b"\13" + INIT[1:]), "number", 11, "10 (init)"),
+        (lambda: InitPacket.decode(INIT[:12] + bytes(1188)), "n_axes", 0, "1..20"),
+        (
+            lambda: InitPacket.build(2, 2, {}, open_axes_map=MAP_OF_ONE).open_axes(),
+            *("open_axes_map", [0], "each slot 0..1 for exactly one axis"),
+        ),
+    ],
+)
+def test_an_error_names_field_value_and_what_is_right(decode, field, value, expected):
+    with pytest.raises(PacketError) as caught:
+        decode()
+    assert (caught.value.field, caught.value.value) == (field, value)
+    assert f"{field} is {value!r}" in str(caught.value)
+    assert expected in str(caught.value)
+
+
 class TestCyclicPacket:
     def test_layout_is_that_of_the_worked_example(self):
         # 6 axes, arm 1 drive on, number 291; axis 1: target 0.5, actual 0.4995, current 0.5 A
@@ -122,6 +150,13 @@ class TestInitPacket:
         assert [axis.slot for axis in init.open_axes()] == list(range(6))
         assert init.encode() == bytes(raw)
 
+    def test_what_is_built_is_laid_out_as_the_worked_example(self):
+        """3 fields per packet and 9 per axis; open axes are closed in slots from 0, others -1."""
+        init = InitPacket.build(6, 2, {})
+        assert init.encode()[:16] == bytes.fromhex("0a000000 03000000 09000000 06000000")
+        assert init.encode()[16:176] == bytes(24) + b"\xff" * 136
+        assert init.encode()[224:388] == struct.pack("<41i", 2, *range(6), *[NO_SLOT] * 34)
+
     @given(st.binary(min_size=INIT_LENGTH - 16, max_size=INIT_LENGTH - 16))
     def test_any_bytes_decode_and_encode_unchanged(self, payload):
         packet = struct.pack("<iiii", 10, 3, 9, 6) + payload
@@ -138,6 +173,11 @@ class TestInitPacket:
         with pytest.raises(PacketError) as caught:
             InitPacket.decode(packet)
         assert caught.value.field == "n_axes"
+
+    @pytest.mark.parametrize("n_axes", [1, 20])
+    def test_one_axis_or_twenty_may_be_open(self, n_axes):
+        packet = struct.pack("<iiii", 10, 3, 9, n_axes) + bytes(1184)
+        assert InitPacket.decode(packet).n_axes == n_axes
 
     @pytest.mark.parametrize("not_open", [NO_SLOT, -1])
     def test_axes_of_two_arms_in_any_slot(self, not_open):

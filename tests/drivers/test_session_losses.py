@@ -26,6 +26,7 @@ from tests.drivers.rig import (
     kind_of,
     limits,
     moving,
+    only,
     opened,
     refused,
     resumptions,
@@ -101,6 +102,14 @@ class TestLostMotion:
         assert rig.sync(1) is not None
         assert rig.state is State.SYNC
 
+    def test_a_stale_number_10_is_no_restart(self):
+        """Sync packets are numbered 1 to 9; 10 is the init packet, by its length."""
+        rig, _ = moving()
+        assert rig.sync(10) is None
+        rig.session.tick(rig.now + 1.0)
+        rig.events += rig.session.events()
+        assert rig.ended.reason == "only packets that do not follow the last one came (1)"
+
     def test_a_late_sync_packet_is_no_restart(self):
         rig, source = moving()
         advances = source.advances
@@ -110,6 +119,16 @@ class TestLostMotion:
         rig.events += rig.session.events()
         assert source.advances == advances + 1
         assert rig.ended.reason == NOTHING_RECEIVED
+
+    @pytest.mark.parametrize(("change", "reason"), [({"status": 0}, OFF), ("init", RESTARTED)])
+    def test_a_late_sync_packet_is_no_cause_of_what_follows(self, change, reason):
+        rig, _ = moving()
+        assert rig.sync(1) is None
+        if change == "init":
+            rig.start()
+        else:
+            rig.cycle(**change)
+        assert (rig.ended.outcome, rig.ended.reason) == ("lost", reason)
 
     @pytest.mark.parametrize(
         ("waits", "change", "reason"),
@@ -167,7 +186,7 @@ FAR = {"lower": np.full(N, -9.0), "upper": np.full(N, 9.0)}
 def at_speed(cycles: int = 600, speed: float = 1.9, **options) -> Rig:
     """An arm whose first joint moves at this speed, rad/s."""
     source = type("AtSpeed", (Cruise,), {"SPEED": speed, "RAMP": 1.0})()
-    rig = running(source, guard_limits=limits(**FAR), **options)
+    rig = running(source, **{"guard_limits": limits(**FAR), **options})
     rig.cycle(cycles)
     assert rig.state is State.OPEN
     return rig
@@ -257,6 +276,18 @@ class TestLostReplies:
     def test_controller_that_accepts_no_reply_is_refused(self):
         rig = at_speed()
         answer = lose(rig, REPETITIONS + 2)
+        assert assert_refused(rig, answer, Check.ACCEPTED).joint == 0
+
+    @pytest.mark.parametrize("max_gap", [0, 1])
+    def test_a_target_older_than_may_be_missed_is_refused(self, max_gap):
+        """At a speed whose steps are more than a tenth of the threshold."""
+        for behind in (max_gap, max_gap + 1):
+            rig = at_speed(speed=6.0, max_gap=max_gap, guard_limits=only(**FAR))
+            target = rig.axes["d"].copy()
+            rig.cycle(behind)
+            rig.axes["d"][:] = target
+            answer = rig.cycle()
+            assert rig.session.counters.rejected == (behind if behind <= max_gap else 0)
         assert assert_refused(rig, answer, Check.ACCEPTED).joint == 0
 
     @pytest.mark.parametrize(("max_gap", "pattern"), [(2, 3), (2, 40), (0, 40), (5, 9)])
@@ -408,10 +439,16 @@ class TestLongGaps:
         assert rig.state is State.OPEN
 
     @pytest.mark.parametrize(
-        ("speed", "factor", "expected"),
-        [(0.5, 1.2, 0.6), (0.5, 0.8, 0.4), (0.01, 1.2, 0.01), (0.01, 0.0, 0.01)],
+        ("speed", "factor", "arm", "expected"),
+        [
+            *((0.5, factor, 0.9, 0.5 * factor) for factor in (1.2, 0.8)),
+            *((0.01, factor, 0.9, 0.01) for factor in (1.2, 0.0)),
+            (0.02, 1.2, 0.6, 0.024),  # the arm alone is below standstill
+        ],
     )
-    def test_the_motion_continues_with_the_velocity_of_its_target(self, speed, factor, expected):
+    def test_the_motion_continues_with_the_velocity_of_its_target(
+        self, speed, factor, arm, expected
+    ):
         """Not that of the arm; below standstill, where a velocity says little, with its own."""
         rig = at_speed(1200, speed=speed)
         resumed = resumptions(rig)
@@ -419,7 +456,7 @@ class TestLongGaps:
         d = rig.axes["d"]
         d[:, [0, 2]] += 5 * d[:, [1]]
         d[:, 1] *= factor
-        d[:, 3] *= 0.9
+        d[:, 3] *= arm
         rig.cycle()
         ((_, velocity, _),) = resumed
         np.testing.assert_allclose(velocity, expected * np.eye(N)[0], rtol=1e-4, atol=1e-6)
@@ -536,6 +573,8 @@ class TestNumbers:
             assert not sequence.is_stale(number)
 
     def test_before_the_init_packet_half_of_them_count_as_missed(self):
+        sequence = PacketSequence()
+        assert (sequence.last, sequence.cycle, sequence.broken) == (0, 0, False)
         assert PacketSequence().accept(self.HALF) == self.HALF - 1
         assert PacketSequence().accept(self.HALF + 1) == 0
 
@@ -650,7 +689,9 @@ class TestTargets:
     def test_begin_resets_the_history(self):
         sent = Sent(SLOW)
         assert sent.check(-1.0) == 1
+        assert sent.set_points.is_resent
         sent.set_points.begin(TURNS)
+        assert not sent.set_points.is_resent
         sent.last = TURNS
         sent.add(1.0)
         assert sent.check(-1.0) == 1
@@ -765,6 +806,7 @@ class TestSentAgain:
         sent.set_points.resend()
         sent.add(1.0)
         sent.set_points.resume_from(sent.last, sent.step)
+        assert not sent.set_points.is_resent
         for _ in range(cycles):
             sent.add(1.0)
         assert sent.check(-1.0, stopping=True) == 1

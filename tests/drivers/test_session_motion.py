@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers import Mode, MotionEnded, MotionStarted, State
+from drivers import Mode, MotionEnded, MotionStarted, Session, State
 from drivers.errors import (
     AxisNotInMode,
 )
@@ -84,6 +84,24 @@ class TestMotion:
         assert rig.state is State.EXITING
         rig.cycle(status=0)
         assert rig.ended.outcome == "completed"  # although the drive went off
+
+    def test_motion_that_is_finished_at_its_begin_has_begun(self):
+        rig = running(still(1), settle_cycles=0)
+        assert rig.exits_asked == 1
+        assert rig.seen(MotionStarted) == [MotionStarted(0, rig.session.cycle)]
+        rig.cycle(mode=Mode.CLOSED)
+        assert rig.ended.outcome == "completed"
+        assert rig.session.counters.rejected == 0
+
+    def test_end_is_held_for_200_cycles_where_nothing_is_said(self):
+        rig = Rig()
+        rig.session = Session(rig.train, rig.guard, rig.ring)
+        rig.session.request(still(2))
+        rig.open()
+        rig.cycle(200)
+        assert not rig.exits_asked
+        rig.cycle()
+        assert rig.exits_asked
 
 
 class TestStaggeredOpening:

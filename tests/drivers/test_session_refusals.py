@@ -362,6 +362,7 @@ def test_request_is_refused_by_state(text):
         rig.session.request(still(3))
     assert f"{caught.value.state}: {caught.value.reason}" == text
     assert caught.value.state == rig.state.name.lower()
+    assert str(caught.value).startswith("no motion can be requested in state ")
 
 
 class TestNumbers:
@@ -640,6 +641,15 @@ class TestIncompleteOpening:
         rig.cycle(mode=Mode.CLOSED)
         assert rig.state is State.CLOSED
 
+    def test_axis_in_another_position_mode_is_held_near_its_target(self):
+        rig = self.opening()
+        rig.modes[2] = Mode.POSITION_RELATIVE
+        rig.cycle()
+        assert rig.state is State.OPENING
+        rig.axes["d"][2, 2] += 2.01
+        assert rig.cycle().axes["mode"][2] == Mode.FOLLOWING_ERROR
+        assert kind_of(rig.refusal) is Check.FOLLOWING_ERROR
+
     @pytest.mark.parametrize("opened", [1, N - 1])
     def test_motion_that_waits_too_long_is_dropped(self, opened):
         rig = self.opening(source := Cruise(), opened)
@@ -719,6 +729,12 @@ class TestOtherAxes:
         assert rig.cycle().axes["mode"][6] == Mode.POSITION
         rig.lose_target(value)
         assert rig.session.counters.refused == 2
+
+    def test_in_the_first_cycle(self, arm, value):
+        rig = OtherAxis(arm)
+        rig.start()
+        rig.axes["mode"][6] = Mode.POSITION
+        rig.lose_target(value)
 
     def test_no_motion_begins(self, arm, value):
         rig = OtherAxis(arm)

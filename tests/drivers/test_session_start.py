@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,15 +19,17 @@ from drivers import (
     RequestError,
     State,
 )
-from drivers.init_check import is_narrower
+from drivers.init_check import float32_text, is_narrower, verify_controller
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
 from drivers.safe_reply import D1, PacketClassifier, safe_reply
 from tests.drivers.rig import (
+    PERIOD,
     START,
     N,
     Rig,
     all_drive_off,
     closed,
+    drive_train,
     init_packet,
     opened,
     running,
@@ -250,6 +253,15 @@ class TestSilence:
         assert rig.ended.reason == "only packets that do not follow the last one came (30)"
 
 
+def test_a_new_session_has_no_controller_and_no_motion():
+    session = Rig().session
+    assert (session.state, session.cycle, session.entered_at) == (State.SYNC, 0, 0)
+    assert (session.interval, session.in_interval) == (-1, False)
+    assert (session.execution, session.stop_reason) == (None, None)
+    assert (session.init, session.deadline) == (None, np.inf)
+    assert session.losses.instead_of_packets == ""
+
+
 class TestConstruction:
     @pytest.mark.parametrize(
         ("options", "message"),
@@ -297,7 +309,9 @@ def test_discarded_packets_are_reported_once():
     assert counts == {"foreign": 5, "torn": 1, "malformed": 4}
     assert session.events() == []
     session.discarded("foreign", 1)
-    assert session.events() == [PacketRejected("foreign", 1)]
+    (event,) = session.events()
+    assert event == PacketRejected("foreign", 1)
+    assert event.reason == "", "the link did not say why"
     assert session.counters.discarded["foreign"] == 6
     assert Rig().session.counters.discarded == {}
 
@@ -312,6 +326,14 @@ def test_drive_off_has_zeros_for_values_not_finite():
     expected[2] = 0.0
     np.testing.assert_allclose(answer.axes["d"][:, 0], expected, rtol=1e-6)
     np.testing.assert_array_equal(answer.axes["d"][:, 1:], 0.0)
+
+
+def test_packets_with_the_same_modes_are_classified_once():
+    classifier, modes = PacketClassifier(np.arange(2), (1, 1), 1, 4), np.array([4, 4], np.int32)
+    first = classifier.classify(bytes(4), modes)
+    assert classifier.classify(bytes(4), modes.copy()) is first
+    modes[1] = 0
+    assert classifier.classify(bytes(4), modes) is not first
 
 
 @pytest.mark.parametrize(
@@ -406,6 +428,7 @@ class TestInit:
         assert rig.cycle() is not None
         for _ in range(2):
             assert all_drive_off(rig.cycle(mode=Mode.POSITION))
+        assert event.unusable in str(rig.refusal)
         rig.cycle(mode=Mode.CLOSED)
         with pytest.raises(RequestError, match=difference):
             rig.session.request(still(3))
@@ -419,6 +442,11 @@ class TestInit:
         for packet in (init, init_packet(), described(("gear_ratio", 6, np.nan))):
             _, event = received(packet)
             assert (event.differences, event.unusable) == ((), None)
+
+    def test_a_wrist_without_coupling_is_no_difference(self):
+        train = replace(drive_train(), k54=0.0, k64=0.0, k65=0.0)
+        init = init_packet(arm_1={"kinematic_influence": np.zeros(N)})
+        assert verify_controller(train, PERIOD, init, 1).differences == ()
 
     def test_every_difference_is_named(self):
         changes = (("gear_ratio", 0, 119.5), ("kinematic_influence", 5, 0.04))
@@ -466,3 +494,8 @@ class TestNextInit:
 )
 def test_limit_rounded_to_six_digits_is_not_narrower(theirs, ours, below):
     assert is_narrower(np.array([theirs], dtype=np.float64), np.array([ours])).tolist() == [below]
+
+
+@pytest.mark.parametrize(("value", "text"), [(18.4, "18.4"), (20.0, "20"), (0.1, "0.1")])
+def test_a_float32_is_written_with_the_digits_it_was_given(value, text):
+    assert float32_text(np.float32(value)) == text

@@ -9,12 +9,13 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from drivers import SimulatedTransport
+from drivers import SimulatedTransport, State
+from drivers.errors import Check
 from drivers.events import RepliesLost
 from planner import PiecewiseCubic, TrajectoryPlayer, plan
 from sim_fixtures.faults import parse_fault, split_faults
-from tests.drivers.rig import limits, running
-from tests.drivers.test_session_losses import FAR, lose, planned
+from tests.drivers.rig import PERIOD, N, at, limits, resumptions, running
+from tests.drivers.test_session_losses import FAR, at_speed, lose, planned
 from tests.fault_matrix import faulty_runs, small_cell
 from tests.laws.motions import Array, slows_down
 
@@ -153,6 +154,29 @@ def test_the_joint_that_slowed_down_least_says_how_fast():
     rig.cycle(2)
     share = np.linalg.norm(rig.records["commanded_velocity"][-1]) / np.linalg.norm(before)
     assert 0.8 * 0.95**8 <= share <= 0.95**7
+
+
+@pytest.mark.parametrize(("waits", "passes"), [(0, True), (1, False)])
+def test_only_the_first_step_of_a_stop_may_be_a_jump(waits, passes):
+    """Of acceleration: from the speed of the arm, here none, to that of the source."""
+    far = limits(**FAR, acceleration=np.full(N, 80.0))
+    rig = at_speed(1200, speed=0.2, guard_limits=far)
+    source, resumed, calls = rig.session.execution._source, resumptions(rig), []
+    move = source.advance
+
+    def advance():
+        if not resumed:
+            return move()
+        calls.append(len(calls))
+        steps = max(0, len(calls) - waits)
+        return resumed[0][0] + at(0, 0.2 * PERIOD * steps), at(0, 0.2 * (steps > 0))
+
+    source.advance = advance
+    lose(rig, 4)
+    rig.cycle(5)
+    assert [(speed.any(), cycles) for _, speed, cycles in resumed] == [(False, 0)]
+    assert (rig.state is State.OPEN) is passes
+    assert passes or rig.refusal.check is Check.JERK
 
 
 def test_an_arm_at_rest_stays_there():
