@@ -83,7 +83,8 @@ def unpacked(path: Path, reader: Any) -> Columns:
         messages = reader(stream).iter_messages(topics=[CYCLE], log_time_order=False)
         values = [unpack(message.data) for _, _, message in messages]
     rows = np.array(values)
-    columns, at = {}, 0
+    columns = {}
+    at = 0
     for name, width in zip(COLUMNS, widths, strict=True):
         base = _LAYOUT[name].base
         columns[name] = np.ascontiguousarray(rows[:, at : at + width].astype(base))
@@ -94,7 +95,9 @@ def unpacked(path: Path, reader: Any) -> Columns:
 
 def _unpacker() -> tuple[Callable[[bytes], tuple[Any, ...]], list[int]]:
     """What unpacks the columns of one message, and how many numbers each has."""
-    code, at, widths = "<", 0, []
+    code = "<"
+    at = 0
+    widths = []
     fields = _LAYOUT.fields
     assert fields is not None
     for name in COLUMNS:

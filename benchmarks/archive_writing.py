@@ -50,7 +50,8 @@ class Exchange:
 
     def __init__(self) -> None:
         self.ring = CycleRing.shared(JOINTS, 20_000)
-        self.ring_fd, self.event_fd = self.ring.fd, event_log.create()
+        self.ring_fd = self.ring.fd
+        self.event_fd = event_log.create()
         self.control_fd = control_memory.create()
         self.events, self.control = EventWriter(self.event_fd), SharedState(self.control_fd)
         self.pid = os.getpid()
@@ -87,7 +88,8 @@ def measure(folder: Path, seconds: float) -> dict[str, Any]:
         spec = ArchiveSpec(path, NAMES, PERIOD, metadata={})
         process.send(Open(1, spec, drive_train(), from_now=True, until_ended=False))
         _require(process.answer(ANSWER, 1), Opened)
-        used, started = _processor_time(process.process.pid), time.monotonic()
+        used = _processor_time(process.process.pid)
+        started = time.monotonic()
         exchange.run(seconds)
         elapsed = time.monotonic() - started
         process.send(Close(1, "completed", "as long as was asked for"))

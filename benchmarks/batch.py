@@ -145,14 +145,16 @@ def _measured(campaigns: Sequence[Path], workers: int | None) -> dict[str, Any]:
 
 
 def _run(places: Sequence[str], cache: Path, estimator: Any, cluster: Cluster) -> BatchResult:
-    options, location = replace(FIXED, estimator=estimator), CacheLocation(str(cache))
+    options = replace(FIXED, estimator=estimator)
+    location = CacheLocation(str(cache))
     return reidentify(places, options, cluster, Silent(), cache=location)
 
 
 def _timed(
     places: Sequence[str], cache: Path, estimator: Any, cluster: Cluster
 ) -> tuple[BatchResult, float, float]:
-    wall, cpu = time.perf_counter(), time.process_time()
+    wall = time.perf_counter()
+    cpu = time.process_time()
     result = _run(places, cache, estimator, cluster)
     return result, time.perf_counter() - wall, time.process_time() - cpu
 

@@ -135,7 +135,8 @@ def rival_errors(name: str, parts: Parts) -> tuple[float, list[float]] | None:
     if name in NEED_MASSES and not plain_fit.has_masses(robot):
         return None
     fitted = RIVALS[name](robot, parts.fitted.measured)
-    torque, predicted = parts.predicted.torque, fitted.predicted_torque(parts.predicted.measured)
+    torque = parts.predicted.torque
+    predicted = fitted.predicted_torque(parts.predicted.measured)
     joints = [
         plain_fit.relative_error(torque[:, joint], predicted[:, joint])
         for joint in range(torque.shape[1])
@@ -226,7 +227,10 @@ def degraded_row(name: str, case: str, whole: Identified, outcome: Identified | 
     the fault as well only what is `expected`.
     """
     expected = EXPECTED[case].checks
-    error, ratio, named, left_open = None, None, list[str](), False
+    error = None
+    ratio = None
+    named = list[str]()
+    left_open = False
     if isinstance(outcome, str):
         sentences = [outcome]
     else:
@@ -234,7 +238,8 @@ def degraded_row(name: str, case: str, whole: Identified, outcome: Identified | 
         findings = [
             finding for finding in suspicious(outcome.results) if finding.check not in before
         ]
-        error, ratio = outcome.error, outcome.error / whole.error
+        error = outcome.error
+        ratio = outcome.error / whole.error
         named = list(dict.fromkeys(finding.check for finding in findings))
         sentences = [f"{finding.check}: {finding.words}" for finding in findings]
         left_open = leaves_open(whole.results) and leaves_open(outcome.results)
@@ -271,7 +276,8 @@ def is_right(case: str, ratio: float, named: Collection[str], *, left_open: bool
 
     The ratio does not show harm where both verdicts say that it is `left_open`.
     """
-    expected, blamed = EXPECTED[case], CAUSES.intersection(named)
+    expected = EXPECTED[case]
+    blamed = CAUSES.intersection(named)
     if blamed - expected.checks:
         return False
     return bool(blamed) or (expected.silence and (ratio <= HARMLESS or left_open))

@@ -194,7 +194,8 @@ def drawn_arm(kind: ArmType, seed: int, conditions: Conditions = DEFAULTS) -> Ar
         return np.asarray(scatter * np.array(values))
 
     robot.armature = near(kind.rotor)
-    coulomb, viscous = near(kind.coulomb), near(kind.viscous)
+    coulomb = near(kind.coulomb)
+    viscous = near(kind.viscous)
     offset = 0.2 * coulomb * random.uniform(-1.0, 1.0, len(coulomb))
     # At full speed it is as large as a third of the viscous term.
     share = near([1.0 / 3.0] * len(coulomb)) if conditions.quadratic else np.zeros(len(coulomb))
@@ -233,7 +234,8 @@ class Motion:
         """Position, velocity and acceleration (m, n); at rest before and after the motion."""
         rate = 2.0 * np.pi * _BASE_FREQUENCY * np.arange(1, len(self.cosine) + 1)
         angle = time[:, None] * rate
-        c, s = np.cos(angle), np.sin(angle)
+        c = np.cos(angle)
+        s = np.sin(angle)
         wave = c @ self.cosine + s @ self.sine
         slope = (c * rate) @ self.sine - (s * rate) @ self.cosine
         bend = -(c * rate**2) @ self.cosine - (s * rate**2) @ self.sine
@@ -507,7 +509,8 @@ def _line(cell: str, row: Mapping[str, Any]) -> str:
     """Return the figures of some runs as a line."""
     shown = [f"{cell:14}"]
     for name in ("inertial", "friction"):
-        share, unsure = row[name], row[f"{name}_unsure"]
+        share = row[name]
+        unsure = row[f"{name}_unsure"]
         within = "" if unsure is None else f" ± {unsure:.1%}"
         shown.append(f"{name} " + ("-" if share is None else f"{share:.1%}{within}"))
     shown += [f"{name} {row[name]}" for name in ("undetermined", "dropped")]

@@ -142,11 +142,13 @@ def turned_sign(log: JointLog) -> JointLog:
 
 def payload_in_second_half(log: JointLog) -> JointLog:
     """A sphere on the flange during the second half, not stated in the cell."""
-    bare, loaded = log.pinocchio_model(), log.pinocchio_model()
+    bare = log.pinocchio_model()
+    loaded = log.pinocchio_model()
     body = pin.Inertia.FromSphere(PAYLOAD_SHARE * log.rated_payload, _PAYLOAD_RADIUS)
     loaded.inertias[loaded.njoints - 1] += body.se3Action(pin.SE3(np.eye(3), _PAYLOAD_OFFSET))
     motion = filtered_motion(log.measured, _MOTION_BANDWIDTH)
-    torque, neutral = log.torque.copy(), pin.neutral(bare)
+    torque = log.torque.copy()
+    neutral = pin.neutral(bare)
     data = bare.createData(), loaded.createData()
     for row in range(log.n_rows // 2, log.n_rows):
         state = pin.integrate(bare, neutral, motion[0][row]), motion[1][row], motion[2][row]

@@ -73,7 +73,8 @@ def of_length(limits: JointLimits, seconds: float) -> PiecewiseCubic:
     """Return a random motion, run at the one speed that makes it last so long."""
     random = np.random.default_rng(3)
     via_points = [random.uniform(limits.lower, limits.upper, (N_VIA, limits.n_joints))]
-    slow, fast = 0.01, 1.0
+    slow = 0.01
+    fast = 1.0
     for _ in range(40):
         middle = math.sqrt(slow * fast)
         speed = np.full((1, limits.n_joints), middle)
@@ -89,7 +90,8 @@ def compare(
     objective: Objective, reference: pin.Model, motion: PiecewiseCubic, repetitions: int
 ) -> dict[str, float]:
     """Time both on one motion, and compare what they find."""
-    coarse, fine = midpoints(motion, SAMPLE_PERIOD), midpoints(motion, FINE)
+    coarse = midpoints(motion, SAMPLE_PERIOD)
+    fine = midpoints(motion, FINE)
     # Memory is made once for either side: ours keeps its working arrays between calls.
     stacked = [_room(reference, samples) for samples in (coarse, fine)]
     tasks: list[Callable[[], object]] = [
@@ -169,7 +171,8 @@ def time_search(cell: Cell, population: int, generations: int) -> dict[str, floa
     """Run the paper's method B by one worker and by two; their results are equal."""
     asked = preset("b").kinematic()
     asked = asked.replaced(search={"population": population, "generations": generations})
-    problem, settings = problem_of(cell, asked), search_settings(asked)
+    problem = problem_of(cell, asked)
+    settings = search_settings(asked)
     durations: dict[str, float] = {}
     fitness = []
     for workers, name in ((1, "ga_one_worker_s"), (2, "ga_two_workers_s")):

@@ -101,7 +101,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--weights", nargs=2, type=float, help="instead of those of the preset")
     options = parser.parse_args(arguments)
     effort = {name: getattr(options, name) for name in ("workers", "quick", "weights")}
-    cell, rows = Cell.load(CELL_PATH), []
+    cell = Cell.load(CELL_PATH)
+    rows = []
     for name in options.only:
         for seed in range(1, options.seeds + 1):
             rows.append(run(cell, name, seed, **effort))

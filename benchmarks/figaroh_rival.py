@@ -72,7 +72,9 @@ class Identification(BaseIdentification):  # type: ignore[misc]
 
     def weighted(self, base: Any, torque: Any, values: Any) -> tuple[Any, Any]:
         """Values and relative standard deviations, from base columns and a first estimate."""
-        self.dynamic_regressor_base, self.tau_noised, self.phi_base = base, torque, values
+        self.dynamic_regressor_base = base
+        self.tau_noised = torque
+        self.phi_base = values
         return self._apply_weighted_least_squares()  # type: ignore[no-any-return]
 
     def ordinary(self, base: Any, torque: Any) -> Any:

@@ -54,7 +54,8 @@ def coverage(
 ) -> GainCoverage:
     """Estimate the constants for the load of every seed."""
     model = arm_model()
-    errors, halves = [], []
+    errors = []
+    halves = []
     for seed in seeds:
         load = load_of(seed)
         xx, xy, xz, yy, yz, zz = load.inertia[np.triu_indices(3)].tolist()
@@ -77,7 +78,8 @@ def coverage(
         estimate = identify_gains(model, factors)
         errors.append(estimate.values / PLANTED - 1.0)
         halves.append(estimate.interval_factor * estimate.std / PLANTED)
-    error, half = np.array(errors), np.array(halves)
+    error = np.array(errors)
+    half = np.array(halves)
     known_values = np.isfinite(error)
     inside = np.where(known_values, np.abs(error) <= half, np.nan)
     return GainCoverage(

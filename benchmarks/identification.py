@@ -201,7 +201,8 @@ def measured(tasks: dict[str, Callable[[], float]], repetitions: int) -> dict[st
 
 def time_fits(python: Path | None, repetitions: int) -> dict[str, float | int | None]:
     """Time the fits, ours and figaroh's in turns."""
-    same, large = case(SAME_PARAMETERS), case(ALL_FRICTION, WRIST)
+    same = case(SAME_PARAMETERS)
+    large = case(ALL_FRICTION, WRIST)
     tasks: dict[str, Callable[[], float]] = {
         "fit": partial(timed, partial(fit, same.model, same.samples)),
         "large_fit": partial(timed, partial(fit, large.model, large.samples)),

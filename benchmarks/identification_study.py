@@ -76,7 +76,8 @@ def recorded(seed: int, *, validation: bool = False) -> Sources:
 
 def run(seed: int) -> Covered:
     """Record a seed and fit it."""
-    cell, sources = study()[0], recorded(seed)
+    cell = study()[0]
+    sources = recorded(seed)
     (source,) = sources.training
     samples = prepare(
         source.recording,

@@ -91,7 +91,8 @@ class JointLog:
         arrays = {"time": self.time, "position": self.position, "torque": self.torque}
         columns = _MAP
         if self.velocity is not None:
-            arrays["velocity"], columns = self.velocity, _MAP_WITH_VELOCITY
+            arrays["velocity"] = self.velocity
+            columns = _MAP_WITH_VELOCITY
         source = output.with_suffix(".npz")
         np.savez(source, allow_pickle=False, **arrays)
         return import_log(source, output, robot=self.robot, columns=columns)

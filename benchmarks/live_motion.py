@@ -47,7 +47,8 @@ def travels(motion: PiecewiseCubic, gone: float) -> tuple[Array, Array]:
 
 def play(worst: Worst, cell: Cell) -> tuple[float, Array]:
     """Time to rest [s] and travel (n,) [rad] that the player really needs, past the guard."""
-    guard, n = Guard(cell.guard_limits, STEP), len(worst.travel)
+    guard = Guard(cell.guard_limits, STEP)
+    n = len(worst.travel)
     player = TrajectoryPlayer(worst.motion, STEP, cell.joint_limits)
     player.begin(player.start)
     guard.begin(player.start, 0)
@@ -55,20 +56,25 @@ def play(worst: Worst, cell: Cell) -> tuple[float, Array]:
         position, velocity = player.advance()
         guard.check_set_point(position, velocity, player.bounds, cycle)
     player.stop()
-    way, cycles = np.zeros(n), 0
+    way = np.zeros(n)
+    cycles = 0
     while not player.finished:
-        before, (position, velocity) = position, player.advance()
+        before = position
+        (position, velocity) = player.advance()
         guard.check_set_point(position, velocity, player.bounds, cycles)
-        way, cycles = way + np.abs(position - before), cycles + 1
+        way = way + np.abs(position - before)
+        cycles = cycles + 1
     return cycles * STEP, way
 
 
 def measure(plans: int, points: int, fly: float) -> dict[str, Any]:
     """All figures."""
     cell = Cell.load(CELL_PATH)
-    limits, factors = cell.joint_limits, cell.file.bounds.stop
+    limits = cell.joint_limits
+    factors = cell.file.bounds.stop
     random = np.random.default_rng(0)
-    stop_s, travel = [], np.zeros(limits.n_joints)
+    stop_s = []
+    travel = np.zeros(limits.n_joints)
     worst: Worst | None = None
     for _ in range(plans):
         via = limits.lower + random.random((points, limits.n_joints)) * (

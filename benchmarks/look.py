@@ -118,9 +118,14 @@ def _weight(recording: Recording, model: RobotModel) -> Array:
 
 def plants(arm: Arm) -> Iterator[Planted]:
     """Yield the recording as it is and with each meaning."""
-    recording, rng = arm.recording, np.random.default_rng(_SEED)
-    names, n = recording.joint_names, recording.n_joints
-    t, q, v, tau = recording.time, recording.position, recording.velocity, recording.torque
+    recording = arm.recording
+    rng = np.random.default_rng(_SEED)
+    names = recording.joint_names
+    n = recording.n_joints
+    t = recording.time
+    q = recording.position
+    v = recording.velocity
+    tau = recording.torque
     assert tau is not None
 
     def of(meaning: str, aspect: str, *expected: str, **arrays: Array | None) -> Planted:

@@ -73,7 +73,8 @@ class Coverage:
 def load_of(seed: int) -> Body:
     """A uniform box of 4 to 16 kg, up to 0.25 m off the flange."""
     rng = np.random.default_rng([seed, 1])
-    mass, edges = rng.uniform(4.0, 16.0), rng.uniform(0.08, 0.3, 3)
+    mass = rng.uniform(4.0, 16.0)
+    edges = rng.uniform(0.08, 0.3, 3)
     centre = np.array([*rng.uniform(-0.08, 0.08, 2), rng.uniform(0.05, 0.25)])
     turned = pin.Quaternion(*_unit(rng.standard_normal(4))).matrix()
     tensor = mass / 12.0 * (np.eye(3) * (edges**2).sum() - np.diag(edges**2))
@@ -155,7 +156,11 @@ def recordings_of(
 
 def coverage(seeds: range, most_pairs: int = 1, duration: float = _DURATION) -> Coverage:
     """Weigh the load of every seed by at most so many pairs of recordings."""
-    inside, moments, errors, halves, pairs = [], [], [], [], []
+    inside = []
+    moments = []
+    errors = []
+    halves = []
+    pairs = []
     model = arm_model()
     for seed in seeds:
         load = load_of(seed)
@@ -167,7 +172,8 @@ def coverage(seeds: range, most_pairs: int = 1, duration: float = _DURATION) -> 
             if (high - low) / 2.0 <= ENOUGH * payload.parameters[9]:
                 break
         pairs.append(pair)
-        truth, intervals = figures_of(load), payload.intervals
+        truth = figures_of(load)
+        intervals = payload.intervals
         inside.append((intervals[:, 0] <= truth) & (truth <= intervals[:, 1]))
         halves.append((intervals[:, 1] - intervals[:, 0]) / 2.0)
         moment = load.mass * float(np.linalg.norm(load.centre))
@@ -190,9 +196,11 @@ def coverage(seeds: range, most_pairs: int = 1, duration: float = _DURATION) -> 
 def _motion(rng: np.random.Generator, time: Array, pace: float) -> tuple[Array, Array, Array]:
     """Five sines a joint between 0.1 and 1 Hz, up to 60 % of the largest speeds."""
     rate = 2.0 * np.pi * pace * rng.uniform(0.1, 1.0, (5, 6))
-    size, phase = rng.standard_normal((5, 6)) / rate, rng.uniform(0.0, 2.0 * np.pi, (5, 6))
+    size = rng.standard_normal((5, 6)) / rate
+    phase = rng.uniform(0.0, 2.0 * np.pi, (5, 6))
     angle = rate * time[:, None, None] + phase
-    wave, slope = size * np.sin(angle), size * rate * np.cos(angle)
+    wave = size * np.sin(angle)
+    slope = size * rate * np.cos(angle)
     fastest = np.abs(slope.sum(axis=1)).max(axis=0) / (0.6 * pace * _SPEED)
     shrink = 1.0 / np.maximum(fastest, np.abs(wave.sum(axis=1)).max(axis=0) / _ROOM)
     bend = -(wave * rate**2).sum(axis=1)

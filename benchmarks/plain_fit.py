@@ -178,12 +178,16 @@ def body_prior(robot: Any, measured: Measured) -> Prior:
     inertia varies as much as the inertia of all links outboard, friction at the speeds of this
     motion by the scatter of its torque, the offset by twice that.
     """
-    n, data, neutral = robot.nv, robot.createData(), pin.neutral(robot)
+    n = robot.nv
+    data = robot.createData()
+    neutral = pin.neutral(robot)
     mass = np.array([inertia.mass for inertia in robot.inertias[1:]])
-    bodies, scale = body_parameters(robot), 1.0
+    bodies = body_parameters(robot)
+    scale = 1.0
     mass_deviation = BODY_SHARE * mass
     if not has_masses(robot):
-        bodies, mass_deviation = np.zeros(14 * n), np.full(n, UNKNOWN_MASS)
+        bodies = np.zeros(14 * n)
+        mass_deviation = np.full(n, UNKNOWN_MASS)
         scale = UNKNOWN_MASS / mass.mean() if mass.any() else 0.0
     powers = np.repeat([0, 1, 2], [1, 3, 6])
     body_deviation = mass_deviation[:, None] * body_lengths(robot)[:, None] ** powers
@@ -217,7 +221,9 @@ def body_lengths(robot: Any) -> Array:
 def regressor(robot: Any, measured: Measured, cutoff: float) -> Array:
     """Regressor (m, n, 14 n) of the filtered motion, columns as in `PlainFit`."""
     position, velocity, acceleration = filtered_motion(measured, cutoff)
-    (m, n), data, neutral = position.shape, robot.createData(), pin.neutral(robot)
+    (m, n) = position.shape
+    data = robot.createData()
+    neutral = pin.neutral(robot)
     table = np.zeros((m, n, 14 * n))
     for row, q, qd, qdd in zip(table, position, velocity, acceleration, strict=True):
         posture = pin.integrate(robot, neutral, q)
@@ -319,7 +325,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             arrays["time"], arrays["position"], arrays.get("velocity"), arrays["torque"]
         )
     cut = round(options.share * len(whole.time))
-    first, last = whole.rows(slice(0, cut)), whole.rows(slice(cut, None))
+    first = whole.rows(slice(0, cut))
+    last = whole.rows(slice(cut, None))
     fitted = fit(robot_from_urdf(options.urdf.read_text(encoding="utf-8")), first)
     errors = {
         name: relative_error(part.torque, fitted.predicted_torque(part))

@@ -51,7 +51,8 @@ def _stretches(points: Array, limits: JointLimits) -> list[ruckig.Trajectory]:
     stretches = []
     for start, end in pairwise(points.tolist()):
         problem = ruckig.InputParameter(n)
-        problem.current_position, problem.target_position = start, end
+        problem.current_position = start
+        problem.target_position = end
         problem.max_velocity = limits.velocity.tolist()
         problem.max_acceleration = limits.acceleration.tolist()
         problem.max_jerk = limits.jerk.tolist()
@@ -98,7 +99,8 @@ def sampling_times(limits: JointLimits, random: np.random.Generator) -> dict[str
     times = []
     for _ in range(25):  # alternating, so that both meet the same machine
         points = random_points(limits, random, POINTS)
-        motion, stretches = plan(points, limits), _stretches(points, limits)
+        motion = plan(points, limits)
+        stretches = _stretches(points, limits)
         t = np.linspace(0.0, motion.duration, SAMPLES)
         times.append(
             [

@@ -169,7 +169,8 @@ def drawn_arm(random: Random) -> tuple[str, Arm]:
     for joint in range(1, robot.njoints):
         robot.inertias[joint] = drawn_body(robot.inertias[joint], random)
     n = robot.nv
-    lower, upper = robot.lowerPositionLimit, robot.upperPositionLimit
+    lower = robot.lowerPositionLimit
+    upper = robot.upperPositionLimit
     stated = np.isfinite(lower) & np.isfinite(upper) & (upper - lower < 50.0)
     stated &= upper - lower > 0.05
     lower = np.where(stated, lower, -_UNSTATED_RANGE)
@@ -205,7 +206,8 @@ def drawn_arm(random: Random) -> tuple[str, Arm]:
 
 def torque_scale(robot: Any, lower: Array, upper: Array, speed: Array, random: Random) -> Array:
     """RMS torque of each joint (n,) over random states, at least a fiftieth of the largest."""
-    n, data = robot.nv, robot.createData()
+    n = robot.nv
+    data = robot.createData()
     torques = [
         pin.rnea(
             robot,
@@ -251,7 +253,8 @@ def fourier(random: Random, time: Array, room: float, speed: float) -> Array:
 
 def point_to_point(random: Random, time: Array, room: float, speed: float) -> Array:
     """Quintic moves (m,) to random points, with rests between them."""
-    targets, ends = [0.0], [0.0]
+    targets = [0.0]
+    ends = [0.0]
     while ends[-1] < time[-1]:
         target = room * random.uniform(-1.0, 1.0)
         way = abs(target - targets[-1])
@@ -260,7 +263,8 @@ def point_to_point(random: Random, time: Array, room: float, speed: float) -> Ar
         targets += [target, target]
         ends += [ends[-1] + duration, ends[-1] + duration + rest]
     leg = np.clip(np.searchsorted(ends, time, side="right") - 1, 0, len(ends) - 2)
-    start, stop = np.array(ends)[leg], np.array(ends)[leg + 1]
+    start = np.array(ends)[leg]
+    stop = np.array(ends)[leg + 1]
     share = quintic((time - start) / np.maximum(stop - start, 1e-9))
     return np.asarray(np.array(targets)[leg] * (1.0 - share) + np.array(targets)[leg + 1] * share)
 
@@ -315,7 +319,8 @@ def logged(
         torque = scipy.signal.sosfilt(low_pass, torque - torque[0], axis=0) + torque[0]
     late = np.maximum(np.arange(len(time)) - round(logger.delay / step), 0)
     rows = slice(None, None, round(1.0 / (logger.rate * step)))
-    position, velocity = motion.position[rows], motion.velocity[rows]
+    position = motion.position[rows]
+    velocity = motion.velocity[rows]
     torque = torque[late][rows]
     keep = np.exp(-1.0 / (_MEMORY * logger.rate))
     drive = np.sqrt(1.0 - keep**2) * random.standard_normal(torque.shape)

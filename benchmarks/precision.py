@@ -242,7 +242,8 @@ def stops(count: int) -> dict[str, Any]:
             torque = repeated + _NOISE * scatter * _coloured(random, clean.shape)
             factors.append(Factor.by_time(model, replace(samples, torque=torque)))
         half = _interval(model, factors[: _MOST // 2])[1]
-        number, met = _MOST, 0
+        number = _MOST
+        met = 0
         for repetition in range(1, _MOST + 1):
             met = met + 1 if np.all(_interval(model, factors[:repetition])[1] <= 1.1 * half) else 0
             if met == IN_A_ROW:
@@ -312,7 +313,10 @@ def weighings(count: int, required: str) -> dict[str, Any]:
         loaded_cell(cell, "load", assumed), settings, None, promise.precision(FEWEST)
     )
     plan = plan_around(cell, run_search(cell, settings, Silent(), problem=problem).excitation)
-    errors, inside, halves, pairs = [], [], [], []
+    errors = []
+    inside = []
+    halves = []
+    pairs = []
     for seed in range(1, count + 1):
         heavy = load_of(seed)  # of up to 16 kg
         share = _HEAVIEST / 16.0

@@ -55,7 +55,8 @@ class Split(_Table):
         if self.part == "all":
             return f"{self.fitted}: in sample"
         other = {"first": "last", "last": "first"}[self.part]
-        mine, theirs = round(100 * self.share), round(100 * (1.0 - self.share))
+        mine = round(100 * self.share)
+        theirs = round(100 * (1.0 - self.share))
         return f"{self.fitted}: {self.part} {mine} % to {other} {theirs} %"
 
 

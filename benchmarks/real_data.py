@@ -237,7 +237,8 @@ def default_errors(folder: Path) -> dict[str, float]:
 
     Of torque that the configuration smooths, the smoothed torque's.
     """
-    published, errors = Published.named(folder.name), {}
+    published = Published.named(folder.name)
+    errors = {}
     width = published.smooth_bandwidth
     for kind in ("in_sample", "held_out"):
         options = Options(
@@ -251,7 +252,8 @@ def default_errors(folder: Path) -> dict[str, float]:
             sources = gather_sources([archive], FITTED_SHARE, in_sample=options.in_sample)
         prepared = prepare_sources(sources, options, Silent())
         values = estimate_with(prepared, options, Silent()).result.pooled.values
-        sources, model = prepared.sources, prepared.sources.cell.model
+        sources = prepared.sources
+        model = prepared.sources.cell.model
         predicted = samples_of(sources.held_out[0], sources.cell, prepared.settings, model)
         errors[kind] = error(model, values, predicted)
     return errors

@@ -72,7 +72,8 @@ def common_columns(model: RobotModel) -> tuple[list[int], list[int]]:
 def _difference(model: RobotModel, ours: Array, theirs: Array) -> float:
     """Return the largest difference of the two Gram matrices, columns scaled to unit length."""
     columns, foreign = common_columns(model)
-    a, b = ours[np.ix_(columns, columns)], theirs[np.ix_(foreign, foreign)]
+    a = ours[np.ix_(columns, columns)]
+    b = theirs[np.ix_(foreign, foreign)]
     length = np.sqrt(np.diag(b))
     return float(np.max(np.abs(a - b) / length / length[:, None]))
 

@@ -62,7 +62,8 @@ from sim_fixtures.ns16 import CELL_PATH
 
 Array = NDArray[np.float64]
 
-WINDOWS, ARMS = 1000, 50
+WINDOWS = 1000
+ARMS = 50
 MORE_ROTOR = 0.1  # kg·m²
 LARGEST_RATIO = 0.5
 """Error of the identified arm over that of the nominal one at 0.5 s."""
@@ -70,11 +71,13 @@ LARGEST_RATIO = 0.5
 
 def recorded(arm: Arm) -> RecordedMotion:
     """Return windows of the arm's exact torque along sines."""
-    model, random = arm.model, np.random.default_rng(1)
+    model = arm.model
+    random = np.random.default_rng(1)
     stride = 0.1
     duration = 1.2 + stride * (WINDOWS - 1)
     grid = np.arange(0.0, duration, 0.002)
-    rate, phase = random.uniform(1.0, 4.0, model.n_joints), random.uniform(0.0, 6.0, model.n_joints)
+    rate = random.uniform(1.0, 4.0, model.n_joints)
+    phase = random.uniform(0.0, 6.0, model.n_joints)
     angle = rate * grid[:, None] + phase
     motion = Motion(
         grid, 0.3 * np.sin(angle), 0.3 * rate * np.cos(angle), -0.3 * rate**2 * np.sin(angle)
@@ -90,16 +93,20 @@ def recorded(arm: Arm) -> RecordedMotion:
 def time_of_windows() -> None:
     """Print the time of the windows."""
     cell = Cell.load(CELL_PATH)
-    model, infinite = cell.model, np.full(len(cell.joint_names), np.inf)
+    model = cell.model
+    infinite = np.full(len(cell.joint_names), np.inf)
     standard = model.nominal
     standard[model.layout.rotors] = cell.nominal.rotor_inertia
     ranges = Ranges(-infinite, infinite, infinite, infinite)
     arm = Arm(cell.urdf, model, standard, cell.nominal_values(), ranges)
-    motion, feedback = recorded(arm), light_feedback(arm, STEP, 1.0)
-    begin, processor = time.perf_counter(), time.process_time()
+    motion = recorded(arm)
+    feedback = light_feedback(arm, STEP, 1.0)
+    begin = time.perf_counter()
+    processor = time.process_time()
     for _ in range(ARMS):
         simulate(arm, motion, feedback)
-    wall, cpu = time.perf_counter() - begin, time.process_time() - processor
+    wall = time.perf_counter() - begin
+    cpu = time.process_time() - processor
     print(
         f"{len(motion.windows)} windows of 1 s x {ARMS} arms of {model.n_joints} axes:"
         f" {wall:.1f} s, {cpu:.1f} s of processor time"
@@ -209,7 +216,8 @@ def arms(names: Sequence[str], data: Path) -> None:
 
 def _print_arm(name: str, result: RolloutResult) -> list[str]:
     """Print a row, and return the bounds that it misses."""
-    missed, ratio = [], None if result.ratio is None else result.ratio[JUDGED]
+    missed = []
+    ratio = None if result.ratio is None else result.ratio[JUDGED]
     at = result.horizons[JUDGED]
     print(
         f"{name:40} {result.windows:4} windows, {result.identified.unstable:3} unstable;"

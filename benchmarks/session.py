@@ -181,9 +181,11 @@ def record() -> list[bytes]:
 
 def stream(packets: list[bytes], cycles: int) -> Iterator[bytes]:
     """`cycles` cyclic packets with running numbers."""
-    number, index = 10, 0
+    number = 10
+    index = 0
     for _ in range(cycles):
-        number, index = next_number(number), index + 1
+        number = next_number(number)
+        index = index + 1
         if index == len(packets):
             index -= LOOP
         yield _NUMBER.pack(number) + packets[index][4:]
@@ -200,7 +202,8 @@ def begun(packets: list[bytes]) -> Session:
 def replay(packets: list[bytes], cycles: int) -> Array:
     """Duration of each `reply`, s."""
     session = begun(packets)
-    reply, clock = session.reply, time.perf_counter
+    reply = session.reply
+    clock = time.perf_counter
     durations = np.empty(cycles)
     gc.disable()
     for index, packet in enumerate(stream(packets, cycles)):
@@ -254,7 +257,8 @@ def profile(cycles: int) -> dict[str, Any]:
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """All figures."""
     packets = record()
-    warm, window = options.warm, options.window
+    warm = options.warm
+    window = options.window
     runs = np.array([replay(packets, options.cycles)[warm:] for _ in range(options.runs)]) * 1e6
     # Another process can only make a cycle longer: the quietest run is nearest the truth.
     quietest = runs[np.argmin(np.median(runs, axis=1))]

@@ -173,7 +173,8 @@ def control(settings: Settings) -> None:
     except RuntimeError as error:
         fault = str(error)
         controller.end()
-    ours, floor = controller.ours, controller.floor
+    ours = controller.ours
+    floor = controller.floor
     np.savez(
         settings.result,
         **{
@@ -192,7 +193,8 @@ def echo(parent: Connection, realtime: RealTimeSettings) -> None:
     server.bind((HOST, 0))
     parent.send(server.getsockname()[1])
     enter(realtime)
-    receive, send = server.recvfrom, server.sendto
+    receive = server.recvfrom
+    send = server.sendto
     while True:
         packet, sender = receive(1501)
         send(packet, sender)

@@ -26,11 +26,13 @@ from hil.progress import Silent, reporter
 from hil.screen import Keyboard, Screen
 
 HERE: Final = Path(__file__).parent
-COLUMNS, ROWS = 80, 24
+COLUMNS = 80
+ROWS = 24
 REPETITION: Final = 3
 MIDDLE: Final = 0.4
 """Share of the motion that is complete in the picture."""
-HEIGHT, MARGIN = 20, 14
+HEIGHT = 20
+MARGIN = 14
 """Height of a letter and margin of the picture, pixels."""
 THEME: Final[TerminalTheme] = MONOKAI
 
@@ -51,7 +53,8 @@ class RecordingScreen(Screen):
             if motion is not None and done > MIDDLE * (motion.duration or 0.0):
                 self._keyboard = Keyboard(str)
                 self._keyboard.attached = True
-                self.stored, self._keyboard = self.picture(), None
+                self.stored = self.picture()
+                self._keyboard = None
 
 
 def screen_in_run() -> Layout:
@@ -79,7 +82,8 @@ def picture(shown: Layout) -> Image.Image:
     for row, line in enumerate(console.render_lines(shown)):
         column = 0
         for segment in Segment.strip_links(line):
-            style, y = segment.style or Style(), MARGIN + row * high
+            style = segment.style or Style()
+            y = MARGIN + row * high
             ink, paper = _colours(style)
             for letter in segment.text.rstrip("\n"):
                 x = MARGIN + column * wide

@@ -107,7 +107,8 @@ def page() -> str:
     )
 
 
-WIDTH, HEIGHT = 1000, 590
+WIDTH = 1000
+HEIGHT = 590
 BOX: Final = (164.0, 50.0)
 AT: Final = {
     State.SYNC: (110, 70),
@@ -186,7 +187,8 @@ def _title(before: str, inputs: tuple[Input, ...], after: State) -> str:
 
 
 def _box(state: State, stays: tuple[Input, ...]) -> Iterator[str]:
-    (x, y), (wide, tall) = AT[state], BOX
+    (x, y) = AT[state]
+    (wide, tall) = BOX
     kind = "box bad" if state in (State.FAULTED, State.FREEZING) else "box"
     yield f'<rect class="{kind}" x="{x - wide / 2:g}" y="{y - tall / 2:g}" ' + (
         f'width="{wide:g}" height="{tall:g}" rx="8"/>'
@@ -200,7 +202,8 @@ def _box(state: State, stays: tuple[Input, ...]) -> Iterator[str]:
 
 def _from_any(after: State, inputs: tuple[Input, ...]) -> Iterator[str]:
     """Draw the short arrow into a state for inputs from every started one."""
-    (x, y), (wide, tall) = AT[after], BOX
+    (x, y) = AT[after]
+    (wide, tall) = BOX
     below = after in FROM_BELOW
     begin = y + (tall / 2 + 24) * (1 if below else -1)
     end = y + tall / 2 * (1 if below else -1)
@@ -221,9 +224,11 @@ def _arrow(before: State, after: State, inputs: tuple[Input, ...]) -> Iterator[s
         _edge_of(corners[-1], corners[-2]),
     ]
     path = "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
-    (ax, ay), (bx, by) = points[0], points[1]
+    (ax, ay) = points[0]
+    (bx, by) = points[1]
     share = LABEL_AT.get((before, after), 0.5)
-    x, y = ax + share * (bx - ax), ay + share * (by - ay)
+    x = ax + share * (bx - ax)
+    y = ay + share * (by - ay)
     labels = ", ".join(label(what) for what in inputs)
     size = 6.7 * len(labels) + 8
     yield f"<g>{_title(label(before), inputs, after)}"
@@ -236,7 +241,8 @@ def _arrow(before: State, after: State, inputs: tuple[Input, ...]) -> Iterator[s
 
 def _edge_of(middle: Point, towards: Point) -> Point:
     """Return the point where the line from the centre of a box leaves it."""
-    dx, dy = towards[0] - middle[0], towards[1] - middle[1]
+    dx = towards[0] - middle[0]
+    dy = towards[1] - middle[1]
     share = min(
         BOX[0] / 2 / abs(dx) if dx else 1.0,
         BOX[1] / 2 / abs(dy) if dy else 1.0,

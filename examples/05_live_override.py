@@ -26,7 +26,8 @@ class Operator:
     """Slows the motion down from a quarter to half of the motion."""
 
     def __init__(self) -> None:
-        self.requested, self.seen = OperatorRequest(), []
+        self.requested = OperatorRequest()
+        self.seen = []
 
     def show(self, progress: MotionProgress) -> None:
         """Choose the override from the progress; called about ten times a second."""
@@ -39,7 +40,8 @@ class Operator:
         return self.requested
 
 
-cell, operator = Cell.load("sim_fixtures/ns16/cell.toml"), Operator()
+cell = Cell.load("sim_fixtures/ns16/cell.toml")
+operator = Operator()
 with TemporaryDirectory() as folder, cell_link(cell) as link, stop_on_interrupt() as stop:
     move = plan_move(cell, link.connect(stop), cell.home, speed=0.02)
     archive = Path(folder) / "move_000_a1.mcap"

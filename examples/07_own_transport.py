@@ -28,7 +28,9 @@ class PipeTransport:
     """One message is one packet; the controller sends the next one after the reply."""
 
     def __init__(self, end: Connection, period: float) -> None:
-        self.end, self.period, self.packets = end, period, 0
+        self.end = end
+        self.period = period
+        self.packets = 0
 
     @property
     def now(self) -> float:
@@ -74,7 +76,8 @@ def controller(end: Connection) -> None:
 
 def main() -> None:
     """Connect through the pipe and go home."""
-    cell, (pc_end, controller_end) = Cell.load(CELL), Pipe()
+    cell = Cell.load(CELL)
+    (pc_end, controller_end) = Pipe()
     get_context("fork").Process(target=controller, args=(controller_end,), daemon=True).start()
     ring = CycleRing(len(cell.joint_names), capacity=1000)
     guard = Guard(cell.guard_limits, cell.period)

@@ -447,7 +447,8 @@ def solve_many(starts: Array, ends: Array, times: Array, bounds: Allowance) -> S
             solver.calculate(problem, result)
         except REFUSALS:
             continue
-        durations[row], results[row] = result.duration * time, result
+        durations[row] = result.duration * time
+        results[row] = result
     return Solutions(starts, ends, times, durations, results)
 
 

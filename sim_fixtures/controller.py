@@ -423,10 +423,12 @@ class Layout:
         modes = np.full(shape, -1, np.int32)
         for i, (arm, slot) in enumerate(zip(self._foreign_arm, self._foreign, strict=True)):
             at = (arm, i % AXES_PER_ARM)
-            slots[at], modes[at] = slot, Mode.CLOSED
+            slots[at] = slot
+            modes[at] = Mode.CLOSED
             for name, value in _FOREIGN.items():
                 tables[name][at] = value
-        slots[axes], modes[axes] = self.slot_array, Mode.CLOSED
+        slots[axes] = self.slot_array
+        modes[axes] = Mode.CLOSED
         for name in _FOREIGN:
             tables[name][axes] = getattr(drive, name)
         tables["kinematic_influence"][row, 3:6] = (drive.k54, drive.k64, drive.k65)
@@ -570,7 +572,8 @@ class Targets:
 
     def release(self, servo: CycleServo) -> None:
         """With the drive off, set targets to the motor positions and abort the own motion."""
-        self.target, self.delta = list(servo.target), list(servo.delta)
+        self.target = list(servo.target)
+        self.delta = list(servo.delta)
         self._offset = [0.0] * len(self.target)
         self._break_off()
 
@@ -588,7 +591,8 @@ class Targets:
         """Return the demand of the cycle that begins, with the PC's reply `wanted` (n,)."""
         demand = self._own_demand(servo, program)
         if self._settings.corrected and program.listening:
-            self.target, self.delta = list(demand.target), list(demand.delta)
+            self.target = list(demand.target)
+            self.delta = list(demand.delta)
             self._correct(demand, wanted)
         else:
             if not self._settings.corrected:
@@ -652,7 +656,8 @@ class Targets:
         for i, fields in enumerate(wanted):
             if fields is None:
                 continue
-            demand.target[i], demand.delta[i] = fields[0], fields[1]
+            demand.target[i] = fields[0]
+            demand.delta[i] = fields[1]
             self._ramp[i] = 0.0
             if feeds:
                 demand.speed[i] = fields[3] - fields[1]

@@ -178,7 +178,8 @@ class Servo:
         self.model_current = self._feed_forward(target, delta)
         self.current = self._close_loops(self._gains)
         self._delta_before = self.delta
-        self.target, self.delta = list(target), list(delta)
+        self.target = list(target)
+        self.delta = list(delta)
         return self.current
 
     def _feed_forward(self, target: Sequence[float], delta: Sequence[float]) -> list[float]:
@@ -298,10 +299,12 @@ class CycleServo:
     def _take_state(self) -> None:
         """Set the values of the cycle to those of released loops."""
         loops = self._loops
-        self.target, self.delta = list(loops.target), list(loops.delta)
+        self.target = list(loops.target)
+        self.delta = list(loops.delta)
         self._speed = list(loops.delta)
         self.measured = list(loops.measured)
-        self.current, self.model_current = list(loops.current), list(loops.model_current)
+        self.current = list(loops.current)
+        self.model_current = list(loops.model_current)
 
     @property
     def inertia(self) -> list[float]:
@@ -347,8 +350,10 @@ class CycleServo:
             currents.append(loops.advance(target, delta))
             model_currents.append(loops.model_current)
             loops.measure(drive_arm(loops.current))
-        self.target, self.delta = list(demand.target), list(demand.delta)
-        self.current, self.model_current = _means(currents), _means(model_currents)
+        self.target = list(demand.target)
+        self.delta = list(demand.delta)
+        self.current = _means(currents)
+        self.model_current = _means(model_currents)
         self._end_cycle()
 
     def _end_cycle(self) -> None:

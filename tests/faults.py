@@ -118,7 +118,8 @@ def _event(line: str) -> ScriptedEvent:
     match = _LINE.fullmatch(line)
     if match is None:
         raise ValueError(f"{line!r} cannot be read; lines are\n{GRAMMAR}\n{FAULTS}")
-    value, word = 0.0, ""
+    value = 0.0
+    word = ""
     for option in filter(None, match["options"].split(":")):
         number = _NUMBER.fullmatch(option)
         if number is not None:
@@ -229,7 +230,10 @@ OPERATION  create, write, fsync, rename; all for each of them
 AFTER      so many pass before; TIMES: on how many it acts, without it on all from there on
 NAMES      pattern of the names of files"""
 
-CREATE, WRITE, SYNC, RENAME = "create", "write", "fsync", "rename"
+CREATE = "create"
+WRITE = "write"
+SYNC = "fsync"
+RENAME = "rename"
 CHANGES: Final = (CREATE, WRITE, SYNC, RENAME)  # operations on which a disk may fail or hang
 REFUSALS: Final = {name: getattr(errno, name) for name in ("EIO", "EDQUOT", "ENOSPC", "EROFS")}
 _DISK_FAULT: Final = re.compile(

@@ -60,7 +60,8 @@ class Journal:
     """
 
     def __init__(self, path: Path | None, sync_every: float = 0.0) -> None:
-        self._every, self._synced = sync_every, time.monotonic()
+        self._every = sync_every
+        self._synced = time.monotonic()
         self._descriptor = -1
         if path is None:
             return

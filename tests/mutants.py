@@ -50,12 +50,15 @@ RESULTS: Final = FOLDER / "results.txt"
 ORIGINAL: Final = "_mutmut_orig"
 """Key of the unchanged function among its versions."""
 
-SLOWER, LEAST, WAIT = 10.0, 5.0, 60.0
+SLOWER = 10.0
+LEAST = 5.0
+WAIT = 60.0
 """A test hangs, which finds the change, if it takes so many times its processor time, and at least
 so many s; or on the clock that much longer."""
 QUICK: Final = 100
 """Tests that have to pass without a change before any is judged."""
-FOUND, UNDECIDED = 1, 3
+FOUND = 1
+UNDECIDED = 3
 """Exit codes of the process of a change, 0 where it survives."""
 
 Line = tuple[str, int]
@@ -148,7 +151,8 @@ class Sources(MetaPathFinder):
                 ]
                 for key, f in functions.items()
             }
-            before, original = sources.pop(ORIGINAL), functions[ORIGINAL]
+            before = sources.pop(ORIGINAL)
+            original = functions[ORIGINAL]
             for name, after in sources.items():
                 difference = list(difflib.unified_diff(before, after, lineterm="", n=2))[3:]
                 lines = changed_lines(before, after)
@@ -242,7 +246,8 @@ class Tracer:
         file = frame.f_code.co_filename
         if not file.startswith(_PREFIX):
             return None
-        module, lines = file.removeprefix(_PREFIX), self.lines
+        module = file.removeprefix(_PREFIX)
+        lines = self.lines
 
         def add(frame: FrameType, event: str, argument: object) -> Any:
             lines.add((module, frame.f_lineno))
@@ -302,7 +307,8 @@ class Judge:
             silence()
             runs = {}
             for item, following in itertools.zip_longest(items, items[1:]):
-                tracer, start = Tracer(), time.process_time()
+                tracer = Tracer()
+                start = time.process_time()
                 with tracer:
                     item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
                 runs[item.nodeid] = CleanRun(time.process_time() - start, frozenset(tracer.lines))

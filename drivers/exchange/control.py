@@ -200,7 +200,8 @@ class HeartbeatMonitor:
     ) -> None:
         self._read = heartbeat
         self._max_interval = max_interval
-        self._last, self._read_at = heartbeat(), time.monotonic()
+        self._last = heartbeat()
+        self._read_at = time.monotonic()
         self._silence = 0.0
 
     def silence(self) -> float:

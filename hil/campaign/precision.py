@@ -85,7 +85,8 @@ class PrecisionMeter:
                 field="--precision",
                 remedy="run it with --payload NAME",
             )
-        self._campaign, self._requirements = campaign, tuple(requirements)
+        self._campaign = campaign
+        self._requirements = tuple(requirements)
         paths = given_to(campaign)
         self._given = given_sources(campaign.cell, paths) if paths else ()
         self._options = Options()
@@ -125,8 +126,10 @@ class PrecisionMeter:
         rates = [each.products for each in recordings if each.products is not None]
         products = np.sum(rates, axis=0) if rates else None
         estimation = estimate_with(prepared, self._options, Silent(), factors, products)
-        values, noise_std = estimation.result.pooled.values, estimation.result.pooled.noise_std
-        posterior, stated = estimation.posterior, estimation.stated
+        values = estimation.result.pooled.values
+        noise_std = estimation.result.pooled.noise_std
+        posterior = estimation.posterior
+        stated = estimation.stated
         weights = inverse_variance(noise_std**2)
         information = estimation.result.factor.weighted(weights).A + posterior.precision
         wanted = self._reference.wanted(
@@ -190,7 +193,8 @@ class PrecisionMeter:
         self._first = path
 
     def _reduced(self, source: Source) -> _Reduced:
-        cell, settings = self._prepared.sources.cell, self._prepared.settings
+        cell = self._prepared.sources.cell
+        settings = self._prepared.settings
         samples = samples_of(source, cell, settings)
         if settings.loading is not None:
             samples = samples.with_load(cell.model, np.array(settings.loading))

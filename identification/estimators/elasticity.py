@@ -52,7 +52,8 @@ class ElasticTorque(NamedTuple):
         cls, model: RobotModel, recordings: Iterable[Samples], values: Array, compliance: Array
     ) -> Self:
         """Return the sums over recordings, with parameters (p,) and compliances (n,)."""
-        n, p = model.n_joints, model.n_parameters
+        n = model.n_joints
+        p = model.n_parameters
         sums = cls(np.zeros((n, p, n)), np.zeros((n, n, n)), np.zeros((n, n)))
         for samples in recordings:
             torque = elastic_torque(model, samples, values, compliance)

@@ -454,7 +454,8 @@ def body_prior(
     pairs = [np.sqrt(std[layout.rotors][i] * std[layout.rotors][j]) for i, j in layout.pairs]
     std[layout.couplings] = pairs
     for name, (value, spread) in (stated or {}).items():
-        mean[names.index(name)], std[names.index(name)] = value, spread
+        mean[names.index(name)] = value
+        std[names.index(name)] = spread
     if stated:
         origin += f", {len(stated)} given"
     bodies = layout.links.ravel()

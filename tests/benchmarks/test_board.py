@@ -21,8 +21,11 @@ from hil.importers import Robot
 pytestmark = pytest.mark.long
 
 URDF = Path(__file__).resolve().parents[2] / "examples" / "two_joints" / "robot.urdf"
-Logs, Archives = dict[str, JointLog], dict[str, Path]
-COULOMB, VISCOUS, ROTOR = np.array([4.0, 2.0]), np.array([2.0, 1.0]), np.array([0.5, 0.2])
+Logs = dict[str, JointLog]
+Archives = dict[str, Path]
+COULOMB = np.array([4.0, 2.0])
+VISCOUS = np.array([2.0, 1.0])
+ROTOR = np.array([0.5, 0.2])
 
 
 def two_joint_log(seed: int, *, noise: float = 1.0, seconds: float = 10.0) -> JointLog:
@@ -95,7 +98,8 @@ class TestRow:
         torque = board.cut(split, logs).predicted.torque
         floor = 0.3 * np.sqrt(torque.size) / np.linalg.norm(torque)
         for name in ("hil", "plain"):
-            error, joints = row[name], row[f"{name}_joints"]
+            error = row[name]
+            joints = row[f"{name}_joints"]
             assert 0.9 * floor < error < 1.5 * floor
             squares = np.square(joints) @ np.square(np.linalg.norm(torque, axis=0))
             assert error == pytest.approx(np.sqrt(squares) / np.linalg.norm(torque))
@@ -271,7 +275,8 @@ class TestPlainFit:
     def test_the_prior_of_a_body(self) -> None:
         """Shares of the mass, times the way to the next joint and its square."""
         prior = plain_fit.body_prior(ROBOT, two_joint_log(1).measured)
-        mass, length = ROBOT.inertias[1].mass, np.linalg.norm(ROBOT.jointPlacements[2].translation)
+        mass = ROBOT.inertias[1].mass
+        length = np.linalg.norm(ROBOT.jointPlacements[2].translation)
         assert prior.mean[:20] == pytest.approx(planted()[:20])
         assert prior.deviation[:10] == pytest.approx(
             0.3 * mass * length ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])

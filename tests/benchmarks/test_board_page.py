@@ -143,7 +143,8 @@ class TestPage:
         assert line.is_loss == loss
 
     def test_it_is_written_again_from_saved_rows(self, tmp_path: Path) -> None:
-        saved, page = tmp_path / "board.json", tmp_path / "board.md"
+        saved = tmp_path / "board.json"
+        page = tmp_path / "board.md"
         saved.write_text(json.dumps({"rows": [row(0.05)], "commit": "1234abcd"}))
         board.main(["--rows", str(saved), "--page", str(page)])
         text = page.read_text("utf-8")

@@ -80,7 +80,8 @@ class TestMotion:
         """In both ramps and between them, by central differences over 20 us."""
         robot = drawn_arm(ARM_TYPES["panda"], 1).robot
         motion = drawn_motion(robot, np.random.default_rng(3), 12.0, SPEED)
-        time, step = np.array([0.3, 0.7, 2.0, 5.5, 8.1, 11.2, 11.9]), 1e-5
+        time = np.array([0.3, 0.7, 2.0, 5.5, 8.1, 11.2, 11.9])
+        step = 1e-5
         before, now, after = (motion.at(time + shift) for shift in (-step, 0.0, step))
         for order in (0, 1):
             difference = (after[order] - before[order]) / (2.0 * step)
@@ -153,7 +154,8 @@ def test_a_run_is_read_from_the_results(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(coverage, "FITTED_TIME", 10.0)
     monkeypatch.setattr(coverage, "HELD_OUT_TIME", 5.0)
     run = coverage.run("ns16", 0.0, 1, Conditions(white=True))
-    n_base, n_friction = 40, 18
+    n_base = 40
+    n_friction = 18
     counted = len(run.inertial) + len(run.friction) + run.undetermined
     assert counted + run.dropped >= n_base + n_friction
     assert len(run.delay_error) == 6

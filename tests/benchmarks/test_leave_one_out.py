@@ -19,7 +19,9 @@ def test_every_default_is_there_and_has_other_values() -> None:
 
 def test_a_robot_is_judged_by_what_the_others_prefer() -> None:
     """Two prefer 3 folds, at which the third is worse than at the present number."""
-    present, few, many = (PRESENT, ""), ("FOLDS", "3"), ("FOLDS", "8")
+    present = (PRESENT, "")
+    few = ("FOLDS", "3")
+    many = ("FOLDS", "8")
     robots = {
         "a": {present: 1.0, few: 0.8, many: 1.0},
         "b": {present: 1.0, few: 0.7, many: 0.9},

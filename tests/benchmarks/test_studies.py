@@ -32,10 +32,12 @@ def pinocchios_torque(urdf: str, samples: Samples, weights: Array) -> Array:
     offset, and numpy's lstsq. The columns are many more than the motion determines; the solution is
     that of least norm, which the predicted torque does not depend on.
     """
-    robot, usable = pin.buildModelFromXML(urdf), samples.usable
+    robot = pin.buildModelFromXML(urdf)
+    usable = samples.usable
     data = robot.createData()
     q, qd, qdd = samples.motion[1:4]
-    n, joint = q.shape[1], np.arange(q.shape[1])
+    n = q.shape[1]
+    joint = np.arange(q.shape[1])
     table = np.zeros((*q.shape, 14 * n))
     for k, row in enumerate(zip(q, qd, qdd, strict=True)):
         table[k, :, : 10 * n] = pin.computeJointTorqueRegressor(robot, data, *row)
@@ -59,7 +61,8 @@ def require_same_fit(model: RobotModel, urdf: str, samples: Samples, weights: Ar
     assert np.abs(ours - expected).max() < 1e-6 * np.sqrt(np.mean(expected**2))
 
 
-P, SEEDS = 58, 400
+P = 58
+SEEDS = 400
 NAMES = [f"p{k}" for k in range(P)]
 
 
@@ -81,7 +84,8 @@ class TestCoverage:
 
 
 def test_the_fit_of_a_simulated_recording_is_pinocchios() -> None:
-    sources, urdf = recorded(7), study()[0].urdf
+    sources = recorded(7)
+    urdf = study()[0].urdf
     assert sources.noise_variance is not None and sources.torque_variance is not None
     law = FrictionLaw(third=None, offset=True, standstill=0.1)
     model = RobotModel.from_urdf(urdf, friction=law)

@@ -41,7 +41,8 @@ def draw(rng: Random, files: Files, kind: str | None = None) -> tuple[Files, str
     Damage by disks, cables and file systems: also sectors and chunks of one archive in another, and
     two archives of one kind that swap their names. No checksum is recomputed.
     """
-    path, kind = rng.choice(sorted(files)), kind or rng.choice([SWAPPED, *KINDS])
+    path = rng.choice(sorted(files))
+    kind = kind or rng.choice([SWAPPED, *KINDS])
     if kind == SWAPPED:
         alike = [file for file in files if file.name.startswith(path.name.partition("_")[0])]
         other = rng.choice(sorted(alike))
@@ -52,7 +53,8 @@ def draw(rng: Random, files: Files, kind: str | None = None) -> tuple[Files, str
 
 
 def _flip(rng: Random, data: bytes, _: bytes) -> Changed:
-    changed, places = bytearray(data), rng.choices(range(len(data)), k=rng.choice((1, 1, 2, 8)))
+    changed = bytearray(data)
+    places = rng.choices(range(len(data)), k=rng.choice((1, 1, 2, 8)))
     for at in places:
         changed[at] ^= 1 << rng.randrange(8)
     return bytes(changed), f"at {places}"
@@ -94,7 +96,8 @@ def _replaced_chunk(rng: Random, data: bytes, other: bytes, what: str) -> Change
 
 def _no_checksum(rng: Random, data: bytes, _: bytes) -> Changed:
     """The checksum of a chunk is 0, which means none in MCAP, and one of its bits is flipped."""
-    changed, (begin, end) = bytearray(data), rng.choice(chunks(data))
+    changed = bytearray(data)
+    (begin, end) = rng.choice(chunks(data))
     struct.pack_into("<I", changed, begin + _CHUNK_CRC, 0)
     at = rng.randrange(begin + _CHUNK_CRC + 4, end)
     changed[at] ^= 1 << rng.randrange(8)
@@ -103,7 +106,8 @@ def _no_checksum(rng: Random, data: bytes, _: bytes) -> Changed:
 
 def _index_unchecked(rng: Random, data: bytes, _: bytes) -> Changed:
     """The checksum of the summary is 0, and one of its bits is flipped."""
-    changed, footer = bytearray(data), len(data) - len(container.MAGIC) - container.FOOTER_SIZE
+    changed = bytearray(data)
+    footer = len(data) - len(container.MAGIC) - container.FOOTER_SIZE
     (summary,) = struct.unpack_from("<Q", changed, footer + 9)
     struct.pack_into("<I", changed, footer + 9 + 16, 0)
     at = rng.randrange(summary, footer)

@@ -25,12 +25,14 @@ from unittest.mock import patch
 from hil.files import write_atomically
 from tests.faults import CREATE, REFUSALS, RENAME, SYNC, WRITE, DiskFault
 
-RULES, STRUCK = "rules.json", "struck.txt"
+RULES = "rules.json"
+STRUCK = "struck.txt"
 
 
 class Disk:
     def __init__(self, root: Path) -> None:
-        self.root, self._count = root, 0
+        self.root = root
+        self._count = 0
 
     def do_wrong(self, *rules: DiskFault) -> list[str]:
         """Activate these rules (none: no faults); return the operations affected before."""
@@ -47,8 +49,10 @@ class Faults:
     """The rules of a disk in a process that writes to it; thread-safe."""
 
     def __init__(self, root: Path) -> None:
-        self.root, self._folder = root, root.parent
-        self._lock, self._text = threading.Lock(), ""
+        self.root = root
+        self._folder = root.parent
+        self._lock = threading.Lock()
+        self._text = ""
         self._rules: list[DiskFault] = []
         self._seen: dict[int, int] = {}
         self._until: dict[int, float] = {}
@@ -57,7 +61,8 @@ class Faults:
         """Wait or raise OSError according to the rules."""
         with self._lock:
             self._read()
-            delay, error = 0.0, 0
+            delay = 0.0
+            error = 0
             for number, rule in enumerate(self._rules):
                 name = Path(path).name
                 if operation not in rule.operations or not fnmatch.fnmatch(name, rule.names):
@@ -85,7 +90,9 @@ class Faults:
         file = self._folder / RULES
         text = file.read_text() if file.exists() else "[0]"
         if text != self._text:
-            self._text, self._seen, self._until = text, {}, {}
+            self._text = text
+            self._seen = {}
+            self._until = {}
             self._rules = [DiskFault(**rule) for rule in json.loads(text)[1:]]
 
 
@@ -101,7 +108,8 @@ def planted_disk(folder: Path) -> Iterator[Disk]:
 @contextmanager
 def processes_disk(folder: Path) -> Iterator[Disk]:
     """Patch the functions of every process that is started meanwhile."""
-    root, code = (folder / "planted").resolve(), folder / "code"
+    root = (folder / "planted").resolve()
+    code = folder / "code"
     root.mkdir()
     code.mkdir()
     (code / "sitecustomize.py").write_text(
@@ -162,7 +170,8 @@ class _Raw(io.FileIO):
     """A file whose writes follow the rules: `FileIO` does not call `os.write`."""
 
     def __init__(self, faults: Faults, path: Path, mode: str) -> None:
-        self._faults, self._path = faults, path
+        self._faults = faults
+        self._path = path
         super().__init__(path, mode)
 
     def write(self, data: Any, /) -> int | None:  # type: ignore[override]  # as FileIO itself

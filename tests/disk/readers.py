@@ -98,7 +98,8 @@ def _checks(truth: Undamaged, path: Path) -> Iterator[str]:
 
 def _repairs(truth: Undamaged, path: Path) -> Iterator[str]:
     """Check that the samples of all undamaged chunks are saved, of a file with chunks in order."""
-    before, now = truth.files[path], path.read_bytes()
+    before = truth.files[path]
+    now = path.read_bytes()
     whole = [before[begin:end] for begin, end in chunks(before)]
     places = [now.find(chunk) for chunk in whole]
     saved_places = [at for at in places if at >= 0]
@@ -141,14 +142,18 @@ def _shows(truth: Undamaged, path: Path) -> Iterator[str]:
 
 
 def _identifies(damage: Damage) -> Iterator[str]:
-    truth, harmed = damage.truth, damage.harmed
+    truth = damage.truth
+    harmed = damage.harmed
     if not any(path in truth.paths for path in harmed):
         return  # moves are never read for it
     if damage.of_campaign:
-        identification, what = identify_campaign(truth.root, Silent()), "identify of the campaign"
+        identification = identify_campaign(truth.root, Silent())
+        what = "identify of the campaign"
     else:
-        identification, what = identify_archives(truth.paths, Silent()), "identify"
-    before, now = truth.loose.estimate.pooled, identification.estimate.pooled
+        identification = identify_archives(truth.paths, Silent())
+        what = "identify"
+    before = truth.loose.estimate.pooled
+    now = identification.estimate.pooled
     same_parameters = before.values.shape == now.values.shape
     if same_parameters and np.allclose(before.values, now.values, rtol=SAME, atol=0.0):
         return

@@ -302,7 +302,8 @@ def remove_at(
     monkeypatch: pytest.MonkeyPatch, campaign: Campaign, archive: str, parts: Sequence[str]
 ) -> None:
     """Remove parts of the folder when an archive has been written to five times."""
-    true, count = os.write, 0
+    true = os.write
+    count = 0
 
     def write(descriptor: int, data: Any) -> int:
         nonlocal count

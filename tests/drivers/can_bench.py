@@ -60,7 +60,8 @@ class Wire:
     """Both ends without a bus; frames pass at `time`, a cycle of 2 ms each."""
 
     def __init__(self, *, n_axes: int = N, sample_time: int = 2) -> None:
-        self.far, self.near = End(BusRates(), UP), End(BusRates(), DOWN)
+        self.far = End(BusRates(), UP)
+        self.near = End(BusRates(), DOWN)
         self.n_axes = n_axes
         self.time = 1000.0
         packet = init_packet(n_axes, sample_time)
@@ -112,13 +113,16 @@ class PacedByPackets:
     """
 
     def __init__(self, near, far, controller, *, lost=(), clock) -> None:
-        self.near, self.far, self.controller = near, far, controller
+        self.near = near
+        self.far = far
+        self.controller = controller
         self.lost = frozenset(lost)
         self.cycle = 0
         self.clock = clock
         self.replies: list[bytes | None] = []
         self._awaiting = False
-        self.rejected, self.forget_peer = near.rejected, near.forget_peer
+        self.rejected = near.rejected
+        self.forget_peer = near.forget_peer
 
     @property
     def now(self) -> float:
@@ -161,7 +165,8 @@ NS16 = Cell.load(ns16.CELL_PATH)
 
 
 def wide_limits() -> GuardLimits:
-    far, current = np.full(N, 4.0), NS16.drive_train.current_limit
+    far = np.full(N, 4.0)
+    current = NS16.drive_train.current_limit
     return limits(lower=-far, upper=far, following_error=np.ones(N), current=current)
 
 

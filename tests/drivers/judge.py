@@ -85,7 +85,9 @@ class Conduct:
     def interrupted(self) -> None:
         """After an init packet or a silence, axes have to be closed first."""
         self.barrier = True
-        self.sent, self.motor, self.exiting = [], None, False
+        self.sent = []
+        self.motor = None
+        self.exiting = False
 
     def judge(
         self, packet: bytes, reply: bytes, record: np.void, missed: int, at_most: int = 0
@@ -95,7 +97,8 @@ class Conduct:
         The session may count them as `at_most`, if that is more.
         """
         n = len(self.arms)
-        received, answer = oracle.parse(packet, n), oracle.parse(reply, n)
+        received = oracle.parse(packet, n)
+        answer = oracle.parse(reply, n)
         assert len(reply) == oracle.length(n)
         assert answer.number == oracle.answer_number(received.number), "another number"
         assert answer.functionality == oracle.ZERO, "function bytes"
@@ -133,9 +136,11 @@ class Conduct:
             if slot not in self.slots or not ready[self.slots.index(slot)]:
                 assert answer.axes[slot] == safe.axes[slot], f"slot {slot}: not the safe answer"
         self.stopping = self.stopping or max(missed, at_most) > self.max_gap
-        self.missed, self.at_most = missed, max(missed, at_most)
+        self.missed = missed
+        self.at_most = max(missed, at_most)
         # The record's word counts for nothing but this: set-points end with the exit.
-        leaving, self.exiting = self.exiting, bool(record["state"] == State.EXITING)
+        leaving = self.exiting
+        self.exiting = bool(record["state"] == State.EXITING)
         if all(ready) and not leaving:
             self._open(received, answer, record)
             self.continuing = np.ones(len(ready), bool)
@@ -166,7 +171,9 @@ class Conduct:
 
     def _over(self, what: str) -> None:
         """End the interval in open mode, if there is one."""
-        self.sent, self.motor, self.exiting = [], None, False
+        self.sent = []
+        self.motor = None
+        self.exiting = False
         self.stopping = self.overridden = False
         self._count(what)
 
@@ -257,7 +264,10 @@ class Conduct:
             for slot in self.slots:
                 assert answer.axes[slot] == received.axes[slot].keep(1), "first: target, at rest"
             self.sent = [q, q, q, q]
-            self.motors, self.lag, self.lost, self.repeats = [], 0, 0, 0
+            self.motors = []
+            self.lag = 0
+            self.lost = 0
+            self.repeats = 0
         else:
             rounding_of_target = 0.0
             if self.at_most > self.max_gap:
@@ -267,7 +277,8 @@ class Conduct:
             near = np.concatenate((self.motors[-self.max_gap - 1 :], self._extrapolated()))
             nearest = np.abs(near - r[0]).min(axis=0)
             assert (nearest <= 0.1 * self.threshold * (1 + 1e-6)).all(), "a leap after losses"
-            low, high = np.float32(motor - rounding), np.float32(motor + rounding)
+            low = np.float32(motor - rounding)
+            high = np.float32(motor + rounding)
             assert ((low <= a[0]) & (a[0] <= high)).all(), "sent and recorded differ"
             if np.array_equal(a, self.answered) and a[1].any():
                 assert np.array_equal(q, self.sent[-1]), "sent again, and recorded otherwise"
@@ -291,7 +302,9 @@ class Conduct:
         assert (q <= self.limits.upper + 2e-6 * span).all(), "position"
         if self.motor is not None:
             self._count_lost(r[0])
-        self.repeats, self.answered, self.arm_share = 0, a, 1.0
+        self.repeats = 0
+        self.answered = a
+        self.arm_share = 1.0
         self.motors = [*self.motors, motor][-(self.max_gap + 2) :]
         self.motor = motor
         del self.sent[:-3]
@@ -307,9 +320,11 @@ class Conduct:
             r: (5, n) the same of the packet.
         """
         begun = a[0] - a[1]  # where the step begins, by its own account
-        off_target, off_before = np.abs(begun - r[0]).max(), np.abs(begun - self.motor).max()
+        off_target = np.abs(begun - r[0]).max()
+        off_before = np.abs(begun - self.motor).max()
         rounding = np.spacing(np.float32(np.abs(a[0]).max()))
-        step, standstill = self._last_step(), self.limits.standstill
+        step = self._last_step()
+        standstill = self.limits.standstill
         again = self.answered is not None and np.array_equal(a, self.answered) and a[1].any()
         if again or not step.any() or off_target > off_before + rounding:
             return
@@ -323,7 +338,8 @@ class Conduct:
         slower = np.abs(r[1] - step) <= np.maximum(0.5 * np.abs(step), standstill) * (1 + 1e-6)
         assert slower.all() or (np.abs(r[1]) <= standstill).all(), "continues at another speed"
         self.motors = [r[0] - k * r[1] for k in (3, 2, 1, 0)]
-        self.sent, self.motor = [self.train.joint_position(row) for row in self.motors], r[0]
+        self.sent = [self.train.joint_position(row) for row in self.motors]
+        self.motor = r[0]
         self._count("resumed from the target")
 
     def _extrapolated(self) -> np.ndarray:
@@ -444,10 +460,14 @@ class Judged:
         inits: Mapping[bytes, bool],
     ) -> None:
         """Start; `inits` are init packets, and whether the arm may be moved with them."""
-        self.session, self.ring, self.conduct = session, ring, conduct
+        self.session = session
+        self.ring = ring
+        self.conduct = conduct
         self.reception = Reception(silence)
         self.max_gap = max_gap
-        self._n_axes, self._period, self._inits = n_axes, period, inits
+        self._n_axes = n_axes
+        self._period = period
+        self._inits = inits
         self.now = 0.0
         self.last: tuple[bytes, bytes] | None = None
         self.unanswered = 0
@@ -462,7 +482,8 @@ class Judged:
         self.now += elapsed
         if elapsed > SILENCE:
             self.record_silence()
-        before, last = self.ring.slot, self.reception.last
+        before = self.ring.slot
+        last = self.reception.last
         kind = self.reception.expect(packet)
         asked = self.source.asked if self.source is not None else 0
         reply = self.session.reply(packet, self.now)

@@ -171,7 +171,9 @@ class Reception:
         """Return the kind of reply to a packet, and record a packet that gets one."""
         kind = self._expect(packet)
         if kind in ("echo", "init", "cyclic"):
-            self.last, self.last_packet, self.silent = number_of(packet), packet, False
+            self.last = number_of(packet)
+            self.last_packet = packet
+            self.silent = False
             self.at_init = kind == "init" or (kind == "echo" and self.at_init)
         return kind
 
@@ -195,7 +197,9 @@ class Reception:
         ahead = (number - self.last) % LAST
         if self.silent and not on and number < 10 and ahead != 1:
             if len(packet) < 1200:
-                self.n_axes, self.at_init, self.synced = None, False, True
+                self.n_axes = None
+                self.at_init = False
+                self.synced = True
                 return "echo"
             return "nothing"
         if not length(self.n_axes) <= len(packet) <= length(20):
@@ -214,7 +218,8 @@ class Reception:
         if self.at_init and packet == self.last_packet:
             return "again"
         self.cold = self.n_axes is None and self.synced
-        self.n_axes, self.synced = n, False
+        self.n_axes = n
+        self.synced = False
         cycle = max(1, int.from_bytes(packet[SAMPLE_TIME], "little", signed=True)) / 1000.0
         self.window = max(1, int(min(self.silence / cycle, LAST // 2)))
         return "init"

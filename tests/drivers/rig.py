@@ -135,7 +135,9 @@ class Cruise:
     def stop(self):
         self.stops += 1
         self.bounds = "stop"
-        self._from, self._target, self._time = self._velocity, 0.0, 0.0
+        self._from = self._velocity
+        self._target = 0.0
+        self._time = 0.0
 
 
 class Table:
@@ -398,7 +400,8 @@ def moving(cycles: int = 300, **options) -> tuple[Rig, Cruise]:
 
 def resumptions(rig: Rig) -> list:
     """Position, velocity and cycles of each resumption of a motion, from now on."""
-    source, resumed = rig.session.execution._source, []
+    source = rig.session.execution._source
+    resumed = []
 
     def resume_from(*arguments):
         resumed.append(arguments)
@@ -438,7 +441,8 @@ def assert_refused(rig: Rig, answer: CyclicPacket, kind: object) -> Exception:
 
 REST = np.zeros(N)
 WIDE = 1e9
-JUST_BELOW, JUST_ABOVE = 1.0 + 5e-7, 1.0 + 2e-6
+JUST_BELOW = 1.0 + 5e-7
+JUST_ABOVE = 1.0 + 2e-6
 """Of a bound, which has a relative tolerance of 1e-6."""
 FACTORS = {"plan": (1.0, 1.0), "override": (1.3, 1.7), "stop": (2.0, 3.0)}
 """On acceleration and jerk, of each set of bounds."""

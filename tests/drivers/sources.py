@@ -13,7 +13,10 @@ class Breaks:
     """What is wrong with a source, and when."""
 
     def __init__(self, what: str = "", index: int = 0, joint: int = 0, value: float = 0.0):
-        self.what, self.index, self.joint, self.value = what, index, joint, value
+        self.what = what
+        self.index = index
+        self.joint = joint
+        self.value = value
 
     def __repr__(self) -> str:
         return f"{self.what} at {self.index} in joint {self.joint}: {self.value}"
@@ -23,7 +26,9 @@ class Scripted:
     """Plays a table (m, n) of motion and one of what goes with it, with one fault."""
 
     def __init__(self, motion: np.ndarray, beside: np.ndarray, breaks: Breaks):
-        self.motion, self.beside, self.breaks = motion, beside, breaks
+        self.motion = motion
+        self.beside = beside
+        self.breaks = breaks
         self.index = 0
         self.begun = self.stopped = False
         self._buffers = np.zeros((2, motion.shape[1]))
@@ -50,8 +55,10 @@ class Scripted:
         self.index = min(self.index + 1, len(self.motion) - 1)
         motion, beside = self._buffers
         # The same arrays every time, as a source without allocations would.
-        motion[:], beside[:] = self.motion[self.index], self.beside[self.index]
-        at, joint = self.index == self.breaks.index, self.breaks.joint
+        motion[:] = self.motion[self.index]
+        beside[:] = self.beside[self.index]
+        at = self.index == self.breaks.index
+        joint = self.breaks.joint
         if at and self.breaks.what == "motion":
             motion[joint] = self.breaks.value
         if at and self.breaks.what == "jumps":
@@ -77,7 +84,8 @@ class Scripted:
 
     def _ramp_down(self):
         """Half a cosine in velocity: within the bounds of a stop where it was not accelerating."""
-        k, cycles = self.index, 400
+        k = self.index
+        cycles = 400
         step = self.motion[k] - self.motion[max(k - 1, 0)]
         share = 0.5 + 0.5 * np.cos(np.linspace(0.0, np.pi, cycles + 1))[1:, None]
         rows = self.motion[k] + np.cumsum(share * step, axis=0)

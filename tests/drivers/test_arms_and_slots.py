@@ -21,7 +21,8 @@ from tests.messages import AXIS_NOT_OPEN
 
 pytestmark = pytest.mark.safety
 
-OPEN, CLOSED = 4, 0
+OPEN = 4
+CLOSED = 0
 ON = 5
 FOLLOWING_ERROR = np.linspace(1.0, 1.9, 40).reshape(4, 10)  # of each arm and axis
 CURRENT_LIMIT = 10.0 * FOLLOWING_ERROR
@@ -181,7 +182,8 @@ def test_no_echo_to_open_axes_without_a_valid_map(mode):
     """The arm of the axis is unknown; an echoed position would be an offset in mode 7."""
     slots = tuple((1, axis) for axis in range(6))
     bench = Bench(slots, 1, 6, open_axes_map=np.full((4, 10), 1))
-    bench.status, bench.modes = [0, ON, 0, 0], [mode] * 6
+    bench.status = [0, ON, 0, 0]
+    bench.modes = [mode] * 6
     received, answer = bench.cycle()
     for ours, theirs in zip(answer.axes, received.axes, strict=True):
         assert ours.mode in (mode, oracle.DRIVE_OFF_REQUEST)

@@ -34,7 +34,8 @@ MODES = (*range(18), *range(500, 509))
 
 
 def random_packets(first, count, seed=3):
-    rng, number = np.random.default_rng(seed), first
+    rng = np.random.default_rng(seed)
+    number = first
     for _ in range(count):
         yield number, random_packet(rng, number)
         number = next_number(number)
@@ -109,7 +110,8 @@ class TestDisturbances:
 
     @staticmethod
     def sent_cycles(first, cycles, seed=3):
-        wire, frames = Wire(), []
+        wire = Wire()
+        frames = []
         packets = dict(random_packets(first, cycles, seed))
         for each in packets.values():
             wire.time += 0.002
@@ -152,7 +154,8 @@ class TestDisturbances:
     def test_of_overlapping_transfers_the_newer_is_received(self):
         """Frames of the older one that come later do not end it."""
         wire, packets, frames = self.sent_cycles(11, 2)
-        first, second = frames[:4], frames[4:]
+        first = frames[:4]
+        second = frames[4:]
         arrivals = [*first[:2], second[0], first[2], *second[1:3], first[3], second[3]]
         out = [wire.near.receive(frame, second[0][0]) for _, frame in arrivals]
         assert out == [None] * 7 + [packets[12]]
@@ -180,7 +183,8 @@ class TestDisturbances:
 
     def test_repeated_transfer_is_delivered_once(self):
         joined = TransferAssembler(Counter())
-        first, second = payloads(b"first" * 20, 0), payloads(b"second" * 20, 1)
+        first = payloads(b"first" * 20, 0)
+        second = payloads(b"second" * 20, 1)
         out = [joined.add(part, 0.001) for part in (*first, *second, *first, *second)]
         assert [packet for packet in out if packet] == [b"first" * 20, b"second" * 20]
         again = [joined.add(part, 1.0) for part in payloads(b"sync", 0)]
@@ -241,7 +245,8 @@ class TestDbc:
     @pytest.mark.parametrize(("sends", "name"), [(UP, "UP"), (DOWN, "DOWN")])
     def test_cantools_reads_packets(self, database, sends, name):
         packet = random_packet(np.random.default_rng(2), 11)
-        wanted, signals = decoded(packet), {}
+        wanted = decoded(packet)
+        signals = {}
         for index, frame in enumerate(End(BusRates(), sends).frames(packet)):
             message = database.get_message_by_frame_id(frame.id)
             assert (message.name, message.is_fd) == (name, True)

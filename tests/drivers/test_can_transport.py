@@ -334,7 +334,8 @@ class TestLock:
         spec.open().close()
 
     def test_two_names_of_one_serial_port_are_one_bus(self, tmp_path: Path) -> None:
-        port, name = tmp_path / "ttyACM0", tmp_path / "by-id"
+        port = tmp_path / "ttyACM0"
+        name = tmp_path / "by-id"
         port.touch()
         name.symlink_to(port)
         held = lock_bus("slcan", str(port))
@@ -392,7 +393,8 @@ class TestSession:
         on = {"clock": clock, "ends": ends, "controller": ns16_controller(cold_start=False)}
         link, session = session_on(until=lambda link: link.cycle == 40, **on)
         session.events()
-        full, bus = Overflowing(), near._bus
+        full = Overflowing()
+        bus = near._bus
         bus.channel[bus.channel.index(bus.queue)] = full
         bus.queue = full
         for _ in range(10):

@@ -123,14 +123,16 @@ N = 6
 
 def limits() -> GuardLimits:
     # Wide: a foreign motion of float32 positions has noise for second and third differences.
-    far, each = np.full(N, 100.0), np.ones(N)
+    far = np.full(N, 100.0)
+    each = np.ones(N)
     return GuardLimits(-far, far, 5.0 * each, 1e7 * each, 1e10 * each, 2.0 * each, 10.0 * each)
 
 
 def train_of(init: InitPacket) -> DriveTrain:
     """Return the arm of the init packet."""
     each = np.ones(N)
-    ratio, calibration = init.gear_ratio[0, :N], init.calibration[0, :N]
+    ratio = init.gear_ratio[0, :N]
+    calibration = init.calibration[0, :N]
     return DriveTrain(
         ratio, calibration, each, 0.0 * each, each, 10.0 * each, *init.wrist_coupling()
     )
@@ -142,7 +144,8 @@ def their_targets(pairs: list[tuple[bytes, bytes | None]]) -> np.ndarray:
     for packet, reply in pairs:
         if len(packet) == INIT_LENGTH or reply is None:
             continue
-        received, answer = oracle.parse(packet, N), oracle.parse(reply, N)
+        received = oracle.parse(packet, N)
+        answer = oracle.parse(reply, N)
         if all(axis.mode in oracle.OPEN for axis in received.axes):
             row = [axis.floats[0] for axis in answer.axes]
             # Its 508 packet has a target in the first slot only.
@@ -239,11 +242,13 @@ def assert_equal(ours: oracle.Packet, expected: oracle.Packet, positions: np.nda
 @pytest.mark.parametrize("name", MOVED)
 def test_replies_are_the_documented_ones(shared_data: Path, name: str):
     # Their program asks for the end of open mode with its last set-point.
-    settle_cycles, mode = 0 if name == "a_exit" else 5, 5 if name == "a_mode5" else 4
+    settle_cycles = 0 if name == "a_exit" else 5
+    mode = 5 if name == "a_mode5" else 4
     replay = Replay(conversation(shared_data, name), mode, settle_cycles)
     arms = (1,) * N
     seen: dict[str, set[str]] = {}
-    row, before = 0, replay.targets[0]
+    row = 0
+    before = replay.targets[0]
     for packet, reply in replay.pairs:
         ours_raw = replay.feed(packet)
         assert ours_raw is not None
@@ -251,7 +256,8 @@ def test_replies_are_the_documented_ones(shared_data: Path, name: str):
             assert ours_raw == oracle.echo(packet) == reply
             continue
         assert len(ours_raw) == oracle.length(N)
-        received, ours = oracle.parse(packet, N), oracle.parse(ours_raw, N)
+        received = oracle.parse(packet, N)
+        ours = oracle.parse(ours_raw, N)
         theirs = oracle.parse(reply, N) if reply is not None else None
         what = situation(received, theirs)
         if what in ("open", "their 505"):
@@ -259,7 +265,8 @@ def test_replies_are_the_documented_ones(shared_data: Path, name: str):
             leaves = name == "a_exit" and row == len(replay.targets) - 1
             expected = expected_open(received, target, before, leaves)
             assert_equal(ours, expected, target)
-            row, before = row + 1, target
+            row = row + 1
+            before = target
         else:
             expected = oracle.safe_answer(received, arms)
             if what == "their 508":
@@ -286,13 +293,16 @@ def test_replies_are_the_documented_ones(shared_data: Path, name: str):
 
 def test_controller_with_an_invalid_axis_map_is_not_moved(shared_data: Path):
     """Five axes that all claim slot 1, a cycle of 1500: the foreign driver moved one of them."""
-    rig, n, moved_by_them = Rig(), 5, 0
+    rig = Rig()
+    n = 5
+    moved_by_them = 0
     for packet, reply in conversation(shared_data, IMPOSSIBLE_MAP):
         ours_raw = rig.send(packet)
         if len(packet) == INIT_LENGTH:
             assert ours_raw == oracle.echo(packet) == reply
             continue
-        received, ours = oracle.parse(packet, n), oracle.parse(ours_raw, n)
+        received = oracle.parse(packet, n)
+        ours = oracle.parse(ours_raw, n)
         expected = oracle.safe_answer(received, (1,) * n)
         if situation(received, None) == "open":
             axes = tuple(axis._replace(mode=oracle.DRIVE_OFF_REQUEST) for axis in expected.axes)
@@ -309,7 +319,8 @@ def test_controller_with_an_invalid_axis_map_is_not_moved(shared_data: Path):
 
 def test_session_that_begins_at_speed_gets_no_reply(shared_data: Path):
     """Before an init packet, with a drive on: an echo would be set-points."""
-    rig, pairs = Rig(), conversation(shared_data, SEVEN_AXES)
+    rig = Rig()
+    pairs = conversation(shared_data, SEVEN_AXES)
     for packet, _ in pairs:
         assert rig.send(packet) == (None if packet[4] == oracle.DRIVE_ON else oracle.echo(packet))
     assert rig.session.counters.malformed == sum(packet[4] == 5 for packet, _ in pairs) > 50

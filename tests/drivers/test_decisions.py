@@ -124,7 +124,8 @@ class TestDecision:
         assert decision == Decision(State.FAULTED, misplaced=joint)
 
     def test_a_motion_dropped_for_its_losses_needs_no_axes(self):
-        waiting, axes = Motion(started=False), Axes(waiting=1)
+        waiting = Motion(started=False)
+        axes = Axes(waiting=1)
         decision = decide(State.OPEN, Input.PARTLY_OPEN, losses(GAP + 1), waiting, axes)
         assert (decision.state, decision.misplaced) == (State.EXITING, None)
         assert decision.stop is not None

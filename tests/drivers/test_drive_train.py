@@ -50,7 +50,8 @@ def drive_trains(draw):
 
 def by_the_published_formulas(train: DriveTrain, q):
     """Motor revolutions axis by axis, as the wire's description prints them."""
-    kr, cal = train.gear_ratio, train.calibration
+    kr = train.gear_ratio
+    cal = train.calibration
     a = train.joint_sign * q + train.joint_offset
     p = kr * a / TURN + cal
     p[4] = kr[4] * (a[4] - train.k54 * a[3]) / TURN + cal[4]

@@ -308,7 +308,9 @@ class TestBacklog:
     def test_packet_after_an_init_packet_is_not_one_before_it(self):
         """Its number, which is low, would make it look overtaken."""
         rig, _ = moving()
-        on_time, late, init = self.on_time(rig), rig.packet(), rig.init.encode()
+        on_time = self.on_time(rig)
+        late = rig.packet()
+        init = rig.init.encode()
         rig.number = 10
         again = [init, rig.packet(), rig.packet()]
         sent = self.serve(rig, on_time, [late, *again, init, again[1]])
@@ -343,7 +345,8 @@ class TestBacklog:
     @pytest.mark.parametrize("turned", [False, True])
     def test_numbers_far_apart_are_of_two_sessions(self, apart, dropped, turned):
         rig, _ = moving()
-        on_time, first = self.on_time(rig), rig.packet()
+        on_time = self.on_time(rig)
+        first = rig.packet()
         second = (rig.number + apart).to_bytes(4, "little") + first[4:]
         self.serve(rig, on_time, [second, first] if turned else [first, second])
         assert rig.session.counters.discarded.get("late", 0) == dropped
@@ -366,13 +369,15 @@ class TestBacklog:
 
     def test_init_packet_in_a_backlog_is_answered(self):
         rig, _ = moving()
-        on_time, late = rig.packet(), rig.packet()
+        on_time = rig.packet()
+        late = rig.packet()
         assert len(self.serve(rig, on_time, [late, rig.init.encode()])) == 3
         assert State.INIT in self.states(rig)
 
     def test_packet_and_duplicate_get_one_reply(self):
         rig, _ = moving()
-        on_time, late = rig.packet(), rig.packet()
+        on_time = rig.packet()
+        late = rig.packet()
         assert len(self.serve(rig, on_time, [late, late])) == 2
         assert rig.session.counters.discarded == {}
 
@@ -444,7 +449,8 @@ class Paced(Link):
 
 @pytest.mark.parametrize("end", ["asked for", "closed link"])
 def test_last_rejections_of_the_link_are_counted(end):
-    link, session = Paced([0.1] * 7), EchoSession()
+    link = Paced([0.1] * 7)
+    session = EchoSession()
     link.rejected = lambda: {"foreign": 1}
     session.reply = link.reply
     exchange(link, session, ends_when=lambda: end == "asked for" and not link.costs)
@@ -453,7 +459,8 @@ def test_last_rejections_of_the_link_are_counted(end):
 
 
 def test_rejections_are_counted_every_hundred_packets():
-    link, session = Paced([0.1] * 250), EchoSession()
+    link = Paced([0.1] * 250)
+    session = EchoSession()
     readings = []
     link.rejected = lambda: readings.append(link.number) or {}
     session.reply = link.reply
@@ -464,7 +471,8 @@ def test_rejections_are_counted_every_hundred_packets():
 @pytest.mark.parametrize("stamped", [True, False], ids=["stamped", "unstamped"])
 class TestLateness:
     def run(self, costs, *, state=State.OPEN, stamped=True, patient=False, max_late=2):
-        link, session = Paced(costs, patient=patient, stamped=stamped), EchoSession()
+        link = Paced(costs, patient=patient, stamped=stamped)
+        session = EchoSession()
         session.state = state
         session.reply = link.reply
         exchange(link, session, ends_when=lambda: False, max_late=max_late)
@@ -495,7 +503,8 @@ class TestLateness:
         assert session.stops == []
 
     def test_packets_without_a_reply_are_not_replied_to_late(self, stamped):
-        link, session = Paced([1.2] + [0.1] * 10, stamped=stamped), EchoSession()
+        link = Paced([1.2] + [0.1] * 10, stamped=stamped)
+        session = EchoSession()
         session.state = State.OPEN
 
         def reply(packet, now):
@@ -518,7 +527,8 @@ class TestLateness:
 @pytest.mark.parametrize("slower", [0.0, 0.0001, 0.005])
 def test_estimated_arrivals_count_no_reply_as_late(slower):
     """Nor where the cycle of the controller is slightly longer than stated."""
-    link, session = Paced([0.95] * 20_000, stamped=False, slower=slower), EchoSession()
+    link = Paced([0.95] * 20_000, stamped=False, slower=slower)
+    session = EchoSession()
     arrivals = []
     session.reply = lambda packet, now: arrivals.append(now) or link.reply(packet, now)
     exchange(link, session, ends_when=lambda: False)
@@ -549,7 +559,8 @@ class TestFullQueue:
     def test_newest_of_an_old_backlog_gets_no_reply(self, is_open, count, since, replies):
         """While axes are open: a single packet or a recent one gets its reply."""
         rig, source = moving() if is_open else (closed(), None)
-        advances, cycle = getattr(source, "advances", 0), rig.session.cycle
+        advances = getattr(source, "advances", 0)
+        cycle = rig.session.cycle
         link = self.serve(rig, [rig.packet() for _ in range(count)], since)
         assert len(link.sent) == replies
         assert rig.session.counters.discarded.get("late", 0) == count - replies

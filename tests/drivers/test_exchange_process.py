@@ -463,7 +463,8 @@ def test_consecutive_late_replies_stop_the_motion():
         exchange.submit(Slow())
         controller.open = True
         controller.cycle(20)
-        ended, begin = [], time.monotonic()
+        ended = []
+        begin = time.monotonic()
         while not ended:
             assert time.monotonic() < begin + 30.0
             controller.post()

@@ -59,7 +59,8 @@ class TestEventLog:
     def log(capacity=4096, events=()):
         """A log with these events: memory, writer, reader."""
         fd = event_log.create(capacity)
-        writer, reader = EventWriter(fd), EventReader(fd)
+        writer = EventWriter(fd)
+        reader = EventReader(fd)
         for event in events:
             writer.write(event)
         return fd, writer, reader
@@ -73,7 +74,9 @@ class TestEventLog:
     @given(st.lists(st.integers(0, 12), max_size=40), st.integers(300, 1100))
     def test_each_event_is_read_in_order_or_counted(self, steps, capacity):
         fd, writer, reader = self.log(capacity)
-        written, seen, reported = 0, [], 0
+        written = 0
+        seen = []
+        reported = 0
         for count in steps:
             for cycle in range(written, written + count):
                 writer.write(PacketRejected("x" * (cycle % 30), cycle))
@@ -118,7 +121,11 @@ class TestEventLog:
 class TestEventLimiter:
     @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 3)), max_size=200))
     def test_sums_are_exact_and_events_few(self, steps):
-        limiter, reported, now, rejected, missed = EventLimiter(), [], 0.0, 0, 0
+        limiter = EventLimiter()
+        reported = []
+        now = 0.0
+        rejected = 0
+        missed = 0
         for count, kind in steps:
             events = [PacketRejected(f"kind {kind}", count), GapSeen(count, round(now * 1000))]
             rejected += count
@@ -208,7 +215,8 @@ class TestLatencyBins:
 class Clock:
     """Time, and another process's heartbeat."""
 
-    time, beat = 1000.0, 1.0
+    time = 1000.0
+    beat = 1.0
 
     def monotonic(self):
         return self.time
@@ -264,7 +272,8 @@ class FakeSession:
         self.receives_packets = True
 
     def events(self):
-        events, self.pending = self.pending, []
+        events = self.pending
+        self.pending = []
         return events
 
     def stop(self, reason):
@@ -408,7 +417,8 @@ class TestSupervisorHeartbeat:
 
     def test_heartbeat_with_the_permission_ends_the_silence(self, bench, monkeypatch):
         """It may arrive between any two readings of one call."""
-        offered, consent = object(), bench.serving._archive.silence
+        offered = object()
+        consent = bench.serving._archive.silence
         bench.step()
         bench.serving._offered = offered
         bench.serving._inbox.identity = bench.control.program_offered = 1

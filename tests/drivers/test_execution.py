@@ -12,7 +12,8 @@ from tests.messages import DID_NOT_COME_TO_REST, MOTION_BEING_STOPPED
 pytestmark = pytest.mark.safety
 
 N = 2
-SETTLE, STOP = 3, 5
+SETTLE = 3
+STOP = 5
 HERE = np.array([0.5, -0.25])
 
 
@@ -24,7 +25,8 @@ class Motion:
         self.calls = []
         for name in ("stop", "hold", "resume"):
             setattr(self, name, lambda name=name: self.calls.append(name))
-        self.step, self.speed = step, speed
+        self.step = step
+        self.speed = speed
         self.bounds = "plan"
 
     def begin(self, position):
@@ -150,7 +152,8 @@ class Careless(Motion):
 
 def test_arrays_of_the_session_are_not_those_of_the_source():
     execution = requested(Careless())
-    here, speed = HERE.copy(), np.zeros(N)
+    here = HERE.copy()
+    speed = np.zeros(N)
     execution.begin(here, 0)
     first, _, _ = execution.advance(1)
     before = first.copy()

@@ -101,9 +101,11 @@ class TestLimits:
 @given(st.integers(0, N - 1), NOT_FINITE)
 def test_values_that_are_not_finite_are_refused(joint, value):
     """Of any joint, before any other violation."""
-    row, far = at(joint, 1.0), at(1, 100.0)
+    row = at(joint, 1.0)
+    far = at(1, 100.0)
     row[joint] = value
-    guard, set_points = Guard(limits(), PERIOD), begun(limits())
+    guard = Guard(limits(), PERIOD)
+    set_points = begun(limits())
     for check, *arguments in (
         (set_points.check_set_point, row, REST, "plan"),
         (begun(limits()).check_set_point, START, row, "plan"),
@@ -127,16 +129,22 @@ def test_motion_within_its_jerk_passes(shares, factor):
     """The k-th difference of a motion is a mean of its k-th derivative."""
     far = np.full(N, 1e6)
     guard = begun(limits(acceleration=far, velocity=far, lower=-far, upper=far))
-    bounds, jerks = {1.0: "plan", 1.7: "override", 3.0: "stop"}[factor], 100.0 * np.array(shares)
-    q, v, a = START[5], 0.0, 0.0
+    bounds = {1.0: "plan", 1.7: "override", 3.0: "stop"}[factor]
+    jerks = 100.0 * np.array(shares)
+    q = START[5]
+    v = 0.0
+    a = 0.0
     for jerk in factor * jerks:
         step = v * PERIOD + a * PERIOD**2 / 2 + jerk * PERIOD**3 / 6
-        q, v, a = q + step, v + a * PERIOD + jerk * PERIOD**2 / 2, a + jerk * PERIOD
+        q = q + step
+        v = v + a * PERIOD + jerk * PERIOD**2 / 2
+        a = a + jerk * PERIOD
         guard.check_set_point(np.append(START[:5], q), at(5, step / PERIOD), bounds, 1)
 
 
 class TestPositions:
-    LOWER, UPPER = -1.0, 0.2
+    LOWER = -1.0
+    UPPER = 0.2
 
     @joints
     @pytest.mark.parametrize("limit", [LOWER, UPPER])
@@ -156,7 +164,8 @@ class TestPositions:
 
     @joints
     def test_range_applies_at_any_speed(self, joint):
-        guard, speed = only(), at(joint, 1.5)
+        guard = only()
+        speed = at(joint, 1.5)
         edge = START + at(joint, 2.0 - START[joint])
         guard.check_set_point(edge, speed, "plan", 1)
         guard.check_set_point(edge, -speed, "plan", 2)
@@ -192,7 +201,8 @@ class TestRates:
         kind, bound, order, limit, step, stated = RATE_EDGES[edge]
         limit *= (1.0, *FACTORS[bounds])[order]
         x = at(joint, sign * limit)
-        passes, fails = only(**dict([bound])), only(**dict([bound]))
+        passes = only(**dict([bound]))
+        fails = only(**dict([bound]))
         below, above = ((START + step * s * x, stated * s * x) for s in (JUST_BELOW, JUST_ABOVE))
         passes.check_set_point(*below, bounds, 1)
         error = refused(kind, fails.check_set_point, *above, bounds, 1)
@@ -214,7 +224,8 @@ class TestRates:
         last_bit = np.spacing(start)
 
         def toggle(bits: float, stated: float = 0.0) -> None:
-            guard, before = begun(limits(**wide | {name: np.full(N, 1e-12)}), start), start
+            guard = begun(limits(**wide | {name: np.full(N, 1e-12)}), start)
+            before = start
             for cycle, up in enumerate([1, 0, 1, 1, 0, 0, 1]):
                 row = start + up * bits * last_bit
                 guard.check_set_point(row, stated * (row - before) / PERIOD, "plan", cycle)
@@ -251,10 +262,12 @@ class TestRates:
         refused(Check.JERK, guard.check_set_point, step, REST, "plan", 10)
 
     def test_the_first_joint_of_the_first_check_that_fails(self):
-        guard, moved = only(velocity=0.5, jerk=50.0), at(1, 60.0 * T**3) + at(4, T)
+        guard = only(velocity=0.5, jerk=50.0)
+        moved = at(1, 60.0 * T**3) + at(4, T)
         step = START + moved
         assert refused(Check.VELOCITY, guard.check_set_point, step, moved / T, "plan", 1).joint == 4
-        guard, both = only(velocity=0.5), START + at(1, T) + at(4, T)
+        guard = only(velocity=0.5)
+        both = START + at(1, T) + at(4, T)
         assert refused(Check.VELOCITY, guard.check_set_point, both, REST, "plan", 1).joint == 1
         q = at(1, -3.0) + at(4, 3.0)
         error = refused(Check.POSITION, Guard(limits(), PERIOD).begin, q, 2)
@@ -315,7 +328,8 @@ EDGES_OF_FEEDBACK = {
 @pytest.mark.parametrize("edge", EDGES_OF_FEEDBACK)
 def test_bounds_of_feedback_and_start(edge, joint, sign):
     kind, bound, below, check = EDGES_OF_FEEDBACK[edge]
-    guard, x = Guard(limits(), PERIOD), at(joint, sign * bound)
+    guard = Guard(limits(), PERIOD)
+    x = at(joint, sign * bound)
     check(guard, x * below, EVERY)
     check(guard, 1e3 * x, np.arange(N) != joint)
     error = refused(kind, check, guard, x * JUST_ABOVE, EVERY)
@@ -331,7 +345,8 @@ def test_joints_left_out_of_feedback_pass_any_threshold():
 
 def test_narrower_limits_of_the_controller():
     """NaN is no limit; new limits replace old ones."""
-    guard, nothing = Guard(limits(), PERIOD), np.full(N, np.nan)
+    guard = Guard(limits(), PERIOD)
+    nothing = np.full(N, np.nan)
     guard.narrow(at(1, 1.0) + at(0, 3.0) + 0.5, at(1, 4.5) + at(0, 30.0) + 5.0)
     np.testing.assert_array_equal(guard.following_error, [2.0, 1.5, 0.5, 0.5, 0.5, 0.5])
     np.testing.assert_array_equal(guard.current, [20.0, 9.5, 5.0, 5.0, 5.0, 5.0])
@@ -356,7 +371,8 @@ class TestAfterGap:
     )
     @pytest.mark.parametrize("way", [-1.0, 1.0])
     def test_the_target_s_velocity_is_the_one_sent(self, joint, sign, sent, off, way):
-        guard, step = Guard(limits(), PERIOD), at(joint, sign * sent)
+        guard = Guard(limits(), PERIOD)
+        step = at(joint, sign * sent)
         # The arm does as commanded.
         measured = np.array([step + at(joint, way * off * 0.999), step])
         guard.check_after_gap(REST, measured, REST, step, 1, EVERY)
@@ -368,7 +384,8 @@ class TestAfterGap:
         check(REST, measured, REST, step, 1, np.arange(N) != joint)
 
     def test_velocity_of_the_arm(self, joint, sign):
-        check, step = Guard(limits(), PERIOD).check_after_gap, at(joint, sign * 4e-3)
+        check = Guard(limits(), PERIOD).check_after_gap
+        step = at(joint, sign * 4e-3)
         stands = np.array([step, at(joint, sign * 5e-4)])
         error = refused(Check.GAP_VELOCITY, check, REST, stands, REST, step, 3, EVERY)
         assert error.joint == joint
@@ -379,7 +396,9 @@ class TestAfterGap:
     @names
     def test_after_a_pause_the_arm_moves_as_the_set_points_sent_last(self, joint, sign, bounds):
         """But for what a servo gains in 50 ms at the acceleration allowed."""
-        guard, speed, q = only(acceleration=8.0), at(joint, sign), START
+        guard = only(acceleration=8.0)
+        speed = at(joint, sign)
+        q = START
         guard.resume_from(q, speed, 0)
         for cycle in range(3):
             q = q + PERIOD * speed
@@ -394,7 +413,9 @@ class TestAfterGap:
             guard.check_after_pause(other, 5, np.arange(N) != joint)
 
     def test_extrapolated_steps_have_bounded_acceleration_and_jerk(self, joint, sign):
-        guard, q, step = Guard(limits(), PERIOD), START, at(joint, sign * 1.5 * PERIOD)
+        guard = Guard(limits(), PERIOD)
+        q = START
+        step = at(joint, sign * 1.5 * PERIOD)
         bound = 2.0 * 8.0 * PERIOD**2  # of a stop, per cycle
         guard.resume_from(q, step / PERIOD, 2)
         for way in (1.0, -1.0, 1.0, -1.0):

@@ -72,7 +72,8 @@ class TestRing:
     def test_each_record_is_read_in_order_or_counted(self, steps):
         ring = CycleRing.shared(1, 10)
         reader = RingReader(ring.fd, 1)
-        seen, written = [], 0
+        seen = []
+        written = 0
         for count in steps:
             write(ring, range(written, written + count))
             written += count

@@ -194,7 +194,8 @@ def at_speed(cycles: int = 600, speed: float = 1.9, **options) -> Rig:
 
 def report_late(rig: Rig) -> None:
     """Make the controller accept replies, and report its target, a cycle late."""
-    follow, late = rig._follow, [rig.axes["d"].copy()]
+    follow = rig._follow
+    late = [rig.axes["d"].copy()]
 
     def follow_late(answer):
         follow(answer)
@@ -228,11 +229,14 @@ class TestLostReplies:
     def test_one_step_at_each_speed(self, share, lost, continues):
         """Until it is accepted, and in each later cycle up to rest."""
         rig = at_speed(speed=1.9 * share)
-        target, last, before = rig.axes["d"][0, 0], 0.0, rig.session.cycle
+        target = rig.axes["d"][0, 0]
+        last = 0.0
+        before = rig.session.cycle
         lose(rig, lost)
         for _ in range(30):
             answer = rig.cycle()
-            step, target = answer.axes["d"][0, 0] - target, answer.axes["d"][0, 0]
+            step = answer.axes["d"][0, 0] - target
+            target = answer.axes["d"][0, 0]
             assert -1e-5 <= step <= 1.001 * share * STEP
             assert last == 0.0 or abs(step - last) <= PULL
             last = step
@@ -245,7 +249,8 @@ class TestLostReplies:
 
     def test_motion_omits_nothing(self):
         """Except for repetitions, the set-points are those of a motion without losses."""
-        rig, other = at_speed(100), at_speed(100)
+        rig = at_speed(100)
+        other = at_speed(100)
         np.testing.assert_array_equal(lose(rig, 1).axes, lose(rig, 1).axes)
         rig.cycle(60)
         other.cycle(60)
@@ -325,7 +330,8 @@ class TestGaps:
         rig.cycle()
         assert source.advances == 301
         assert rig.seen(GapSeen) == [GapSeen(missed, rig.records["cycle"][-1])]
-        last, before = rig.records[-1], rig.records[-2]
+        last = rig.records[-1]
+        before = rig.records[-2]
         assert (last["gap"], last["cycle"] - before["cycle"]) == (missed, missed + 1)
         assert (rig.state, source.stops) == (State.OPEN, missed == 3)
         if missed == 3:
@@ -465,10 +471,12 @@ class TestLongGaps:
     def test_a_target_reported_late_is_further_on_by_now(self, late):
         """The set-point after the gap is one step from where the controller has its target."""
         rig = running(planned())
-        targets, d = [rig.axes["d"][:, 0].copy()] * 4, rig.axes["d"]
+        targets = [rig.axes["d"][:, 0].copy()] * 4
+        d = rig.axes["d"]
 
         def report():
-            now, before = targets[-1 - late], targets[-2 - late]
+            now = targets[-1 - late]
+            before = targets[-2 - late]
             d[:, 0], d[:, 1] = now, now - before
             # An arm that lags behind.
             d[:, 2], d[:, 3] = targets[-1], 0.9 * (targets[-1] - targets[-2])
@@ -698,7 +706,8 @@ class TestTargets:
         sent.refuse(25.0)
 
     def test_selected_joints(self):
-        sent, others = Sent(0.24), np.arange(N) != 1
+        sent = Sent(0.24)
+        others = np.arange(N) != 1
         assert sent.check(9.0, where=others) == 0
         assert sent.check(-1.0, where=others) == 0
         sent.refuse(9.0, where=~others)
@@ -745,7 +754,8 @@ class TestSentAgain:
         ],
     )
     def test_each_is_counted_once(self, steps, behind, counts, way):
-        sent, counted = Sent(way * SENT_STEP), []
+        sent = Sent(way * SENT_STEP)
+        counted = []
         for step, back in zip(steps, behind, strict=True):
             counted.append(sent.check(-back))
             sent.add(step)

@@ -255,9 +255,11 @@ def test_internal_error_requests_drive_off(where, monkeypatch):
     def fails(*_, **__):
         raise MemoryError("no room")
 
-    owner, name = rig.guard, "check_set_point"
+    owner = rig.guard
+    name = "check_set_point"
     if where != "guard":
-        owner, name = rig.session, "_record"
+        owner = rig.session
+        name = "_record"
     monkeypatch.setattr(owner, name, fails)
     assert all_drive_off(rig.cycle())
     assert "the session failed: MemoryError: no room" in str(rig.refusal)

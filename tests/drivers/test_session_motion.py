@@ -60,7 +60,8 @@ class TestMotion:
 
     @pytest.mark.parametrize("mode", [4, 5])
     def test_motion_in_cycles_of_1_ms(self, mode):
-        rig, source = Rig(mode=mode, period=0.001), smooth_move(MOVE, 600)
+        rig = Rig(mode=mode, period=0.001)
+        source = smooth_move(MOVE, 600)
         source.velocities = np.diff(source.positions, axis=0, prepend=source.positions[:1]) / 0.001
         rig.session.request(source)
         rig.open()

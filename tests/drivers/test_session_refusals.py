@@ -57,7 +57,8 @@ class TestRefusedSetPoints:
     @pytest.mark.parametrize("value", NOT_FINITE)
     @pytest.mark.parametrize("part", ["position", "velocity"])
     def test_not_finite(self, value, part):
-        rows, velocities = np.tile(START, (5, 1)), np.zeros((5, N))
+        rows = np.tile(START, (5, 1))
+        velocities = np.zeros((5, N))
         (rows if part == "position" else velocities)[4, 3] = value
         rig = running(Table(rows, velocities))
         answer = rig.cycle(4)
@@ -273,7 +274,8 @@ class TestFollowingError:
         rig.axes["d"][3, 2] -= 2.01
         rig.cycle(mode=Mode.CLOSED)
         rig.cycle(status=0)
-        rig.status, rig.modes = 5, Mode.POSITION
+        rig.status = 5
+        rig.modes = Mode.POSITION
         assert all_drive_off(rig.cycle())
 
 
@@ -450,7 +452,8 @@ def test_lost_reply_is_counted_in_its_interval_only():
 class TestExit:
     """Requests for the end of open mode, with short limits."""
 
-    RETRY, TIMEOUT = 10, 25
+    RETRY = 10
+    TIMEOUT = 25
 
     @pytest.fixture(autouse=True)
     def short(self, monkeypatch):
@@ -488,7 +491,8 @@ def test_missed_cycles_count_as_time_to_leave():
     assert rig.exits_asked == 2
     rig.cycle()
     assert rig.exits_asked == 3
-    begun, answer = rig.session.entered_at, None
+    begun = rig.session.entered_at
+    answer = None
     while rig.session.cycle - begun < TIMEOUT:
         assert rig.state is State.EXITING
         rig.miss(399)

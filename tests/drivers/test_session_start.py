@@ -141,7 +141,8 @@ class TestReplies:
 
     def test_number_too_far_ahead_is_stale(self):
         rig = closed()
-        answered, old = rig.number, rig.transcript[-1][0]
+        answered = rig.number
+        old = rig.transcript[-1][0]
         rig.number = answered + 500
         assert rig.cycle() is None, "1 s is 500 cycles; this one is 501 ahead"
         rig.number = answered + 499
@@ -329,7 +330,8 @@ def test_drive_off_has_zeros_for_values_not_finite():
 
 
 def test_packets_with_the_same_modes_are_classified_once():
-    classifier, modes = PacketClassifier(np.arange(2), (1, 1), 1, 4), np.array([4, 4], np.int32)
+    classifier = PacketClassifier(np.arange(2), (1, 1), 1, 4)
+    modes = np.array([4, 4], np.int32)
     first = classifier.classify(bytes(4), modes)
     assert classifier.classify(bytes(4), modes.copy()) is first
     modes[1] = 0

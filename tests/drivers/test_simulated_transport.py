@@ -127,7 +127,8 @@ class TestFaults:
     def test_effect(self, name):
         faults, expected, accepted, surplus, late = CASES[name]
         peer = Script(packets(len(accepted)))
-        transport, seen = SimulatedTransport(peer, faults), []
+        transport = SimulatedTransport(peer, faults)
+        seen = []
         with pytest.raises(TransportClosed):
             while True:
                 packet = transport.receive(1.0)

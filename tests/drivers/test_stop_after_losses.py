@@ -120,7 +120,8 @@ def lose_slowing(lost: int, others: float = 0.95):
     The first slows down by a factor of 0.95, the others by `others`.
     """
     rig = running(planned(), 60, guard_limits=limits(**FAR))
-    follow, d = rig._follow, rig.axes["d"]
+    follow = rig._follow
+    d = rig.axes["d"]
 
     def brake(answer):
         d[:, 1] = 0.0
@@ -161,7 +162,9 @@ def test_only_the_first_step_of_a_stop_may_be_a_jump(waits, passes):
     """Of acceleration: from the speed of the arm, here none, to that of the source."""
     far = limits(**FAR, acceleration=np.full(N, 80.0))
     rig = at_speed(1200, speed=0.2, guard_limits=far)
-    source, resumed, calls = rig.session.execution._source, resumptions(rig), []
+    source = rig.session.execution._source
+    resumed = resumptions(rig)
+    calls = []
     move = source.advance
 
     def advance():

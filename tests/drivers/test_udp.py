@@ -32,7 +32,8 @@ class Controller:
         self.socket.bind((host, 0))
         self.socket.connect((HOST, transport.address[1]))
         self.socket.settimeout(PATIENCE)
-        self.send, self.close = self.socket.send, self.socket.close
+        self.send = self.socket.send
+        self.close = self.socket.close
         self.replies: list[bytes] = []
 
     def wait(self) -> None:
@@ -315,7 +316,8 @@ class TestArrival:
     def test_long_queueing_time_is_reported(self, transport, controller):
         controller.send(bytes(48))
         sent = transport.now
-        clock, wall = time.monotonic, time.time
+        clock = time.monotonic
+        wall = time.time
         with (
             patch("time.monotonic", lambda: clock() + 60.0),
             patch("time.time", lambda: wall() + 60.0),

@@ -81,7 +81,8 @@ def cycles(warm_up):
 
 @pytest.mark.parametrize("period", [0.001, 0.002])
 def test_it_holds_the_middle_of_the_range_in_open_mode(period):
-    lower, upper = np.linspace(-3.0, -1.0, N), np.linspace(1.0, 2.5, N)
+    lower = np.linspace(-3.0, -1.0, N)
+    upper = np.linspace(1.0, 2.5, N)
     warm_up = WarmUp(drive_train(), limits(lower=lower, upper=upper), period)
     assert warm_up.session.state is State.OPEN
     answer = CyclicPacket.decode(warm_up.reply, N)

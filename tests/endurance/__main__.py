@@ -109,7 +109,8 @@ def sampled(
     link: LiveLink, pids: dict[str, int], journal: Journal, seconds: float, stop: Stop, task: Task
 ) -> Iterator[None]:
     """Sample memory, threads, counters and latencies in a thread; stop when the time is over."""
-    over, began = threading.Event(), time.monotonic()
+    over = threading.Event()
+    began = time.monotonic()
 
     def sample() -> None:
         status = link.port.exchange.status()
@@ -160,7 +161,9 @@ def run_campaign(
     campaign: Campaign, link: LiveLink, simulator: SimulatorProcess, stop: Stop
 ) -> dict[str, Any]:
     """Run and resume a campaign until it is complete; return the facts for the journal."""
-    before, errors, complete = link.port.exchange.status().ended_count, list[str](), False
+    before = link.port.exchange.status().ended_count
+    errors = list[str]()
+    complete = False
     lasting: Any = Lasting(link)
     while not (complete or stop.requested or len(errors) == TRIES):
         try:
@@ -191,7 +194,8 @@ def archived(folder: Path) -> dict[str, Any]:
     paths = sorted(folder.glob("*.mcap"))
     for path in paths:
         try:
-            check, archive = check_archive(path), open_archive(path, fields=())
+            check = check_archive(path)
+            archive = open_archive(path, fields=())
         except HilError as error:
             faulty.append(str(error))
             continue
@@ -241,7 +245,8 @@ def main(arguments: list[str] | None = None) -> int:
         pieces = read_journal(chosen.journal)  # before anything is appended to another file
         if not chosen.merge:
             with stop_on_interrupt() as stop:
-                duration, progress = 60.0 * chosen.minutes, reporter(quiet=chosen.json)
+                duration = 60.0 * chosen.minutes
+                progress = reporter(quiet=chosen.json)
                 run_piece(chosen.folder, chosen.journal, duration, chosen.rate, stop, progress)
             pieces = read_journal(chosen.journal)
     except JournalError as error:

@@ -46,10 +46,8 @@ def faults(piece: Piece) -> Iterator[str]:
         if end["reason"] not in ("", "interrupted"):
             yield f"ended early: {end['reason']}"
     for campaign in piece.campaigns:
-        what, moved = (
-            [*campaign["faulty"]],
-            campaign["archives"] - campaign["outcomes"].get("void", 0),
-        )
+        what = [*campaign["faulty"]]
+        moved = campaign["archives"] - campaign["outcomes"].get("void", 0)
         if not campaign["complete"] and not campaign["stopped"]:
             what.append(f"abandoned after {campaign['restarts']}")
         if not campaign["stopped"] and moved != campaign["motions"]:
@@ -71,7 +69,8 @@ def growth(piece: Piece) -> Iterator[str]:
     """
     if not piece.is_long:
         return
-    samples, over = piece.samples, piece.samples[-1]["t"]
+    samples = piece.samples
+    over = piece.samples[-1]["t"]
     first = [sample for sample in samples if 0.5 * BLOCK <= sample["t"] < 1.5 * BLOCK]
     last = [sample for sample in samples if sample["t"] >= over - BLOCK]
     for name in PROCESSES:

@@ -29,7 +29,8 @@ Change = Callable[[Line], None]
 def piece(change: Change = lambda _: None, **campaign: Any) -> Piece:
     """80 minutes with noise; a change of each sample, and of the last campaign."""
     rng = np.random.default_rng(1)
-    samples, counts = [], np.zeros(BINS, np.int64)
+    samples = []
+    counts = np.zeros(BINS, np.int64)
     for second in range(0, SECONDS + 1, 5):
         sample: Line = {
             "t": float(second),
@@ -101,7 +102,8 @@ def test_hours_without_a_fault_pass_and_short_runs_warn() -> None:
 
 
 def test_pieces_of_a_journal_are_merged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, original = tmp_path / "j.jsonl", piece()
+    path = tmp_path / "j.jsonl"
+    original = piece()
     for _ in range(2):
         with Journal(path) as journal:
             journal.add(kind="begin", **original.begun)

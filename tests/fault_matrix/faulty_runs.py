@@ -209,12 +209,14 @@ class JudgedSession(Judged):
 
     def events(self) -> list[Any]:
         self.read_events()
-        events, self._logged.pending = self._logged.pending, []
+        events = self._logged.pending
+        self._logged.pending = []
         return events
 
     def request(self, source: TrajectoryPlayer) -> None:
         self._logged.request(source)
-        self.conduct.entitled, self.conduct.stopping = True, False
+        self.conduct.entitled = True
+        self.conduct.stopping = False
 
     def stop(self, reason: str) -> None:
         self._logged.stop(reason)

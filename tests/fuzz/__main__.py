@@ -26,7 +26,8 @@ from tests.fuzz import targets
 
 ROOT = Path(__file__).resolve().parents[2]
 OURS = ("hil", "drivers", "planner", "identification", "sim_fixtures")
-INPUT, TRACEBACK = "input", "traceback.txt"
+INPUT = "input"
+TRACEBACK = "traceback.txt"
 LONGEST = 5  # s for one input
 MEMORY = 1 << 10  # MB resident
 ADDRESSES = 6 << 30  # bytes of address space, so that an absurd array is refused and not tried
@@ -60,7 +61,8 @@ def fuzz(name: str, minutes: float, folder: Path) -> None:
 
     with atheris.instrument_imports(include=[*OURS, "tomllib", "rosbags", "mcap"]):
         target = targets.load(name)
-    corpus, findings = folder / "corpus", folder / "findings"
+    corpus = folder / "corpus"
+    findings = folder / "findings"
     for made in (corpus, findings):
         made.mkdir(parents=True, exist_ok=True)
     for data in target.seeds():  # named as libFuzzer names them

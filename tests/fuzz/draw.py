@@ -79,7 +79,8 @@ def mutate_bytes(data: bytes, most: int, seed: int) -> bytes:
 
 
 def _change(data: bytearray, rng: random.Random) -> None:
-    at, length = rng.randrange(len(data)), rng.choice((1, 2, 4, 8, 36, 64))
+    at = rng.randrange(len(data))
+    length = rng.choice((1, 2, 4, 8, 36, 64))
     kind = rng.randrange(7)
     if kind == 0:
         data[at] ^= 1 << rng.randrange(8)
@@ -139,7 +140,8 @@ def _of_tokens(text: str, rng: random.Random) -> str:
 
 def _of_lines(text: str, rng: random.Random) -> str:
     lines = text.splitlines(keepends=True) or [""]
-    at, other = rng.randrange(len(lines)), rng.randrange(len(lines))
+    at = rng.randrange(len(lines))
+    other = rng.randrange(len(lines))
     kind = rng.randrange(4)
     if kind == 0:
         del lines[at : at + rng.choice((1, 1, 3))]

@@ -176,7 +176,8 @@ def _mutated(data: bytes, rng: random.Random, mutate: Mutation = mutate_bytes) -
 
 def _shuffled(records: list[Record], rng: random.Random) -> None:
     """Remove, repeat or exchange records, or change the kind of one."""
-    at, other = rng.randrange(len(records)), rng.randrange(len(records))
+    at = rng.randrange(len(records))
+    other = rng.randrange(len(records))
     kind = rng.randrange(4)
     if kind == 0 and len(records) > 1:
         del records[at]
@@ -193,7 +194,8 @@ def _of_a_message(message: Record, rng: random.Random) -> None:
     if message.opcode != container.MESSAGE or len(message.body) < _MESSAGE.size:
         message.body = _mutated(message.body, rng)
         return
-    head, data = list(_MESSAGE.unpack_from(message.body)), message.body[_MESSAGE.size :]
+    head = list(_MESSAGE.unpack_from(message.body))
+    data = message.body[_MESSAGE.size :]
     kind = rng.randrange(6)
     if kind < 4:
         strange = (0, 1, head[kind] + 1, head[kind] - 1, 2**63, 2**16 - 1, 2**32 - 1)

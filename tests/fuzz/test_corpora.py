@@ -14,7 +14,8 @@ from tests.fuzz.targets import CORPORA
 
 pytestmark = pytest.mark.safety
 
-MOST_FILES, MOST_BYTES = 40, 200_000
+MOST_FILES = 40
+MOST_BYTES = 200_000
 
 
 def inputs(name: str) -> list[bytes]:
@@ -24,7 +25,8 @@ def inputs(name: str) -> list[bytes]:
 
 @pytest.mark.parametrize("name", targets.NAMES)
 def test_corpus_is_small_and_violates_no_law(name: str) -> None:
-    target, corpus = targets.load(name), inputs(name)
+    target = targets.load(name)
+    corpus = inputs(name)
     assert 0 < len(corpus) <= MOST_FILES
     assert len(set(corpus)) == len(corpus)
     assert sum(map(len, corpus)) <= MOST_BYTES
@@ -47,7 +49,8 @@ def test_well_formed_input_is_accepted(name: str) -> None:
 
 @pytest.mark.parametrize("name", targets.NAMES)
 def test_changes_violate_no_law(name: str) -> None:
-    target, corpus = targets.load(name), inputs(name)
+    target = targets.load(name)
+    corpus = inputs(name)
     for seed in range(target.replayed):
         target.run(target.mutate(corpus[seed % len(corpus)], target.most, seed))
 
@@ -55,7 +58,8 @@ def test_changes_violate_no_law(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", targets.NAMES)
 def test_many_changes_violate_no_law(name: str) -> None:
-    target, rng = targets.load(name), random.Random(name)
+    target = targets.load(name)
+    rng = random.Random(name)
     pool = inputs(name)
     for _ in range(20 * target.replayed):
         data = target.mutate(rng.choice(pool), target.most, rng.getrandbits(32))

@@ -101,7 +101,8 @@ def test_cell_whose_link_is_an_inline_table_is_changed(tmp_path: Path) -> None:
 
 def log(path: Path, value: float = 0.0, kind: str = "f8", last: float = 6e-3) -> None:
     """Import a log with this position in its third row; check that no archive is left."""
-    position, time = np.zeros((4, 2), kind), np.array([0.0, 2e-3, 4e-3, last])
+    position = np.zeros((4, 2), kind)
+    time = np.array([0.0, 2e-3, 4e-3, last])
     position[2, 1] = value
     np.savez(path.with_name("log.npz"), q=position, t=time)
     output = path.with_name("o.mcap")
@@ -182,7 +183,8 @@ def test_number_out_of_range_is_refused(
 
 def test_signalling_nan_is_sent_over_can() -> None:
     """To the bit, as any other word."""
-    sender, receiver = End(BusRates(), UP), End(BusRates(), DOWN)
+    sender = End(BusRates(), UP)
+    receiver = End(BusRates(), DOWN)
     packet = CyclicPacket.zeros(11, 1)
     packet.axes.view(np.int32)[1] = 0x7F800001
     sent = packet.encode()

@@ -66,7 +66,9 @@ def test_a_planted_defect_is_found(what: str, monkeypatch: pytest.MonkeyPatch) -
     """By an input of the corpus, or of archives by a change of one."""
     name, owner, attribute, value, wanted = PLANTED[what]
     monkeypatch.setattr(owner, attribute, value)
-    target, corpus, causes = targets.load(name), inputs(name), set()
+    target = targets.load(name)
+    corpus = inputs(name)
+    causes = set()
     for seed in range(-len(corpus), 60 if name == "archive" else 0):
         data = corpus[seed % len(corpus)]
         try:

@@ -69,7 +69,8 @@ def motion():
 
 def torque(condition):
     """Of `motion` under a condition (m, 6), by recursive Newton-Euler of pinocchio."""
-    arm, load = pin.buildModelFromXML(cell().urdf), condition.load
+    arm = pin.buildModelFromXML(cell().urdf)
+    load = condition.load
     body = pin.Inertia(load, CENTRE, 0.01 * load * np.eye(3))
     arm.appendBodyToJoint(arm.njoints - 1, body, pin.SE3.Identity())
     data = arm.createData()
@@ -85,7 +86,9 @@ def noise_size():
 
 
 def campaign(condition, k, random):
-    arm, clean, size = model(), torque(condition), noise_size()
+    arm = model()
+    clean = torque(condition)
+    size = noise_size()
     factor = Factor.zero(arm)
     for _ in range(2):
         # Coloured: residuals of torque models remember some tenths of a second.

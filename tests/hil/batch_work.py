@@ -64,7 +64,8 @@ class Held(WorkerPlugin):
     name = "held archive"
 
     def __init__(self, archive, until):
-        self.archive, self.until = archive, until
+        self.archive = archive
+        self.until = until
 
     def setup(self, worker):
         read = discovery.open_archive

@@ -21,8 +21,10 @@ from collections import Counter
 
 HEADER = struct.Struct("<i4s4s")
 AXIS = struct.Struct("<i8f")
-DRIVE_ON, EXIT = 5, 1
-END, DRIVE_OFF = 504, 505
+DRIVE_ON = 5
+EXIT = 1
+END = 504
+DRIVE_OFF = 505
 OPEN_MODES = (1, 2, 4, 5, 7, 8, 9)
 
 
@@ -123,7 +125,8 @@ class Program:
         return reply + bytes(8) + b"".join(blocks)
 
     def while_open(self, reply: bytes, axes: list[list[float]]) -> bytes:
-        options, k = self.options, self.open_cycles
+        options = self.options
+        k = self.open_cycles
         if k == 0:
             self.start = [axis[1] for axis in axes]
             self.excursion = 0.0
@@ -137,7 +140,8 @@ class Program:
         wanted = options.amplitude * (1 - math.cos(2 * math.pi * k / options.sine_period)) / 2
         if leaving:
             wanted = self.excursion
-        step, self.excursion = wanted - self.excursion, wanted
+        step = wanted - self.excursion
+        self.excursion = wanted
         blocks = []
         for i, axis in enumerate(axes):
             moving = i == 0

@@ -66,7 +66,8 @@ def heads(chunk: bytes) -> Iterator[Head]:
 
 def chunks(data: bytes) -> list[tuple[int, int]]:
     """Return begin and end of each chunk of a file."""
-    bounds, at = [], len(container.MAGIC)
+    bounds = []
+    at = len(container.MAGIC)
     while at < len(data) and data[at] != container.DATA_END:
         opcode, end = container.record_bounds(data, at, 0)
         if opcode == container.CHUNK:
@@ -78,7 +79,8 @@ def chunks(data: bytes) -> list[tuple[int, int]]:
 def with_attachment(source: Path, target: Path, old: str, new: str) -> Path:
     """Copy a file with another text of the same length in an attachment, checksum included."""
     assert len(old.encode()) == len(new.encode())
-    data, changed = bytearray(source.read_bytes()), 0
+    data = bytearray(source.read_bytes())
+    changed = 0
     with source.open("rb") as stream:
         for record in container.records(stream, len(data)):
             if record.opcode == container.ATTACHMENT and old.encode() in record.body:
@@ -177,7 +179,8 @@ class Indexed:
         """Append a record, given with its head."""
         item = Record(len(self.data), data[0], data[container.RECORD.size :])
         if item.opcode == container.CHUNK:
-            head, parser = container.parse_chunk(item), ChunkParser()
+            head = container.parse_chunk(item)
+            parser = ChunkParser()
             by_channel = parser.messages(container.chunk_data(head, item.offset), item.offset)
             for definition in parser.definitions:
                 self._index.define(definition)

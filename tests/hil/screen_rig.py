@@ -35,7 +35,8 @@ NAMES = ("joint_1", "joint_2")
 
 def status(request: OperatorRequest) -> RunStatus:
     """In the third repetition, with the requested override."""
-    share, zero = np.array([0.1, 0.9]), np.zeros(2)
+    share = np.array([0.1, 0.9])
+    zero = np.zeros(2)
     motion = MotionProgress(
         1.0, 4.0, 1000, 0, 0, 0, State.OPEN, zero, zero, share, zero, share,
         override=request.override, held=request.held,
@@ -115,7 +116,8 @@ def on_terminal(*command: object, columns: int = 80) -> Iterator[Terminal]:
 
 def main() -> int:
     """Run it."""
-    file, ending = Path(sys.argv[1]), sys.argv[2]
+    file = Path(sys.argv[1])
+    ending = sys.argv[2]
     with stop_on_interrupt() as stop, Screen(NAMES, stop, title="rig") as screen:
         with file.open("w", buffering=1) as reported:
             last: OperatorRequest | None = None

@@ -73,7 +73,8 @@ def simulate(
     model = pin.buildModelFromUrdf(str(path))
     model = pin.buildReducedModel(model, [model.getJointId(j) for j in locked], pin.neutral(model))
     model.gravity.linear = np.array(gravity)
-    n, rng = model.nv, np.random.default_rng(seed)
+    n = model.nv
+    rng = np.random.default_rng(seed)
     amplitude = rng.uniform(0.1, 0.3, (5, n)) / np.arange(1, 6)[:, None] ** 0.5
     hertz = 0.08 + 0.13 * np.arange(5)[:, None] + rng.uniform(0.0, 0.04, (5, n))
     rate = pace * 2.0 * np.pi * hertz
@@ -122,7 +123,8 @@ def write_log(path: Path, names: Sequence[str], *columns: Array) -> Path:
 def write_moving_log(path: Path, urdf: str, *, seed: int = 0, duration: float = 8.0) -> Path:
     """Write the log of a simulated motion, its torques those of the URDF's masses and friction."""
     model = pin.buildModelFromXML(urdf)
-    data, rng = model.createData(), np.random.default_rng(seed)
+    data = model.createData()
+    rng = np.random.default_rng(seed)
     time = np.arange(0.0, duration, 0.01)
     rate = rng.uniform(2.0, 8.0, (3, model.nv))
     angle = rate * time[:, None, None] + rng.uniform(0.0, 6.0, rate.shape)

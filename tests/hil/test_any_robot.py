@@ -105,7 +105,8 @@ def test_seven_axes_in_degrees_at_an_uneven_100_hz(tmp_path: Path) -> None:
     time = time[(time < 11.0) | (time > 12.0)]
     simulated = simulate(PANDA, time, locked=FINGERS)
     order = [6, 2, 0, 1, 3, 4, 5]
-    degrees, torque = np.degrees(simulated.position)[:, order], simulated.torque[:, order]
+    degrees = np.degrees(simulated.position)[:, order]
+    torque = simulated.torque[:, order]
     stamp = EPOCH_MS + np.round(time * 1e3, 3)
     table = np.column_stack([degrees, np.full(len(time), 0.04), torque, np.zeros(len(time)), stamp])
     table = np.insert(table, 500, table[499], axis=0)  # a line written twice
@@ -153,7 +154,8 @@ def test_a_standstill_gives_the_noise(tmp_path: Path) -> None:
             noise = POSITION_NOISE * np.random.default_rng(9).standard_normal(
                 simulated.position.shape
             )
-            arrays, quantities = {"q": simulated.position[0] + noise}, {"position": position}
+            arrays = {"q": simulated.position[0] + noise}
+            quantities = {"position": position}
         np.savez(tmp_path / f"{name}.npz", **arrays)
         paths.append(
             import_log(
@@ -189,7 +191,8 @@ def fitted_by(commands: list[str], output: Path) -> FittedResult:
         arguments = shlex.split(command)
         status = 0
         if arguments[0] == "identify":
-            arguments, status = [*arguments, "--output", str(output)], NOT_GOOD
+            arguments = [*arguments, "--output", str(output)]
+            status = NOT_GOOD
         result = CliRunner().invoke(app, arguments)
         assert result.exit_code == status, (command, result.output, result.exception)
     return Results.load(output / "results.json").fitted

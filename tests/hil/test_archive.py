@@ -202,7 +202,8 @@ class TestBadInput:
         assert (tmp_path / NAME).read_bytes() == b"precious"
 
     def test_records_of_another_arm_or_session_are_refused(self, tmp_path):
-        rows, falling = records(100), records(100, first=12_100)
+        rows = records(100)
+        falling = records(100, first=12_100)
         falling["cycle"][60:] -= 30
         refused = [
             (records(100, first=first), f"cycle {first} follows cycle 12099")

@@ -78,7 +78,8 @@ def bits(values: Any, like: NDArray[Any]) -> bytes:
 
 def assert_same_messages(by_topic: dict[str, list[Any]], ours: Archive) -> None:
     """Decoded messages by topic hold what our reader reads."""
-    cycles, measured = by_topic[profile.CYCLE], by_topic[profile.MEASURED]
+    cycles = by_topic[profile.CYCLE]
+    measured = by_topic[profile.MEASURED]
     for name, column in ours.columns.items():
         if name != "stamp":
             assert bits(stacked(cycles, name), column) == column.tobytes(), name
@@ -171,7 +172,8 @@ def test_our_reader_takes_chunks_of_every_compression_and_layout(
 
 def test_a_check_computes_the_index_that_the_library_writes() -> None:
     """For messages of sizes that are not aligned and stamps in any order, metadata in between."""
-    rng, stamps = np.random.default_rng(3), [0, 2**62, 5, 5, 1, 7]
+    rng = np.random.default_rng(3)
+    stamps = [0, 2**62, 5, 5, 1, 7]
     output = io.BytesIO()
     writer: Any = Writer(output, chunk_size=1 << 62, compression=CompressionType.ZSTD)
     writer.start("ros2", "test")

@@ -90,7 +90,8 @@ class Rig:
     """An archive process on this memory."""
 
     def __init__(self, memory: Memory, folder: Path) -> None:
-        self.memory, self.folder = memory, folder
+        self.memory = memory
+        self.folder = folder
         self.process = ArchiveProcessHandle.start(memory, 2)
 
     def open(self, job: int, name: str = NAME, *, until_ended: bool = True) -> Path:
@@ -148,12 +149,14 @@ def complete_archive(path: Path) -> Archive:
 
 class TestArchiveProcess:
     def test_end_with_lost_event_is_detected_by_the_count(self, rig: Rig) -> None:
-        path, memory = rig.open(1), rig.memory
+        path = rig.open(1)
+        memory = rig.memory
         memory.control.program_accepted = 1
         memory.cycles(20)
         memory.events.write(MotionStarted(4, 5))
         wait(lambda: open_archive(path).n_samples >= 0)
-        memory.control.ended_outcome, memory.control.ended_interval = OUTCOMES.index("stopped"), 4
+        memory.control.ended_outcome = OUTCOMES.index("stopped")
+        memory.control.ended_interval = 4
         memory.control.ended_count += 1
         done = rig.closed(1)
         assert (done.outcome, done.interval) == ("stopped", 4)
@@ -162,7 +165,8 @@ class TestArchiveProcess:
         assert [event.name for event in complete_archive(path).events][-1] == "MotionEnded"
 
     def test_events_are_counted_in_the_outcome(self, rig: Rig) -> None:
-        path, memory = rig.open(1, until_ended=False), rig.memory
+        path = rig.open(1, until_ended=False)
+        memory = rig.memory
         memory.cycles(50)
         memory.events.write(RepliesLost(2, 10))
         memory.events.write(PacketRejected("replied to late", 3))
@@ -180,7 +184,8 @@ class TestArchiveProcess:
         assert names >= {"EventsLost", "AnswersLost"}
 
     def test_motion_never_requested_leaves_a_void_archive(self, rig: Rig) -> None:
-        path, memory = rig.open(1), rig.memory
+        path = rig.open(1)
+        memory = rig.memory
         memory.cycles(20)
         rig.process.channel.close()  # the supervisor dies
         time.sleep(0.2)
@@ -192,7 +197,8 @@ class TestArchiveProcess:
         )  # fmt: skip
 
     def test_motion_whose_exchange_died_is_lost(self, rig: Rig) -> None:
-        path, memory = rig.open(1), rig.memory
+        path = rig.open(1)
+        memory = rig.memory
         memory.control.program_accepted = 1
         memory.cycles(20)
         memory.end()

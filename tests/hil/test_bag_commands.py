@@ -53,7 +53,8 @@ class Moved(NamedTuple):
 def a_motion(duration: float = 4.0) -> Moved:
     """Sines which the joints follow 20 ms late."""
     time = np.arange(0.0, duration, 1e-9 * PERIOD)
-    motion, command = four_sines(time, 0.5), four_sines(time + 0.02, 0.5)
+    motion = four_sines(time, 0.5)
+    command = four_sines(time + 0.02, 0.5)
     return Moved(time, motion.position, motion.velocity, command.position)
 
 
@@ -525,7 +526,8 @@ class TestServo:
         self.imported(tmp_path, moved._replace(**{
             name: values[:500] for name, values in moved._asdict().items()
         }))  # fmt: skip
-        bag_path, urdf = tmp_path / "bag.db3", tmp_path / "robot.urdf"
+        bag_path = tmp_path / "bag.db3"
+        urdf = tmp_path / "robot.urdf"
         refused = CliRunner().invoke(app, ["identify", str(bag_path), "--urdf", str(urdf)])
         assert "has neither joint torques nor motor currents" in str(refused.exception)
         assert "`hil import log` and `hil rollout --polish`" in str(refused.exception)

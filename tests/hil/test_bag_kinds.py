@@ -65,7 +65,8 @@ def ros_1_bag(
     compression: Ros1Writer.CompressionFormat | None = None,
 ) -> Path:
     """Write joint states of ROS 2 to a bag of ROS 1."""
-    new, old = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
+    new = get_typestore(Stores.ROS2_HUMBLE)
+    old = get_typestore(Stores.ROS1_NOETIC)
     kinds = (STATE, "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
     state, header, clock = (old.types[kind] for kind in kinds)
     writer = Ros1Writer(path)
@@ -91,7 +92,8 @@ class Typed:
     suffix = "db3"
 
     def __init__(self, urdf: Path, messages: Sequence[Message], *options: str) -> None:
-        self.urdf, self.folder = urdf, urdf.parent
+        self.urdf = urdf
+        self.folder = urdf.parent
         self.path = self.folder / f"bag.{self.suffix}"
         self.path.unlink(missing_ok=True)
         if self.suffix == "bag":

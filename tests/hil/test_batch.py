@@ -56,7 +56,8 @@ NAMES = ("excitation_000", "excitation_001", "excitation_002")
 
 
 def batch(*places, options=FIXED, cache=UNCACHED, cluster=None, **changed):
-    names, options = [str(place) for place in places], replace(options, **changed)
+    names = [str(place) for place in places]
+    options = replace(options, **changed)
     return reidentify(names, options, cluster or Here(), Silent(), cache=cache)
 
 
@@ -149,9 +150,11 @@ class TestNumbers:
         """With the default options, which choose the settings."""
         identified = identify_campaign(campaign.folder.root, Silent()).estimate
         result = batch(campaign.folder.root, options=Options())
-        (level,), (pooled,) = result.campaigns, result.pooled
+        (level,) = result.campaigns
+        (pooled,) = result.pooled
         assert (pooled.level, pooled.campaign) == ("pooled", "")
-        level, pooled = level.estimate, pooled.estimate
+        level = level.estimate
+        pooled = pooled.estimate
         assert pooled.values.tobytes() == level.values.tobytes()
         np.testing.assert_allclose(level.values, identified.pooled.values, **EXACT)
         np.testing.assert_allclose(
@@ -204,8 +207,10 @@ class TestNumbers:
         np.testing.assert_allclose(level.std, identified.pooled.std, rtol=1e-8)
 
     def test_held_out_errors_equal_those_of_samples(self, prepared, batch_result):
-        (level,), model = batch_result.campaigns, prepared.sources.cell.model
-        squares, rows = np.zeros(6), np.zeros(6)
+        (level,) = batch_result.campaigns
+        model = prepared.sources.cell.model
+        squares = np.zeros(6)
+        rows = np.zeros(6)
         for samples in prepared.held_out:
             error = samples.torque - samples.predicted_torque(model, level.estimate.values)
             squares += np.where(samples.usable, error**2, 0.0).sum(axis=0)
@@ -220,7 +225,8 @@ class TestNumbers:
         assert [level.repetitions for level in result.campaigns] == [1, 2]
         assert [level.repetitions for level in result.pooled] == [3]
         # Sums in another order: rounding of poorly determined parameters.
-        mine, theirs = result.pooled[0].estimate, batch_result.pooled[0].estimate
+        mine = result.pooled[0].estimate
+        theirs = batch_result.pooled[0].estimate
         assert np.abs((mine.values - theirs.values) / theirs.std).max() < 1e-6
         np.testing.assert_allclose(mine.std, theirs.std, rtol=1e-6)
 
@@ -314,7 +320,8 @@ class TestBroken:
 
     def test_damaged_archives(self, loose):
         """Also the first excitation, with and without cache."""
-        intact, (truncated, damaged, left) = batch(loose), excitations(loose)
+        intact = batch(loose)
+        (truncated, damaged, left) = excitations(loose)
         truncated.write_bytes(truncated.read_bytes()[:-5000])
         (loose / "nothing.mcap").write_bytes(b"")
         (loose / "other.mcap").write_bytes(b"not an archive at all")
@@ -562,7 +569,8 @@ class TestGroups:
             victim, tmp_path / victim.name, "delay_cycles = 0.2", "delay_cycles = 4.2"
         )
         other.replace(victim)
-        used, reduce_one = {}, reduction.archive_factor
+        used = {}
+        reduce_one = reduction.archive_factor
 
         def spied(ref, settings):
             used[ref.name] = settings.preprocessing.torque_delay
@@ -577,7 +585,8 @@ class TestGroups:
 
     def test_newest_intact_accepted_attempt_is_used(self, tmp_path, arm):
         """Truncated ones as a full disk leaves them; of empty ones only the name is known."""
-        folder, paths = tmp_path / "c" / "archives", {}
+        folder = tmp_path / "c" / "archives"
+        paths = {}
         for index in range(6):
             for number in (1, 2):
                 path = folder / f"imported_{index:03d}_a{number}.mcap"
@@ -626,7 +635,8 @@ class TestMetadata:
         path = recording(tmp_path / "data" / "a.mcap", arm)
         monkeypatch.setattr(discovery, "_UNTOUCHED", 0)
         time.sleep(0.01)  # then its time stamps are trusted
-        opened, read = [], discovery.open_archive
+        opened = []
+        read = discovery.open_archive
 
         def counting(path, **how):
             opened.append(path)

@@ -101,7 +101,8 @@ class Background:
     """A batch in a thread; what it returns or raises."""
 
     def __init__(self, *arguments, **options):
-        self.result, self.error = None, None
+        self.result = None
+        self.error = None
         self.thread = threading.Thread(target=self.run, args=arguments, kwargs=options)
         self.thread.start()
 

@@ -116,7 +116,8 @@ class TestThread:
         client.close()
 
     def test_is_waited_for_when_closed_and_begins_no_other_task(self):
-        begun, go = threading.Event(), threading.Event()
+        begun = threading.Event()
+        go = threading.Event()
         client = ThreadClient()
         first = client.submit(lambda: begun.set() or go.wait(), key="first", pure=False)
         second = client.submit(abs, 1, key="second", pure=False)
@@ -135,7 +136,8 @@ class TestCache:
     @given(st.data())
     def test_entries_with_one_wrong_bit_are_ignored(self, tmp_path, data):
         """Or they are as written, if the bit is one of those that a reader does not need."""
-        cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
+        cache = CacheLocation(str(tmp_path))
+        place = "/data/a.mcap"
         cache.write(place, KEY, self.CONTENT, self.ARRAYS)
         path = cache.path(place, KEY)
         intact = path.read_bytes()
@@ -153,7 +155,8 @@ class TestCache:
     @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(st.data())
     def test_texts_with_a_wrong_bit_or_cut_short_are_ignored(self, tmp_path, data):
-        cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
+        cache = CacheLocation(str(tmp_path))
+        place = "/data/a.mcap"
         cache.put(place, KEY, self.CONTENT)
         path = cache.path(place, KEY, JSON)
         intact = path.read_bytes()
@@ -167,7 +170,8 @@ class TestCache:
 
     @pytest.mark.parametrize("suffix", [NPZ, JSON])
     def test_entries_of_another_key_are_ignored(self, tmp_path, suffix):
-        cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
+        cache = CacheLocation(str(tmp_path))
+        place = "/data/a.mcap"
         cache.write(place, KEY, self.CONTENT, {})
         cache.put(place, KEY, self.CONTENT)
         other = cache.path(place, KEY[::-1], suffix)
@@ -187,7 +191,8 @@ class TestCache:
         ],
     )
     def test_forged_reductions_are_ignored(self, tmp_path, content, arrays):
-        stated, cache = Settings(Preprocessing()), CacheLocation(str(tmp_path))
+        stated = Settings(Preprocessing())
+        cache = CacheLocation(str(tmp_path))
         cache.write(a_ref(0).location, reduction_key([a_ref(0)], stated), content, arrays)
         assert cached_reduction([a_ref(0)], stated, cache) is None
 
@@ -204,13 +209,15 @@ class TestCache:
     )
     def test_forged_arrays_are_not_read(self, tmp_path, layout, numbers):
         """Objects, of which a pickle would make some, and arrays that are not there."""
-        cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
+        cache = CacheLocation(str(tmp_path))
+        place = "/data/a.mcap"
         np.savez(self.new(cache, place), **{HEADER: self.header(layout), NUMBERS: numbers})
         assert cache.read(place, KEY) is None
 
     def test_compressed_entries_are_not_read(self, tmp_path):
         """They may be a thousand times as large in memory."""
-        cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
+        cache = CacheLocation(str(tmp_path))
+        place = "/data/a.mcap"
         header = self.header({"values": ["<f8", [100_000]]})
         arrays = {HEADER: header, NUMBERS: np.zeros(800_000, np.uint8)}
         np.savez(self.new(cache, place), **arrays)
@@ -230,7 +237,8 @@ class TestCache:
         return path
 
     def test_entries_of_two_writers_are_intact(self, tmp_path):
-        cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
+        cache = CacheLocation(str(tmp_path))
+        place = "/data/a.mcap"
         contents = [{"values": np.full(20_000, number)} for number in (1.0, 2.0)]
 
         def write(arrays):
@@ -269,7 +277,8 @@ class TestCache:
         assert folder.parent == tmp_path / "hil"
 
     def test_archives_of_a_folder_share_a_folder(self, tmp_path):
-        here, there = str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap")
+        here = str(tmp_path / "a.mcap")
+        there = str(tmp_path / "b.mcap")
         for place in (CacheLocation(), CacheLocation(str(tmp_path / "elsewhere"))):
             assert place.folder(here) == place.folder(there)
             assert place.folder(here) != place.folder(str(tmp_path / "sub" / "a.mcap"))
@@ -286,7 +295,8 @@ class TestCache:
             loading=(1.0 / 3.0, -2.0),
             choices=(Choice("rows", ("slow", "rests"), (0.1, np.inf), 0),),
         )
-        cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
+        cache = CacheLocation(str(tmp_path))
+        place = "/data/a.mcap"
         cache.put(place, KEY, stated)
         assert cache.get(place, KEY, Settings) == stated
         cache.put(place, KEY, {"velocity": "position", "torque_delay": 0.0})
@@ -298,7 +308,8 @@ class TestDigests:
         "name", ["batch/discovery.py", "batch/run.py", "signals/samples.py", "record.py"]
     )
     def test_that_of_the_programs_depends_on_each(self, name, monkeypatch):
-        here, read = code_digest(), Path.read_bytes
+        here = code_digest()
+        read = Path.read_bytes
 
         def changed(path):
             return read(path) + (b"\n" if path.as_posix().endswith(name) else b"")
@@ -407,7 +418,8 @@ class TestTables:
         for row, expected in zip(rows, columns, strict=True):
             key = (row["level"], row["campaign"], row["parameter"])
             assert (*key, float(row["value"]), float(row["std"])) == expected
-        row, undetermined = rows[0], rows[3]
+        row = rows[0]
+        undetermined = rows[3]
         half = levels()[0].estimate.interval_factor * float(row["std"])
         for end, sign in (("low", -1.0), ("high", 1.0)):
             assert float(row[end]) == pytest.approx(float(row["value"]) + sign * half)
@@ -427,7 +439,8 @@ class TestTables:
         assert by_name["f1_3"] == ("friction", "joint_3")
         assert by_name["mc2x"] == ("inertial", "")
         estimated = result().campaigns[0]
-        weight, noise = estimated.estimate.samples.astype(float), estimated.estimate.noise_std
+        weight = estimated.estimate.samples.astype(float)
+        noise = estimated.estimate.noise_std
         expected = math.sqrt((weight @ noise**2) / (weight @ estimated.torque_rms**2))
         campaign = next(row for row in rows if row["level"] == "campaign")
         assert datetime.fromisoformat(campaign["when"]) == datetime(2026, 1, 1, 8, tzinfo=UTC)

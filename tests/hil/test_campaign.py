@@ -125,7 +125,8 @@ class TestArchives:
     def test_commanded_is_what_was_planned_and_the_arm_returns(self, campaign: Campaign) -> None:
         archive = open_archive(campaign.folder.completed("excitation")[0])
         commanded = set_points(archive)
-        trajectory, period = campaign.plan.excitation.trajectory, campaign.cell.period
+        trajectory = campaign.plan.excitation.trajectory
+        period = campaign.cell.period
         planned, _, _ = trajectory.sample(np.arange(len(commanded)) * period)
         # The first set-point is the controller's float32 target; its rounding offset remains.
         assert commanded == pytest.approx(planned, abs=2e-6)
@@ -133,7 +134,8 @@ class TestArchives:
         assert np.all(velocity <= campaign.cell.joint_limits.velocity * (1 + 1e-6))
         first = open_archive(campaign.folder.archives / "move_000_a1.mcap")
         last = open_archive(campaign.folder.archives / "move_001_a1.mcap")
-        before, after = first.columns["target_position"][0], last.columns["target_position"][-1]
+        before = first.columns["target_position"][0]
+        after = last.columns["target_position"][-1]
         assert after == pytest.approx(before, abs=2e-6)
         # Stiction keeps the arm itself some encoder counts away from the target.
         assert last.columns["position"][-1] == pytest.approx(after, abs=5e-3)
@@ -143,7 +145,8 @@ class TestArchives:
         files = [open_archive(campaign.folder.archives / e.name).columns
                  for e in campaign.folder.manifest()]  # fmt: skip
         for columns in files:
-            interval, state = columns["interval"], columns["state"]
+            interval = columns["interval"]
+            state = columns["state"]
             assert len(set(interval[interval >= 0])) == 1
             assert state[0] in (State.CLOSED, State.OPENING)
             assert state[-1] == State.CLOSED
@@ -156,7 +159,8 @@ class TestArchives:
     ) -> None:
         campaign = run(tmp_path / "damaged", *one_repetition(cell, plan))
         (intact,), (damaged,) = (campaign.folder.completed(k) for k in ("excitation", "validation"))
-        before, content = intact.read_bytes(), bytearray(damaged.read_bytes())
+        before = intact.read_bytes()
+        content = bytearray(damaged.read_bytes())
         content[len(content) // 2] ^= 1
         damaged.write_bytes(content)
         assert campaign.folder.completed("validation") == []
@@ -171,7 +175,8 @@ class TestStop:
     """A stop ends a motion on its path, or begins none."""
 
     def test_on_the_path_and_the_rest_is_resumed(self, arm: Arm) -> None:
-        stop, advance = Stop(), arm.controller.accept
+        stop = Stop()
+        advance = arm.controller.accept
 
         def stop_at_speed(reply: bytes | None) -> None:
             advance(reply)
@@ -252,7 +257,8 @@ def test_a_refusal_has_names_and_fields_of_the_cell_file(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
     """A wrong position is received: both the line at once and the error name joint and field."""
-    arm, lines = Arm.made(tmp_path, cell, plan, Corrupt(600, offset=27, mask=0x40)), list[str]()
+    arm = Arm.made(tmp_path, cell, plan, Corrupt(600, offset=27, mask=0x40))
+    lines = list[str]()
     reporter = Silent()
     reporter.say = lines.append  # type: ignore[method-assign]
     with pytest.raises(MotionFailedError, match="was refused: following error of") as failed:
@@ -267,7 +273,8 @@ def test_a_refusal_has_names_and_fields_of_the_cell_file(
 def test_a_refusal_shows_degrees_in_the_frame_of_the_limits(cell: Cell) -> None:
     """Those of the teach pendant here, where joint 3 has another sense and zero position."""
     pendant = AngleFrame.of(cell)
-    value, bound = np.radians(100.0), np.radians(90.0) * (1.0 + 1e-7)
+    value = np.radians(100.0)
+    bound = np.radians(90.0) * (1.0 + 1e-7)
     shown = [pendant.shown(np.full(6, angle))[2] for angle in (value, bound)]
     for check, text in (
         (Check.VELOCITY, "100 °/s; allowed is 90 °/s, set by [limits] velocity_deg"),
@@ -285,7 +292,8 @@ def test_a_refusal_shows_degrees_in_the_frame_of_the_limits(cell: Cell) -> None:
 def test_the_arm_comes_to_rest_when_archiving_fails(
     arm: Arm, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
-    write, speeds = ArchiveWriter.write, list[float]()
+    write = ArchiveWriter.write
+    speeds = list[float]()
 
     def failing(writer: ArchiveWriter, *arguments: Any) -> None:
         speeds.append(arm.speed)
@@ -442,7 +450,8 @@ def test_a_solver_that_crashes_ends_the_campaign_only(
 
 
 def test_an_override_changes_as_fast_as_the_bounds_allow(cell: Cell) -> None:
-    old, new = "acceleration = 1.3, jerk = 1.7", "acceleration = 1.05, jerk = 1.1"
+    old = "acceleration = 1.3, jerk = 1.7"
+    new = "acceleration = 1.05, jerk = 1.1"
     narrow = written(cell, f"override = {{ {old} }}", f"override = {{ {new} }}")
     limits = cell.joint_limits
     motion = plan_moves(cell.home + 0.5, (Move(cell.home, speed=0.1),), limits).trajectory

@@ -70,7 +70,8 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
     The search is shorter than the default one.
     """
-    folder, printed = tmp_path_factory.mktemp("day"), {}
+    folder = tmp_path_factory.mktemp("day")
+    printed = {}
     fast_cell(folder)
     (folder / "quick.toml").write_text(QUICK)
     with pytest.MonkeyPatch.context() as here:
@@ -130,7 +131,8 @@ def test_a_design_replaces_no_recorded_campaign(
     assert isinstance(refused.exception, CampaignFolderError)
     assert HOLDS_RECORDINGS in str(refused.exception)
 
-    cell, excitation = fast_cell(tmp_path), DesignResult.load(mine).excitation
+    cell = fast_cell(tmp_path)
+    excitation = DesignResult.load(mine).excitation
     root = tmp_path / "made"
     first = campaign_of_design(root, cell, excitation)
     sealed = (root / "manifest.json").stat().st_mtime_ns
@@ -258,7 +260,8 @@ def test_exist_ok_opens_what_fits_and_nothing_else(
     campaign: Campaign, ran: Campaign, tmp_path: Path
 ) -> None:
     """So that a script can be run again."""
-    root, cell = str(campaign.folder.root), ran.cell
+    root = str(campaign.folder.root)
+    cell = ran.cell
     pass_rehearsal(campaign.folder)
     for excitation in (ran.plan, ran.plan.excitation):
         again = Campaign.create(root, cell, excitation, exist_ok=True)
@@ -303,7 +306,8 @@ def test_one_seed_gives_the_same_bytes_in_any_folder(tmp_path: Path, ran: Campai
 
 
 def test_an_arm_at_its_limit_by_rounding_may_leave_it(ran: Campaign) -> None:
-    cell, limits = ran.cell, ran.cell.joint_limits
+    cell = ran.cell
+    limits = ran.cell.joint_limits
     start = limits.lower - 4e-7 * (limits.upper - limits.lower)
     assert np.array_equal(at_limit(start, limits), limits.lower)
     motions = [straight_move(cell, start, cell.home).trajectory, plan_move(cell, start, cell.home)]
@@ -318,7 +322,8 @@ def test_an_arm_at_its_limit_by_rounding_may_leave_it(ran: Campaign) -> None:
 def test_an_arm_beyond_its_limit_is_reported_in_degrees(
     plan_of_move: Callable[..., object], ran: Campaign
 ) -> None:
-    cell, start = ran.cell, ran.cell.joint_limits.lower.copy()
+    cell = ran.cell
+    start = ran.cell.joint_limits.lower.copy()
     start[1] -= np.radians(0.5)
     elbow = np.degrees(start[1])
     with pytest.raises(

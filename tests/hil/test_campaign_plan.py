@@ -113,7 +113,8 @@ def test_a_design_that_cannot_be_read_is_named_first(tmp_path: Path) -> None:
 def test_the_demo_runs_a_design_and_identifies_from_its_archives(
     tmp_path: Path, method: str, changes: dict[str, Any]
 ) -> None:
-    folder, made = tmp_path / "demo", tmp_path / "design"
+    folder = tmp_path / "demo"
+    made = tmp_path / "design"
     small = {"population": 12, "generations": 2, "polish": 0}
     settings = preset(method).replaced(search=small, **changes)
     run_design(DesignFolder(made), Cell.load(CELL_PATH), settings, Silent())

@@ -73,7 +73,8 @@ def test_the_ns16_cell_describes_six_joints_and_58_parameters(ns16: Cell) -> Non
     limits = ns16.joint_limits
     assert np.degrees(limits.lower) == pytest.approx([-180, -140, -20, -360, -120, -360])
     assert np.degrees(limits.upper) == pytest.approx([180, 5, 260, 360, 120, 360])
-    shown, frame = np.array(ns16.campaign.home_deg), AngleFrame.pendant(ns16)
+    shown = np.array(ns16.campaign.home_deg)
+    frame = AngleFrame.pendant(ns16)
     assert np.degrees(ns16.controller_angles(ns16.home)) == pytest.approx(shown)
     assert frame.shown(frame.urdf(shown)) == pytest.approx(shown)
 

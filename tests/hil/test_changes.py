@@ -173,7 +173,8 @@ class TestInMemory:
 
     def test_quantities_are_inertial_parameters_and_friction_of_axes(self):
         """Friction is the mean of both directions."""
-        arm, (level,) = arm_histories.model(), levels_of(Condition())
+        arm = arm_histories.model()
+        (level,) = levels_of(Condition())
         compared = quantities(arm, level)
         axes = {quantity.name: quantity.axis for quantity in compared if quantity.kind == "inertia"}
         assert len(compared) == arm.base.rank + 6
@@ -189,7 +190,8 @@ class TestInMemory:
             assert quantity.weights @ values == pytest.approx(0.5 * (both[0] - both[1]), rel=0.05)
 
     def test_scatter_of_repetitions_hides_a_change(self):
-        certain, uncertain = in_memory(1.5), in_memory(1.5, repetitions=scattered)
+        certain = in_memory(1.5)
+        uncertain = in_memory(1.5, repetitions=scattered)
         assert {change.axis for change in certain.changed} == {f"joint_{j}" for j in range(1, 7)}
         assert not uncertain.changed
 

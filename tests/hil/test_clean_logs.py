@@ -27,7 +27,8 @@ def write_clean_log(path: Path, urdf: Path, *, repeated: bool, smooth: float = 0
     With a speed `smooth` [rad/s] there is friction, which reverses as in simulators.
     """
     model = pin.buildModelFromUrdf(str(urdf))
-    data, random = model.createData(), np.random.default_rng(0)
+    data = model.createData()
+    random = np.random.default_rng(0)
     time = np.arange(2500) / 250.0
     rate = random.uniform(1.0, 4.0, (3, model.nv))
     angle = rate * time[:, None, None] + random.uniform(0.0, 6.0, rate.shape)
@@ -59,7 +60,8 @@ ARMS = ["three joints", "on a lift", "UR5", "UR5, stamps repeated", "smooth 0.05
 
 @pytest.fixture(scope="module", params=ARMS)
 def arm(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> IdentifiedArm:
-    folder, urdf = tmp_path_factory.mktemp("clean"), urdf_path("ur5_robot.urdf")
+    folder = tmp_path_factory.mktemp("clean")
+    urdf = urdf_path("ur5_robot.urdf")
     if not request.param.startswith("UR5"):
         urdf = folder / "three.urdf"
         lifted = URDF.replace("<link name='base'/>", LIFT)

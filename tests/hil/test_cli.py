@@ -202,7 +202,8 @@ def test_a_resumed_demo_ignores_no_option(campaign: Campaign, tmp_path: Path, op
 
 
 def test_force_removes_only_a_campaign(campaign: Campaign, tmp_path: Path) -> None:
-    folder, link = tmp_path / "copy", tmp_path / "link"
+    folder = tmp_path / "copy"
+    link = tmp_path / "link"
     shutil.copytree(campaign.folder.root, folder)
     (folder / "my_notes.txt").write_text("mine")
     link.symlink_to(folder)

@@ -202,7 +202,8 @@ def test_a_picture_that_cannot_be_written_is_a_warning(invoke, copied):
 
 
 def test_json_agrees_with_the_file(bare):
-    printed, result = json.loads(bare[1]), DesignResult.load(bare[0])
+    printed = json.loads(bare[1])
+    result = DesignResult.load(bare[0])
     for name in ("log10_det", "coupling_index", "condition"):
         assert printed[name] == getattr(result.excitation.criteria, name)
     assert printed["complete"] is True

@@ -54,7 +54,8 @@ def test_a_campaign_counts_with_its_repetitions(campaign, given):
 
 def test_the_same_motion_again_has_the_same_criteria(campaign, given):
     """Criteria are of an average sample: the same motion once more changes neither."""
-    trajectory, model = campaign.plan.excitation.trajectory, campaign.cell.model
+    trajectory = campaign.plan.excitation.trajectory
+    model = campaign.cell.model
     alone = Objective(model).criteria(trajectory, 0.008)
     planned = Objective(model).information(midpoints(trajectory))
     exact = type(given)(planned / midpoints(trajectory).n_samples, 2 * trajectory.duration)

@@ -75,7 +75,8 @@ def design_of(cell: Cell, trajectory: Trajectory, chosen: int | None = 1) -> Des
 
 def wandering(cell: Cell, points: int = 5) -> Trajectory:
     limits = cell.joint_limits
-    middle, half = (limits.upper + limits.lower) / 2.0, (limits.upper - limits.lower) / 2.0
+    middle = (limits.upper + limits.lower) / 2.0
+    half = (limits.upper - limits.lower) / 2.0
     random = np.random.default_rng(4)
     via = middle + 0.4 * half * random.uniform(-1.0, 1.0, (points, limits.n_joints))
     return plan(via, limits, fly=0.5)

@@ -31,7 +31,8 @@ def cell() -> Cell:
 
 
 def test_presets_have_the_values_of_table_1():
-    a, b = preset("a"), preset("b")
+    a = preset("a")
+    b = preset("b")
     assert (a.search.population, a.search.generations) == (100, 120)
     assert (a.search.mutation, a.search.crossover, a.search.polish) == (0.01, 0.7, 0)
     assert a.sines is not None and a.sines.harmonics == 3
@@ -45,7 +46,8 @@ def test_presets_have_the_values_of_table_1():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_presets_are_files_with_all_constraints_on(method, tmp_path):
-    path, settings = tmp_path / "my.toml", preset(method)
+    path = tmp_path / "my.toml"
+    settings = preset(method)
     path.write_text(preset_text(method))
     assert load_settings(path) == settings
     assert settings.method == search_settings(settings).method == method
@@ -126,7 +128,8 @@ def test_motions_through_via_points_are_closed_by_default(cell):
 
 def test_frequencies_are_the_papers_or_those_of_the_limits(cell):
     """Offsets are in the frame of the limits; sines without a ramp need not rest."""
-    settings, limits = preset("a").kinematic(), cell.joint_limits
+    settings = preset("a").kinematic()
+    limits = cell.joint_limits
     slowest, fastest = problem_of(cell, settings).genome.frequency_range
     np.testing.assert_array_equal(slowest, np.full(6, 0.314))
     np.testing.assert_array_equal(fastest, [0.94, 2.38, 0.53, 0.44, 0.89, 0.44])
@@ -165,14 +168,16 @@ def test_settings_that_do_not_fit_the_cell_are_refused(cell, method, changes, me
 
 def test_a_cell_without_drive_train_has_torque_limits_only():
     cell = Cell.load(CELL_PATH)
-    start, end = cell.text.index("[nominal]"), cell.text.index("[limits]")
+    start = cell.text.index("[nominal]")
+    end = cell.text.index("[limits]")
     without = Cell.from_texts(cell.text[:start] + cell.text[end:], cell.urdf, cell.path)
     assert problem_of(without, preset("b").kinematic()).constraints.currents is None
     with pytest.raises(Exception, match=r"add a table \[nominal\]"):
         problem_of(without, preset("b"))
 
 
-VIA, SINES = preset("b"), preset("a")
+VIA = preset("b")
+SINES = preset("a")
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,8 @@ def test_a_stall_counts_each_of_its_cycles() -> None:
 @given(samples, st.floats(0.0, 0.01))
 def test_one_more_latency_never_makes_a_cycle_fit(values: list[float], more: float) -> None:
     """Nor a shorter cycle; the worse of two measurements decides."""
-    before, after = judge([latency(*values)], 1), judge([latency(*values, more)], 1)
+    before = judge([latency(*values)], 1)
+    after = judge([latency(*values, more)], 1)
     assert after.late_cycles >= before.late_cycles
     both = judge([latency(*values), latency(more)], 1)
     assert both.fit <= before.fit <= judge([latency(*values)], 2).fit
@@ -147,7 +148,8 @@ def test_the_exit_status_is_0_only_for_a_reliable_fit(
 def test_page_and_json_agree_and_remedies_come_worst_first() -> None:
     slow = DoctorCheck("slow", Status.WARN, "", ("make it fast",))
     made = diagnosis(slow, PORT, PORT)
-    text, document = page(made), json.loads(json.dumps(as_json(made)))
+    text = page(made)
+    document = json.loads(json.dumps(as_json(made)))
     assert "in use [by] a" in text
     assert "p50 50" in text and "max 3000" in text
     commands = [line.strip() for line in text.splitlines() if line.startswith("    ")]

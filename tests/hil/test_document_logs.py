@@ -72,7 +72,8 @@ def stamps() -> Iterator[tuple[int, int]]:
 
 
 def test_names_in_json_put_joints_in_order(tmp_path: Path, robot: Robot) -> None:
-    path, order = tmp_path / "json.mcap", [2, 0, 1]
+    path = tmp_path / "json.mcap"
+    order = [2, 0, 1]
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
@@ -105,7 +106,9 @@ def joint_state() -> descriptor_pb2.FileDescriptorProto:
 
 
 def test_protobuf_is_decoded_by_its_own_definition(tmp_path: Path, robot: Robot) -> None:
-    path, pool, file = tmp_path / "proto.mcap", descriptor_pool.DescriptorPool(), joint_state()
+    path = tmp_path / "proto.mcap"
+    pool = descriptor_pool.DescriptorPool()
+    file = joint_state()
     pool.Add(file)
     kind = message_factory.GetMessageClass(pool.FindMessageTypeByName("arm.JointState"))
     definition = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()

@@ -58,7 +58,8 @@ def arm() -> IdentifiedArm:
 
 
 def exported(arm: IdentifiedArm, folder: Path) -> Exports:
-    names, consistent = arm.essential.estimate.names, arm.consistency.consistent
+    names = arm.essential.estimate.names
+    consistent = arm.consistency.consistent
     return write_exports(
         folder, arm.cell, arm.estimate, consistent, essential=names, provenance=PROVENANCE
     )
@@ -173,7 +174,8 @@ def fields(model: type[BaseModel]) -> Iterator[str]:
 
 def test_every_file_and_field_is_explained(text: str, arm: IdentifiedArm) -> None:
     document = parameters_json(arm.cell.model, arm.estimate, consistent=arm.consistency.consistent)
-    content, explained = json.loads(document), named(text)
+    content = json.loads(document)
+    explained = named(text)
     assert set(fields(Results)) <= explained
     assert set(content) | set(content["parameters"][0]) | set(content["standard"]) <= explained
     tensor = {"Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz"}
@@ -192,7 +194,8 @@ def test_the_python_example_predicts_the_torque_of_the_model(
     command_line = [sys.executable, "-I", "-c", program]
     done = subprocess.run(command_line, cwd=tmp_path, capture_output=True, text=True, check=True)
     shown = np.fromstring(done.stdout.strip().strip("[]"), sep=" ")
-    zero, speed = np.zeros((1, 2)), np.full((1, 2), 0.5)
+    zero = np.zeros((1, 2))
+    speed = np.full((1, 2), 0.5)
     values = arm.consistency.consistent.estimate.values
     (expected,) = arm.cell.model.torque(values, zero, speed, zero)
     np.testing.assert_allclose(shown, expected, rtol=1e-6)
@@ -267,7 +270,8 @@ class TestReuse:
     def test_the_file_is_that_of_a_new_identification(
         self, folder: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        new, stored = folder / "new.urdf", folder / "stored.urdf"
+        new = folder / "new.urdf"
+        stored = folder / "stored.urdf"
         again = command("export", folder, "--to", "urdf", "--again", "-o", new)
         assert "parameters: from" not in again.stdout
 

@@ -148,7 +148,8 @@ class TestMisspelt:
     def test_a_file(self, tmp_path: Path) -> None:
         (tmp_path / "arm.urdf").write_text("<robot/>")
         (tmp_path / "log.csv").write_text("t\n0\n")
-        log, urdf = str(tmp_path / "log.csv"), str(tmp_path / "amr.urdf")
+        log = str(tmp_path / "log.csv")
+        urdf = str(tmp_path / "amr.urdf")
         assert "arm.urdf" in str(invoke("identify", log, "--urdf", urdf).exception)
         urdf = str(tmp_path / "arm.urdf")
         (tmp_path / "arm.urdf").write_text((Path(__file__).parents[2] / "sim_fixtures" / "ns16"

@@ -58,7 +58,8 @@ class TestResult:
     def test_prediction_is_the_torque_that_was_simulated(self, result: Any) -> None:
         """Of Newton and Euler with the friction that was planted, at 100 random states."""
         model = pin.buildModelFromXML(URDF)
-        data, rng = model.createData(), np.random.default_rng(5)
+        data = model.createData()
+        rng = np.random.default_rng(5)
         q, v, a = rng.uniform(-1.0, 1.0, (3, 100, 3)) * np.array([1.0, 3.0, 10.0])[:, None, None]
         rigid = np.array([pin.rnea(model, data, *row) for row in zip(q, v, a, strict=True)])
         truth = rigid + 0.4 * np.sign(v) + 0.2 * v

@@ -113,7 +113,9 @@ def imported_ur5(folder, time, late, still=0):
     lags = zip(np.broadcast_to(late, 6), made.torque.T, strict=True)
     torque = np.column_stack([np.interp(time - lag, time, column) for lag, column in lags])
     rows = slice(0 if still else 10, None)
-    t, q, tau = time[rows], made.position[rows], torque[rows]
+    t = time[rows]
+    q = made.position[rows]
+    tau = torque[rows]
     before = t[0] + (time[1] - time[0]) * np.arange(-still, 0)
     resting = (np.repeat(channel[:1], still, axis=0) for channel in (q, tau))
     q, tau = (np.concatenate(both) for both in zip(resting, (q, tau), strict=True))
@@ -136,10 +138,8 @@ class TestCampaign:
 
     def test_planned_criteria_are_those_that_were_executed(self, identification):
         """At equal times; stiction and noise change the columns by per mille."""
-        planned, executed = (
-            identification.results.excitation.planned,
-            identification.results.excitation.executed,
-        )
+        planned = identification.results.excitation.planned
+        executed = identification.results.excitation.executed
         assert executed.n_samples == pytest.approx(3 * planned.n_samples, abs=6)
         assert executed.log10_det == pytest.approx(planned.log10_det, abs=58 * np.log10(1.01))
         assert executed.coupling_index == pytest.approx(planned.coupling_index, rel=0.02)
@@ -336,7 +336,8 @@ class TestJudgement:
             assert 0.01 < joint.controller_relative < 0.15
 
     def test_is_a_table_sentences_and_json(self, identification, judgement):
-        rows, lines = table(identification.results), sentences(identification.results)
+        rows = table(identification.results)
+        lines = sentences(identification.results)
         heading = "joint RMS error relative fitted of limit R² nominal controller"
         assert rows[0].split() == heading.split()
         for row, name in zip(rows[1:], identification.results.joint_names, strict=True):
@@ -344,7 +345,8 @@ class TestJudgement:
         assert len({len(row) for row in rows}) == 1
         for finding in judgement.findings:
             assert sum(finding.words in line for line in lines) == 1
-        read, verdict = json.loads(as_json(identification.results)), identification.results.verdict
+        read = json.loads(as_json(identification.results))
+        verdict = identification.results.verdict
         assert (read["good"], read["line"]) == (verdict.good, verdict.line)
         assert {finding["check"] for finding in read["findings"]} >= {"excitation", "delay"}
         assert len(read["joints"]) == 6
@@ -553,7 +555,8 @@ def test_nothing_is_called_good_in_sample(log, split):
     line = results.verdict.line
     assert "in-sample" in line and "no motion was held out" in line
     assert "unseen motion well" not in line
-    more, fewer = results.excitation.executed, split.results.excitation.executed
+    more = results.excitation.executed
+    fewer = split.results.excitation.executed
     assert more.n_samples > fewer.n_samples
     relative = [joint.relative for joint in results.judgement.joints]
     assert relative == pytest.approx(results.fitted.relative_error)
@@ -576,6 +579,7 @@ def test_series_of_figures_have_fitted_rows_and_friction(tmp_path):
     for j, noise in enumerate(rested.results.noise_std):
         drawn = np.isfinite(series.friction_speed[:, j])
         assert drawn.sum() > 100
-        speed, torque = series.friction_speed[drawn, j], series.friction_torque[drawn, j]
+        speed = series.friction_speed[drawn, j]
+        torque = series.friction_torque[drawn, j]
         law = np.interp(speed, series.law_speed[:, j], series.law_torque[:, j])
         assert np.std((torque - law)[np.abs(speed) > 0.05]) < 2.0 * noise

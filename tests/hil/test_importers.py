@@ -81,7 +81,9 @@ def file(tmp_path: Path) -> Path:
     return log(tmp_path / "a.csv", VALUES, HEADER)
 
 
-Q, TAU, TIME = VALUES[:, 1:4], VALUES[:, 4:], VALUES[:, 0]
+Q = VALUES[:, 1:4]
+TAU = VALUES[:, 4:]
+TIME = VALUES[:, 0]
 WIDE = np.random.default_rng(7).normal(size=(20, 5))
 QUOTED = '# made by hand\n% 2020\n\n"t", "q1", "q2", "q3", "a", "b", "c"'
 TURNED = ("ankle", "hip", "knee")
@@ -104,7 +106,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("run", "wide"):
         (root / name).mkdir()
     for joint in range(3):
-        run, number = root / "run", joint + 1
+        run = root / "run"
+        number = joint + 1
         np.savetxt(run / f"q_{number}.txt", VALUES[:, [0, number]], fmt="%.17g")
         np.savetxt(run / f"tau{joint}.dat", TAU[:, joint], fmt="%.17g")
         np.savetxt(run / f"late_{number}.txt", VALUES[:, [0, number]] + [0.001 * joint, 0.0])
@@ -264,7 +267,10 @@ class TestUnitsAndGears:
     def test_motor_side_is_converted_with_power_conserved(self, tmp_path, robot):
         """Expected values are computed ratio by ratio."""
         q, qd, tau_motor = np.random.default_rng(8).normal(size=(3, 30, 3))
-        n1, n2, n3, n32 = 100.0, -80.0, 50.0, 25.0
+        n1 = 100.0
+        n2 = -80.0
+        n3 = 50.0
+        n32 = 25.0
 
         def motor(x):
             return np.column_stack([n1 * x[:, 0], n2 * x[:, 1], n3 * x[:, 2] + n32 * x[:, 1]])
@@ -408,7 +414,8 @@ LOG = {
 }
 
 
-RECORDS, CELLS = np.zeros((1, 3), [("q", object)]), np.empty(3, object)
+RECORDS = np.zeros((1, 3), [("q", object)])
+CELLS = np.empty(3, object)
 for _joint in range(3):
     RECORDS[0, _joint]["q"] = CELLS[_joint] = Q[:, _joint]
 LOG |= {"cells": CELLS, "records": RECORDS, "signals": {"values": Q.T[None]}}
@@ -510,9 +517,11 @@ class TestMatlab73:
 class TestUntrustedFiles:
     @pytest.mark.parametrize("compressed", [False, True])
     def test_damaged_files_raise_no_other_error(self, tmp_path, compressed):
-        rng, path = np.random.default_rng(1), tmp_path / "a.mat"
+        rng = np.random.default_rng(1)
+        path = tmp_path / "a.mat"
         savemat(path, {"t": TIME, "q": Q}, do_compression=compressed)
-        intact, refused = path.read_bytes(), 0
+        intact = path.read_bytes()
+        refused = 0
         for _ in range(40):
             data = bytearray(intact)
             data[rng.integers(min(len(data), 400))] = rng.integers(256)
@@ -536,7 +545,8 @@ class TestUntrustedFiles:
         assert np.array_equal(read_arrays(tmp_path / "b.mat", robot)["position"], Q)
 
     def test_only_arrays_of_the_map_are_read_with_limited_size(self, tmp_path, robot):
-        path, forged = tmp_path / "a.npz", {"descr": "<f8", "fortran_order": False}
+        path = tmp_path / "a.npz"
+        forged = {"descr": "<f8", "fortran_order": False}
         np.savez(path, q=Q, o=np.array([print], object), few=np.array([1, 2j]))
         with zipfile.ZipFile(path, "a") as archive:
             with archive.open("bomb.npy", "w") as bomb:
@@ -581,7 +591,8 @@ class TestTextMatrices:
         rows = [("time", TIME), *((f"q{j + 1}", Q[:, j]) for j in range(3))]
         lines = [" ".join([name, *(repr(float(v)) for v in values)]) for name, values in rows]
         (tmp_path / "a.txt").write_text("\n".join(lines))
-        time, form = {"column": "time"}, {"transposed": True}
+        time = {"column": "time"}
+        form = {"transposed": True}
         arrays = read(tmp_path / "a.txt", robot, time=time, format=form)
         assert np.array_equal(arrays["position"], Q)
 
@@ -635,7 +646,8 @@ class TestTextMatrices:
         self, tmp_path, robot, suffix, column, named
     ):
         """A missing time, in a file of any kind, is a hole like a missing number."""
-        rows, path = np.column_stack([TIME, Q]), tmp_path / f"a{suffix}"
+        rows = np.column_stack([TIME, Q])
+        path = tmp_path / f"a{suffix}"
         rows[7, column] = np.nan
         if suffix == ".npz":
             np.savez(path, t=rows[:, 0], q=rows[:, 1:])
@@ -715,12 +727,14 @@ def dh_text(rows: tuple[tuple[object, ...], ...]) -> str:
 
 
 def about_z(angle: float, along: float) -> Floats:
-    c, s = np.cos(angle), np.sin(angle)
+    c = np.cos(angle)
+    s = np.sin(angle)
     return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, along], [0, 0, 0, 1.0]])
 
 
 def about_x(angle: float, along: float) -> Floats:
-    c, s = np.cos(angle), np.sin(angle)
+    c = np.cos(angle)
+    s = np.sin(angle)
     return np.array([[1, 0, 0, along], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1.0]])
 
 
@@ -758,7 +772,8 @@ class TestDhKinematics:
         """Standard convention; base and tool frames differ by constant transforms."""
         ours = pin.buildModelFromXML(urdf_of_dh(dh_table(tmp_path / "ur5.csv", UR5), "standard"))
         theirs = pin.buildModelFromUrdf(str(urdf_path("ur5_robot.urdf")))
-        base, tools = about_z(np.pi, 0.0), []
+        base = about_z(np.pi, 0.0)
+        tools = []
         for q in np.random.default_rng(3).uniform(-3.0, 3.0, (10, 6)):
             there = base @ placement(theirs, q, "tool0")
             tools.append(np.linalg.solve(there, placement(ours, q, "flange")))
@@ -1172,7 +1187,8 @@ class TestRobotOptions:
     @pytest.fixture
     def place(self, tmp_path: Path) -> Path:
         time = np.arange(200) / 100.0
-        q, tau = np.sin(time), np.sin(2.0 * time)
+        q = np.sin(time)
+        tau = np.sin(2.0 * time)
         rows = np.column_stack([time, q, tau])
         np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header="t,q1,tau1", comments="")
         messages = [

@@ -234,7 +234,8 @@ class TestImport:
             recorded_joints(empty)
 
     def test_options_effort_joint_names_and_held_joints(self, tmp_path, imported):
-        names, held = {"j1": "hip", "j2": "ankle"}, ["hip"]
+        names = {"j1": "hip", "j2": "ankle"}
+        held = ["hip"]
         messages = states(names=["j2", "j1"])
         archive = imported(messages, effort="motor_current", joint_names=names, held_joints=held)
         assert "torque" not in archive.columns

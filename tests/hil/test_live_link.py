@@ -193,7 +193,8 @@ class Operator:
 
     def __init__(self, stop: Stop) -> None:
         self.seen: list[MotionProgress] = []
-        self._stop, self._rested = stop, 0
+        self._stop = stop
+        self._rested = 0
 
     def show(self, progress: MotionProgress) -> None:
         self.seen.append(progress)
@@ -202,7 +203,8 @@ class Operator:
 
     def request(self) -> OperatorRequest:
         time = (self.seen[-1].motion_time or 0.0) if self.seen else 0.0
-        first, second = time > 0.5 and self._rested < 3, time > 1.2
+        first = time > 0.5 and self._rested < 3
+        second = time > 1.2
         return OperatorRequest(0.5 if time > 0.2 else 1.0, held=first or second)
 
 
@@ -225,7 +227,8 @@ def test_a_motion_is_slowed_held_and_stopped_with_a_viewer(cell: Cell, tmp_path:
         with Viewer(link.live.port) as viewer:
             viewer.subscribe("/hil/cycle", "/hil/events")
             ended = link.run(player, spec, stop, override=0.7, watch=person)
-            cycles, events = {}, []
+            cycles = {}
+            events = []
             while not cycles or max(cycles) <= ended.cycle:
                 topic, _, message = viewer.message()
                 if topic == "/hil/cycle":
@@ -272,7 +275,8 @@ def test_a_hold_while_a_motion_is_handed_over_is_applied(
 ) -> None:
     """And nothing is sent with limits that were not checked."""
     cell = cell.with_link(transport="udp", host="192.0.2.1", bind="127.0.0.1")
-    held, stop = False, Stop()
+    held = False
+    stop = Stop()
 
     class Holding(Operator):
         def request(self) -> OperatorRequest:
@@ -336,7 +340,8 @@ def test_a_live_view_that_cannot_be_served_is_refused(cell: Cell, tmp_path: Path
 
 
 def test_a_silent_archive_process_is_named_with_cause_and_remedy() -> None:
-    disk, busy = archive_silence(3.2), archive_silence(0.0)
+    disk = archive_silence(3.2)
+    busy = archive_silence(0.0)
     for text in (disk, busy):
         assert text.startswith(f"{NO_ARCHIVE}, for more than 0.5 s")
     assert "its disk for 3.2 s" in disk and "check that disk" in disk

@@ -118,7 +118,8 @@ def test_a_viewer_that_reads_nothing_delays_nothing() -> None:
         dead.subscribe("/hil/cycle", "/joint_states", "/joint_states_commanded")
         with Viewer(publisher.port) as viewer:
             viewer.subscribe("/joint_states")
-            took, first = [], 0
+            took = []
+            first = 0
             until = time.monotonic() + 0.8
             while first <= 10 * live.BACKLOG or time.monotonic() < until:
                 began = time.perf_counter()

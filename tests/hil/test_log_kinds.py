@@ -18,7 +18,8 @@ from hil.importers import ColumnMap, Robot, import_log
 from hil.importers.findings import whole_turns
 
 Floats = NDArray[np.float64]
-RATE, COUNT = 250, 400
+RATE = 250
+COUNT = 400
 TIME = np.arange(COUNT) / RATE
 JOINTS = ("hip", "knee", "ankle")
 POSITION = np.column_stack([0.9 * np.sin(2.0 * TIME + k) for k in range(3)])

@@ -51,7 +51,8 @@ def sunrise(path: Path) -> Path:
 
 def kortex(path: Path) -> Path:
     """A Gen3: joint after joint, degrees from 0 to 360 without a unit, and currents."""
-    names, columns = ["time"], [TIME]
+    names = ["time"]
+    columns = [TIME]
     for joint in range(3):
         degrees = np.mod(np.degrees(POSITION[:, joint]), 360.0)
         for name, values in (("position", degrees), ("torque", TORQUE[:, joint])):
@@ -119,7 +120,8 @@ def of(time: str, *names: str) -> Callable[[Path], Path]:
     def write(path: Path) -> Path:
         factor = 180.0 / np.pi if any("deg" in name or "°" in name for name in names) else 1.0
         columns = [factor * POSITION, factor * SLOPE, TORQUE, 0.01 * TORQUE, 0.01 * TORQUE]
-        header, values = [time], [TIME]
+        header = [time]
+        values = [TIME]
         for name, part in zip(names, columns, strict=False):
             numbered = [name.replace("{}", str(joint)) for joint in range(3)]
             header += [name.replace("JOINT", JOINTS[k]) for k, name in enumerate(numbered)]
@@ -160,7 +162,8 @@ ORDER = (2, 0, 1)
 
 def message_rows(joints: Sequence[int]) -> list[str]:
     """Seconds, nanoseconds, frame, then names and values of joints in an order."""
-    order, rows = list(joints), []
+    order = list(joints)
+    rows = []
     for time, *values in zip(TIME, POSITION, SLOPE, TORQUE, strict=True):
         nanoseconds = round(1e9 * time)
         stamp = [str(EPOCH + nanoseconds // 10**9), str(nanoseconds % 10**9), "base"]

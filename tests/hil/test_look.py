@@ -200,7 +200,8 @@ class TestCommand:
     def test_the_map_it_writes_is_read(
         self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
     ) -> None:
-        path, target = tmp_path / "a.csv", tmp_path / "map.toml"
+        path = tmp_path / "a.csv"
+        target = tmp_path / "map.toml"
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *{**table, **negated(table)}.values())
         result = hil("look", path, "--urdf", urdf, "-o", target, "--json")
         assert result.exit_code == 0, result.output
@@ -234,7 +235,8 @@ class TestConclusions:
         self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
     ) -> None:
         """Also by the map that a look writes."""
-        path, target = tmp_path / "a.csv", tmp_path / "map.toml"
+        path = tmp_path / "a.csv"
+        target = tmp_path / "map.toml"
         planted = {**table, **to_the_ground(table)}
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *planted.values())
         result = hil("identify", path, "--urdf", urdf, "--output", tmp_path / "o")
@@ -252,7 +254,8 @@ class TestConclusions:
         self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
     ) -> None:
         """Torques of motors or currents: the map is written without what is open."""
-        path, target = tmp_path / "a.csv", tmp_path / "map.toml"
+        path = tmp_path / "a.csv"
+        target = tmp_path / "map.toml"
         planted = {**table, **of_motors(table)}
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *planted.values())
         looked = hil("look", path, "--urdf", urdf, "-o", target)
@@ -299,7 +302,8 @@ class TestConclusions:
         self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
     ) -> None:
         """Torques that follow no masses of the arm: those of another motion."""
-        path, rng = tmp_path / "a.csv", np.random.default_rng(0)
+        path = tmp_path / "a.csv"
+        rng = np.random.default_rng(0)
         noise = np.cumsum(rng.normal(size=table["tau"].shape), axis=0)
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *{**table, "tau": noise}.values())
         result = hil("identify", path, "--urdf", urdf)
@@ -335,7 +339,8 @@ class TestOtherArm:
     def test_a_torque_that_no_masses_explain_refuses_it_besides(
         self, tmp_path: Path, table: Mapping[str, Floats]
     ) -> None:
-        path, rng = tmp_path / "a.csv", np.random.default_rng(0)
+        path = tmp_path / "a.csv"
+        rng = np.random.default_rng(0)
         noise = 0.3 * table["tau"].std(axis=0) * rng.normal(size=table["tau"].shape)
         write_log(
             path, ["t", "q{}", "v{}", "tau{}"], *{**table, "tau": table["tau"] + noise}.values()

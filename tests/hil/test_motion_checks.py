@@ -71,7 +71,8 @@ def test_postures_are_in_the_angles_of_the_teach_pendant(cell: Cell) -> None:
 
 
 def test_a_joint_limit_is_in_the_angles_of_the_file(cell: Cell) -> None:
-    frame, limits = AngleFrame.of(cell), cell.joint_limits
+    frame = AngleFrame.of(cell)
+    limits = cell.joint_limits
     # joint_sign of J3 is -1: the URDF's upper limit is the file's lower one, -170 deg.
     beyond = limits.upper.copy()
     beyond[2] += np.radians(5.0)

@@ -36,10 +36,14 @@ def recorded(outcome: str, reason: str, disk_waited: float = 0.0) -> Recorded:
 class ScriptedPort:
     """A port of which things happen at given times [s], with a diary of what was asked of it."""
 
-    is_virtual, only_simulated, live = False, True, None
+    is_virtual = False
+    only_simulated = True
+    live = None
 
     def __init__(self, *script: tuple[float, Happens]) -> None:
-        self.now, self.state, self.ended_count = 0.0, State.CLOSED, 0
+        self.now = 0.0
+        self.state = State.CLOSED
+        self.ended_count = 0
         self.script = list(script)
         self.events: list[Any] = []
         self.diary: list[str] = []
@@ -59,7 +63,8 @@ class ScriptedPort:
         return self.exchange_gone
 
     def poll(self) -> Sequence[Any]:
-        events, self.events = self.events, []
+        events = self.events
+        self.events = []
         return events
 
     def new_records(self) -> np.ndarray:
@@ -118,7 +123,8 @@ def started(port: ScriptedPort) -> None:
 
 def ended(outcome: str = "completed", reason: str = "the motion is complete") -> Happens:
     def happens(port: ScriptedPort) -> None:
-        port.state, port.ended_count = State.CLOSED, port.ended_count + 1
+        port.state = State.CLOSED
+        port.ended_count = port.ended_count + 1
         port.events.append(MotionEnded(outcome, reason, 0, 500))  # type: ignore[arg-type]
 
     return happens

@@ -138,7 +138,8 @@ def test_the_path_is_checked_and_not_only_its_ends(ns16: Cell) -> None:
         "walls = []", "walls = [{ lower = [0.9, -0.1, 0.0], upper = [1.6, 0.1, 1.8] }]"
     )
     walled = Cell.from_texts(text, ns16.urdf, ns16.path)
-    left, right = posture(walled, "60,20,-80,0,30,0"), posture(walled, "-60,20,-80,0,30,0")
+    left = posture(walled, "60,20,-80,0,30,0")
+    right = posture(walled, "-60,20,-80,0,30,0")
     plan_move(ns16, left, right)  # free without the wall
     for end in (left, right):
         plan_move(walled, end, turned(walled, end, "6", 10.0))

@@ -172,7 +172,8 @@ def test_an_archive_gives_its_cell_and_init_packet(campaign: Campaign, tmp_path:
     summary = new(URDF_PATH, tmp_path / "cell.toml", "--from-archive", str(archive))
     assert summary["unknown"] == []
     assert any("simulated" in note for note in summary["notes"])
-    written, original = Cell.load(tmp_path / "cell.toml"), campaign.cell
+    written = Cell.load(tmp_path / "cell.toml")
+    original = campaign.cell
     assert written.file.drive_train == original.file.drive_train
     assert written.file.limits == original.file.limits
     assert written.file.simulation == original.file.simulation

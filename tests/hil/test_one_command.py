@@ -290,7 +290,8 @@ def test_import_without_a_map_leaves_the_map(tmp_path: Path, urdf: Path) -> None
 
 
 def test_a_bag_needs_no_map(tmp_path: Path, urdf: Path) -> None:
-    source, robot = tmp_path / "x.db3", Robot.from_urdf(urdf)
+    source = tmp_path / "x.db3"
+    robot = Robot.from_urdf(urdf)
     bag(source, {"/joint_states": (STATE, WHOLE)})
     imported = import_recording(source, tmp_path / "a.mcap", lambda _: robot)
     import_rosbag2(source, tmp_path / "b.mcap", robot=robot)
@@ -319,7 +320,8 @@ def test_a_bag_leaves_how_it_was_read(tmp_path: Path, urdf: Path) -> None:
 
 @pytest.mark.long
 def test_a_bag_is_identified_again_with_its_map(tmp_path: Path, urdf: Path) -> None:
-    source, folder = tmp_path / "x.db3", tmp_path / "out"
+    source = tmp_path / "x.db3"
+    folder = tmp_path / "out"
     rows = np.loadtxt(moving(tmp_path / "a.csv"), delimiter=",", skiprows=1)
     stamps = (10**9 + np.rint(1e9 * rows[:, 0])).astype(int).tolist()
     messages = [
@@ -350,7 +352,8 @@ class TestIdentify:
 
     def test_a_log_and_a_urdf_are_enough(self, tmp_path: Path, urdf: Path) -> None:
         """One log fitted, one predicted; the folder holds what the next run needs."""
-        first, second = moving(tmp_path / "a.csv"), moving(tmp_path / "b.csv", seed=1)
+        first = moving(tmp_path / "a.csv")
+        second = moving(tmp_path / "b.csv", seed=1)
         result = hil("identify", first, "--urdf", urdf, "--predict", second)
         assert result.exit_code == 0, (result.output, result.exception)
         folder = tmp_path / "a"
@@ -490,7 +493,8 @@ REAL: Sequence[tuple[str, str]] = [
 def test_real_logs_are_read_as_by_their_maps(
     tmp_path: Path, shared_data: Path, recording: str, urdf: str
 ) -> None:
-    source, robot = shared_data / recording, Robot.from_urdf(shared_data / urdf)
+    source = shared_data / recording
+    robot = Robot.from_urdf(shared_data / urdf)
     import_recording(source, tmp_path / "a.mcap", lambda _: robot)
     columns = ColumnMap.load(source.parent / "map.toml")
     import_log(source, tmp_path / "b.mcap", robot=robot, columns=columns)

@@ -138,11 +138,13 @@ class TestInertiaScale:
     def test_the_demo_has_table_2_and_other_nominal_values(self):
         cell = Cell.load(CELL_PATH)
         table = base_from_standard(standard_parameters())
-        planted, nominal = planted_values(cell), cell.nominal_values()
+        planted = planted_values(cell)
+        nominal = cell.nominal_values()
         b = cell.model.base.rank
         large = np.abs(planted) > 1e-6
         # Table 2 has other signs and another order.
-        sizes, printed = np.sort(np.abs(planted[:b])), np.sort(np.abs(table))
+        sizes = np.sort(np.abs(planted[:b]))
+        printed = np.sort(np.abs(table))
         np.testing.assert_allclose(sizes, printed, rtol=1e-9, atol=1e-12)
         errors = np.abs(nominal[large] / planted[large] - 1.0)
         assert errors.max() < 0.25
@@ -159,7 +161,8 @@ class TestInertiaScale:
 
     def test_without_it_the_urdf_is_true(self):
         cell = Cell.load(CELL_PATH).with_values({"simulation.inertia_scale": []})
-        b, standard = cell.model.base.rank, cell.model.nominal
+        b = cell.model.base.rank
+        standard = cell.model.nominal
         np.testing.assert_array_equal(planted_truth(cell).inertia_scale, np.ones(6))
         standard[cell.model.layout.rotors] = cell.simulation.rotor_inertia
         np.testing.assert_allclose(planted_values(cell)[:b], cell.model.base.grouping @ standard)

@@ -438,7 +438,8 @@ class TestCommand:
             command = re.search(r"`hil run (\S+) ([^`]*)`", printed)
             words = [] if command is None else shlex.split(command[2])
             assert command is None or command[1] == str(root)
-        no, yes = ["--mounted", "no"], ["--mounted", "yes"]
+        no = ["--mounted", "no"]
+        yes = ["--mounted", "yes"]
         accept = "--accept-dry-run"
         assert typed == [[*no, "--dry-run"], [*no, accept], [*yes, accept], [*no, accept]]
         assert (root / "payload" / "gripper" / "payload.json").exists()

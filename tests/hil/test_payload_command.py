@@ -29,7 +29,8 @@ from tests.hil.simulated_logs import Simulated, archive_of, simulate
 
 pytestmark = pytest.mark.long
 
-MASS, CENTRE = 4.0, np.array([0.0, 0.09, 0.12])
+MASS = 4.0
+CENTRE = np.array([0.0, 0.09, 0.12])
 TENSOR = np.diag([0.01, 0.02, 0.015])
 LAW = FrictionLaw(third=None, offset=True)
 BOTH = ("--loaded", "full.mcap", "--mass", "4", "--centre", "0,0.09,0.12")
@@ -110,7 +111,8 @@ class TestFigures:
 
     def test_each_controller_has_its_own_units(self, printed: dict[str, dict]) -> None:
         """COMAU uses mm, UR and Franka m; Franka the complete matrix."""
-        typed, figures = printed["controllers"], printed["figures"]
+        typed = printed["controllers"]
+        figures = printed["figures"]
         centre = [figures[name]["value"] for name in ("cx", "cy", "cz")]
         assert f"$TOOL_CNTR := POS({1e3 * centre[0]:.2f}, {1e3 * centre[1]:.2f}" in typed["COMAU"]
         assert f"$TOOL_INERTIA[2] := {figures['Iyy']['value']:.5f}" in typed["COMAU"]
@@ -154,7 +156,8 @@ class TestByModel:
         self, by_model: dict[str, Any], printed: dict[str, Any]
     ) -> None:
         for name in ("mass", "cx", "cy", "cz"):
-            alone, both = by_model["figures"][name], printed["figures"][name]
+            alone = by_model["figures"][name]
+            both = printed["figures"][name]
             low, high = alone["interval"]
             assert low <= both["interval"][1] and both["interval"][0] <= high
         widths = [
@@ -294,7 +297,8 @@ class TestRefused:
         turned = archived(
             tmp_path / "turned.mcap", simulate("ur5_robot.urdf", time, seed=3, load=load)
         )
-        bare, full = folder / "empty.mcap", folder / "full.mcap"
+        bare = folder / "empty.mcap"
+        full = folder / "full.mcap"
         with pytest.raises(InputError, match=r"contradict.*full\.mcap.*turned\.mcap.*mm") as error:
             find_payload([bare], [full, turned], Silent())
         command = shlex.split(str(error.value.remedy).split("itself: ")[1])

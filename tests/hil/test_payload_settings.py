@@ -21,7 +21,8 @@ KILOGRAM_FORCE = 9.80665  # N
 def random_body(seed: int) -> Body:
     """Of a box of some decimetres, turned and away from the flange."""
     rng = np.random.default_rng(seed)
-    mass, sides = rng.uniform(1.0, 60.0), rng.uniform(0.05, 0.6, 3)
+    mass = rng.uniform(1.0, 60.0)
+    sides = rng.uniform(0.05, 0.6, 3)
     squares = sides**2
     moments = mass / 12.0 * (squares.sum() - squares)
     turned = np.linalg.qr(rng.standard_normal((3, 3)))[0]
@@ -39,8 +40,10 @@ def lines(body: Body, *, with_centre: bool = True, with_inertia: bool = True) ->
 
 def about(axis: int, degrees: float) -> Array:
     """Rotation about a coordinate axis, by its definition."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    j, k = (axis + 1) % 3, (axis + 2) % 3
+    c = np.cos(np.radians(degrees))
+    s = np.sin(np.radians(degrees))
+    j = (axis + 1) % 3
+    k = (axis + 2) % 3
     matrix = np.eye(3)
     matrix[j, j] = matrix[k, k] = c
     matrix[j, k], matrix[k, j] = -s, s

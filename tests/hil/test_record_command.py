@@ -211,7 +211,8 @@ def own_motion(cell: Path, port: int, *options: str) -> tuple[object, ...]:
 
 
 def wait_until_recorded(archive: Path, recorder: subprocess.Popen[str], cycles: int = 500) -> None:
-    deadline, recorded = time.monotonic() + 60.0, 0
+    deadline = time.monotonic() + 60.0
+    recorded = 0
     while recorded <= cycles:
         assert time.monotonic() < deadline
         assert recorder.poll() is None, recorder.communicate()

@@ -141,7 +141,8 @@ def at(*numbers: int) -> NDArray[np.void]:
 class TestPreTriggerBuffer:
     @pytest.mark.parametrize("batch", [7, 20, 333, 2 * BUFFERED_CYCLES])
     def test_the_newest_records_stay(self, batch: int) -> None:
-        buffer, numbers = PreTriggerBuffer(), range(3 * BUFFERED_CYCLES)
+        buffer = PreTriggerBuffer()
+        numbers = range(3 * BUFFERED_CYCLES)
         for begin in numbers[::batch]:
             part = numbers[begin : begin + batch]
             buffer.add(at(*part), [])

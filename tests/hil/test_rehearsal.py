@@ -102,7 +102,8 @@ def test_simulated_parameters_are_within_a_tenth_of_nominal(designed: Campaign, 
 
 def moving(designed: Campaign, degrees: tuple[float, float], speed: float) -> CampaignPlan:
     """A plan whose excitation goes to a posture and back."""
-    cell, home = designed.cell, designed.cell.home
+    cell = designed.cell
+    home = designed.cell.home
     moves = (Move(home + np.radians(degrees), speed=speed), Move(home, speed=speed))
     trajectory = plan_moves(home, moves, cell.joint_limits).trajectory
     excitation = replace(designed.plan.excitation, trajectory=trajectory)
@@ -125,11 +126,14 @@ def test_a_wrong_cell_or_plan_fails(
     tmp_path: Path, designed: Campaign, monkeypatch: pytest.MonkeyPatch, right: str, wrong: str
 ) -> None:
     """The simulated arm shares no conversion with the PC, so that a sign cannot cancel."""
-    cell, plan, expected = designed.cell, designed.plan, {"parameters"}
+    cell = designed.cell
+    plan = designed.plan
+    expected = {"parameters"}
     match wrong:
         case "of the wrong sign on our side":
             # The residuals are so large that the intervals of the parameters become wide.
-            expected, honest = {"unseen motion"}, DriveTrain.joint_torque
+            expected = {"unseen motion"}
+            honest = DriveTrain.joint_torque
             monkeypatch.setattr(
                 DriveTrain,
                 "joint_torque",
@@ -137,14 +141,17 @@ def test_a_wrong_cell_or_plan_fails(
             )
         case "tiny and slow" | "one joint only":
             poor = ((1.0, 1.0), 0.02) if wrong == "tiny and slow" else ((0.0, 40.0), 1.0)
-            plan, expected = moving(designed, *poor), {"excitation", "unseen motion"}
+            plan = moving(designed, *poor)
+            expected = {"excitation", "unseen motion"}
         case "nearly too weak":
             good = Rehearsal.load(designed.folder)
             (share,) = (c.value for c in good.criteria if c.name == "current (as modelled)")
             text = CELL.replace(right, f"current_limit = {[20.0 * share / 0.85, 12.0]}")
-            cell, expected = cell_of(tmp_path, text), {"current (as modelled)"}
+            cell = cell_of(tmp_path, text)
+            expected = {"current (as modelled)"}
         case _:
-            cell, expected = cell_of(tmp_path, CELL.replace(right, wrong, 1) + GEARS), set()
+            cell = cell_of(tmp_path, CELL.replace(right, wrong, 1) + GEARS)
+            expected = set()
     campaign = Campaign.create(tmp_path / "campaign", cell, plan)
     rehearsal = campaign.rehearse()
     failed = {criterion.name for criterion in rehearsal.criteria if not criterion.passed}
@@ -294,7 +301,8 @@ class StopsAfter(Silent):
 
 
 def test_a_stopped_rehearsal_replaces_no_passed_one(tmp_path: Path, designed: Campaign) -> None:
-    campaign, stop = Campaign.create(tmp_path / "campaign", designed.cell, designed.plan), Stop()
+    campaign = Campaign.create(tmp_path / "campaign", designed.cell, designed.plan)
+    stop = Stop()
     with pytest.raises(OperatorStopError, match="rehearse again"):
         campaign.rehearse(stop=stop, reporter=StopsAfter(stop))
     assert Rehearsal.load(campaign.folder) is None
@@ -322,7 +330,8 @@ def test_the_command_is_the_method_with_exit_codes(designed: Campaign, tmp_path:
 # --- A rehearsal of an arm with seven joints, two of whose main axes are almost parallel
 
 HOME = [0.0, -30.0, 0.0, -120.0, 0.0, 90.0, 0.0]
-FOUR, THREE = [2.0] * 4, [1.0] * 3
+FOUR = [2.0] * 4
+THREE = [1.0] * 3
 
 
 @pytest.fixture(scope="module")
@@ -348,7 +357,8 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Cell:
 def test_springs_of_the_twin_suit_axes_that_carry_each_other(cell: Cell) -> None:
     """The plant itself, without gravity, friction and servo: energy put into the springs stays."""
     given = Twin.of(cell, seed=1, repetitions=1).cell.file.simulation
-    compliance, none = np.array(given.elasticity), np.zeros(7)
+    compliance = np.array(given.elasticity)
+    none = np.zeros(7)
     assert (compliance[:3] > 0.0).all() and not compliance[3:].any()
     step = 0.5 * cell.period
     assert FASTEST * step <= 1.0

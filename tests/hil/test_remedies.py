@@ -80,7 +80,8 @@ class TestBags:
         assert_right(source)
 
     def test_joints_of_other_names(self, urdf: Path) -> None:
-        source, names = urdf.with_name("other.db3"), ("a", "b", "c")
+        source = urdf.with_name("other.db3")
+        names = ("a", "b", "c")
         bag(source, {"/joint_states": (STATE, renamed(names))})
         refused = typed("rosbag2", source, urdf)
         assert "--rename RECORDED=URDF" in refused and "a, b, c" in refused
@@ -90,7 +91,8 @@ class TestBags:
         assert_right(source)
 
     def test_a_joint_without_effort(self, urdf: Path) -> None:
-        source, effort = urdf.with_name("still.db3"), TORQUE.copy()
+        source = urdf.with_name("still.db3")
+        effort = TORQUE.copy()
         effort[:, 1] = np.nan
         silent = [message(k, effort=effort) for k in range(COUNT)]
         bag(source, {"/joint_states": (STATE, silent)})

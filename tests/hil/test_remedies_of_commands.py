@@ -57,7 +57,8 @@ def log(
 ) -> Path:
     """Write a log with dry friction that grows by `load` of the torque; spikes in N·m."""
     model = pin.buildModelFromXML(URDF)
-    data, random = model.createData(), np.random.default_rng([seed, 1])
+    data = model.createData()
+    random = np.random.default_rng([seed, 1])
     time, position, velocity, acceleration = motion(seed)
     states = zip(position, velocity, acceleration, strict=True)
     rigid = np.array([pin.rnea(model, data, *state) for state in states])
@@ -151,7 +152,8 @@ class TestIdentify:
     def test_options_that_do_not_fit(
         self, archive: Path, tmp_path: Path, options: Sequence[str], remedy: str
     ) -> None:
-        line, other = ["identify", archive, "-q", "-o", tmp_path / "result"], tmp_path / "b.mcap"
+        line = ["identify", archive, "-q", "-o", tmp_path / "result"]
+        other = tmp_path / "b.mcap"
         other.write_bytes(archive.read_bytes() if "--predict" not in options else b"")
         if "--predict" in options:
             source = log(tmp_path / "b.csv", 1)
@@ -171,7 +173,8 @@ class TestIdentify:
     ) -> None:
         typed("identify", archive, "--fit-all", "-q", "-o", tmp_path / "fit")
         (option,) = re.findall(r"hil identify (--predict) ARCHIVE", steps(tmp_path / "fit"))
-        other, urdf = tmp_path / "b.mcap", archive.parents[1] / "arm.urdf"
+        other = tmp_path / "b.mcap"
+        urdf = archive.parents[1] / "arm.urdf"
         done = typed("import", "log", log(tmp_path / "b.csv", 1), "--urdf", urdf, "-o", other)
         assert done.exit_code == 0, message(done)
         predicted = typed("identify", archive, option, other, "-q", "-o", tmp_path / "result")

@@ -60,7 +60,8 @@ HOSTILE = '$\\frac$\x07"><script>alert(1)</script><img src=x onerror=alert(2)>--
 def make_results(**changes):
     """The NS 16 as a campaign on the simulated cell would leave it; `changes` replace fields."""
     rng = np.random.default_rng(16)
-    truth, size = np.array([row.pi_c or 0.0 for row in TABLE2]), len(TABLE2)
+    truth = np.array([row.pi_c or 0.0 for row in TABLE2])
+    size = len(TABLE2)
     std = (0.002 + 0.004 * np.abs(truth)) * rng.lognormal(0.0, 0.5, size)
     estimate = truth + std * rng.standard_normal(size)
     values = estimate + 5.0 * std * rng.standard_normal((30, size))
@@ -160,14 +161,18 @@ def _validation(rng, k):
 def make_series(samples = 2000, joints = 6, name = "v.mcap"):
     """Smooth motion with the amplitudes of a real one, and a torque that is nearly right."""
     rng = np.random.default_rng(4)
-    time, half = 0.002 * np.arange(samples), samples // 2
-    rate, phase = rng.uniform(0.4, 2.6, (4, joints)), rng.uniform(0.0, 6.28, (4, joints))
+    time = 0.002 * np.arange(samples)
+    half = samples // 2
+    rate = rng.uniform(0.4, 2.6, (4, joints))
+    phase = rng.uniform(0.0, 6.28, (4, joints))
     angle = rate * time[:, None, None] + phase
-    position, velocity = 0.7 * np.sin(angle).sum(axis=1), 0.7 * (rate * np.cos(angle)).sum(axis=1)
+    position = 0.7 * np.sin(angle).sum(axis=1)
+    velocity = 0.7 * (rate * np.cos(angle)).sum(axis=1)
     size = np.resize(TORQUE, joints)
     torque = size * (np.sin(position) + 0.3 * np.tanh(40.0 * velocity))
     noise = np.convolve(rng.standard_normal(samples), np.ones(9) / 3.0, "same")[:, None]
-    fitted, used = np.ones((samples, joints)), np.ones((half, joints))
+    fitted = np.ones((samples, joints))
+    used = np.ones((half, joints))
     fitted[: samples // 4] = used[-samples // 20:] = 0.0
     parts = (0.3 * size * np.sin(position) * noise, 0.1 * size * np.cos(position))
     frequency = np.linspace(0.25, 250.0, 60)
@@ -422,7 +427,8 @@ class TestPage:
         assert "<script>alert(1)</script>" in rendered_page.text
         # Also characters that change the direction of text.
         text = environment().from_string("{{ name }}|{{ same }}|{{ number }}")
-        name, same = "a\u202eb\x1b[31m\u2066c\x7f", "1\u2009234\u00a0N\n\té"
+        name = "a\u202eb\x1b[31m\u2066c\x7f"
+        same = "1\u2009234\u00a0N\n\té"
         shown = text.render(name=name, same=same, number=3)
         assert shown == r"a\u202eb\x1b[31m\u2066c\x7f" + f"|{same}|3"
 
@@ -536,7 +542,8 @@ class TestPage:
 
 class TestParameters:
     def test_are_in_a_table(self, whole, results):
-        rows, parameters = whole.table("Estimate"), results.parameters
+        rows = whole.table("Estimate")
+        parameters = results.parameters
         assert [row["Id"] for row in rows] == [str(p.table2_id) for p in parameters]
         for row, p in zip(rows, parameters, strict=True):
             half = 0.06 * p.std  # numbers are rounded at the second digit of std
@@ -597,7 +604,8 @@ class TestParameters:
     def test_figure_and_summary_have_the_order_of_the_table(self, results):
         """Of the parameters estimated first and last the numbers are exchanged."""
         parameters = [p.model_dump() for p in results.parameters]
-        first, last = parameters[0], parameters[N_ESSENTIAL - 1]
+        first = parameters[0]
+        last = parameters[N_ESSENTIAL - 1]
         ids = last["table2_id"], first["table2_id"]
         for parameter, number in zip((first, last), ids, strict=True):
             values = {"estimate": 0.0, "std": 1.0, "truth": -4.0}
@@ -661,7 +669,8 @@ class TestFigures:
     """A panel for each joint; rows that do not count are shaded."""
 
     def test_show_every_joint_that_moved(self, results):
-        series, joints = make_series(), figures.joints_of(results)
+        series = make_series()
+        joints = figures.joints_of(results)
         series.law_speed[:, 2] = 0.0
         for panels, expected in (
             (figures.excitation_charts(series, joints), JOINTS),
@@ -727,7 +736,8 @@ class TestFigures:
             ReportSeries.from_arrays({k: v for k, v in needed.items() if k != "law_speed"})
 
     def test_are_small_enough_for_one_file_of_fifteen_joints(self):
-        results, series = with_joints(make_results(), 15), make_series(samples=20_000, joints=15)
+        results = with_joints(make_results(), 15)
+        series = make_series(samples=20_000, joints=15)
         assert len(report_bytes(results, series)) < 3_000_000
 
     def test_shade_rows_to_midway_to_the_next(self):
@@ -771,7 +781,8 @@ class TestFigures:
 
     @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=3000), st.integers(1, 200))
     def test_thinning_leaves_order_ends_and_every_peak(self, values, bins):
-        time, signal = np.arange(float(len(values))), np.array(values)
+        time = np.arange(float(len(values)))
+        signal = np.array(values)
         thin_time, thin = thinned(time, signal, bins)
         assert thin.size <= 2 * bins + 2
         assert np.all(np.diff(thin_time) > 0)

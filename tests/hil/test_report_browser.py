@@ -104,7 +104,8 @@ class TestCharts:
         assert boxes[1]["y"] + boxes[1]["height"] < 900
 
     def test_zoom_together_and_back(self, opened):
-        page, before = opened.page, x_ranges(opened.page)
+        page = opened.page
+        before = x_ranges(opened.page)
         drag(page, "t0", 0.4, 0.6)
         zoomed = x_ranges(page)
         assert zoomed[0][0] > before[0][0] and zoomed[0][1] < before[0][1]
@@ -127,7 +128,8 @@ class TestCharts:
         assert moved[1] - moved[0] == pytest.approx(zoomed[1] - zoomed[0])
 
     def test_leave_the_wheel_to_the_page_unless_ctrl_is_held(self, opened):
-        page, before = opened.page, x_ranges(opened.page)
+        page = opened.page
+        before = x_ranges(opened.page)
         page.locator('[data-chart="t0"] .plot-holder').first.hover()
         page.mouse.wheel(0, 120)
         page.wait_for_timeout(300)
@@ -148,7 +150,8 @@ class TestCharts:
         assert all(word in text for word in ("time", "measured", "nominal", "predicted", "N·m"))
 
     def test_hide_joints_and_lines(self, opened):
-        page, before = opened.page, heights(opened.page)
+        page = opened.page
+        before = heights(opened.page)
         page.get_by_role("button", name="joint_2", exact=True).locator("visible=true").first.click()
         assert not page.locator('[data-chart="t1"]').is_visible()
         assert not page.locator('[data-chart="k1"]').is_visible()

@@ -43,7 +43,8 @@ class TestParts:
         assert all(np.ptp(part, axis=0).max() > 0.1 for part in parts.values())
 
     def test_grow_as_their_causes_do(self, samples):
-        parts, motion = torque_parts(MODEL, truth(), samples), samples.motion
+        parts = torque_parts(MODEL, truth(), samples)
+        motion = samples.motion
         faster = motion._replace(
             velocity=2.0 * motion.velocity, acceleration=3.0 * motion.acceleration
         )

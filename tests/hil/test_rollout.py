@@ -94,7 +94,8 @@ class TestSectionOfTheReport:
     def test_the_rollout_writes_it(self, folder: Path) -> None:
         assert "Simulated motion" not in (folder / REPORT).read_text()
         run("rollout", folder, "--samples", "3")
-        page, result = (folder / REPORT).read_text(), RolloutResult.load(folder / ROLLOUT)
+        page = (folder / REPORT).read_text()
+        result = RolloutResult.load(folder / ROLLOUT)
         assert result.message in page
         assert "arms drawn from the posterior" in page
         assert page.count('<div class="panel" data-chart="rollout-') == len(result.joint_names) + 1
@@ -119,7 +120,8 @@ class TestSectionOfTheReport:
     def test_it_counts_an_arm_that_explodes(self, folder: Path) -> None:
         run("rollout", folder, "--samples", "3")
         result = RolloutResult.load(folder / ROLLOUT)
-        count, others = result.windows, len(result.joint_names) - 1
+        count = result.windows
+        others = len(result.joint_names) - 1
         lost = ArmErrors(
             joints=[[np.pi] * (others + 1)] * len(result.horizons),
             tool=[None] * len(result.horizons),
@@ -174,7 +176,8 @@ def test_a_polish_is_judged_on_held_out_windows(folder: Path) -> None:
 
 def test_a_log_without_torque_and_command_is_named(tmp_path: Path) -> None:
     time = np.arange(0.0, 5.0, 0.01)
-    log, urdf = tmp_path / "log.csv", ROOT / "examples" / "two_joints" / "robot.urdf"
+    log = tmp_path / "log.csv"
+    urdf = ROOT / "examples" / "two_joints" / "robot.urdf"
     columns = np.column_stack([time, np.sin(time), np.cos(time)])
     np.savetxt(log, columns, delimiter=",", header="t,q1,q2", comments="")
     refused = run("identify", log, "--urdf", urdf)

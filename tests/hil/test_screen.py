@@ -228,7 +228,8 @@ class Rig:
     """`screen_rig.py` on a terminal."""
 
     def __init__(self, end: Terminal, file: Path) -> None:
-        self._end, self._file = end, file
+        self._end = end
+        self._file = file
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._end, name)
@@ -237,7 +238,8 @@ class Rig:
         self, ready: Callable[[list[dict[str, object]]], bool], typing: str = ""
     ) -> None:
         """Wait until what the program received is as wanted; type again what it discarded."""
-        again, until = time.monotonic() + 0.1, time.monotonic() + 30.0
+        again = time.monotonic() + 0.1
+        until = time.monotonic() + 30.0
         while not ready(self.reported()):
             assert time.monotonic() < until, self.reported()
             if typing and time.monotonic() >= again:
@@ -259,7 +261,8 @@ def terminal(folder: Path, ending: str = "return") -> Iterator[Rig]:
         yield Rig(end, folder / "reported")
 
 
-ENTER, LEAVE = b"\x1b[?1049h", b"\x1b[?1049l"
+ENTER = b"\x1b[?1049h"
+LEAVE = b"\x1b[?1049l"
 
 
 def test_keys_arrive_and_the_screen_survives_a_resize(tmp_path: Path) -> None:
@@ -505,7 +508,8 @@ def test_lines_come_every_tenth_of_the_way(capsys: pytest.CaptureFixture[str]) -
 
 
 def test_eighty_columns_hold_count_times_and_note() -> None:
-    screen, title = StringIO(), "running the campaign (s of motion)"
+    screen = StringIO()
+    title = "running the campaign (s of motion)"
     bar = Bar(Console(file=screen, force_terminal=True, width=80, color_system=None))
     note = "generation 112 of 120, log det 104.1, I_c 80.1"
     with bar.task(title, 23000) as task:

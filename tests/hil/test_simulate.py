@@ -108,7 +108,8 @@ class Forked:
 def _be_hil(command: list[str], out: int) -> None:
     os.dup2(out, 1)
     os.dup2(out, 2)
-    sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
+    sys.stdout = os.fdopen(1, "w", closefd=False)
+    sys.stderr = os.fdopen(2, "w", closefd=False)
     sys.argv = ["hil", *command]
     try:
         main()
@@ -286,7 +287,8 @@ def test_the_own_motion_of_the_command_has_no_end(monkeypatch):
 def test_own_postures_are_within_limits_and_clear_on_the_way():
     cell = Cell.load(CELL_PATH)
     postures = np.array(own_postures(cell))
-    limits, checker = cell.joint_limits, MotionChecks.of(cell).checker
+    limits = cell.joint_limits
+    checker = MotionChecks.of(cell).checker
     assert len(postures) == 13
     assert (postures >= limits.lower).all() and (postures <= limits.upper).all()
     assert np.ptp(postures, axis=0).min() >= 0.5

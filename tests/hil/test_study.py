@@ -78,7 +78,8 @@ class TestCompared:
         logs = np.random.default_rng(3).normal(0.1, 0.3, 12)
         forms = np.zeros((12, 3, 3))
         forms[:, 0, 0], forms[:, 1, 1] = 1.0, np.exp(2.0 * logs)
-        first, second = np.tile([1.0, 0.0], (13, 1)), np.tile([0.0, 1.0], (13, 1))
+        first = np.tile([1.0, 0.0], (13, 1))
+        second = np.tile([0.0, 1.0], (13, 1))
         comparison = compared(forms, first, second)
         assert comparison.ratio == pytest.approx(np.exp(logs.mean()))
         assert (comparison.wins, comparison.motions) == (np.count_nonzero(logs < 0.0), 12)
@@ -98,8 +99,10 @@ class TestCompared:
     @pytest.mark.parametrize("memory", [0.0, 0.6])
     def test_a_method_seldom_differs_from_itself(self, repetitions: int, memory: float) -> None:
         """Also if successive repetitions are correlated, of which blocks are resampled."""
-        trials, differ = 60, 0
-        random, forms = np.random.default_rng(4), random_forms(10, 12)
+        trials = 60
+        differ = 0
+        random = np.random.default_rng(4)
+        forms = random_forms(10, 12)
         for _ in range(trials):
             noise = random.standard_normal((2, repetitions, 12))
             for k in range(1, repetitions if repetitions >= 10 else 0):
@@ -110,7 +113,8 @@ class TestCompared:
         assert differ <= stats.binom(trials, 0.05).ppf(0.999)
 
     def test_a_difference_that_exists_is_found(self) -> None:
-        forms, random = random_forms(10, 12), np.random.default_rng(5)
+        forms = random_forms(10, 12)
+        random = np.random.default_rng(5)
         near, far = (off + 0.02 * random.standard_normal((10, 12)) for off in (1.0, 1.2))
         comparison = compared(forms, near, far)
         assert comparison.ratio == pytest.approx(1.2, rel=0.02)

@@ -45,7 +45,9 @@ class Watcher:
     def __init__(
         self, script: Callable[[float, int], OperatorRequest] = lambda *_: OperatorRequest()
     ) -> None:
-        self._script, self._time, self._asked = script, 0.0, 0
+        self._script = script
+        self._time = 0.0
+        self._asked = 0
         self.seen: list[MotionProgress] = []
 
     def show(self, progress: MotionProgress) -> None:
@@ -75,7 +77,8 @@ class WatchedArm:
         return cls(cell, link, plan_moves(where, moves, cell.joint_limits).trajectory, path)
 
     def run(self, watch: Watcher, stop: Stop | None = None, override: float = 1.0) -> MotionEnded:
-        player, given = player_of(self.cell, self.motion), spec(self.cell, self.path)
+        player = player_of(self.cell, self.motion)
+        given = spec(self.cell, self.path)
         return self.link.run(player, given, stop or Stop(), override=override, watch=watch)
 
     @property
@@ -167,7 +170,8 @@ def test_a_motion_that_ends_during_a_hold_ends_its_supervision(
 
 
 def test_a_stop_ends_a_hold(arm: WatchedArm) -> None:
-    stop, held = Stop(), 0
+    stop = Stop()
+    held = 0
 
     def script(time: float, _: int) -> OperatorRequest:
         nonlocal held
@@ -185,7 +189,8 @@ class StopAt(Stop):
 
     def __init__(self, link: VirtualLink, cycle: int) -> None:
         super().__init__()
-        self._link, self._cycle = link, cycle
+        self._link = link
+        self._cycle = cycle
 
     @property  # type: ignore[override]
     def requested(self) -> bool:
@@ -220,7 +225,9 @@ def test_a_request_before_a_motion_begins_is_applied(
     arm: WatchedArm, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     """Also while a slow disk creates the archive; nothing is asked of the controller."""
-    stop, asked, opened = Stop(), 0, ArchiveSpec.open
+    stop = Stop()
+    asked = 0
+    opened = ArchiveSpec.open
     pressed = what == "hold"
 
     def slowly(given: ArchiveSpec) -> ArchiveWriter:
@@ -262,7 +269,8 @@ def test_what_is_shown_is_what_is_archived(arm: WatchedArm) -> None:
     columns = arm.archive.columns
     moving = [progress for progress in person.seen if progress.state is State.OPEN]
     assert moving
-    ratio, table = arm.cell.drive_train.gear_ratio[0], arm.cell.drive_table
+    ratio = arm.cell.drive_train.gear_ratio[0]
+    table = arm.cell.drive_table
     for progress in moving:
         same = (columns["position"] == progress.position).all(axis=1)
         same &= (columns["target_current"] == progress.current).all(axis=1)
@@ -329,7 +337,8 @@ def test_a_motion_that_may_have_begun_is_waited_for(
 ) -> None:
     """Whatever the state; an end whose event was lost is known from the count."""
     monkeypatch.setattr(StartTimeout, "no_start", lambda *_: "the motion will not start")
-    link, port = arm.link, arm.link.port
+    link = arm.link
+    port = arm.link.port
     monkeypatch.setattr(port, "poll", lambda poll=port.poll: [event, *without_end(poll())])
     ended = arm.run(Watcher())
     assert (ended.outcome, ended.reason, ended.cycle) == ("completed", "the motion is complete", -1)
@@ -341,11 +350,13 @@ def without_end(events: Sequence[Any]) -> list[Any]:
 
 
 def test_heartbeats_end_when_the_supervising_loop_stalls() -> None:
-    clock, given = Clock(), list[float]()
+    clock = Clock()
+    given = list[float]()
     heart = Heartbeat(lambda: given.append(clock.now), clock)
 
     def beats_in(seconds: float) -> int:
-        before, end = len(given), clock.now + seconds
+        before = len(given)
+        end = clock.now + seconds
         while clock.now < end:
             clock.now += 0.05
             heart.update()
@@ -369,7 +380,8 @@ class Failing:
     can_answer = False
 
     def __init__(self) -> None:
-        self.shown, self.fails = 0, False
+        self.shown = 0
+        self.fails = False
         self.answer: Any = OperatorRequest()
 
     def show(self, _: RunStatus) -> None:

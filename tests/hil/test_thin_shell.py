@@ -32,7 +32,8 @@ def imported(tree: ast.AST) -> Iterator[str]:
 
 def violations(source: str) -> list[str]:
     """Return operations that a module of the command line must not contain."""
-    tree, operations = ast.parse(source), []
+    tree = ast.parse(source)
+    operations = []
     for name in imported(tree):
         top = name.lstrip(".").split(".")[0]
         if top in WIRE or (top in ALGEBRA and not name.startswith("numpy")):

@@ -148,7 +148,8 @@ class TestEdited:
         "text", ["limits = { torque = 3, frame = 'urdf' }\n", "limits.torque = 3\nlimits.frame = 1"]
     )
     def test_a_table_needs_no_header_line(self, text: str) -> None:
-        before, changed = tomllib.loads(text), with_values(text, {"limits.torque": 5})
+        before = tomllib.loads(text)
+        changed = with_values(text, {"limits.torque": 5})
         assert tomllib.loads(changed) == {"limits": {**before["limits"], "torque": 5}}
 
     def test_an_edit_that_would_change_another_entry_is_refused(

@@ -160,7 +160,8 @@ def test_the_program_asks_first_and_its_speed_scales_time() -> None:
         exec(program + "\nexcitation()", names)
         return given
 
-    full, slow = commands(1.0), commands(0.2)
+    full = commands(1.0)
+    slow = commands(0.2)
     assert [name for name, _ in full[:2]] == ["popup", "movej"]
     paths = [np.array([target for name, target in run if name == "servoj"]) for run in (full, slow)]
     assert len(paths[1]) == 5 * len(paths[0])

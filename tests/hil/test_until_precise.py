@@ -43,7 +43,8 @@ def campaign_of(folder, **changes) -> Campaign:
 
 
 def run(campaign, *texts: str, stop: Stop | None = None, **choices) -> Heard:
-    heard, required = Heard(), requirements_of(campaign, texts)
+    heard = Heard()
+    required = requirements_of(campaign, texts)
     campaign.run(stop=stop, reporter=heard, unrehearsed=True, until_precise=required, **choices)
     return heard
 
@@ -95,7 +96,8 @@ class TestEnd:
         assert campaign.precision is None
 
     def test_a_stopped_run_is_resumed(self, tmp_path) -> None:
-        campaign, stop = campaign_of(tmp_path), Stop()
+        campaign = campaign_of(tmp_path)
+        stop = Stop()
 
         class Stopping(Heard):
             def say(self, text: str) -> None:

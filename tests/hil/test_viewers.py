@@ -39,7 +39,8 @@ def excitation(campaign: Campaign) -> Path:
 def test_every_quantity_of_every_joint_is_shown_with_its_peaks(
     excitation: Path, campaign: Campaign
 ) -> None:
-    view, columns = view_of(excitation), open_archive(excitation).columns
+    view = view_of(excitation)
+    columns = open_archive(excitation).columns
     titles = ", ".join(quantity.title.partition(" [")[0] for quantity in view.quantities)
     assert titles == "position, speed, motor current, torque at the joint, following error"
     current = view.quantities[2]
@@ -51,7 +52,8 @@ def test_every_quantity_of_every_joint_is_shown_with_its_peaks(
     assert view.quantities[0].traces[1].value.max() == pytest.approx(pendant[:, 1].max())
     assert any(name == "MotionEnded" for _, name, _, _ in view.events)
     # In the unit of the controller's thresholds, by the drive train's own conversion.
-    columns, drives = open_archive(excitation).columns, campaign.cell.drive_train
+    columns = open_archive(excitation).columns
+    drives = campaign.cell.drive_train
     error = drives.motor_revolutions(columns["target_position"]) - drives.motor_revolutions(
         columns["position"]
     )

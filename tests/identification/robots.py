@@ -94,7 +94,8 @@ def some_bodies(n, seed=0):
     rng = np.random.default_rng(seed)
     standard = np.empty((n, 11))
     for row in standard:
-        points, mass = rng.normal(scale=0.1, size=(9, 3)), rng.uniform(0.5, 20.0)
+        points = rng.normal(scale=0.1, size=(9, 3))
+        mass = rng.uniform(0.5, 20.0)
         spread = np.cov(points.T) * mass
         tensor = np.trace(spread) * np.eye(3) - spread
         row[:10] = inertial_parameters(Body(mass, rng.normal(scale=0.2, size=3), tensor))

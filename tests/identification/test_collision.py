@@ -57,7 +57,8 @@ def brute(arm):
         joints = [shapes.geometryObjects[k].parentJoint for k in (a, b)]
         if abs(joints[0] - joints[1]) > (0 if b == ground else 1):
             shapes.addCollisionPair(pin.CollisionPair(a, b))
-    data, places = arm.createData(), pin.GeometryData(shapes)
+    data = arm.createData()
+    places = pin.GeometryData(shapes)
 
     def least(q):
         distances = []

@@ -58,7 +58,8 @@ def deviation(estimate):
 
 
 def test_the_torque_is_that_of_links_that_lag_their_motors():
-    elastic, rigid = recorded(COMPLIANCE / 10.0), recorded(np.zeros(2))
+    elastic = recorded(COMPLIANCE / 10.0)
+    rigid = recorded(np.zeros(2))
     each = elastic_torque(MODEL, rigid, truth(), COMPLIANCE / 10.0)
     added = elastic.torque - rigid.torque
     error = (each.sum(axis=2) - added)[200:-200]  # its low-pass turns round at the ends

@@ -18,8 +18,12 @@ mujoco = pytest.importorskip("mujoco", reason="the extra mujoco is not installed
 
 N = MODEL.n_joints
 NO_LIMITS = Ranges(*(np.full(N, limit) for limit in (-np.inf, np.inf, np.inf, np.inf)))
-KP, KD, DELAY = np.array([2000.0, 500.0]), np.array([60.0, 10.0]), 0.012
-ROTORS, DRY, VISCOUS = np.array([0.4, 0.1]), np.array([3.0, 1.0]), np.array([2.0, 0.5])
+KP = np.array([2000.0, 500.0])
+KD = np.array([60.0, 10.0])
+DELAY = 0.012
+ROTORS = np.array([0.4, 0.1])
+DRY = np.array([3.0, 1.0])
+VISCOUS = np.array([2.0, 0.5])
 TRUE = np.column_stack([KP, KD, ROTORS, DRY, VISCOUS])
 STEP = 0.005
 
@@ -61,11 +65,14 @@ def on_its_servo(
     white = np.random.default_rng(seed).standard_normal(command.position.shape)
     coloured = scipy.signal.lfilter([1.0], [1.0, -np.exp(-step / 0.02)], white, axis=0)
     torque = disturbance * coloured / coloured.std(axis=0)
-    data.qpos[order], data.qvel[order] = late[0][0], late[1][0]
+    data.qpos[order] = late[0][0]
+    data.qvel[order] = late[1][0]
     position, velocity = np.empty((2, *command.position.shape))
     for k in range(len(time)):
-        position[k], velocity[k] = data.qpos[order], data.qvel[order]
-        error, slip = late[0][k] - position[k], late[1][k] - velocity[k]
+        position[k] = data.qpos[order]
+        velocity[k] = data.qvel[order]
+        error = late[0][k] - position[k]
+        slip = late[1][k] - velocity[k]
         data.qfrc_applied[order] = servo.kp * error + servo.kd * slip + torque[k]
         mujoco.mj_step(model, data)
     settled = slice(round(0.5 / step), None)

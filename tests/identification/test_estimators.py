@@ -98,7 +98,8 @@ class TestRepeatedRecordings:
             recording(repeated + 0.1 * NOISE * rng.standard_normal(repeated.shape), motion)
             for _ in range(16)
         ]
-        single_run, many = estimate_repetitions(MODEL, runs[:1]), estimate_repetitions(MODEL, runs)
+        single_run = estimate_repetitions(MODEL, runs[:1])
+        many = estimate_repetitions(MODEL, runs)
         # Sixteen repetitions of one error count as one, unlike their scatter.
         np.testing.assert_allclose(many.pooled.std, single_run.pooled.std, rtol=0.35)
         assert np.median(many.std / 4.0 / many.pooled.std) < 0.1
@@ -128,7 +129,8 @@ PIECES = {
 @cache
 def whole():
     """A recording with outliers, and its plan."""
-    plan, rng = a_motion(5.0), np.random.default_rng(7)
+    plan = a_motion(5.0)
+    rng = np.random.default_rng(7)
     motion = plan._replace(acceleration=plan.acceleration + rng.normal(0.0, 0.3, (1000, 2)))
     samples = recording(coloured(rng, 1000, 5e-3, 0.02), motion)
     samples.torque[100:110] += 40.0
@@ -163,7 +165,8 @@ class TestBlocks:
     @pytest.mark.parametrize("correlation", [0.0, 0.02, 0.05, 0.1])
     def test_95_percent_intervals_cover_90_to_99_percent(self, correlation):
         motion = a_motion()
-        honest, classical = [], []
+        honest = []
+        classical = []
         for seed in range(120):
             noise = coloured(np.random.default_rng(seed), len(motion.time), 5e-3, correlation)
             result = estimate_repetitions(MODEL, [recording(noise, motion)])
@@ -181,8 +184,10 @@ class TestBlocks:
         phase = Factor.by_time(MODEL, recording(noise, motion))
         weights = 1.0 / NOISE**2
         weighted = phase.by_block(weights)
-        a_blocks, b_blocks = weighted[:, :-1, :-1], weighted[:, :-1, -1]
-        a, b = a_blocks.sum(axis=0), b_blocks.sum(axis=0)
+        a_blocks = weighted[:, :-1, :-1]
+        b_blocks = weighted[:, :-1, -1]
+        a = a_blocks.sum(axis=0)
+        b = b_blocks.sum(axis=0)
         values = np.linalg.solve(a, b)
         scores = b_blocks - a_blocks @ values
         np.testing.assert_allclose(phase.scores(weights, values), scores, atol=1e-8)
@@ -209,7 +214,8 @@ class TestBlocks:
     def test_correlation_of_neighbouring_blocks_counts(self, shared):
         """Mean of blocks that are correlated with the next one."""
         rng = np.random.default_rng(3)
-        blocks, k = 300, 40
+        blocks = 300
+        k = 40
         weight = (1.0 - np.sqrt(1.0 - 4.0 * shared**2)) / (2.0 * shared) if shared else 0.0
         white = rng.standard_normal((blocks + 1, k)) / np.sqrt(blocks * (1.0 + weight**2))
         scores = white[1:] + weight * white[:-1]
@@ -234,7 +240,8 @@ class TestBlocks:
         assert result.interval_factor == pytest.approx(2.02, abs=0.01)
 
     def test_independent_repetitions_are_averaged(self):
-        motion, rng = a_motion(), np.random.default_rng(4)
+        motion = a_motion()
+        rng = np.random.default_rng(4)
         runs = [recording(coloured(rng, len(motion.time), 5e-3, 0.02), motion) for _ in range(16)]
         result = estimate_repetitions(MODEL, runs)
         assert np.median(result.std / 4.0 / result.pooled.std) == pytest.approx(1.0, abs=0.35)
@@ -254,7 +261,9 @@ class TestBlocks:
             strict=True,
         ):
             array[:, 1] = elbow_rate
-        inside, alone, classical = [], [], []
+        inside = []
+        alone = []
+        classical = []
         for seed in range(150):
             noise = coloured(np.random.default_rng(seed), len(motion.time), 5e-3, 0.05)
             result = estimate_repetitions(MODEL, [recording(noise, motion)])
@@ -290,7 +299,8 @@ class TestLosses:
     @pytest.mark.parametrize("loss", [Loss(), *LOSSES, Huber(0.7), Tukey(3.0)])
     @given(x=st.floats(-1e6, 1e6))
     def test_weights_decrease_from_one_to_zero(self, loss, x):
-        weight, further = loss.weight(np.array([x])), loss.weight(np.array([1.1 * x]))
+        weight = loss.weight(np.array([x]))
+        further = loss.weight(np.array([1.1 * x]))
         assert 0.0 <= further[0] <= weight[0] <= 1.0
         assert loss.weight(np.array([-x])) == weight
         assert loss.weight(np.zeros(1)) == 1.0
@@ -326,7 +336,8 @@ class TestRobustEstimate:
     @given(seed=st.integers(0, 2**16), size=st.floats(20.0, 300.0))
     @settings(max_examples=8)
     def test_outliers_have_little_effect(self, loss, seed, size):
-        motion, rng = a_motion(5.0), np.random.default_rng(seed)
+        motion = a_motion(5.0)
+        rng = np.random.default_rng(seed)
         samples = recording(with_outliers(rng, gaussian(rng, motion), 0.05, size), motion)
         robust = robust_estimate(MODEL, [samples], loss)
         ordinary = estimate(MODEL, Factor.of(MODEL, samples))
@@ -338,11 +349,13 @@ class TestRobustEstimate:
 
     @pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
     def test_it_minimises_the_loss(self, loss):
-        motion, rng = a_motion(2.0), np.random.default_rng(3)
+        motion = a_motion(2.0)
+        rng = np.random.default_rng(3)
         samples = recording(with_outliers(rng, gaussian(rng, motion), 0.05, 15.0), motion)
         result = robust_estimate(MODEL, [samples], loss)
         rows = MODEL.regressor(*motion[1:]).dense(P)
-        scale, usable = result.estimate.noise_std, samples.usable
+        scale = result.estimate.noise_std
+        usable = samples.usable
 
         def cost(values):
             x = (samples.torque - rows @ values) / scale
@@ -402,7 +415,8 @@ class TestRobustEstimate:
         assert "f0_1" not in result.estimate.undetermined
 
     def test_missing_convergence_is_reported(self):
-        motion, rng = a_motion(3.0), np.random.default_rng(7)
+        motion = a_motion(3.0)
+        rng = np.random.default_rng(7)
         samples = recording(with_outliers(rng, gaussian(rng, motion), 0.05, 30.0), motion)
         result = robust_estimate(MODEL, [samples], most_iterations=1)
         assert not result.converged
@@ -410,7 +424,8 @@ class TestRobustEstimate:
         assert "Huber" in result.estimate.method
 
     def test_many_outliers_mean_a_wrong_model(self):
-        motion, rng = a_motion(5.0), np.random.default_rng(11)
+        motion = a_motion(5.0)
+        rng = np.random.default_rng(11)
         error = gaussian(rng, motion)
         # The elbow's friction in one direction of some poses is not in the model.
         error[:, 1] += 3.0 * (motion.position[:, 1] > 0.3) * (motion.velocity[:, 1] > 0.0)
@@ -451,7 +466,8 @@ class TestGaussianPrior:
         std[random.permutation(7)[:flat]] = np.inf
         prior = GaussianPrior.of_combinations(combinations, np.zeros(7), std)
         # Woodbury's identity in the limit of infinite variances.
-        bounded, endless = combinations[:, np.isfinite(std)], combinations[:, np.isinf(std)]
+        bounded = combinations[:, np.isfinite(std)]
+        endless = combinations[:, np.isinf(std)]
         finite = np.linalg.inv((bounded * std[np.isfinite(std)] ** 2) @ bounded.T)
         seen = finite @ endless
         expected = finite - seen @ np.linalg.inv(endless.T @ seen) @ seen.T
@@ -467,7 +483,8 @@ class TestPosterior:
         covariance = size * (np.transpose(rows) @ rows + 0.1 * np.eye(P))
         weights = 1.0 / NOISE**2
         factor = Factor.of(MODEL, noisy())
-        equations, precision = factor.weighted(weights), np.linalg.inv(covariance)
+        equations = factor.weighted(weights)
+        precision = np.linalg.inv(covariance)
         posterior = np.linalg.inv(equations.A + precision)
         expected = posterior @ (equations.b + precision @ mean)
         root = np.linalg.cholesky(covariance)
@@ -550,17 +567,17 @@ class TestPosterior:
         prior = prior_of(KNOWN)
         spread = np.linalg.inv(prior.root)  # no flat direction
         motion = one_sine_each()
-        inside, surprise, naive = [], [], []
+        inside = []
+        surprise = []
+        naive = []
         for seed in range(80):
             rng = np.random.default_rng(seed)
             values = prior.mean + spread @ rng.standard_normal(P)
             samples = simulated(MODEL, values, motion)
             samples.torque[:] += coloured(rng, len(motion.time), 5e-3, correlation)
             result = fit_posterior(MODEL, Factor.by_time(MODEL, samples), prior)
-            estimate, white = (
-                result.estimate,
-                with_prior(MODEL, Factor.of(MODEL, samples), prior).estimate,
-            )
+            estimate = result.estimate
+            white = with_prior(MODEL, Factor.of(MODEL, samples), prior).estimate
             inside.append(
                 np.abs(estimate.values - values) < estimate.interval_factor * estimate.std
             )
@@ -578,7 +595,8 @@ class TestPosterior:
     @pytest.mark.parametrize("effect", [1.0, 7.0])
     def test_rows_that_count_less_are_less_information(self, effect):
         """At the weights of the joints' own residuals."""
-        prior, factor = prior_of(KNOWN), Factor.by_time(MODEL, noisy())
+        prior = prior_of(KNOWN)
+        factor = Factor.by_time(MODEL, noisy())
         posterior = fit_posterior(MODEL, factor, prior, effect)
         values, weights = posterior_values(factor, prior, effect)
         equations = factor.weighted(weights)
@@ -595,7 +613,8 @@ class TestPosterior:
     @settings(max_examples=10)
     def test_what_the_data_determine_the_prior_does_not_change(self, seed):
         """Noise of a thousandth of a prior's deviation and less."""
-        rng, motion = np.random.default_rng(seed), a_motion()
+        rng = np.random.default_rng(seed)
+        motion = a_motion()
         samples = recording(1e-4 * gaussian(rng, motion), motion)
         factor = Factor.by_time(MODEL, samples)
         prior = prior_of(KNOWN)
@@ -639,7 +658,8 @@ class TestWeightOfBodies:
 
     def test_intervals_hold_for_bodies_as_uncertain_as_is_believed(self):
         """Arms drawn from the prior, fitted as if their bodies were nearly the described ones."""
-        rng, motion = np.random.default_rng(4), a_motion(5.0)
+        rng = np.random.default_rng(4)
+        motion = a_motion(5.0)
         stronger = self.PRIOR.with_weight(100.0).gaussian
         inside = []
         for _ in range(30):
@@ -659,7 +679,8 @@ class TestDesignEffect:
     """Rows that count as one."""
 
     def effects(self, correlation):
-        motion, prior = a_motion(20.0), prior_of(KNOWN)
+        motion = a_motion(20.0)
+        prior = prior_of(KNOWN)
         errors = [
             coloured(np.random.default_rng(seed), len(motion.time), 5e-3, correlation)
             for seed in range(8)
@@ -693,7 +714,8 @@ class TestBodyPrior:
     LENGTHS = np.array([0.5, np.hypot(0.01, 0.2)])
 
     def test_it_is_that_of_sampled_arms(self):
-        share, count = 0.3, 20_000
+        share = 0.3
+        count = 20_000
         factor = Factor.of(MODEL, noisy())
         prior = body_prior(MODEL, factor, share, stated=KNOWN).gaussian
         nominal = MODEL.nominal.reshape(2, 11)
@@ -855,7 +877,8 @@ class TestPlaceholders:
     @pytest.mark.parametrize("model", [EQUAL, BARE], ids=["equal", "bare"])
     @pytest.mark.parametrize("unit", [1e-3, -1.0, 1e3])
     def test_the_estimate_has_the_unit_of_the_torque(self, model, unit):
-        (prior, factor), (other, scaled) = self.prior(model), self.prior(model, unit)
+        (prior, factor) = self.prior(model)
+        (other, scaled) = self.prior(model, unit)
         np.testing.assert_allclose(other.std, abs(unit) * prior.std, rtol=1e-9)
         posterior = fit_posterior(model, factor, prior.gaussian, 3.0)
         same = fit_posterior(model, scaled, other.gaussian, 3.0)
@@ -948,7 +971,8 @@ class TestConsistentEstimate:
     @pytest.mark.parametrize(("noise", "samples"), [(0.5, 150), (0.3, 300), (0.02, 2000)])
     def test_base_parameters_follow_from_standard_ones(self, noise, samples):
         """These are consistent with poor data; good data are hardly changed."""
-        consistent, rank = fit_of(truth(), noise, 1, samples=samples), MODEL.base.rank
+        consistent = fit_of(truth(), noise, 1, samples=samples)
+        rank = MODEL.base.rank
         assert_consistent(MODEL, consistent)
         assert consistent.status == "optimal" and np.all(consistent.margin > 0.0)
         expected = MODEL.base.grouping @ consistent.standard
@@ -983,7 +1007,8 @@ class TestConsistentEstimate:
         root, target = rows_of(factor.weighted(weights))
         excess = float(np.sum((root @ consistent.estimate.values - target) ** 2))
         assert excess > 100.0
-        rank, s = MODEL.base.rank, len(MODEL.layout.names)
+        rank = MODEL.base.rank
+        s = len(MODEL.layout.names)
         mapping = np.zeros((MODEL.n_parameters, s + 4))
         mapping[:rank, :s] = MODEL.base.grouping
         mapping[rank:, s:] = np.eye(4)
@@ -1326,7 +1351,8 @@ class TestDelay:
         position = np.radians([10.0, -100.0, 170.0, -30.0, 60.0, 20.0])
         position = position + np.radians([12.0, 8.0, 10.0, 22.0, 20.0, 25.0]) * swing
         cell = Cell.load(CELL_PATH)
-        train, noise = cell.drive_train, cell.simulation
+        train = cell.drive_train
+        noise = cell.simulation
         controller = SimulatedController(
             urdf_text(), DRIVE, PLANT,
             ControllerSettings(
@@ -1406,7 +1432,8 @@ class TestDelayUncertainty:
             return prepare(recording, MODEL, options=options)
 
         middle = samples(0.004)
-        fitted, products = self.fit(MODEL, middle), rate_products(MODEL, middle)
+        fitted = self.fit(MODEL, middle)
+        products = rate_products(MODEL, middle)
         fitted = replace(fitted, noise_std=np.array([1.0, 0.2]))  # as weighted
         wider = with_uncertain_delay(fitted, Factor.of(MODEL, middle), products, 0.25)
         ends = [self.fit(MODEL, samples(0.004 + side)).values for side in (-5e-4, 5e-4)]

@@ -91,7 +91,8 @@ class TestGenomes:
 class TestViaPoints:
     @pytest.mark.parametrize("genome", [OPEN, CLOSED])
     def test_genes_reach_the_ends_of_range_and_speed(self, genome):
-        lower, upper = LIMITS.lower, LIMITS.upper
+        lower = LIMITS.lower
+        upper = LIMITS.upper
         spare = (1.0 - genome.range_share) / 2.0 * (upper - lower)
         free_points = slice(None) if genome.home is None else slice(1, -1)
         for gene, end, share in ((0.0, lower + spare, genome.slowest), (1.0, upper - spare, 1.0)):
@@ -290,7 +291,8 @@ def swing():
 class TestCurrents:
     def test_static_currents_agree_with_the_textbook(self, swing):
         motion = sampled(swing, 0.008)
-        currents, unsure = make_currents([1.0, 1.0]), make_currents([1.0, 1.0], uncertainty=0.2)
+        currents = make_currents([1.0, 1.0])
+        unsure = make_currents([1.0, 1.0], uncertainty=0.2)
         torque = currents.torque(motion)
         # At rest and level at the very start: elbow 1 kg at 0.5 m, shoulder 2 kg at 0.5 m more.
         np.testing.assert_allclose(
@@ -483,7 +485,8 @@ class TestSamples:
     @settings(max_examples=50, deadline=None)
     def test_they_are_uniform_at_ends_or_in_the_middle(self, seed, period):
         trajectory = some_motion(seed)
-        ends, middles = sampled(trajectory, period), midpoints(trajectory, period)
+        ends = sampled(trajectory, period)
+        middles = midpoints(trajectory, period)
         steps = np.diff(ends.time)
         assert (ends.time[0], ends.time[-1]) == (0.0, trajectory.duration)
         np.testing.assert_allclose(steps, steps[0], rtol=1e-9)
@@ -547,7 +550,8 @@ class TestMeasures:
     @given(seed=seeds, chosen=st.sets(st.integers(0, P - 1), min_size=1))
     @settings(max_examples=20, deadline=None)
     def test_they_are_of_the_chosen_columns(self, seed, chosen):
-        motion, random = midpoints(some_motion(seed)), np.random.default_rng(seed)
+        motion = midpoints(some_motion(seed))
+        random = np.random.default_rng(seed)
         order = random.permutation(sorted(chosen))
         columns = rows_of(motion)
         objective = Objective(MODEL, parameters=order)

@@ -326,7 +326,8 @@ WITH_TOOL = TWO_LINK.replace(
 )
 
 
-START, END = TWO_LINK.index("    <inertial>"), TWO_LINK.index("</inertial>\n") + 12
+START = TWO_LINK.index("    <inertial>")
+END = TWO_LINK.index("</inertial>\n") + 12
 ROTATED = 'rpy="0.3 -1 2"'
 NOTHING = (
     '<inertial><mass value="0"/>'
@@ -416,7 +417,8 @@ class TestWriting:
     )
     def test_inertia_is_written_in_its_frame(self, urdf):
         """A rotated inertial frame stays; a link without inertia gets one."""
-        model, standard = RobotModel.from_urdf(urdf), some_bodies(2)
+        model = RobotModel.from_urdf(urdf)
+        standard = some_bodies(2)
         written = write_urdf(urdf, model, standard)
         assert (ROTATED in written) == (ROTATED in urdf)
         again = RobotModel.from_urdf(written).nominal.reshape(2, 11)[:, :10]
@@ -691,7 +693,8 @@ class TestLoadFriction:
     @FORMS
     def test_what_is_left_out_is_the_friction_beyond_that_load(self, form):
         arm = replace(an_arm(urdf_text(), friction=FrictionLaw(load=True)), load=self.LOAD)
-        motion, model = random_states(arm, 60), arm.model
+        motion = random_states(arm, 60)
+        model = arm.model
         comparison = compared(form, arm, samples=60)
         beyond = [torque for name, torque in comparison.left_out.items() if "grows" in name]
         shares = np.array(

@@ -109,7 +109,8 @@ class TestFactor:
         """Gram matrices and triangles agree to nine digits, with any weights of joints."""
         samples = noisy(a_motion(1500), NOISE, seed)
         random = np.random.default_rng(seed)
-        edges, weights = random.integers(0, 1501, pieces - 1), random.uniform(0.1, 20.0, 2)
+        edges = random.integers(0, 1501, pieces - 1)
+        weights = random.uniform(0.1, 20.0, 2)
         edges = np.unique([0, *edges, 1500]).tolist()
         many = summed(storage, [samples.between(*part) for part in pairwise(edges)])
         whole = Factor.of(MODEL, samples, "qr")
@@ -118,10 +119,8 @@ class TestFactor:
         np.testing.assert_array_equal(many.samples, whole.samples)
         np.testing.assert_allclose(joint_weights(many), joint_weights(whole), rtol=1e-9)
         for joint_weights_or_none in (None, weights):
-            of_sum, other = (
-                estimate(MODEL, many, joint_weights_or_none),
-                estimate(MODEL, whole, joint_weights_or_none),
-            )
+            of_sum = estimate(MODEL, many, joint_weights_or_none)
+            other = estimate(MODEL, whole, joint_weights_or_none)
             for name in ("values", "std", "noise_std", "condition"):
                 np.testing.assert_allclose(getattr(of_sum, name), getattr(other, name), rtol=1e-9)
             scale = np.outer(of_sum.std, of_sum.std)
@@ -160,8 +159,10 @@ class TestFactor:
 
 class TestConditioning:
     def test_qr_is_more_accurate_than_gram(self):
-        samples, ordinary = ill(), np.ones(2)
-        exact, solution = exact_solution(samples), Factor.of(MODEL, samples, "qr").solve(ordinary)
+        samples = ill()
+        ordinary = np.ones(2)
+        exact = exact_solution(samples)
+        solution = Factor.of(MODEL, samples, "qr").solve(ordinary)
         assert 3e6 < solution.condition < 1e8
         assert solution.determined.all()
         np.testing.assert_allclose(solution.values, exact, rtol=1e-7)
@@ -172,7 +173,8 @@ class TestConditioning:
 
     def test_qr_resolves_small_residuals(self):
         """A residual of 1e-9 of the torque, below the resolution of a Gram matrix."""
-        samples, ordinary = noisy(a_motion(), 1e-9 * NOISE), np.ones(2)
+        samples = noisy(a_motion(), 1e-9 * NOISE)
+        ordinary = np.ones(2)
         errors = []
         for storage in ("qr", "gram"):
             factor = Factor.of(MODEL, samples, storage)
@@ -183,7 +185,8 @@ class TestConditioning:
         assert errors[1] > 1.0
 
     def test_the_condition_selects_gram_or_qr(self):
-        good, bad = noisy(a_motion(), NOISE), ill()
+        good = noisy(a_motion(), NOISE)
+        bad = ill()
         assert reduced(MODEL, [good], Factor.of(MODEL, good)).storage == "gram"
         factor = reduced(MODEL, [bad, bad], summed("gram", [bad, bad]))
         assert factor.storage == "qr"
@@ -245,7 +248,8 @@ class TestConditioning:
     @given(k=st.integers(1, 12), p=st.integers(1, 8), seed=st.integers(0, 999))
     def test_rows_are_solved_as_by_the_pseudo_inverse(self, k, p, seed):
         random = np.random.default_rng(seed)
-        rows, target = random.standard_normal((k, p)), random.standard_normal(k)
+        rows = random.standard_normal((k, p))
+        target = random.standard_normal(k)
         scale = np.linalg.norm(rows, axis=0)
         solution = solve_rows(rows, target)
         expected = np.linalg.pinv(rows / scale) @ target / scale
@@ -261,7 +265,8 @@ class TestEstimate:
         return Factor.of(MODEL, noisy(a_motion(), noise, seed))
 
     def test_values_noise_and_weights_are_the_true_ones(self):
-        exact, factor = estimate(MODEL, self.trial(0, np.zeros(2))), self.trial(1)
+        exact = estimate(MODEL, self.trial(0, np.zeros(2)))
+        factor = self.trial(1)
         np.testing.assert_allclose(exact.values, truth(), rtol=1e-6, atol=1e-7)
         assert exact.undetermined == ()
         assert exact.value("f0_2") == pytest.approx(2.0, rel=1e-6)
@@ -283,7 +288,8 @@ class TestEstimate:
 
     def test_parameters_reduce_degrees_of_freedom(self):
         """With half as many parameters as rows."""
-        variances, weights = [], np.ones(2)
+        variances = []
+        weights = np.ones(2)
         motion = a_motion(11, step=0.4)
         for seed in range(300):
             factor = Factor.from_samples(MODEL, motion, noisy(motion, 1.0, seed).torque)
@@ -293,7 +299,8 @@ class TestEstimate:
 
     @pytest.mark.parametrize("weighting", ["ordinary", "weighted"])
     def test_covariance_from_rows_is_that_from_blocks(self, weighting):
-        motion, rng = two_link.a_motion(), np.random.default_rng(9)
+        motion = two_link.a_motion()
+        rng = np.random.default_rng(9)
         runs = [recording(coloured(rng, len(motion.time), 5e-3, 0.05), motion) for _ in range(3)]
         factor = total_factor(MODEL, runs)
         weights = np.ones(2) if weighting == "ordinary" else joint_weights(factor)

@@ -79,7 +79,8 @@ def start(population):
 def test_slopes_are_derivatives_by_the_information():
     random = np.random.default_rng(1)
     root = random.standard_normal((40, 13)) * np.geomspace(0.1, 30.0, 13)
-    gram, change = root.T @ root, random.standard_normal((13, 13))
+    gram = root.T @ root
+    change = random.standard_normal((13, 13))
     change = 1e-6 * (change + change.T)
     objective = problem().objective
     values = {"log10_det": lambda gram: log10_det(gram, 40), "coupling_index": smoothed_coupling}
@@ -98,7 +99,8 @@ def smoothed_coupling(gram):
 def test_the_gradient_predicts_changes_of_the_criteria(population, start, with_given):
     """In random directions, along which no kink of the interpolator lies."""
     genes, _ = start
-    problem_, random = population.problem, np.random.default_rng(2)
+    problem_ = population.problem
+    random = np.random.default_rng(2)
     if with_given:
         root = random.standard_normal((13, 40))
         given = Given(root @ root.T / 40.0, 2.0)
@@ -137,8 +139,10 @@ class Watched:
     """The ascent of a population; records what it scores and where it takes the slopes."""
 
     def __init__(self, population, stop_after=99):
-        self.population, self.left = population, stop_after
-        self.scored, self.centres = [], []
+        self.population = population
+        self.left = stop_after
+        self.scored = []
+        self.centres = []
 
     def ascent(self):
         def score(genes):

@@ -35,7 +35,8 @@ PLAN = four_sines(TIME)
 
 def executed(seed, *, position_noise=0.0, correlation=0.02, noise=1.0):
     """Return the plan followed within 2 %, with noisy encoders and a 40 Hz smoother."""
-    rng, beside = np.random.default_rng(seed), four_sines(TIME, seed=13 + seed, size=0.02)
+    rng = np.random.default_rng(seed)
+    beside = four_sines(TIME, seed=13 + seed, size=0.02)
     true = Motion(TIME, *(a + b for a, b in zip(PLAN[1:4], beside[1:4], strict=True)))
     torque = MODEL.torque(TRUTH, *true[1:]) + noise * two_link.coloured(
         rng, len(TIME), STEP, correlation
@@ -169,7 +170,8 @@ class TestPlannedMotion:
         assert instruments.usable[inside].all()
 
     def test_missing_commands_are_not_used(self):
-        samples, command = executed(0), PLAN.position.copy()
+        samples = executed(0)
+        command = PLAN.position.copy()
         command[300:340, 1] = np.nan
         instruments = planned_motion(samples, command)
         assert not instruments.usable[300:340].any()
@@ -181,7 +183,8 @@ class TestPlannedMotion:
     def test_repetitions_share_a_plan_for_any_clock(self):
         plan = TIME, PLAN.position
         spline = fit_smoothing_spline(TIME, PLAN.position, np.full(2, 1e-16), widest=40.0)
-        later, half = TIME[20:-20] + 0.3 * STEP, len(TIME) // 2
+        later = TIME[20:-20] + 0.3 * STEP
+        half = len(TIME) // 2
         gapped = spline(later)
         gapped[100:120] = np.nan
         assert same_plan(plan, (later, gapped))

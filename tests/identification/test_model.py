@@ -169,7 +169,8 @@ class TestRobotModel:
 
     def test_arrays_of_the_wrong_shape_are_refused_by_name(self):
         model = RobotModel.from_urdf(urdf_text())
-        good, short = np.zeros((5, 6)), np.zeros((4, 6))
+        good = np.zeros((5, 6))
+        short = np.zeros((4, 6))
         with pytest.raises(ShapeError, match=r"qd has shape \(4, 6\), expected \(5, 6\)"):
             model.regressor(good, short, good)
         with pytest.raises(ShapeError, match=r"q has shape \(6,\), expected \(m, 6\)"):
@@ -225,7 +226,9 @@ class TestLockedJoints:
         all_q, all_qd, all_qdd = np.zeros((3, 20, whole.n_joints))
         for name, position in held.items():
             all_q[:, whole.joint_names.index(name)] = position
-        all_q[:, free], all_qd[:, free], all_qdd[:, free] = q, qd, qdd
+        all_q[:, free] = q
+        all_qd[:, free] = qd
+        all_qdd[:, free] = qdd
         expected = whole.torque(values(whole), all_q, all_qd, all_qdd)[:, free]
         np.testing.assert_allclose(model.torque(values(model), q, qd, qdd), expected, atol=1e-9)
 
@@ -302,7 +305,9 @@ def a_link(moments, mass=2.0):
     return inertial_parameters(Body(mass, np.array([0.1, 0.0, 0.2]), np.diag(moments)))
 
 
-SOUND, FLAT, POINT = (0.1, 0.1, 0.02), (0.001, 0.002, 0.02), (0.0, 0.0, 0.0)
+SOUND = (0.1, 0.1, 0.02)
+FLAT = (0.001, 0.002, 0.02)
+POINT = (0.0, 0.0, 0.0)
 
 
 class TestReferenceBodies:
@@ -585,7 +590,8 @@ class TestPreslidingState:
     def test_it_is_dahls_recursion(self, steps, distance):
         """z <- s + (z - s) exp(-|dq| / d), from zero."""
         position = 0.3 + np.cumsum([0.0, *steps])
-        state, expected = 0.0, [0.0]
+        state = 0.0
+        expected = [0.0]
         for step in np.diff(position):
             state = np.sign(step) + (state - np.sign(step)) * np.exp(-abs(step) / distance)
             expected.append(state)
@@ -836,7 +842,8 @@ class TestElementModel:
 
     def test_torque_adds_to_that_of_the_arm(self):
         """W pi with elements is W pi without them plus their torque."""
-        model, motion = with_elements(SPRING, GAS), two_link.a_motion()
+        model = with_elements(SPRING, GAS)
+        motion = two_link.a_motion()
         values = np.concatenate([two_link.truth(), [35.0, 0.8]])
         expected = two_link.MODEL.torque(two_link.truth(), *motion[1:])
         expected[:, 0] += 35.0 * (motion.position[:, 0] - 0.3)
@@ -850,7 +857,8 @@ class TestElementModel:
     def test_ripple_turns_with_the_motor(self):
         """Cosine and sine of each order of the angle of a coupled motor."""
         motor = tuple(zip(JOINTS, (20.0, -30.0), strict=True))
-        model, motion = with_elements(TorqueRipple(JOINTS[1], motor, (1, 2))), two_link.a_motion()
+        model = with_elements(TorqueRipple(JOINTS[1], motor, (1, 2)))
+        motion = two_link.a_motion()
         assert model.parameter_names[model.element_part] == tuple(
             f"ripple_{wave}{order}_2" for order in (1, 2) for wave in ("cos", "sin")
         )
@@ -888,7 +896,8 @@ class TestElementModel:
 @pytest.fixture(scope="module")
 def identified():
     """A model with two elements, its true values, and the factor of a recording."""
-    model, motion = with_elements(SPRING, GAS), two_link.a_motion()
+    model = with_elements(SPRING, GAS)
+    motion = two_link.a_motion()
     values = np.concatenate([two_link.truth(), [-35.0, 0.8]])
     samples = two_link.simulated(model, values, motion, two_link.NOISE, 3)
     return model, values, Factor.of(model, samples)
@@ -903,7 +912,8 @@ class TestIdentifiedElements:
     def test_the_consistent_solution_leaves_them_free(self, identified):
         """A stiffness may be negative and has no prior."""
         model, values, factor = identified
-        free, element_columns = estimate(model, factor), model.element_part
+        free = estimate(model, factor)
+        element_columns = model.element_part
         consistent = consistent_estimate(model, factor, free)
         assert len(consistent.friction) == len(model.friction.terms)
         assert np.all(
@@ -943,7 +953,8 @@ class TestRegressor:
                 assert np.allclose(long[t], short[0], rtol=1e-13, atol=1e-13)
 
     def test_threads_do_not_share_working_arrays(self, ns16):
-        first, second = some_states(300, seed=1), some_states(300, seed=2)
+        first = some_states(300, seed=1)
+        second = some_states(300, seed=2)
         alone = [np.concatenate([b.copy() for b in rows]) for _, rows in ns16.plan.chunks(*first)]
         together = []
         for (_, rows), _ in zip(ns16.plan.chunks(*first), ns16.plan.chunks(*second), strict=True):

@@ -59,12 +59,14 @@ def states(n):
 class TestPayload:
     @pytest.mark.parametrize("case", ["ns16", "ur10 at its tool", *range(6)])
     def test_its_torque_is_the_difference_in_pinocchio(self, case):
-        frame, where = None, pin.SE3.Identity()
+        frame = None
+        where = pin.SE3.Identity()
         urdf = urdf_text()
         if isinstance(case, int):
             urdf = random_urdf(case)
         elif case.startswith("ur10"):
-            urdf, frame = robot_text("ur_description/urdf/ur10_robot.urdf"), "tool0"
+            urdf = robot_text("ur_description/urdf/ur10_robot.urdf")
+            frame = "tool0"
             reader = pin.buildModelFromXML(urdf)
             where = reader.frames[reader.getFrameId("tool0", pin.FrameType.BODY)].placement
         payload = Payload(7.0, (0.05, -0.02, 0.11), INERTIA, frame)
@@ -112,7 +114,8 @@ SEEDS = 24
 
 def recordings(loads, *, noise=NOISE, drift=0.0, pace=1.0, seed=0):
     """Recordings of one motion of two links about y, with drifting friction."""
-    rng, motion = np.random.default_rng(seed), four_sines(TIME, pace)
+    rng = np.random.default_rng(seed)
+    motion = four_sines(TIME, pace)
     runs = []
     for k, load in enumerate(loads):
         drifted = truth()
@@ -212,7 +215,8 @@ class TestFrame:
             '<child link="tool"/><origin xyz="0.1 0 0.3" rpy="0 0.5 0"/></joint></robot>'
         )
         urdf = URDF.replace("</robot>", tool)
-        model, motion = RobotModel.from_urdf(urdf, friction=FrictionLaw(third=None)), a_motion()
+        model = RobotModel.from_urdf(urdf, friction=FrictionLaw(third=None))
+        motion = a_motion()
         bare = model.torque(truth(), *motion[1:])
         loaded = bare + load_torque(model, replace(LOAD, frame="tool"), motion)
         runs = [
@@ -246,7 +250,8 @@ def factors_of(
     noise=CURRENT_NOISE, *, seed=0, model=MODEL, values=None, gains=PLANTED, load=KNOWN, **more
 ):
     """Reduce a recording without payload and one with it; noise is on the currents."""
-    motion, turns = more.get("motion"), more.get("turns")
+    motion = more.get("motion")
+    turns = more.get("turns")
     motion = four_sines(TIME, n=model.n_joints) if motion is None else motion
     samples = as_samples(model, motion, np.zeros_like(motion.position))
     rng = np.random.default_rng(seed)

@@ -42,14 +42,16 @@ def wanted(kind: str, p: int = 12) -> Precision:
     if kind == "arm":
         quantities = Quantities(RANDOM.standard_normal((3, p)), allowed)
     else:
-        change, root = RANDOM.standard_normal((p, 4)), np.linalg.cholesky(positive(p))
+        change = RANDOM.standard_normal((p, 4))
+        root = np.linalg.cholesky(positive(p))
         quantities = LoadQuantities(RANDOM.standard_normal((3, 4)), allowed, change, root)
     return Precision(quantities, np.ones(2), positive(p))
 
 
 class TestVariances:
     def test_of_an_arm_are_those_of_the_inverse_information(self) -> None:
-        precision, information = wanted("arm"), positive(12)
+        precision = wanted("arm")
+        information = positive(12)
         a = precision.quantities.directions
         covariance = np.linalg.inv(precision.prior + information)
         half = INTERVAL * np.sqrt(np.diag(a @ covariance @ a.T))
@@ -57,7 +59,8 @@ class TestVariances:
 
     def test_of_a_load_are_those_of_least_squares(self) -> None:
         """The arm is known with C, the loaded recording determines arm and load together."""
-        precision, data = wanted("load"), positive(12)
+        precision = wanted("load")
+        data = positive(12)
         load = precision.quantities
         assert isinstance(load, LoadQuantities)
         arm_information = np.linalg.inv(load.root @ load.root.T)
@@ -69,7 +72,9 @@ class TestVariances:
 
     @pytest.mark.parametrize("kind", ["arm", "load"])
     def test_the_slope_is_that_of_differences(self, kind: str) -> None:
-        precision, information, change = wanted(kind), positive(12), positive(12)
+        precision = wanted(kind)
+        information = positive(12)
+        change = positive(12)
         step = 1e-6
         above, below = (
             -np.log(precision.criterion(information + sign * step * change)) for sign in (1, -1)
@@ -81,7 +86,8 @@ class TestVariances:
 class TestSearch:
     def problem(self):
         problem = small_problem()
-        p, n = problem.objective.model.n_parameters, problem.objective.model.n_joints
+        p = problem.objective.model.n_parameters
+        n = problem.objective.model.n_joints
         precision = Precision(
             Quantities(np.eye(p), np.ones(p)), np.linspace(1.0, 3.0, n), 1e-3 * np.eye(p)
         )
@@ -89,7 +95,8 @@ class TestSearch:
 
     def test_the_gradient_predicts_changes_of_the_criterion(self) -> None:
         """A motion that lasts longer informs more, so that the duration counts too."""
-        problem, random = self.problem(), np.random.default_rng(3)
+        problem = self.problem()
+        random = np.random.default_rng(3)
         genes = 0.3 + 0.4 * random.random(problem.genome.n_genes)
         tangent = problem.tangent(genes, None)
         gradient = gene_slopes(problem, tangent, genes, np.arange(len(genes)))[:, 0]

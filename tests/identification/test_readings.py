@@ -40,7 +40,8 @@ def motion(factors: tuple[float, ...] = (1.0, 1.0, 1.0)) -> tuple[Floats, Floats
 
     The bodies are those of the description times a factor each.
     """
-    robot, rng = model(), np.random.default_rng(0)
+    robot = model()
+    rng = np.random.default_rng(0)
     rate = rng.uniform(2.0, 8.0, (3, 3))
     angle = rate * TIME[:, None, None] + rng.uniform(0.0, 6.0, rate.shape)
     q = 0.3 * np.sin(angle).sum(axis=1)

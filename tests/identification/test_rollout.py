@@ -118,7 +118,8 @@ def test_the_clock_of_mujoco_runs_after_a_rollout() -> None:
 
 @pytest.mark.long
 def test_a_polish_finds_friction_rotor_and_delay() -> None:
-    true, motion = an_arm(coulomb=3.0), a_recording(an_arm(coulomb=3.0), 0.005)
+    true = an_arm(coulomb=3.0)
+    motion = a_recording(an_arm(coulomb=3.0), 0.005)
     values = true.values.copy()
     values[MODEL.friction_part] *= 1.4
     start = Driven(replace(true, values=values), replace(motion, delay=0.004), NOTHING)
@@ -218,7 +219,8 @@ class TestServo:
         )
 
     def test_is_found_from_commanded_and_measured_positions(self) -> None:
-        kp, kd = np.array([2000.0, 500.0]), np.array([40.0, 10.0])
+        kp = np.array([2000.0, 500.0])
+        kd = np.array([40.0, 10.0])
         servo = identify_servo(self.stretches(kp, kd, 0.010), 0.005, ("a", "b"))
         assert servo.delay == pytest.approx(0.010, abs=2e-4)
         assert servo.kp == pytest.approx(kp, rel=0.05)

@@ -51,7 +51,8 @@ class RecordingPopulation(Population):
         self.begin()
 
     def begin(self, interrupted_after=None):
-        self.genes, self.rows = [], []
+        self.genes = []
+        self.rows = []
         self.interrupted_after = interrupted_after
         return self
 
@@ -215,7 +216,8 @@ class TestRun:
         chosen = asked(method, polish=60, gradient=4 if method == "gradient" else 0)
         whole = bits(search(population, chosen))
         sizes = [len(genes) for genes in population.genes]
-        file, first = io.BytesIO(), population.begin(interrupt)
+        file = io.BytesIO()
+        first = population.begin(interrupt)
         try:
             half = search(first, chosen, journal=journal_of(file, chosen), stop=Stop(stop))
             assert not half.complete and half.generations == min(stop, 4)

@@ -65,7 +65,8 @@ def three_sines(seed, n=2, duration=12.0, step=0.005):
     time = np.arange(0.0, duration, step)
     rng = np.random.default_rng(seed)
     a = rng.uniform(0.2, 0.5, (3, n))
-    w, phase = rng.uniform(2.0, 9.0, (3, n)), rng.uniform(0.0, 6.0, (3, n))
+    w = rng.uniform(2.0, 9.0, (3, n))
+    phase = rng.uniform(0.0, 6.0, (3, n))
     return sine_motion(time, a, w, phase)
 
 
@@ -95,7 +96,8 @@ class TestElimination:
         weights = np.array([0.2, 3.0])
         result = eliminate(ARM, training, unseen, weights=weights)
         left = [ARM.parameter_names.index(name) for name in result.estimate.names]
-        rows, torque = [], []
+        rows = []
+        torque = []
         for run in runs:
             dense = ARM.regressor(*run.motion[1:]).dense(ARM.n_parameters)
             rows.append(np.where(run.usable[..., None], dense, 0.0))
@@ -358,7 +360,8 @@ class TestChosenSettings:
     def test_a_delay_is_not_called_a_low_pass(self, shape, name):
         """Delay and low-pass of equal lag each predict best where they are the cause."""
         recording = a_recording()
-        time, torque = recording.time, recording.torque
+        time = recording.time
+        torque = recording.torque
         if shape is None:
             late = [np.interp(time - CAUSAL.lag(6.0), time, column) for column in torque.T]
             changed = replace(recording, torque=np.column_stack(late))
@@ -447,7 +450,8 @@ class TestChosenSettings:
             }
             for duration in (0.9 * SHORT, LONG)
         }
-        short, long = candidates[0.9 * SHORT], candidates[LONG]
+        short = candidates[0.9 * SHORT]
+        long = candidates[LONG]
         assert short.keys() == long.keys()
         width = "bandwidth of the motion"
         assert set(long[width]) - set(short[width]) == {"10 Hz"}
@@ -639,7 +643,9 @@ def late_by(recording, delay):
 
 def with_pauses(shape):
     """Return three motions of 5 s with rests of 2 s between them, through a low-pass."""
-    span, pause, count = 5.0, 2.0, 3
+    span = 5.0
+    pause = 2.0
+    count = 3
     time = np.arange(0.0, count * (span + pause), 1.0 / RATE)
     moving = time % (span + pause) < span
     # The time along the motion stands during a pause; the motion begins and ends at rest.
@@ -766,7 +772,8 @@ class TestLowPassShape:
 
     @pytest.mark.parametrize("shape", [*WITHOUT_PHASE, *FORWARDS], ids=str)
     def test_its_lag_is_the_derivative_of_its_logarithm(self, shape):
-        frequency, step = np.array([0.0, 1.0, 3.0, 20.0]), 1e-4
+        frequency = np.array([0.0, 1.0, 3.0, 20.0])
+        step = 1e-4
         _, lag = shape.response(frequency, BANDWIDTH)
         before, after = (
             shape.response(frequency + sign * step, BANDWIDTH)[0] for sign in (-1.0, 1.0)

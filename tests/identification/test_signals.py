@@ -175,7 +175,8 @@ STEP = 2e-3
 def recorded(seed, *, start=0.0, clock=0.0, pace=1.0, noise=0):
     """Return eight seconds of a motion from `start`, with a clock offset [s]."""
     rng = np.random.default_rng(seed)
-    amplitude, rate = rng.uniform(0.2, 1.0, (3, 2)), rng.uniform(0.5, 3.0, (3, 2))
+    amplitude = rng.uniform(0.2, 1.0, (3, 2))
+    rate = rng.uniform(0.5, 3.0, (3, 2))
     time = start + STEP * np.arange(4000)
     angle = pace * rate * time[:, None, None] + rng.uniform(0.0, 6.0, (3, 2))
     position = (amplitude * np.sin(angle)).sum(axis=1)
@@ -230,7 +231,8 @@ class TestAveraged:
 class TestInSuccession:
     def test_recordings_are_segments_of_one(self):
         """With one step between them, and the channels that all have."""
-        first, second = a_recording(150), replace(a_recording(90), commanded_position=None)
+        first = a_recording(150)
+        second = replace(a_recording(90), commanded_position=None)
         both = in_succession([first, second])
         assert [part.stop - part.start for part in both.segments()] == [150, 90]
         for name in ("position", "torque"):
@@ -491,7 +493,8 @@ class TestNoise:
 
     @pytest.mark.parametrize("creeps", [False, True])
     def test_variance_at_standstill_is_that_of_the_noise(self, creeps):
-        time, size = np.arange(5000) * 1e-3, np.array([1e-6, 1e-3])
+        time = np.arange(5000) * 1e-3
+        size = np.array([1e-6, 1e-3])
         noise = size * np.random.default_rng(6).standard_normal((5000, 2))
         slip = 3e-4 * (time > 3.0) * (1.0 - np.exp(-(time - 3.0) / 0.2))
         values = 0.4 + creeps * (1e-4 * time + slip)[:, None] + noise
@@ -604,8 +607,10 @@ SLIDING = RobotModel.from_urdf(URDF, friction=FrictionLaw(standstill=0.05))
 
 
 def motion_and_recording(clip=np.inf):
-    rate, rng = np.array([2.0, 3.1]), np.random.default_rng(2)
-    angle, motion = rate * TIME[:, None] + 0.4, sine_motion(TIME, np.ones(2), rate, np.full(2, 0.4))
+    rate = np.array([2.0, 3.1])
+    rng = np.random.default_rng(2)
+    angle = rate * TIME[:, None] + 0.4
+    motion = sine_motion(TIME, np.ones(2), rate, np.full(2, 0.4))
     torque = 20.0 * np.sin(angle * 1.7) + 0.2 * rng.standard_normal(angle.shape)
     return motion, Recording(
         time=TIME,

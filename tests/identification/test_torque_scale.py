@@ -27,7 +27,8 @@ LOAD = Payload(4.0, (0.2, 0.0, 0.1), (0.02, 0.0, 0.0, 0.03, 0.0, 0.04))
 
 @pytest.fixture(scope="module")
 def torque():
-    rng, motion = np.random.default_rng(1), a_motion()
+    rng = np.random.default_rng(1)
+    motion = a_motion()
     clean = MODEL.torque(truth(), *motion[1:])
     return motion, clean + 0.5 * rng.standard_normal(clean.shape)
 
@@ -137,8 +138,10 @@ class TestPayload:
         figures = {"mass": 4.0, "cx": 0.2, "cz": 0.1, "Iyy": 0.03}
         places = [NAMES.index(name) for name in figures]
         values = np.array([*figures.values()])
-        rng, std = np.random.default_rng(4), np.full(2, 0.03)
-        inside, without = np.zeros(4), np.zeros(4)
+        rng = np.random.default_rng(4)
+        std = np.full(2, 0.03)
+        inside = np.zeros(4)
+        without = np.zeros(4)
         for _ in range(60):
             scales = 1.0 + std * rng.standard_normal(2)
             for counts, assumed in ((inside, std), (without, None)):

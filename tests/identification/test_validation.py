@@ -131,7 +131,8 @@ class TestPredictionError:
 
     def test_noise_is_measured_between_repetitions(self):
         """With different clock offsets."""
-        rng, sizes = np.random.default_rng(2), np.array([1.0, 2.0])
+        rng = np.random.default_rng(2)
+        sizes = np.array([1.0, 2.0])
         common = np.array([0.5, 0.4]) * rng.standard_normal((3000, 2))
         values = np.ones(MODEL.n_parameters)
         runs = [
@@ -230,7 +231,8 @@ class TestHeldOutTorque:
         noise = coloured(np.random.default_rng(2), LENGTH, 5e-3, 0.05)
         spoiled = noise.copy()
         spoiled[CUT:] += 20.0 * NOISE
-        sound, off = split(noise), split(spoiled)
+        sound = split(noise)
+        off = split(spoiled)
         np.testing.assert_array_equal(off.half_width, sound.half_width)
         assert off.inside == 0.0 < 0.8 < sound.inside
 
@@ -240,7 +242,8 @@ class TestInnerFolds:
         """Equal to leaving out the first fold by hand."""
         noise = coloured(np.random.default_rng(4), LENGTH, 5e-3, 0.05)
         samples = replace(recording(noise, MOTION), usable=np.ones((LENGTH, 2), dtype=np.bool_))
-        phase, means = Factor.by_time(MODEL, samples), TorqueMeans.of(MODEL, [samples])
+        phase = Factor.by_time(MODEL, samples)
+        means = TorqueMeans.of(MODEL, [samples])
         errors = inner_errors(phase, means, least_squares)
         first = LENGTH // FOLDS
         other_folds = least_squares(Factor.of(MODEL, samples.between(first, LENGTH)))
@@ -253,7 +256,8 @@ class TestTorqueMeans:
     def test_edges_are_excluded_and_rest_included(self):
         """Motion or torque are unknown at edges."""
         ends, slow = np.zeros((2, LENGTH, 2), dtype=np.bool_)
-        ends[:20], slow[40:60] = True, True
+        ends[:20] = True
+        slow[40:60] = True
         reasons = {EDGE: ends, SATURATED: np.zeros_like(ends), STANDSTILL: slow}
         mask = RowMask(reasons, (LENGTH, 2), ~(ends | slow))
         error = np.where(ends, 1e3, np.where(slow, 1.0, 0.0))
@@ -280,7 +284,8 @@ def unit_noise(rng, shape, memory=MEMORY):
 def a_run(seed, disturbance=None, *, duration=12.0, noise=RESIDUAL_NOISE):
     time = np.arange(round(duration / STEP)) * STEP
     rng = np.random.default_rng(seed)
-    amplitude, rate = rng.uniform(0.3, 0.9, (3, 2)), rng.uniform(0.7, 3.0, (3, 2))
+    amplitude = rng.uniform(0.3, 0.9, (3, 2))
+    rate = rng.uniform(0.7, 3.0, (3, 2))
     motion = sine_motion(time, amplitude, rate, rng.uniform(0.0, 6.0, (3, 2)))
     torque = MODEL.torque(VALUES, *motion[1:])
     torque = torque + noise * unit_noise(rng, torque.shape)
@@ -330,8 +335,11 @@ class TestCorrelation:
             )
 
     def test_block_means_cover_unlike_independent_samples(self):
-        blocks, per_block, seeds = 60, 125, 400
-        inside, naive = 0, 0
+        blocks = 60
+        per_block = 125
+        seeds = 400
+        inside = 0
+        naive = 0
         for seed in range(seeds):
             noise = unit_noise(np.random.default_rng(seed), (blocks * per_block,))
             sums = noise.reshape(blocks, per_block).sum(axis=1, keepdims=True)
@@ -358,7 +366,8 @@ class TestFoldedNoise:
 
     def test_it_grows_with_the_step(self):
         """Of 50 Hz two fifths are below 10 Hz, of 1 kHz a fiftieth."""
-        fast, slow = self.measured(2.0), self.measured(2.0, every=20)
+        fast = self.measured(2.0)
+        slow = self.measured(2.0, every=20)
         assert slow.share == pytest.approx(4.0 * 0.4 / (4.0 * 0.4 + 0.5), abs=0.1)
         assert fast.share == pytest.approx(4.0 * 0.02 / (4.0 * 0.02 + 0.5), abs=0.05)
 
@@ -566,7 +575,8 @@ class TestConsistencyCheck:
 
     def test_the_cost_is_the_rise_of_the_error(self):
         recordings = runs(I2m=-0.1)
-        check, run = consistency_of(recordings), recordings[1]
+        check = consistency_of(recordings)
+        run = recordings[1]
         torque = np.where(run.usable, run.torque, 0.0)
         both = check.consistent.estimate.values, check.consistent.unconstrained.values
         errors = [
@@ -649,7 +659,8 @@ class TestPositionJumps:
     @pytest.mark.parametrize("rate", [100.0, 125.0, 500.0, 1000.0])
     @pytest.mark.parametrize("size", [0.2, 0.02, -0.02])
     def test_a_lasting_jump_is_found(self, rate, size):
-        smooth, at = uneven(rate), int(5 * rate)
+        smooth = uneven(rate)
+        at = int(5 * rate)
         (jump,) = position_jumps(with_jump(smooth, size, slice(at, None)), "log.mcap")
         assert (jump.recording, jump.joint) == ("log.mcap", "knee")
         assert jump.time == pytest.approx(smooth.time[at] - smooth.time[0])
@@ -743,7 +754,8 @@ def with_friction(factor):
 
 
 def changes_between(fitted, unseen):
-    training, held_out = [arm_with(fitted, 1)], [arm_with(unseen, 2)]
+    training = [arm_with(fitted, 1)]
+    held_out = [arm_with(unseen, 2)]
     estimate = estimate_repetitions(MODEL, training).pooled
     return find_changes(MODEL, estimate, training, held_out, total_factor(MODEL, held_out))
 
@@ -798,10 +810,8 @@ class TestChangesToUnseenMotion:
 
     def test_an_uncertain_friction_is_no_change(self):
         """What the fitted motion leaves open differs on unseen motion by no fault of it."""
-        training, held_out = (
-            [arm_with(as_it_is, 1)],
-            [arm_with(with_friction(np.array([1.0, 1.3])), 2)],
-        )
+        training = [arm_with(as_it_is, 1)]
+        held_out = [arm_with(with_friction(np.array([1.0, 1.3])), 2)]
         estimate = estimate_repetitions(MODEL, training).pooled
         unseen = total_factor(MODEL, held_out)
         friction = np.diag(MODEL.friction_columns * (0.3 * estimate.values) ** 2)

@@ -82,7 +82,8 @@ def a_motion(seed, *, duration=8.0, step=0.01):
 
 def executed(model, truth, motion, seed, assumed, other):
     """Return the samples of a PC that assumes another drive train than the arm has."""
-    (real, constant), torque = drive(), model.torque(truth, *motion[1:])
+    (real, constant) = drive()
+    torque = model.torque(truth, *motion[1:])
     torque = torque + other(motion, torque)
     current = np.linalg.solve(real.T, torque.T).T / constant
     current += CURRENT_NOISE * np.random.default_rng(seed).standard_normal(current.shape)
@@ -100,7 +101,8 @@ def campaign(
 ):
     assumed = drive(*wrong)
     truth = ns16_values(real) if truth is None else truth
-    training, unseen = a_motion(17, duration=12.0), unseen_disturbance or disturbance
+    training = a_motion(17, duration=12.0)
+    unseen = unseen_disturbance or disturbance
     fitted = [executed(real, truth, training, k, assumed, disturbance) for k in range(2)]
     held_out = [executed(real, truth, a_motion(k), 10 + k, assumed, unseen) for k in range(2)]
     result = estimate_repetitions(MODEL, fitted)
@@ -231,7 +233,9 @@ AXES = ("one", "two")
 
 def an_error(relative, joints=2):
     """Prediction error of given relative size in 1000 rows of torques of RMS 10."""
-    rows, zero, torque = np.full(joints, 1000), np.zeros(joints), np.full(joints, 1e5)
+    rows = np.full(joints, 1000)
+    zero = np.zeros(joints)
+    torque = np.full(joints, 1e5)
     squared = torque * np.broadcast_to(relative, joints) ** 2
     return PredictionError(rows, np.sqrt(squared), zero, squared, zero, torque)
 
@@ -353,7 +357,8 @@ class TestJudgement:
 
         def axes(torque, **context):
             """Two axes with errors of 5 and 60 %; the torque of the second as a share of 10 N·m."""
-            error, power = an_error(np.array([0.05, 0.6])), np.array([1.0, torque**2])
+            error = an_error(np.array([0.05, 0.6]))
+            power = np.array([1.0, torque**2])
             error = replace(
                 error, squared=error.squared * power, torque_squared=error.torque_squared * power
             )
@@ -391,7 +396,8 @@ class TestJudgement:
 
     def test_nor_is_one_whose_share_grew_more_than_its_error(self):
         """Twice the error, of less torque."""
-        fitted, unseen = an_error(np.array([0.04, 0.03])), an_error(np.array([0.04, 0.09]))
+        fitted = an_error(np.array([0.04, 0.03]))
+        unseen = an_error(np.array([0.04, 0.09]))
         less = np.array([1.0, 0.45])
         unseen = replace(
             unseen, squared=unseen.squared * less, torque_squared=unseen.torque_squared * less
@@ -597,7 +603,9 @@ def drift(*change):
 @pytest.fixture(scope="module")
 def clean():
     """Checks of the residual of two links with white noise, without ripple and drift."""
-    model, values, time = two_link.MODEL, two_link.truth(), np.arange(3000) * 4e-3
+    model = two_link.MODEL
+    values = two_link.truth()
+    time = np.arange(3000) * 4e-3
     runs = [
         two_link.simulated(model, values, four_sines(time, seed=seed), two_link.NOISE, seed)
         for seed in range(6)
@@ -784,7 +792,9 @@ class TestErrorsWithoutCause:
     def test_a_joint_that_stands_is_not_interchanged(self):
         """Not with joint 5, whose torque is small noise, either."""
         motion = a_motion(1, duration=10.0, step=8e-3)
-        motion.position[:, 4], motion.velocity[:, 4], motion.acceleration[:, 4] = 0.3, 0.0, 0.0
+        motion.position[:, 4] = 0.3
+        motion.velocity[:, 4] = 0.0
+        motion.acceleration[:, 4] = 0.0
         torque = MODEL.torque(ns16_values(MODEL), *motion[1:])
         torque += (
             NOISE * torque.std(axis=0) * np.random.default_rng(3).standard_normal(torque.shape)
@@ -828,7 +838,8 @@ class TestCausesOfParts:
     def test_a_changed_load_is_measured(self, count):
         """In the second half of one recording, or in two of four."""
         part_name = "0.mcap from 5 s on" if count == 1 else "1.mcap, 3.mcap"
-        half, whole = LOAD * (np.arange(1250) >= 625), np.full(1250, LOAD)
+        half = LOAD * (np.arange(1250) >= 625)
+        whole = np.full(1250, LOAD)
         runs = [recorded(1, half)]
         if count == 4:
             runs = [recorded(k, whole if k in (1, 3) else None) for k in range(4)]

@@ -34,7 +34,8 @@ def test_weight_and_offset_are_one_parameter_beside_the_inertia() -> None:
 
 def test_every_mass_rotor_and_offset_has_its_parameters() -> None:
     """The force of a rotor inertia and of an offset is in the span, and the columns independent."""
-    lift, rng = model(), np.random.default_rng(0)
+    lift = model()
+    rng = np.random.default_rng(0)
     q, qd, qdd = rng.normal(size=(3, 200, 2))
     columns = np.array([lift.torque(row, q, qd, qdd)[:, 0] for row in np.eye(lift.n_parameters)])
     of_joint = columns[np.abs(columns).max(axis=1) > 0.0].T

@@ -48,7 +48,8 @@ class TestDefaultSettings:
     @pytest.mark.parametrize("kind", ["inertial", "friction"])
     def test_intervals_hold_93_to_98_percent(self, study: dict[str, Any], kind: str) -> None:
         """Within two standard errors of the share."""
-        share, unsure = study[kind], study[f"{kind}_unsure"]
+        share = study[kind]
+        unsure = study[f"{kind}_unsure"]
         assert 0.93 - unsure < share < 0.98 + unsure
 
     def test_every_stated_coefficient_is_estimated(self, study: dict[str, Any]) -> None:

@@ -196,14 +196,16 @@ class TestDelayOfABriskMotion:
         """Within 0.3 ms in 19 of 20 runs; 95 % intervals of parameters cover 93 to 98 %."""
         arm = ARMS[name]()
         model = model_of(arm)
-        near, shares = 0, []
+        near = 0
+        shares = []
         for seed in range(SEEDS):
             recording = recorded(arm, seed, noise, delay, BRISK)
             estimate = estimate_delay(recording, model)
             near += estimate.determined and abs(estimate.delay - delay) < NEAR
             shares.append(coverage(arm, model, recording, estimate))
         # Within two standard errors of the share.
-        share, unsure = np.mean(shares), 2.0 * np.std(shares, ddof=1) / np.sqrt(SEEDS)
+        share = np.mean(shares)
+        unsure = 2.0 * np.std(shares, ddof=1) / np.sqrt(SEEDS)
         assert near >= 0.95 * SEEDS
         assert 0.93 - unsure < share < 0.98 + unsure
 
@@ -214,7 +216,8 @@ class TestDelayBesideOtherSettings:
     def test_a_presliding_displacement_does_not_replace_it(self, seed):
         """On all rows 1e-5 rad without delay predicts better than 1e-6 rad with the true one."""
         arm = ns16()
-        model, recording = model_of(arm), recorded(arm, seed, "coloured", 0.0013, BRISK)
+        model = model_of(arm)
+        recording = recorded(arm, seed, "coloured", 0.0013, BRISK)
         estimate = estimate_delay(recording, model)
 
         def ready(model, how):

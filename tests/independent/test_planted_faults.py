@@ -30,7 +30,8 @@ from hil.importers import IMPORTED_LAW, Robot
 from hil.progress import Silent
 from identification.validation.finding import Finding
 
-GAIN, FRICTION = 1.1, 1.3
+GAIN = 1.1
+FRICTION = 1.3
 SEEDS = (1, 2, 3)
 
 pytestmark = [pytest.mark.long, pytest.mark.slow]
@@ -85,7 +86,8 @@ def identified(
     else:
         held_out = with_friction(held_out, arm, seed)
     if rests:
-        fitted, held_out = with_rest(fitted), with_rest(held_out)
+        fitted = with_rest(fitted)
+        held_out = with_rest(held_out)
     archives = [
         JointLog(robot, log.time, log.position, None, log.torque, kind.rated_payload).imported(
             folder / f"{part}.mcap"

@@ -46,7 +46,8 @@ def alike(ours: Estimate, theirs: Estimate) -> Iterator[str]:
 @lru_cache(maxsize=64)
 def degrees_of_freedom(interval_factor: float) -> float:
     """Return those of the t distribution with this 97.5 % quantile; infinite for the normal one."""
-    least, most = 0.5, 1e7
+    least = 0.5
+    most = 1e7
     if interval_factor <= student.ppf(0.975, most):
         return math.inf
     return float(brentq(lambda k: student.ppf(0.975, k) - interval_factor, least, most))

@@ -23,7 +23,8 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from numpy.typing import NDArray
 
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
-_CHANNEL_OP, _MESSAGE_OP = 4, 5
+_CHANNEL_OP = 4
+_MESSAGE_OP = 5
 _ARRAYS: Final = (
     *("target_position", "target_velocity", "position", "velocity", "torque", "target_current"),
     *("model_current", "diagonal_inertia", "extra3", "commanded_position", "commanded_velocity"),
@@ -152,7 +153,8 @@ class _Reading:
 
     def _messages(self, content: bytes) -> None:
         """Divide a chunk into messages: the library takes a hundred times as long."""
-        at, parts = 0, self._parts
+        at = 0
+        parts = self._parts
         while at < len(content):
             opcode, length, channel, sequence, stamp, _ = _MESSAGE.unpack_from(content, at)
             if opcode == _MESSAGE_OP:
@@ -168,7 +170,8 @@ class _Reading:
 
     def finish(self) -> None:
         """Convert the collected messages to columns."""
-        archived, parts = self._found, self._parts
+        archived = self._found
+        parts = self._parts
         archived.events = [_event(message) for message in parts.get("/hil/events", ())]
         names = json.loads((archived.metadata or {}).get("joint_names", "[]"))
         cycles = parts.get("/hil/cycle", ())

@@ -133,7 +133,8 @@ def test_targets_set_on_request_give_the_same_motion(fly):
     queue(at_once, points[1:])
     one_by_one = ready(SIX_AXES, points[0], fly=fly)
     waiting = list(enumerate(points[1:], 1))
-    steps, expected = [], steps_to_rest(at_once)
+    steps = []
+    expected = steps_to_rest(at_once)
     one_by_one.set_next_target(*waiting.pop(0))
     while not steps or steps[-1].status != Status.FINAL_STEP:
         steps.append(one_by_one.get_next_step())
@@ -238,11 +239,13 @@ def test_a_motion_time_too_short_is_refused():
 
 def test_the_interpolation_time_changes_the_steps_not_the_motion():
     a, b = random_points(41, 2)
-    fine, coarse = ready(SIX_AXES, a), ready(SIX_AXES, a)
+    fine = ready(SIX_AXES, a)
+    coarse = ready(SIX_AXES, a)
     assert coarse.set_interpolation_time(2.0 * PERIOD) == Status.OK
     queue(fine, [b])
     queue(coarse, [b])
-    slow, fast = steps_to_rest(coarse), steps_to_rest(fine)
+    slow = steps_to_rest(coarse)
+    fast = steps_to_rest(fine)
     every_other = positions(fast)[1 : 2 * len(slow) - 2 : 2]
     np.testing.assert_allclose(positions(slow)[:-1], every_other, rtol=0, atol=1e-12)
     assert slow[-1].elapsed_time == pytest.approx(fast[-1].elapsed_time)

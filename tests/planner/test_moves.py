@@ -47,7 +47,8 @@ def robots(draw):
 @st.composite
 def routes(draw, limits: JointLimits):
     """Degenerate positions: on the limits, repeated, microscopic moves, one joint."""
-    n, span = limits.n_joints, (limits.upper - limits.lower) / 2.0
+    n = limits.n_joints
+    span = (limits.upper - limits.lower) / 2.0
     centre = limits.lower + span
     rows = [centre]
     for _ in range(draw(st.integers(2, 6))):
@@ -206,10 +207,12 @@ class TestShares:
         start, end = random_points(3, 2)
         full = plan_moves(start, [Move(end)], SIX_AXES)
         gentle = plan_moves(start, [Move(end)], SIX_AXES, Overrides(**{name: 0.25}))
-        changed, unchanged = ramps(gentle)[ramp], ramps(gentle)[1 - ramp]
+        changed = ramps(gentle)[ramp]
+        unchanged = ramps(gentle)[1 - ramp]
         np.testing.assert_allclose(changed, 0.25 * ramps(full)[ramp], rtol=1e-3)
         np.testing.assert_allclose(unchanged, ramps(full)[1 - ramp], rtol=1e-3)
-        extrema, before = gentle.trajectory.extrema(), full.trajectory.extrema()
+        extrema = gentle.trajectory.extrema()
+        before = full.trajectory.extrema()
         np.testing.assert_allclose(extrema.velocity, before.velocity)
         np.testing.assert_allclose(extrema.jerk, before.jerk)
 
@@ -416,7 +419,9 @@ class TestPopulation:
             assert bits(plan(neighbour, SIX_AXES, fly=0.5)) == bits(motion)
 
     def test_motions_that_cannot_be_planned_are_errors(self):
-        good, outside, unknown = random_points(0), random_points(1), random_points(2)
+        good = random_points(0)
+        outside = random_points(1)
+        unknown = random_points(2)
         outside[3, 2] = 50.0
         unknown[0, 0] = np.nan
         assert plan_chunk([], np.ones((0, 6)), SIX_AXES, 0.5) == []
@@ -429,7 +434,9 @@ class TestPopulation:
         assert planned[5].sample(np.array([np.inf]))[0][0] == pytest.approx(good[2], abs=1e-11)
 
 
-COUNT, JOINTS, PIECES = 3, 2, 5
+COUNT = 3
+JOINTS = 2
+PIECES = 5
 JUST = [0.5, 1.0 - 1e-6, 1.0, 1.0 + 1e-6, 2.0]
 
 

@@ -166,9 +166,12 @@ def test_a_short_detour_differs_from_the_planned_motion():
     # In the middle of a cruise, out and back within 50 ms of the minutes that it takes.
     knots, pieces = (data["motion"][name][0] for name in ("knots", "coefficients"))
     cruise = int(np.argmax(np.diff(knots)))
-    begin, part = knots[cruise] + 100.0, 0.05 / 8
+    begin = knots[cruise] + 100.0
+    part = 0.05 / 8
     p, v, a, _ = pieces[cruise]
-    state, times, detour = [p + 100.0 * v, v, a], [], []
+    state = [p + 100.0 * v, v, a]
+    times = []
+    detour = []
     for index, sign in enumerate((1, -1, -1, 1, -1, 1, 1, -1)):
         times.append(begin + index * part)
         detour.append([*state, 80.0 * sign])

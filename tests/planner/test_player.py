@@ -59,7 +59,8 @@ def test_the_distance_from_the_start_remains(motions, seed):
     reference.begin(reference.start)
     player = TrajectoryPlayer(motions[0], PERIOD, SIX_AXES)
     player.begin(player.start + offset)
-    exact, shifted = play(reference, 300), play(player, 300)
+    exact = play(reference, 300)
+    shifted = play(player, 300)
     np.testing.assert_allclose(shifted[0] - exact[0], np.tile(offset, (len(exact[0]), 1)))
     np.testing.assert_array_equal(shifted[1], exact[1])
 
@@ -84,7 +85,8 @@ def test_an_arm_away_from_the_start_is_refused(motions, away):
 @example(which=0, share=1.0, period=0.002)
 @example(which=6, share=0.5, period=0.001)
 def test_a_stop_stays_on_the_path_and_within_its_bounds(motions, which, share, period):
-    motion, limits = motions[which], SIX_AXES
+    motion = motions[which]
+    limits = SIX_AXES
     player = TrajectoryPlayer(motion, period, limits)
     offset = np.linspace(-9e-4, 9e-4, 6)
     player.begin(player.start + offset)
@@ -177,7 +179,8 @@ class TestResumeFrom:
                     step = last - before
                     last = last + k * step
                     player.resume_from(last, step / PERIOD, 2 * k)
-                before, last = last, player.advance()[0]
+                before = last
+                last = player.advance()[0]
                 count += 1
             return count
 
@@ -190,7 +193,8 @@ class TestResumeFrom:
         with pytest.raises(StartMismatch, match=r"tolerance is 0\.002 rad"):
             for _ in range(30):
                 player.resume_from(last + aside, (last - before) / PERIOD, 2)
-                before, last = last + aside, player.advance()[0]
+                before = last + aside
+                last = player.advance()[0]
 
     @pytest.mark.parametrize("left", [18, 22, 26, 30])
     def test_near_the_end_it_comes_to_rest_within_bounds(self, left):
@@ -280,7 +284,9 @@ class Smooth:
     n_joints = 6
 
     def __init__(self, start, way, duration):
-        self.start, self.way, self.duration = start, way, duration
+        self.start = start
+        self.way = way
+        self.duration = duration
 
     def sample(self, t):
         x = (np.clip(t, 0.0, self.duration) / self.duration)[:, None]
@@ -355,7 +361,10 @@ class Arm:
         self.player = TrajectoryPlayer(motion, period, limits)
         self.guard = Guard(bounds, period)
         self.granted = {"plan"}
-        self.bounds, self.rates, self.times, self.positions = [], [], [], []
+        self.bounds = []
+        self.rates = []
+        self.times = []
+        self.positions = []
 
     def begin(self):
         first = self.player.start + self.offset
@@ -523,7 +532,8 @@ def test_a_motion_that_ends_during_a_hold_has_ended(live_motions):
     cycles = int(live_motions[1].duration / PERIOD)
     arm = Arm(live_motions[1], SIX_AXES).begin().run(cycles - 10).ask("hold").run(1000)
     assert arm.player.finished
-    rate, bounds = arm.player.rate, arm.player.bounds
+    rate = arm.player.rate
+    bounds = arm.player.bounds
     assert rate > 0.0  # of motion time after the end
     for request in ("resume", "hold", "stop"):
         arm.ask(request)

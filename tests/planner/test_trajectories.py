@@ -46,7 +46,8 @@ numbers = st.floats(-10.0, 10.0)
 @st.composite
 def tables(draw):
     """Tables of 1-3 joints, 1-5 constant jerks, some pieces of zero length."""
-    n, m = draw(st.integers(1, 3)), draw(st.integers(1, 5))
+    n = draw(st.integers(1, 3))
+    m = draw(st.integers(1, 5))
     start = draw(arrays(np.float64, (n, 3), elements=numbers))
     jerks = draw(arrays(np.float64, (n, m), elements=numbers))
     lengths = draw(arrays(np.float64, (n, m), elements=st.sampled_from([0.0, 0.1, 0.3, 1.0, 2.0])))
@@ -146,7 +147,8 @@ def test_a_rate_at_an_end_is_named(column, quantity, at_end):
 @st.composite
 def series(draw, ramped=None):
     """Series of 1-3 joints and 1-4 sines, some equal, some constant, ramps of all lengths."""
-    n, w = draw(st.integers(1, 3)), draw(st.integers(1, 4))
+    n = draw(st.integers(1, 3))
+    w = draw(st.integers(1, 4))
     amplitude = draw(arrays(np.float64, (n, w), elements=st.floats(-2.0, 2.0)))
     frequency = draw(
         arrays(np.float64, (n, w), elements=st.sampled_from([0.0, 0.3, 1.0, -2.0, 7.0]))
@@ -180,7 +182,8 @@ def jerk_of(motion: FourierSeries, t: np.ndarray, h: float) -> np.ndarray:
 
 
 def test_it_is_equation_8_without_and_between_ramps():
-    offset, amplitude = np.array([0.5, -1.0]), np.array([[0.3, 0.1, -0.2], [0.4, 0.0, 0.7]])
+    offset = np.array([0.5, -1.0])
+    amplitude = np.array([[0.3, 0.1, -0.2], [0.4, 0.0, 0.7]])
     frequency = np.array([[0.4, 1.0, 2.0], [0.3, 0.9, 1.7]])
     t = np.linspace(0.0, 10.0, 301)
     expected = np.stack(
@@ -220,12 +223,14 @@ def test_a_ramped_series_starts_and_ends_at_rest(motion):
 @given(tables() | series())
 @settings(max_examples=60, deadline=None)
 def test_extrema_bound_every_sample_and_are_reached(motion):
-    extrema, rounding = motion.extrema(), 1e-9
+    extrema = motion.extrema()
+    rounding = 1e-9
     rough = np.zeros(4)
     t = np.linspace(0.0, motion.duration, 20001)
     step = t[1]
     if isinstance(motion, FourierSeries):
-        rounding, rough = 1e-13, [room(motion, order) for order in range(4)]
+        rounding = 1e-13
+        rough = [room(motion, order) for order in range(4)]
     else:
         t = np.union1d(t, np.concatenate(motion.knots))
     q, qd, qdd = motion.sample(t)
@@ -251,7 +256,8 @@ def test_the_bound_of_jerk_holds_and_is_reached(motion):
     t = np.concatenate((t, ends - 2 * h, ends + 2 * h))
     t = t[(t > h) & (t < motion.duration - h)]
     t = t[np.all(np.abs(t[:, None] - edges) > 1.5 * h, axis=1)]
-    bound, seen = motion.extrema().jerk, np.abs(jerk_of(motion, t, h)).max(axis=0)
+    bound = motion.extrema().jerk
+    seen = np.abs(jerk_of(motion, t, h)).max(axis=0)
     noise = 1e-15 * (1.0 + motion.extrema().acceleration) / h * 10
     assert np.all(bound >= seen - noise)
     # The ends are missed by 2 h; where a ramp of a tenth begins, jerk changes by 6 / ramp a second.
@@ -359,7 +365,8 @@ def executable(limits, seed: int) -> FourierSeries:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_set_points_of_a_player_satisfy_the_limits(seed):
-    motion, period = executable(SIX_AXES, seed), 0.002
+    motion = executable(SIX_AXES, seed)
+    period = 0.002
     player = TrajectoryPlayer(motion, period, SIX_AXES)
     player.begin(player.start)
     rows = [player.start] * 3
@@ -405,7 +412,8 @@ def test_the_line_is_straight_for_any_slowest_joint():
         acceleration=[3.0, 1.0, 9.0],
         jerk=[50.0, 100.0, 5.0],
     )
-    start, end = np.array([0.1, -0.2, 0.3]), np.array([1.1, 0.9, -1.2])
+    start = np.array([0.1, -0.2, 0.3])
+    end = np.array([1.1, 0.9, -1.2])
     moves = straight(start, end, limits)
     (motion,) = moves.tables(np.zeros(1), moves.durations)
     q, qd, _ = motion.sample(np.linspace(0.0, motion.duration, 200))
@@ -440,7 +448,8 @@ class TestRestToRest:
         assert down == pytest.approx(law.duration - law.knots[0][4], abs=1e-9 * law.duration)
         within = 1 + 1e-9
         tick = 4 * jerk * np.spacing(law.duration)  # a knot is no finer than the clock
-        first, last = law.coefficients[0][:4], law.coefficients[0][4:]
+        first = law.coefficients[0][:4]
+        last = law.coefficients[0][4:]
         assert np.max(first[:, 2]) <= acceleration * within + tick
         assert np.max(-last[:, 2]) <= deceleration * within + tick
         extrema = law.extrema()
@@ -459,8 +468,10 @@ class TestRestToRest:
         distance, velocity, acceleration, deceleration, jerk = problem
         asked = ruckig.InputParameter(1)
         asked.target_position = [distance]
-        asked.max_velocity, asked.max_acceleration = [velocity], [acceleration]
-        asked.min_acceleration, asked.max_jerk = [-deceleration], [jerk]
+        asked.max_velocity = [velocity]
+        asked.max_acceleration = [acceleration]
+        asked.min_acceleration = [-deceleration]
+        asked.max_jerk = [jerk]
         solution = ruckig.Trajectory(1)
         ruckig.Ruckig(1).calculate(asked, solution)
         assert scalar(*problem)[0].duration == pytest.approx(solution.duration, rel=1e-6)
@@ -474,7 +485,8 @@ def flown(points, limits, share=0.5):
 def cut(points, limits, share):
     """The states that a corner joins, and the time that it replaces."""
     moves = legs_between(points, limits).moves
-    leave, enter = share * moves.slowing_down[0], share * moves.speeding_up[1]
+    leave = share * moves.slowing_down[0]
+    enter = share * moves.speeding_up[1]
     start, end = moves.states(np.array([moves.durations[0] - leave, enter]))
     return start, end, leave + enter
 
@@ -524,7 +536,8 @@ def test_the_motion_stops_if_the_solver_raises(monkeypatch, error):
 
 
 def test_a_corner_slower_than_a_stop_is_not_used(monkeypatch):
-    points, asked = random_points(1, 3), []
+    points = random_points(1, 3)
+    asked = []
 
     def slow(starts, *arguments):
         asked.extend(starts)
@@ -641,9 +654,11 @@ def test_no_ramp_is_faster(state, target):
     slope = float(np.clip(slope, -0.9 * bounds.slope, 0.9 * bounds.slope))
     problem = ruckig.InputParameter(1)
     problem.control_interface = ruckig.ControlInterface.Velocity
-    problem.current_velocity, problem.current_acceleration = [rate], [slope]
+    problem.current_velocity = [rate]
+    problem.current_acceleration = [slope]
     problem.target_velocity = [target]
-    problem.max_acceleration, problem.max_jerk = [bounds.slope], [bounds.change]
+    problem.max_acceleration = [bounds.slope]
+    problem.max_jerk = [bounds.change]
     reference = ruckig.Trajectory(1)
     ruckig.Ruckig(1).calculate(problem, reference)
     duration = ramp(rate, slope, target, bounds).duration
@@ -683,7 +698,8 @@ def test_a_state_outside_its_bounds_is_not_admitted(state, rising):
 
 
 def test_motion_time_follows_the_ramp_and_settles():
-    bounds, period = RateBounds(2.0, 20.0), 0.002
+    bounds = RateBounds(2.0, 20.0)
+    period = 0.002
     law = TimeLaw(period)
     law.restart(1.5, 1.0)
     assert law.settled
@@ -736,7 +752,8 @@ def motions():
 def test_bounds_are_satisfied_between_set_points_too(
     motions, which, share, factors, from_rate, to_rate
 ):
-    motion, limits = motions[which], SIX_AXES
+    motion = motions[which]
+    limits = SIX_AXES
     way = ramp(from_rate, 0.0, to_rate, slowing_bounds(limits, *factors, motion.extrema()))
     t = np.linspace(0.0, way.duration, 2000)
     s, r, dr = np.array([way.sample(float(x)) for x in t]).T[:, :, None]

@@ -94,7 +94,9 @@ def test_states_that_crash_the_solver_are_not_passed_to_it():
     limits = JointLimits(
         [-3.0], [3.0], [CRASH["max_velocity"]], [CRASH["acceleration"]], [CRASH["max_jerk"]]
     )
-    p, v, a = CRASH["position"], CRASH["velocity"], CRASH["acceleration"]
+    p = CRASH["position"]
+    v = CRASH["velocity"]
+    a = CRASH["acceleration"]
     assert join(np.array([[p, -v, a]]), np.array([[p, v, a]]), limits, 0.1) is None
 
 

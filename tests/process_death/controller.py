@@ -115,7 +115,9 @@ class WaitingLink:
     def __init__(self, host: str, port: int, page: Page) -> None:
         self.number = 0
         self.deserted = self._began = False
-        self._link, self._port, self._page = UdpControllerLink(host, port), port, page
+        self._link = UdpControllerLink(host, port)
+        self._port = port
+        self._page = page
         self._exchange = _Life()
 
     def send(self, packet: bytes) -> None:
@@ -176,7 +178,9 @@ def serve(cell: Cell, played: Round, page: Page) -> None:
             cycles = replies = 0
         if tally.cycles == cycles:
             return
-        replied, cycles, replies = tally.replies > replies, tally.cycles, tally.replies
+        replied = tally.replies > replies
+        cycles = tally.cycles
+        replies = tally.replies
         plant = controller.plant
         rejected = controller.rejected_replies + tally.rejected
         page.add((

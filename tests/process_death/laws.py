@@ -177,7 +177,8 @@ def _seen_last(rows: Records) -> Phase:
 def link(processes: Processes) -> Iterator[str]:
     """The records of the exchange contain each packet that the controller had replied to, once."""
     seen = processes.seen
-    rows, records = seen.rows, seen.records
+    rows = seen.rows
+    records = seen.records
     if not len(records):
         return
     if (np.diff(records["cycle"]) != 1).any() or records["gap"].any():
@@ -318,7 +319,8 @@ def _missing(processes: Processes) -> NDArray[np.int64]:
 
 def motions(processes: Processes) -> Iterator[str]:
     """Every set-point of a repetition or validation motion lies on its planned path."""
-    seen, campaign = processes.seen, processes.campaign
+    seen = processes.seen
+    campaign = processes.campaign
     for recording in processes.recorded:
         plan = campaign.plan
         match recording.name.kind:

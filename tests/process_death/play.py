@@ -66,7 +66,8 @@ if {module!r} in sys.orig_argv:
 
 def planted(name: str, folder: Path) -> Path:
     """Return a folder that injects a defect into processes with it on their path."""
-    defect, there = DEFECTS[name], folder / "planted"
+    defect = DEFECTS[name]
+    there = folder / "planted"
     there.mkdir()
     (there / "sitecustomize.py").write_text(
         _SITE.format(module=defect.module, code=defect.code), "utf-8"
@@ -130,7 +131,8 @@ def play(stage: Stage, number: int, strikes: Strikes | None = None) -> dict[str,
 
     The folder remains if a law was broken.
     """
-    played, began = round_of(number), time.monotonic()
+    played = round_of(number)
+    began = time.monotonic()
     played = played if strikes is None else replace(played, strikes=strikes)
     used = os.times()
     folder = stage.folder / f"round_{number:05d}"

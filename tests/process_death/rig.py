@@ -61,7 +61,8 @@ def started_by(supervisor: int, module: str) -> int:
 
 def marked(name: str, value: str) -> list[int]:
     """Processes that were started with a variable in their environment, zombies left out."""
-    mark, pids = f"{name}={value}".encode(), []
+    mark = f"{name}={value}".encode()
+    pids = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             with suppress(OSError):
@@ -169,7 +170,9 @@ class Watched:
     def __init__(
         self, campaign: Campaign, played: Round, report: Path, planted: Path | None
     ) -> None:
-        self.campaign, self.played, self.page = campaign, played, Page()
+        self.campaign = campaign
+        self.played = played
+        self.page = Page()
         controller = forked(lambda: serve(campaign.cell, played, self.page))
         supervisor = forked(lambda: supervise(campaign.folder.root, report, planted))
         self.pids: dict[Victim, int] = {"supervisor": supervisor, "controller": controller}
@@ -350,7 +353,8 @@ def supervise(campaign: Path, report: Path, planted: Path | None) -> int:
     try:
         with stop_on_interrupt() as stop:
             result = Campaign.open(campaign).run(None, stop, Silent(), unrehearsed=True)
-        outcome, status = {"complete": result.complete, "rejected": len(result.rejected)}, 0
+        outcome = {"complete": result.complete, "rejected": len(result.rejected)}
+        status = 0
     except HilError as error:
         outcome = {"error": type(error).__name__, "text": str(error)}
         status = error.exit_code
@@ -362,11 +366,13 @@ class _Due:
     """Whether the moment of a trigger has come."""
 
     def __init__(self, watched: Watched, trigger: Trigger) -> None:
-        self._watched, self._trigger = watched, trigger
+        self._watched = watched
+        self._trigger = trigger
         self._folder = watched.campaign.folder
         self._begun = self._modified()
         self._entered = 0
-        self._state, self._times = -1, 0
+        self._state = -1
+        self._times = 0
 
     def _modified(self) -> int:
         return (self._folder.root / "manifest.json").stat().st_mtime_ns
@@ -389,7 +395,8 @@ class _Due:
             return False
         control = self._watched.memory.control
         if trigger.moment == "motion":
-            ended, going_on = control.ended_count, control.program_accepted
+            ended = control.ended_count
+            going_on = control.program_accepted
             on_the_way = going_on == trigger.count and control.motion_time >= trigger.way
             return on_the_way or ended >= trigger.count
         state = control.state
@@ -409,7 +416,8 @@ def run(
     with Watched(campaign, played, report, planted) as watched:
         deaths, entered = watched.struck(strikes)
         watched.wait("supervisor", "exchange", "archive")
-        rows, memory = watched.rest(), watched.memory
+        rows = watched.rest()
+        memory = watched.memory
         records = np.zeros(0, cycle_dtype(JOINTS)) if memory is None else memory.records()
         watched.page.abandoned = 1
         watched.wait("controller")

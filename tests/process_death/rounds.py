@@ -85,5 +85,6 @@ def _trigger(chance: random.Random) -> Trigger:
         return Trigger(moment, chance.randint(1, ARCHIVES), chance.expovariate(10.0))
     if moment == "entered":
         return Trigger(moment, chance.randint(1, ARCHIVES - 1), chance.expovariate(100.0))
-    count, delay = chance.randint(1, ARCHIVES), chance.expovariate(50.0)
+    count = chance.randint(1, ARCHIVES)
+    delay = chance.expovariate(50.0)
     return Trigger(moment, count, delay, state=chance.choice(STATES))

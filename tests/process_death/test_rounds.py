@@ -44,7 +44,8 @@ CYCLES = 3000
 
 def seen(*victims: Victim, text: str = "", behind: int = 0) -> Seen:
     """3000 cycles of motion at whose end these died, `behind` of them not archived yet."""
-    records, rows = np.zeros(CYCLES, cycle_dtype(2)), np.zeros(CYCLES, ROW)
+    records = np.zeros(CYCLES, cycle_dtype(2))
+    rows = np.zeros(CYCLES, ROW)
     records["cycle"] = records["number"] = rows["number"] = np.arange(CYCLES)
     records["commanded_velocity"] = 0.1
     deaths = [Death(victim, CYCLES, behind) for victim in victims]
@@ -82,7 +83,8 @@ def test_a_dead_archive_process_costs_a_chunk_and_its_backlog(
 def test_only_the_newest_archive_may_be_truncated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    older, newest = tmp_path / "move_000_a1.mcap", tmp_path / "excitation_000_a1.mcap"
+    older = tmp_path / "move_000_a1.mcap"
+    newest = tmp_path / "excitation_000_a1.mcap"
     for place, path in enumerate((older, newest), 1):
         path.touch()
         os.utime(path, ns=(place * 10**9, place * 10**9))

@@ -62,7 +62,8 @@ FRICTIONLESS = frictionless(TRUTH.rotor_inertia)
 
 def _smooth_motion() -> tuple[Array, Array]:
     """Three seconds within the NS 16's limits at up to about a third of its speeds."""
-    duration, n = 3.0, int(3.0 / PERIOD)
+    duration = 3.0
+    n = int(3.0 / PERIOD)
     s = np.arange(n + 1) * PERIOD / duration
     window = 30 * s**2 * (1 - s) ** 2 / duration  # dx/dt of the quintic from 0 to 1
     phase = 10 * s**3 - 15 * s**4 + 6 * s**5
@@ -96,8 +97,12 @@ class MinimalPC:
         self.deltas = deltas
 
     def run(self, settle: int = 100) -> Log:
-        controller, n = self.controller, self.targets.shape[1]
-        axes, q, qd, raw = [], [], [], []
+        controller = self.controller
+        n = self.targets.shape[1]
+        axes = []
+        q = []
+        qd = []
+        raw = []
         k = -settle
         while (packet := controller.next_packet()) is not None:
             raw.append(packet)

@@ -150,7 +150,8 @@ class TestStart:
     def test_a_stated_drive_train_replaces_the_true_one_in_init_only(self) -> None:
         wrong = make_drive(gear_ratio=[116.0, 116.0, -106.0, -50.0, 51.5, -33.0])
         assert init_of(make(cold_start=False, stated=wrong)).gear_ratio[0, 0] == 116.0
-        stating, honest = make(Phase.OPEN, stated=wrong), make(Phase.OPEN)
+        stating = make(Phase.OPEN, stated=wrong)
+        honest = make(Phase.OPEN)
         np.testing.assert_array_equal(receive(stating).axes, receive(honest).axes)
 
     def test_modes_and_status_on_the_way_to_open(self) -> None:
@@ -261,7 +262,8 @@ class TestOpenMode:
 
 @pytest.mark.safety
 def test_one_seed_is_one_run_bit_for_bit() -> None:
-    settings, effects = ControllerSettings(**NOISY), UnmodelledEffects.default_sizes(6)
+    settings = ControllerSettings(**NOISY)
+    effects = UnmodelledEffects.default_sizes(6)
     logs = [play(DRIVE, settings, seed=seed, effects=effects)[1] for seed in (3, 3, 4)]
     first, again, other = (log.raw for log in logs)
     assert len(first) > 3000
@@ -305,7 +307,8 @@ class TestCurrentsAreTorques:
         fine = make_drive(encoder_counts=2**30)
         controller, log = play(fine, ControllerSettings(encoder_noise=0.0))
         qdd = (log.qd[2:] - log.qd[:-2]) / 0.002
-        q, qd = log.q[1:-1], log.qd[1:-1]
+        q = log.q[1:-1]
+        qd = log.qd[1:-1]
         model = pin.buildModelFromXML(ns16.urdf_text())
         data = model.createData()
         rigid = np.array([pin.rnea(model, data, *state) for state in zip(q, qd, qdd, strict=True)])
@@ -459,7 +462,8 @@ class TestArms:
 class TestOwnMotion:
     """Its moves are those of `planner.Interpolator`."""
 
-    PERIOD, SPEED = 0.002, 0.5
+    PERIOD = 0.002
+    SPEED = 0.5
     angles = st.floats(-2.0, 2.0)
 
     def motion(
@@ -474,7 +478,8 @@ class TestOwnMotion:
     def test_it_rests_in_its_postures_within_its_limits(
         self, there: tuple[float, float], then: tuple[float, float]
     ) -> None:
-        motion, rows = self.motion(there, then), []
+        motion = self.motion(there, then)
+        rows = []
         while not motion.finished:
             rows.append([part.copy() for part in motion.advance()])
             assert len(rows) < 20_000
@@ -580,7 +585,8 @@ class TestFields:
 
     @pytest.mark.parametrize("mode", [1, 2, 9])
     def test_modes_1_2_and_9_add_d5_to_the_target_current(self, mode: int) -> None:
-        extra, current = np.array([0.25, -0.125]), []
+        extra = np.array([0.25, -0.125])
+        current = []
         for fields in ({}, {5: extra}):
             controller = opened(open_mode=mode)
             first = receive(controller)
@@ -604,7 +610,8 @@ class TestWithoutAnAnswer:
             delta = np.array([0.03 * min(1.0, k / 250), 0.0])
             target = target + delta
             step(controller, {1: target, 2: delta})
-        targets, reasons = [], []
+        targets = []
+        reasons = []
         for _ in range(300):
             receive(controller)
             controller.accept(None)

@@ -193,9 +193,11 @@ def test_a_jam_trips_the_drive_in_motion_only(fault: str, step: float, trips: bo
 
 
 def test_a_slip_changes_the_reported_position_only() -> None:
-    pc, faultless = run(160, "following-error@100x50:axis=2:slip"), run(160)
+    pc = run(160, "following-error@100x50:axis=2:slip")
+    faultless = run(160)
     for k, slip in ((99, 0.0), (100, 1.5), (149, 1.5), (150, 0.0)):
-        d, expected = pc.cyclic(k).axes["d"].copy(), faultless.cyclic(k).axes["d"].copy()
+        d = pc.cyclic(k).axes["d"].copy()
+        expected = faultless.cyclic(k).axes["d"].copy()
         expected[1, 2] += slip * small_cell.FOLLOWING_ERROR
         np.testing.assert_allclose(d, expected, atol=1e-6)
 

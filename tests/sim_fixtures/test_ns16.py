@@ -42,7 +42,10 @@ def test_link_frames_are_the_dh_frames_at_the_previous_origin(model: pin.Model) 
     before = np.eye(4)
     for i in range(6):
         alpha = (-1, 0, -1, -1, -1, 0)[i] * np.pi / 2
-        c, s, ca, sa = np.cos(q[i]), np.sin(q[i]), np.cos(alpha), np.sin(alpha)
+        c = np.cos(q[i])
+        s = np.sin(q[i])
+        ca = np.cos(alpha)
+        sa = np.sin(alpha)
         after = before @ np.array(
             [
                 [c, -s * ca, s * sa, ns16.A[i] * c],

@@ -53,7 +53,8 @@ def steps(plant: Plant, count: int, torque: Array | None = None) -> Plant:
 def swing(step: float) -> tuple[Plant, float]:
     """Let the arm fall freely for a second; return it and the largest error of its energy [J]."""
     plant = rigid_plant(FRICTIONLESS)
-    before, worst = plant.energy(), 0.0
+    before = plant.energy()
+    worst = 0.0
     for _ in range(round(1.0 / step)):
         plant.step(np.zeros(6), step)
         worst = max(worst, abs(plant.energy() - before))
@@ -80,7 +81,8 @@ def test_inverse_dynamics_of_a_step_give_the_applied_torque() -> None:
     smooth_steps = 0
     steady = np.zeros(6, dtype=bool)  # no kink in this joint's motion since the last step
     for _ in range(400):
-        q, v = plant.position.copy(), plant.velocity.copy()
+        q = plant.position.copy()
+        v = plant.velocity.copy()
         plant.step(torque, STEP)
         middle = 0.5 * (q + plant.position), 0.5 * (v + plant.velocity)
         rigid = pin.rnea(plant.model, data, *middle, plant.acceleration)
@@ -187,7 +189,8 @@ class TestElasticGears:
         np.testing.assert_allclose(steps(plant, 200, gravity).position, START, atol=1e-9)
 
     def test_a_stiff_gear_is_a_rigid_one(self) -> None:
-        stiff, rigid = elastic(compliance=(5e-8, 5e-8, 0.0, 0.0, 0.0, 0.0)), rigid_plant()
+        stiff = elastic(compliance=(5e-8, 5e-8, 0.0, 0.0, 0.0, 0.0))
+        rigid = rigid_plant()
         for k in range(1000):
             torque = np.array([900.0, -300.0, 0.0, 5.0, 15.0, 8.0]) * np.sin(0.01 * k)
             steps(stiff, 1, torque)
@@ -225,7 +228,8 @@ def test_friction_holds_what_it_can_and_opposes_what_slides(seed: int, n: int, p
     free = STEP * push * rng.normal(size=n)
     guess = rng.uniform(-60.0, 60.0, n)
     result = resolve_dry_friction(free.tolist(), inverse, coulomb.tolist(), STEP, guess.tolist())
-    velocity, torque = np.array(result.velocity), np.array(result.torque)
+    velocity = np.array(result.velocity)
+    torque = np.array(result.torque)
 
     slack = 10.0 * TOLERANCE * (coulomb.max() + 1.0)
     assert np.all(np.abs(torque) <= coulomb)
@@ -274,10 +278,13 @@ def test_current_at_rest_is_limited_and_without_wind_up(servo: Servo) -> None:
 
 
 def test_the_model_is_wrong_by_five_to_ten_per_cent() -> None:
-    model, exact = nominal(0.05, 0.10), nominal(0.0, 0.0)
+    model = nominal(0.05, 0.10)
+    exact = nominal(0.0, 0.0)
     off = np.abs(model.rotor_inertia / TRUTH.rotor_inertia - 1.0)
     assert np.all((off >= 0.05) & (off <= 0.10))
-    q, qd, qdd = np.array(POSTURE), np.ones(6), np.full(6, 2.0)
+    q = np.array(POSTURE)
+    qd = np.ones(6)
+    qdd = np.full(6, 2.0)
     true = exact.torque(q, qd, qdd)
     assert 0.01 < np.abs(model.torque(q, qd, qdd) - true).max() / np.abs(true).max() < 0.5
     rigid = pin.buildModelFromXML(ns16.urdf_text())
@@ -290,7 +297,8 @@ def test_the_model_is_wrong_by_five_to_ten_per_cent() -> None:
 @pytest.mark.parametrize("substeps", [1, 2, 5])
 def test_the_current_follows_with_the_stated_lag(substeps: int) -> None:
     """Area above a step response is the time constant."""
-    lag, period = 0.0007, 0.001
+    lag = 0.0007
+    period = 0.001
     loop = CurrentLoop(1, lag=lag, substep=period / substeps, delay_substeps=0)
     missing = 0.0
     for _ in range(50 * substeps):
@@ -338,7 +346,8 @@ def test_encoders_read_whole_counts() -> None:
     np.testing.assert_allclose((shifted - read) * DRIVE.encoder_counts, 2.0, atol=1e-6)
 
 
-SIMPLE, NO_ROTORS = frictionless(np.ones(6)), frictionless(np.zeros(6))
+SIMPLE = frictionless(np.ones(6))
+NO_ROTORS = frictionless(np.zeros(6))
 NO_WRIST = ((1.0, 1.0),) * 7
 
 

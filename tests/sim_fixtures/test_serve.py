@@ -51,8 +51,11 @@ class Cabinet:
     ) -> None:  # fmt: skip
         self.sent_at: list[float] = []
         self.accepted: list[bytes | None] = []
-        self.at_rest, self.silent_in, self.ends_in = at_rest, silent_in, ends_in
-        self._clock, self._cycles = clock, cycles
+        self.at_rest = at_rest
+        self.silent_in = silent_in
+        self.ends_in = ends_in
+        self._clock = clock
+        self._cycles = cycles
         self._number = 1
 
     def next_packet(self) -> bytes | None:
@@ -104,7 +107,8 @@ class VirtualLink:
     def __init__(self, clock: VirtualClock, answer: Answer, cost: float) -> None:
         self.cost = cost
         self.sent: list[tuple[float, bytes]] = []
-        self._clock, self._answer = clock, answer
+        self._clock = clock
+        self._answer = answer
         self._coming: list[tuple[float, int, bytes]] = []
         self._order = 0
 
@@ -286,7 +290,8 @@ def test_each_cycle_accepts_at_most_one_answer_of_its_own(delays, copies, naps):
     def answer(index, packet):
         if index == 0:
             return prompt(index, packet)
-        delay, count = delays[index % len(delays)], copies[index % len(copies)]
+        delay = delays[index % len(delays)]
+        count = copies[index % len(copies)]
         return [(delay * T, echo(packet))] * count
 
     stalls = sorted((100.0 + at, nap) for at, nap in naps)

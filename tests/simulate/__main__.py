@@ -72,7 +72,8 @@ def _one(options: argparse.Namespace) -> int:
         except UndisturbedError as error:
             sys.stdout.write(f"BROKEN undisturbed: {error}\n")
             return 1
-        broken, runs = broken_by(seen), runs_of(seen)
+        broken = broken_by(seen)
+        runs = runs_of(seen)
         lines = [f"seed {options.seed}: {stage.twin(options.seed).scene.words}"]
     if options.json:
         document = {
@@ -104,7 +105,8 @@ def _one(options: argparse.Namespace) -> int:
 def _many(options: argparse.Namespace) -> int:
     seeds = range(options.start, options.start + options.seeds)
     verdicts: list[Verdict] = []
-    failed, shrink = 0, not options.no_shrink
+    failed = 0
+    shrink = not options.no_shrink
     with redirect_stdout(sys.stderr if options.json else sys.stdout):
         progress = reporter()
         with progress.task("simulating seeds", len(seeds)) as task:

@@ -63,9 +63,12 @@ def draw_arm(chance: random.Random) -> Arm:
 def _urdf(chance: random.Random, shape: str, mass: Sequence[float], reach: Sequence[float]) -> str:
     parts = ['<robot name="drawn"><link name="base"/>']
     for i, (m, length) in enumerate(zip(mass, reach, strict=True)):
-        x, y, z = (chance.uniform(-0.04, 0.04), chance.uniform(-0.04, 0.04), 0.45 * length)
+        x = chance.uniform(-0.04, 0.04)
+        y = chance.uniform(-0.04, 0.04)
+        z = 0.45 * length
         wide = chance.uniform(0.05, 0.09)
-        along, across = m * (length**2 + wide**2) / 12.0, m * wide**2 / 6.0
+        along = m * (length**2 + wide**2) / 12.0
+        across = m * wide**2 / 6.0
         lift = 0.3 if i == 0 else reach[i - 1]
         parts.append(
             f'<link name="link_{i + 1}"><inertial><mass value="{m:.6g}"/>'
@@ -230,7 +233,8 @@ def _excitation(
 
 def _vias(chance: random.Random, cell: Cell, size: float) -> Excitation | None:
     """Return a motion through random via points about home, or None."""
-    n, limits = len(cell.joint_names), cell.joint_limits
+    n = len(cell.joint_names)
+    limits = cell.joint_limits
     home = cell.home
     reach = np.minimum(np.radians(28.0), 0.9 * (limits.upper - home)) * size
     points = [

@@ -108,7 +108,8 @@ def test_a_motion_stopped_while_axes_open_leaves_them_closed(
     """Seed 2088 with `stop@30`: the link was left with some of the axes in open mode."""
     link = VirtualLink.over(SimulatedTransport(controller), cell)
     motion, spec = short_way(cell, link.connect(Stop()), tmp_path)
-    stop, phases = Stop(), []
+    stop = Stop()
+    phases = []
 
     class Stopping:
         """Requests a stop when the first axis has opened."""

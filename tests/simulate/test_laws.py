@@ -188,16 +188,20 @@ def with_set_points(
 
     Rows count from the record `first`, by default from the middle of the longest motion.
     """
-    life, rows = observed.runs[0], observed.runs[0].records.copy()
+    life = observed.runs[0]
+    rows = observed.runs[0].records.copy()
     first = first or int(moving(observed)[len(moving(observed)) // 2])
-    slots, drives = list(talk_of(observed).init.slots or ()), observed.cell.drive_train
-    exchanged, before = list(life.exchanged), 0.0
+    slots = list(talk_of(observed).init.slots or ())
+    drives = observed.cell.drive_train
+    exchanged = list(life.exchanged)
+    before = 0.0
     for index, exchange in enumerate(exchanged):
         row = exchange.record
         q = rows["commanded_position"][row]
         if row < first or rows["interval"][row] != rows["interval"][first] or np.isnan(q).any():
             continue
-        now, reply = change(row - first), bytearray(exchange.replies[0])
+        now = change(row - first)
+        reply = bytearray(exchange.replies[0])
         origin = drives.joint_position(np.zeros(len(q)))
         q = q + drives.joint_position(np.full(len(q), now)) - origin
         position = np.asarray(drives.motor_revolutions(q), np.float32)
@@ -205,7 +209,8 @@ def with_set_points(
             at = 16 + 36 * slot
             step = float(np.frombuffer(reply[at + 4 : at + 8], np.float32)[0]) + now - before
             reply[at : at + 8] = np.array([position[joint], step], np.float32).tobytes()
-        exchanged[index], before = exchange._replace(replies=(bytes(reply),)), now
+        exchanged[index] = exchange._replace(replies=(bytes(reply),))
+        before = now
         if records:
             rows["commanded_position"][row] = q
     return with_life(observed, 0, exchanged=tuple(exchanged), records=rows)
@@ -218,7 +223,8 @@ def leapt(observed: Observed, height: float = 0.2, *, records: bool = True) -> O
 
 def revolutions_of_jerk(observed: Observed) -> np.ndarray:
     """(n,) the largest third difference of each joint's set-points."""
-    limits, period = observed.cell.joint_limits, observed.cell.period
+    limits = observed.cell.joint_limits
+    period = observed.cell.period
     gears = np.abs(np.diag(observed.cell.drive_train.motor_from_joint)) / (2.0 * np.pi)
     return np.asarray(limits.jerk * period**3 * gears)
 
@@ -280,14 +286,16 @@ def too_many_missed(observed: Observed) -> Observed:
             if exchanged.record >= 0 and moving[exchanged.record]
         ]
         if at:
-            middle, most = at[len(at) // 2], observed.cell.controller.max_gap
+            middle = at[len(at) // 2]
+            most = observed.cell.controller.max_gap
             left = life.exchanged[:middle] + life.exchanged[middle + most + 1 :]
             return with_life(observed, number, exchanged=left)
     raise AssertionError("no motion completed")
 
 
 def piled_up(observed: Observed) -> Observed:
-    exchanged, mode = list(observed.runs[0].exchanged), observed.cell.controller.mode
+    exchanged = list(observed.runs[0].exchanged)
+    mode = observed.cell.controller.mode
     at = next(
         index
         for index, exchange in enumerate(exchanged)
@@ -383,7 +391,8 @@ def after_gap(observed: Observed) -> int:
 
 def received_there(observed: Observed, field: int, factor: float, more: float = 0.0) -> Observed:
     """One of D1..D5 of the first joint after the gap, scaled and shifted."""
-    index, at = index_of(observed, after_gap(observed)), axis_of(observed) + 4 + 4 * field
+    index = index_of(observed, after_gap(observed))
+    at = axis_of(observed) + 4 + 4 * field
     packet = observed.runs[0].exchanged[index].packet
     value = factor * np.frombuffer(packet[at : at + 4], np.float32)[0] + more
     return with_received(observed, (index, at), np.float32(value).tobytes())
@@ -569,7 +578,8 @@ def test_a_model_that_predicts_other_torques_is_found(observed: Observed) -> Non
     """By far less than the few degrees of freedom of each standard deviation allow."""
     assert observed.found is not None
     assert observed.twin_found is not None
-    found_one, pooled = observed.found, observed.found.result.pooled
+    found_one = observed.found
+    pooled = observed.found.result.pooled
     (samples, *_) = found_one.fitted
     for share, seen in ((0.05, False), (10.0, True)):
         change = share * pooled.std * np.sign(pooled.values)

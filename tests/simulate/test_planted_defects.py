@@ -42,7 +42,8 @@ def answers_duplicates_again(patch: pytest.MonkeyPatch) -> None:
 
 def catches_up_unguarded(patch: pytest.MonkeyPatch) -> None:
     """After a gap the motion catches up, and the guard does not check speeds."""
-    advance, gap = TrajectoryPlayer.advance, [0]
+    advance = TrajectoryPlayer.advance
+    gap = [0]
     receive = LossTracker.receive
 
     def received(self: LossTracker, missed: int, elapsed: float) -> None:

@@ -34,7 +34,8 @@ Fails = Callable[[tuple[str, ...]], bool]
 
 def shrunk(lines: Sequence[str], fails: Fails, tries: int = MOST_TRIES) -> tuple[str, ...]:
     """Return a failing script with as few lines as found in some tries."""
-    left, current = [tries], tuple(lines)
+    left = [tries]
+    current = tuple(lines)
 
     def still(candidate: tuple[str, ...]) -> bool:
         left[0] -= 1

@@ -127,7 +127,8 @@ class WatchedTransport(SimulatedTransport):
         faults = [fault for _, fault in script.faults if isinstance(fault, LinkFault)]
         self._inner = SimulatedTransport(peer, faults)
         self._inner.cycle = peer.cycle
-        self._clock, self._on_cycle = clock, on_cycle
+        self._clock = clock
+        self._on_cycle = on_cycle
         self._period = peer.period
         stalls = (
             event
@@ -158,7 +159,8 @@ class WatchedTransport(SimulatedTransport):
             received = self._inner.receive(timeout)
             if received is None:
                 return None
-            self._arrival, packet = self._inner.now, received
+            self._arrival = self._inner.now
+            packet = received
         self.seen.append((self.now, self._inner.cycle - 1, packet, []))
         return packet
 
@@ -197,7 +199,8 @@ class SessionLog:
     """Recorder of the calls, events and records of a session."""
 
     def __init__(self, link: VirtualLink, transport: WatchedTransport) -> None:
-        self._transport, self._seen = transport, transport.seen
+        self._transport = transport
+        self._seen = transport.seen
         self.acts: list[Act] = []
         self.events: list[tuple[int, Any]] = []
         self._rows: list[bytes] = []

@@ -93,7 +93,9 @@ class Disk:
 
     def begin(self) -> None:
         self.dead = False
-        self.failures, self.torn, self.refused = [], {}, set()
+        self.failures = []
+        self.torn = {}
+        self.refused = set()
         self._paths.clear()
         self._last.clear()
 
@@ -204,7 +206,8 @@ class ScriptedOperator:
         if self._holds and self._holds[0].at <= cycle:
             if self._asked == 0:
                 self.struck.append(self._holds[0].line)
-            held, self._asked = self._asked < self._holds[0].count, self._asked + 1
+            held = self._asked < self._holds[0].count
+            self._asked = self._asked + 1
             if not held:
                 self._holds.pop(0)
                 self._asked = 0
@@ -291,8 +294,10 @@ class World:
         folder: Path,
     ) -> None:
         self.folder = folder
-        self.settings, self.script = settings, script
-        self._scene, self._chance = scene, chance
+        self.settings = settings
+        self.script = script
+        self._scene = scene
+        self._chance = chance
         self._kind = chance.choice((WatchedTransport, StampedWatchedTransport))
         self.controller = WatchedController(
             simulated_controller(scene.cell, settings=settings), script
@@ -343,13 +348,16 @@ class World:
         """Run one process, which opens the campaign and runs it."""
         self._stop = Stop()
         self.disk.begin()
-        first, before, names = self.controller.cycle, self._digests, _names(self.folder)
+        first = self.controller.cycle
+        before = self._digests
+        names = _names(self.folder)
         transport = self._kind(self.controller, self.script, self._clock, self._on_cycle)
         connection = VirtualLink.over(
             transport, self._scene.cell, finish=self.controller.controller.finish
         )
         log = SessionLog(connection, transport)
-        self._begun, self._session = first, connection.port.session
+        self._begun = first
+        self._session = connection.port.session
         result, error = self._run(connection)
         self._digests = after = _digests(self.folder)
         self._struck += transport.struck
@@ -521,7 +529,8 @@ def twin_of(group: int, root: Path) -> Twin:
 
 def _check_usable(scene: Scene, life: Life) -> None:
     """Raise SceneError for an unusable arm or motion, UndisturbedError for another failure."""
-    error, result = life.error, life.result
+    error = life.error
+    result = life.result
     if isinstance(error, RepetitionsRejectedError):
         raise SceneError(f"{scene.words}: {error}")
     if isinstance(error, MotionFailedError) and Check.STANDSTILL.quantity in error.reason:
@@ -569,7 +578,8 @@ def play(seed: int, twin: Twin, root: Path, script: Script | None = None) -> Obs
     script = parse_script(drawn_lines) if script is None else script
     world = World(twin.scene, settings, script, chance, root / f"seed_{seed}")
     lives = world.all_lives()
-    estimate, why = None, ""
+    estimate = None
+    why = ""
     if lives[-1].result is not None and lives[-1].result.complete:
         estimate, why = estimated(world.folder)
     seen = _observed(twin.scene, world, lives, estimate, why)

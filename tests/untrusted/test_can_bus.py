@@ -36,8 +36,10 @@ class SharedBus:
     """The controller's end of a bus with a third node, which acts after each of its packets."""
 
     def __init__(self, meddle: Meddle) -> None:
-        self._clock, channel = Cycles(), f"untrusted-{next(_channels)}"
-        rates, clock = BusRates(), self._clock
+        self._clock = Cycles()
+        channel = f"untrusted-{next(_channels)}"
+        rates = BusRates()
+        clock = self._clock
         self.pc = CanTransport(UnstampedBus(channel), rates, clock=clock)
         self._controller = CanControllerLink(
             UnstampedBus(channel), rates, clock=clock, start_patience=0.0

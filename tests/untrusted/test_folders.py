@@ -193,7 +193,8 @@ def test_writing_follows_no_link_and_waits_for_no_pipe(
     suffix: str, thing: str, folder: Path
 ) -> None:
     """Neither at the file nor at its temporary file."""
-    other_file, target = folder.parent / "profile", folder / "manifest.json"
+    other_file = folder.parent / "profile"
+    target = folder / "manifest.json"
     other_file.write_text("mine")
     in_the_way = folder / f"{target.name}{suffix}"
     in_the_way.unlink(missing_ok=True)
@@ -376,7 +377,8 @@ def test_markup_in_the_name_of_a_campaign_is_shown(folder: Path, tmp_path: Path)
     assert "[bold]c" in shown.output
 
 
-HUGE, DIGITS = 10**400, "9" * 5000
+HUGE = 10**400
+DIGITS = "9" * 5000
 ENTRY = {"name": "excitation_000_a1.mcap", "outcome": "completed", "sha256": "00", "reason": ""}
 
 
@@ -436,7 +438,8 @@ def imported(tmp_path: Path) -> Path:
 
 def test_imported_archive_instead_of_a_recorded_one(imported: Path, folder: Path) -> None:
     campaign = Campaign.open(folder)
-    cell, motion = campaign.cell, campaign.plan.excitation.trajectory
+    cell = campaign.cell
+    motion = campaign.plan.excitation.trajectory
     (folder / "archives").mkdir(exist_ok=True)
     shutil.copy(imported, folder / "archives" / "dryrun_000_a1.mcap")
     names = ["dryrun_000_a1.mcap"]
@@ -531,7 +534,8 @@ def test_journal_of_forged_frames_is_read_in_linear_time(
     for k in range(count):  # each claims all that follows
         length = frame * (count - k) - 12
         file.write(length.to_bytes(8, "little") + bytes(4) + b"\x93NUMPY")
-    summed, crc32 = [], zlib.crc32
+    summed = []
+    crc32 = zlib.crc32
 
     def crc32_with_count(data: bytes) -> int:
         summed.append(len(data))

@@ -59,7 +59,9 @@ def attacked(port: int) -> Iterator[socket]:
 
 @pytest.mark.slow
 def test_other_host_gets_no_reply_and_the_motion_completes(tmp_path: Path) -> None:
-    cell, port, output = fast_cell(tmp_path), free_port(), tmp_path / "moved.mcap"
+    cell = fast_cell(tmp_path)
+    port = free_port()
+    output = tmp_path / "moved.mcap"
     linked = cell.with_link(transport="udp", host=LOOPBACK, port=port, bind=LOOPBACK)
     cell.path.write_text(linked.text)
     move = (sys.executable, "-m", "hil", "move", str(cell.path), "--joint", "1", "--by", "30")

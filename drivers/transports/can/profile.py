@@ -220,7 +220,8 @@ class End:
     """
 
     def __init__(self, rates: BusRates, sends: int) -> None:
-        self.rates, self.discarded = rates, Counter[str]()
+        self.rates = rates
+        self.discarded = Counter[str]()
         self.cyclic_length: int | None = None
         self._sends = sends
         self._receives = UP if sends == DOWN else DOWN

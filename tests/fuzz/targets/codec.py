@@ -28,14 +28,18 @@ class Talk:
 
     def __init__(self, draw: Draw) -> None:
         self._draw = draw
-        self._pc, self._controller = End(BusRates(), DOWN), End(BusRates(), UP)
+        self._pc = End(BusRates(), DOWN)
+        self._controller = End(BusRates(), UP)
         self._n = draw.between(1, 6)
-        self._time, self._untouched = 0.0, True
+        self._time = 0.0
+        self._untouched = True
         self._sent: set[bytes] = set()
 
     def play(self) -> bool:
         """Init packet, then cycles until the bytes run out; AssertionError if a law is broken."""
-        draw, number, answered = self._draw, 10, 0
+        draw = self._draw
+        number = 10
+        answered = 0
         init = InitPacket.build(self._n, draw.choice((2, 1)), {}).encode()
         try:
             begun = self._passed(init, self._controller, self._pc)
@@ -53,7 +57,8 @@ class Talk:
         return begun is not None and answered > 0
 
     def _packet(self, number: int) -> bytes:
-        draw, n = self._draw, self._n
+        draw = self._draw
+        n = self._n
         block = draw.raw(draw.choice((0, 36, 36 * n))).ljust(36 * n, b"\0")
         axes = np.frombuffer(block, CyclicPacket.zeros(number, n).axes.dtype).copy()
         if draw.chance(128):

@@ -83,7 +83,8 @@ def robot() -> Robot:
 def run(data: bytes) -> bool:
     """Import it if possible; check what was written."""
     kind = data[0] % len(SUFFIXES) if data else TEXT
-    source, output = folder() / SUFFIXES[kind], folder() / "out.mcap"
+    source = folder() / SUFFIXES[kind]
+    output = folder() / "out.mcap"
     source.write_bytes(data[1:])
     output.unlink(missing_ok=True)
     try:
@@ -126,7 +127,8 @@ def _map() -> ColumnMap:
 
 def seeds() -> list[bytes]:
     """Return one valid input of each kind."""
-    q, t = np.arange(16.0).reshape(8, 2), np.arange(8) * 0.002
+    q = np.arange(16.0).reshape(8, 2)
+    t = np.arange(8) * 0.002
     arrays, packed, array, typed = (io.BytesIO() for _ in range(4))
     np.savez(arrays, q=q, t=t)
     np.savez_compressed(packed, q=q, t=t)

@@ -56,7 +56,9 @@ class Controller:
         slots: Sequence[int],
     ) -> None:
         self._train = train
-        self._arm, self._n_axes, self._slots = arm, n_axes, slots
+        self._arm = arm
+        self._n_axes = n_axes
+        self._slots = slots
         self.number = 0
         self.status = [0, 0, 0, 0]
         self.status[arm - 1] = oracle.DRIVE_ON
@@ -239,7 +241,8 @@ class Conversation(Judged):
     # What the controller does -------------------------------------------------------------
 
     def _init(self) -> None:
-        draw, packet = self._draw, self.arm.init
+        draw = self._draw
+        packet = self.arm.init
         if draw.chance(24):
             packet = self.arm.other
         elif draw.chance(24):
@@ -283,7 +286,8 @@ class Conversation(Judged):
 
     def disturb(self) -> None:
         draw = self._draw
-        slot, column = draw.below(len(self.arm.axes)), draw.below(8)
+        slot = draw.below(len(self.arm.axes))
+        column = draw.below(8)
         value = draw.float32() if draw.chance(64) else draw.choice((*WILD, 0.19, 0.21, 1.9, 2.1))
         before = self.controller.d[slot, column]
         with np.errstate(all="ignore"):
@@ -364,7 +368,8 @@ class Conversation(Judged):
         self.source = source
 
     def _motion(self) -> ScriptedMotion:
-        draw, n = self._draw, self.arm.n
+        draw = self._draw
+        n = self.arm.n
         direction = np.array([draw.choice((1.0, 0.0, -1.0)) for _ in range(n)])
         if draw.chance(128):
             hold = draw.between(1, 45)

@@ -59,7 +59,8 @@ def flipped(data: bytes, at: int, mask: int = 0xFF) -> bytes:
 
 def repaired_twice(path: Path, data: bytes) -> tuple[Repair, bytes]:
     """Repair bytes, and repair the result."""
-    output, again = path.with_name("once.mcap"), path.with_name("twice.mcap")
+    output = path.with_name("once.mcap")
+    again = path.with_name("twice.mcap")
     for earlier in (output, again):
         earlier.unlink(missing_ok=True)
     path.write_bytes(data)
@@ -194,7 +195,8 @@ class TestLosses:
         case = LOSSES[what]
         data = case.data(written, path)
         path.write_bytes(data)
-        archive, check = open_archive(path), check_archive(path)
+        archive = open_archive(path)
+        check = check_archive(path)
         sentence = str(archive.missing)
         assert sentence.startswith(str(path))
         assert case.reason in sentence
@@ -223,7 +225,8 @@ class TestLosses:
         assert check.repaired == bool(done.losses)
 
     def test_range_of_the_bytes_left_out_is_stated(self, written, path):
-        begin, end = written.chunks[1].offset, written.chunks[2].offset
+        begin = written.chunks[1].offset
+        end = written.chunks[2].offset
         path.write_bytes(written.changed(written.chunks[1], -5))
         assert f"(bytes {begin} to {end} are left out)" in repair(path).losses[0]
 
@@ -264,7 +267,8 @@ def flips(rng: random.Random, data: bytes, _: float) -> bytes:
 
 
 def bursts(rng: random.Random, data: bytes, _: float) -> bytes:
-    at, length = rng.randrange(len(data)), rng.randrange(1, 600)
+    at = rng.randrange(len(data))
+    length = rng.randrange(1, 600)
     return data[:at] + rng.randbytes(min(length, len(data) - at)) + data[at + length :]
 
 
@@ -465,7 +469,8 @@ FAULTS: dict[str, tuple[Callable[[Content], object], str]] = {
 
 @pytest.mark.parametrize("what", FAULTS)
 def test_fault_of_a_file_by_another_writer_is_named(what, written, tmp_path):
-    content, (change, named) = Content.of(written.path), FAULTS[what]
+    content = Content.of(written.path)
+    (change, named) = FAULTS[what]
     change(content)
     check = check_archive(content.write(tmp_path / written.path.name))
     assert check.conforms == (what == "nothing"), check.faults
@@ -530,7 +535,8 @@ class TestFiles:
 
     def test_is_on_the_disk_before_it_has_its_name(self, path, monkeypatch):
         steps: list[str] = []
-        sync, rename = os.fsync, Path.replace
+        sync = os.fsync
+        rename = Path.replace
 
         def synced(descriptor: int) -> None:
             mode = os.fstat(descriptor).st_mode

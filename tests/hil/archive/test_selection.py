@@ -34,9 +34,11 @@ class TestTimes:
     @given(instants, instants, st.booleans(), st.sampled_from([0, 1 << 20]))
     def test_range_selects_samples_and_events(self, written, start, stop, truncated, batch):
         """Of a truncated file what is left."""
-        path, sound = written.path, 43
+        path = written.path
+        sound = 43
         if truncated:
-            path, sound = path.with_name("truncated.mcap"), 30
+            path = path.with_name("truncated.mcap")
+            sound = 30
             path.write_bytes(written.data[: written.chunks[3].offset])
         with mock.patch("hil.archive.scan._BATCH", batch):  # bytes of chunks decoded at once
             archive = open_archive(path, start=start, stop=stop)

@@ -180,7 +180,8 @@ class TestEntries:
         name = "../../etc/evil.toml"
         names = json.dumps([*sorted(written.attachments), name])
         path = forged(written.data, folder / NAME, metadata={"attachments": names})
-        data, end = path.read_bytes(), records_of(path)[-1].offset
+        data = path.read_bytes()
+        end = records_of(path)[-1].offset
         path.write_bytes(data[:end] + mcap_bytes.attachment(name, b"x") + data[end:])
         assert open_archive(path).attachments[name] == b"x"
         assert repair(path).samples == 43
@@ -211,7 +212,8 @@ def without_cycles(chunk: bytes) -> bytes:
 
 def with_cycles(chunk: bytes) -> bytes:
     """Return a chunk whose cycles are of another channel, defined only here, numbered from 0."""
-    changed, number = bytearray(chunk), 0
+    changed = bytearray(chunk)
+    number = 0
     for message in mcap_bytes.heads(chunk):
         if message.channel == CYCLE:
             struct.pack_into("<HI", changed, message.start + 9, ELSEWHERE, number)

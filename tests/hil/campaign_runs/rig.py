@@ -37,7 +37,8 @@ class Operator:
     def __init__(
         self, requests: Requests = lambda _: OperatorRequest(), *, accepts: bool = True
     ) -> None:
-        self.accepts, self.requests = accepts, requests
+        self.accepts = accepts
+        self.requests = requests
         self.seen: list[RunStatus] = []
         self.asked: list[DryRunRecord] = []
 

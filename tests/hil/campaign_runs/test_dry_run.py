@@ -93,7 +93,8 @@ def test_the_operator_is_asked_and_a_no_ends_the_run(make: Make) -> None:
 
 
 def test_a_mirrored_joint_is_accepted_by_its_name_only(tmp_path: Path, designed: Campaign) -> None:
-    cell, against = mirrored(designed.cell, "[-1, -1]"), ("shoulder",)
+    cell = mirrored(designed.cell, "[-1, -1]")
+    against = ("shoulder",)
     campaign = Campaign.create(tmp_path / "campaign", cell, designed.plan)
     pass_rehearsal(campaign.folder)
     with pytest.raises(AgainstGravityError, match=AGAINST_GRAVITY) as refused:

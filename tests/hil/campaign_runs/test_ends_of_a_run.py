@@ -28,7 +28,8 @@ def test_the_time_left_is_right_and_counts_down(
     make: Make, warmup_drift: float, first_repetitions: int
 ) -> None:
     """Within a fifth after the first tenth, with a dry run, and where an earlier run is resumed."""
-    campaign, stop = make(repetitions=6, warmup_drift=warmup_drift), Stop()
+    campaign = make(repetitions=6, warmup_drift=warmup_drift)
+    stop = Stop()
     if first_repetitions:
 
         def stopping(status: RunStatus) -> OperatorRequest:
@@ -47,7 +48,8 @@ def test_the_time_left_is_right_and_counts_down(
 
     campaign.run(link, operator=Clock(), durable=False)
     now, left = np.array(estimates).T
-    true, settled = now[-1] - now, now - now[0] > 0.1 * (now[-1] - now[0])
+    true = now[-1] - now
+    settled = now - now[0] > 0.1 * (now[-1] - now[0])
     assert settled.sum() >= 10
     off = np.abs(left - true)[settled] / (0.2 * true[settled] + 1.0)
     assert off.max() < 1.0, (true[settled][off.argmax()], left[settled][off.argmax()])

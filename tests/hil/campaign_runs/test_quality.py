@@ -166,12 +166,15 @@ def test_a_truncated_stuck_or_saturated_motion_is_named(undisturbed: Campaign) -
     check = RepetitionCheck(undisturbed.cell, undisturbed.plan.excitation.trajectory)
     good = played(undisturbed.folder.completed("excitation")[0])
     short = {name: getattr(good, name)[:400] for name in ("position", "current", "commanded")}
-    position, current, saturated = good.position.copy(), good.current.copy(), good.current.copy()
+    position = good.position.copy()
+    current = good.current.copy()
+    saturated = good.current.copy()
     commanded = good.commanded[:, 1]
     end = 100 + int(np.argmax(np.abs(commanded[100:] - commanded[100]) > 0.03))
     position[100:end, 1] = position[100, 1]
     limit = undisturbed.cell.drive_train.current_limit[1]
-    current[100:102, 1], saturated[100:105, 1] = limit, -limit
+    current[100:102, 1] = limit
+    saturated[100:105, 1] = -limit
     few, many = (round(share * len(good.position)) for share in (0.005, 0.03))
     for changes, message in (
         ({}, None),

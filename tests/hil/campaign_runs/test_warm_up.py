@@ -107,7 +107,8 @@ def test_an_arm_that_rests_for_hours_is_warmed_up_again(
     make: Make, monkeypatch: pytest.MonkeyPatch, when: str
 ) -> None:
     """Between two repetitions, or while the operator holds the next one before it begins."""
-    campaign, clock = make(warmup_drift=0.9, warmup_least=4, repetitions=2), time.time
+    campaign = make(warmup_drift=0.9, warmup_least=4, repetitions=2)
+    clock = time.time
     passed = [0.0]
     monkeypatch.setattr("hil.campaign.stages.time.time", lambda: clock() + passed[0])
 

@@ -122,7 +122,8 @@ def _last_of(placed_archive: Placed) -> int:
 
 
 def _readable(placed_archive: Placed, *, intact_too: bool, newest: bool) -> Iterator[str]:
-    archived, life = placed_archive.archived, placed_archive.life
+    archived = placed_archive.archived
+    life = placed_archive.life
     name = archived.path.name
     being_written = newest and (life.died or bool(life.disk))  # at the fault
     yield from not_truncated(
@@ -136,7 +137,9 @@ def _readable(placed_archive: Placed, *, intact_too: bool, newest: bool) -> Iter
 
 def _made_of(placed_archive: Placed, gears: Gears, constants: Array) -> Iterator[str]:
     """Each record agrees with its packet and answer."""
-    archived, talk, rows = placed_archive.archived, placed_archive.talk, placed_archive.rows
+    archived = placed_archive.archived
+    talk = placed_archive.talk
+    rows = placed_archive.rows
     cycles = archived.cycles
     if not len(cycles):
         return
@@ -188,7 +191,8 @@ def _decoded(
     )
     if np.any(np.abs(cycles["torque"][finite] - torque) > 16.0 * len(slots) * _EPS * (scale + 1.0)):
         yield "torque is not that of the current"
-    settings, sent = talk.life.settings, cycles["commanded_position"]
+    settings = talk.life.settings
+    sent = cycles["commanded_position"]
     wanted, answered = (side.mode[rows][:, slots] for side in (talk.received, talk.answer))
     on = talk.received.status[rows, int(settings.get("arm", 1)) - 1] == oracle.DRIVE_ON
     refused = (np.isin(answered, REFUSALS) & (answered != wanted)).any(axis=1)

@@ -88,7 +88,8 @@ class _Classifier:
     """Classifies a life packet by packet with `Reception`."""
 
     def __init__(self, life: Life, n_joints: int) -> None:
-        self._life, self._n_joints = life, n_joints
+        self._life = life
+        self._n_joints = n_joints
         self._arm = int(life.settings.get("arm", 1))
         self._silence = float(life.settings.get("silence_timeout", SILENCE_TIMEOUT))
         self._reception = Reception(self._silence)
@@ -132,7 +133,8 @@ class _Classifier:
             return
         if exchanged.now >= self._deadline and not reception.ended:
             self._wrong.append((index, "came after a silence that was not detected"))
-        last, silent = reception.last, reception.silent
+        last = reception.last
+        silent = reception.silent
         kind = reception.expect(exchanged.packet)
         self._kinds.append(kind if exchanged.replies else "nothing")
         if not exchanged.replies:
@@ -161,7 +163,8 @@ class _Classifier:
         fell = False
         while self._ticks and self._ticks[0] <= index + (now >= self._deadline):
             self._ticks.pop(0)
-            self._deadline, fell = np.inf, True
+            self._deadline = np.inf
+            fell = True
         return fell
 
     def _judge(self, index: int, exchanged: Exchanged, kind: Kind) -> None:

@@ -29,7 +29,8 @@ ALLOWED: Final = 5.0
 
 def estimate(observed: Observed) -> Iterator[str]:
     """Check the law of this module."""
-    estimated, twin = observed.found, observed.twin_found
+    estimated = observed.found
+    twin = observed.twin_found
     if estimated is not None:
         yield from _pooled(observed)
     if estimated is not None and twin is not None:
@@ -55,7 +56,8 @@ def _pooled(observed: Observed) -> Iterator[str]:
 
 
 def _predicted_alike(estimated: Estimated, twin: Estimated) -> Iterator[str]:
-    ours, theirs = estimated.result.pooled, twin.result.pooled
+    ours = estimated.result.pooled
+    theirs = twin.result.pooled
     if ours.names != theirs.names:
         return
     determined = ~np.isin(ours.names, [*ours.undetermined, *theirs.undetermined])

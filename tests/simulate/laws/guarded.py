@@ -39,7 +39,9 @@ def guard(observed: Observed) -> Iterator[str]:
 
 
 def _conduct(observed: Observed, talk: Talk, entitled: bool) -> Conduct:
-    limits, settings, init = observed.cell.guard_limits, talk.life.settings, talk.init
+    limits = observed.cell.guard_limits
+    settings = talk.life.settings
+    init = talk.init
     assert init.arms is not None and init.slots is not None
     return Conduct(
         limits,
@@ -71,7 +73,8 @@ def _judged(talk: Talk, conduct: Conduct) -> Iterator[int]:
             _note(conduct, news.pop(0)[2])
         if talk.silent[row]:
             conduct.interrupted()
-        record, exchanged = talk.records[row], talk.life.exchanged[index]
+        record = talk.records[row]
+        exchanged = talk.life.exchanged[index]
         # Superseded packets count as missing. The session counts those with a corrupted number
         # twice, as stale and as missing, unless they are no packets at all.
         newest, *between = talk.life.exchanged[last:index]
@@ -88,7 +91,9 @@ def _judged(talk: Talk, conduct: Conduct) -> Iterator[int]:
 def _note(conduct: Conduct, what: str) -> None:
     """Apply a request, or the end of a motion."""
     if what in ("request", "ended"):
-        conduct.entitled, conduct.stopping, conduct.overridden = what == "request", False, False
+        conduct.entitled = what == "request"
+        conduct.stopping = False
+        conduct.overridden = False
     elif what in ("stop", "hold", "resume"):
         conduct.stopping = conduct.entitled
     elif what == "override":

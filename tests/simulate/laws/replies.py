@@ -43,7 +43,8 @@ def _of_life(life: Life, conversation: Heard) -> Iterator[str]:
 
 def _counters(life: Life, conversation: Heard) -> Iterator[str]:
     """The counters of the session agree with the packets."""
-    counters, fates = life.counters, conversation.fates
+    counters = life.counters
+    fates = conversation.fates
     answered = fates["echo"] + fates["init"] + fates["cyclic"]
     # The last packet may be counted without an answer, if the process is killed or the link closed.
     last = life.exchanged[-1:]
@@ -51,7 +52,8 @@ def _counters(life: Life, conversation: Heard) -> Iterator[str]:
     # Waiting packets that were being read at the end are not counted.
     given = [index for index, other in enumerate(life.exchanged) if other.given]
     pile = [index for index in conversation.left_out if given and index < given[-1]]
-    late, left_out = counters.discarded.get("late", 0), len(conversation.left_out)
+    late = counters.discarded.get("late", 0)
+    left_out = len(conversation.left_out)
     refused = counters.stale + counters.malformed + counters.ended
     for name, number, least, most in (
         ("replied", counters.replied, answered, answered + slack),

@@ -30,7 +30,8 @@ _SWING: Final = 0.1
 
 def rest(observed: Observed) -> Iterator[str]:
     """Check the law of this module."""
-    arm, period = observed.arm, observed.cell.period
+    arm = observed.arm
+    period = observed.cell.period
     gears = Gears.of(observed.cell.drive_table)
     phase = arm.phase[-1] if arm.phase else ""
     yield from closed(phase, any_open=bool(arm.open_axes[-1:].any()), when="at the end")

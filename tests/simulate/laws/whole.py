@@ -49,7 +49,8 @@ def piles(seen: Observed) -> Iterator[str]:
     """
     for number, life in enumerate(seen.runs, start=1):
         for talk in heard(seen)[number - 1].talks:
-            received, cycle = talk.received, np.array([life.exchanged[k].cycle for k in talk.index])
+            received = talk.received
+            cycle = np.array([life.exchanged[k].cycle for k in talk.index])
             together = (np.diff(cycle) == 0) & (np.diff(received.number) != 0)
             kind = np.concatenate((received.status, received.mode), axis=1)
             on = (received.status == oracle.DRIVE_ON).any(axis=1)

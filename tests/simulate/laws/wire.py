@@ -111,9 +111,12 @@ class Gears:
     @classmethod
     def of(cls, table: Any) -> Gears:
         """Return the gears of a cell's `[drive_train]`."""
-        kr, sign = np.array(table.gear_ratio, float), np.array(table.joint_sign, float)
+        kr = np.array(table.gear_ratio, float)
+        sign = np.array(table.joint_sign, float)
         shift = np.radians(np.array(table.joint_offset_deg, float))
-        k54, k64, k65 = table.k54 or 0.0, table.k64 or 0.0, table.k65 or 0.0
+        k54 = table.k54 or 0.0
+        k64 = table.k64 or 0.0
+        k65 = table.k65 or 0.0
         turned = np.eye(len(kr))  # of the controller's angles
         if len(kr) >= 6:
             turned[4, 3] = -k54
