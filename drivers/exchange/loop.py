@@ -313,12 +313,11 @@ def exchange(
                 reply = reply_to(packet, arrived)
                 if reply is not None:
                     now = transport.now
+                    send(reply)
                     # Silence is counted from the reply: the packet may have been queued for long.
                     if session.deadline != deadline:
                         session.sent(now)
-                    # Before it leaves: the controller's next packet may come at once.
                     lateness.after_reply(arrived, now)
-                    send(reply)
                 peers.after_packet(reply is not None)
             handled += 1
             if handled % _COUNT_EVERY == 0:

@@ -126,16 +126,11 @@ class WarmUp:
         """Let the session reply to one more packet."""
         self._number = next_number(self._number)
         packet = CyclicPacket(self._number, _STATUS, bytes(N_ARMS), self._axes).encode()
-        self._exchange(packet)
-        self.reply = self.session.reply(packet, 0.0)
-        if self.reply is not None:
-            self._exchange(self.reply)
-
-    def _exchange(self, packet: bytes) -> None:
-        """Send and receive a packet; what comes does not matter."""
         if self._link is not None:
             self._link.send(packet)
-            self._link.receive(0.0)
+            self._link.receive(0.0)  # whatever comes
+        # Last: it has more code than a link, and what ran last is nearest.
+        self.reply = self.session.reply(packet, 0.0)
 
     def before_packet(self, transport: Transport, session: Session, arrived: float) -> None:
         """Run one cycle shortly before the packet that follows one which arrived at this time.
