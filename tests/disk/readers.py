@@ -97,7 +97,10 @@ def _checks(truth: Undamaged, path: Path) -> Iterator[str]:
 
 
 def _repairs(truth: Undamaged, path: Path) -> Iterator[str]:
-    """Check that the samples of all undamaged chunks are saved, of a file with chunks in order."""
+    """Check that the samples of all undamaged chunks are saved, of a file with chunks in order.
+
+    One with a chunk of another archive promises only that no sample is made up.
+    """
     before = truth.files[path]
     now = path.read_bytes()
     whole = [before[begin:end] for begin, end in chunks(before)]
@@ -110,7 +113,9 @@ def _repairs(truth: Undamaged, path: Path) -> Iterator[str]:
         yield f"{path.name}: repaired with a sample that was never written"
     if saved.missing:
         yield f"repaired, and not complete: {saved.missing}"
-    if defined and saved_places == sorted(saved_places):
+    others = [data for file, data in truth.files.items() if file != path]
+    foreign = any(data[begin:end] in now for data in others for begin, end in chunks(data))
+    if defined and not foreign and saved_places == sorted(saved_places):
         needed = set().union(
             *(_stamps(chunk) for chunk, at in zip(whole, places, strict=True) if at >= 0)
         )
@@ -146,6 +151,9 @@ def _identifies(damage: Damage) -> Iterator[str]:
     harmed = damage.harmed
     if not any(path in truth.paths for path in harmed):
         return  # moves are never read for it
+    contents = sorted(path.read_bytes() for path in truth.paths)
+    if not damage.of_campaign and contents == sorted(truth.files[path] for path in truth.paths):
+        return  # the same recordings in another order
     if damage.of_campaign:
         identification = identify_campaign(truth.root, Silent())
         what = "identify of the campaign"
