@@ -443,6 +443,9 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=math.inf, help="most for one change")
     options = parser.parse_args()
     os.chdir(ROOT)
+    for path in options.modules:
+        if not Path(path).is_file():
+            parser.error(f"{path}: there is no such module; name one such as drivers/guard.py")
     sources = Sources(options.modules or settings["only_mutate"])
     arguments = [
         *settings["pytest_add_cli_args"],
