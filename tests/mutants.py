@@ -282,6 +282,8 @@ class Judge:
         if session.testsfailed:
             pytest.exit("some tests cannot be collected")
         mutants = list(self._sources.mutants())
+        if not mutants:
+            pytest.exit("no module was imported with changes")
         print(f"{len(mutants)} changes, {len(session.items)} tests", flush=True)
         refused = self._sources.refused_by_types(self._settings["type_check_command"])
         print(f"{len(refused)} changes are refused by types", flush=True)
@@ -450,7 +452,8 @@ def main() -> None:
     arguments = [
         *settings["pytest_add_cli_args"],
         *settings["pytest_add_cli_args_test_selection"],
-        *("-n", "0", "-s", "-W", "ignore:Module already imported"),
+        # Rewriting of asserts would import the modules of an installed package in our place.
+        *("-n", "0", "-s", "--assert=plain", "-W", "ignore:Module already imported"),
     ]
     sys.exit(pytest.main(arguments, plugins=[Judge(sources, settings, options)]))
 
