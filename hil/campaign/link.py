@@ -307,7 +307,7 @@ class MotionLink:
             closed_by = min(closed_by, port.now + CLOSE_TIMEOUT)
             return state().state not in HAS_SET_POINTS or port.now > closed_by
 
-        port.exchange_until(finished)
+        self.exchange(finished)
         return self.motion_ended
 
     # --- one recording
@@ -474,12 +474,19 @@ class MotionLink:
         for event in self.port.poll():
             self.connection.update(event)
 
+    def exchange(self, finished: Callable[[], bool]) -> bool:
+        """Exchange packets until `finished()`; False if the exchange ended before.
+
+        Events and records that came since `finished` was last called are then archived, too.
+        """
+        done = self.port.exchange_until(finished)
+        if not done:
+            self._poll()
+        return done
+
     def _exchange_until(self, finished: Callable[[], bool], consequence: str) -> None:
         """Exchange packets until `finished()`; `consequence` ends the message of a failure."""
-        if self.port.exchange_until(finished):
-            return
-        self._poll()
-        if (failure := self.port.failure()) is not None:
+        if not self.exchange(finished) and (failure := self.port.failure()) is not None:
             raise ControllerError(f"{failure}; {consequence}")
 
 
@@ -508,7 +515,7 @@ class _Supervision:
             ControllerError: it did not begin, or the link broke.
             ArchiveWriteError: the archive cannot be written; the arm is at rest.
         """
-        if not self._port.exchange_until(self._finished):
+        if not self._link.exchange(self._finished):
             self._await_archive()
         if self._recorded is None:
             return self._give_up()

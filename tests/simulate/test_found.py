@@ -129,6 +129,34 @@ def test_a_motion_stopped_while_axes_open_leaves_them_closed(
     assert link.port.session.state is State.CLOSED
 
 
+def test_a_motion_whose_link_closes_is_archived(
+    cell: Cell, controller: SimulatedController, tmp_path: Path
+) -> None:
+    """Seed 2000098: the records since the archive was last written, 78 cycles, were dropped."""
+    link = VirtualLink.over(SimulatedTransport(controller), cell)
+    motion, spec = short_way(cell, link.connect(Stop()), tmp_path)
+    phases = []
+
+    class Leaving:
+        """Sends no more packets after the 30th of the motion."""
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(controller, name)
+
+        def next_packet(self) -> bytes | None:
+            phases.append(controller.phase)
+            return None if phases.count(Phase.OPEN) > 30 else controller.next_packet()
+
+    link.port.transport = SimulatedTransport(Leaving())
+    ended = link.run(motion, spec, Stop())
+    assert (ended.outcome, ended.reason) == ("lost", "nothing was received from the controller")
+    archive = open_archive(spec.path)
+    assert archive.outcome is not None
+    assert (archive.outcome.outcome, archive.outcome.reason) == (ended.outcome, ended.reason)
+    assert archive.cycles()["cycle"][-1] == ended.cycle
+    assert len(archive.cycles()) >= 30
+
+
 def test_a_repetition_with_a_stuck_joint_is_run_again(tmp_path: Path) -> None:
     """Seed 4982: it was valid, the campaign complete, and no estimate could be made of it."""
     seen = Stage(tmp_path).observed(4982, ["following-error@349x26:axis=1"])
@@ -196,6 +224,7 @@ CLOCK_SET_FORWARD = (201111,)  # behind an init packet: the start is over
 CLOCK_SET_BACK = (101575,)  # a start timeout of an hour, with the drive off
 SCATTERED_REPETITIONS = (100232,)  # they rejected one another in turn
 REFUSED_DURING_A_HOLD = (700132,)  # the run waited forever for the hold to be released
+CLOSED_WITH_THE_MOTION = (2000098,)  # the last cycles were not archived
 HALF_A_SECOND = (400869, 102383)  # see `TestHalfASecond`
 
 
@@ -212,6 +241,7 @@ HALF_A_SECOND = (400869, 102383)  # see `TestHalfASecond`
         *CLOCK_SET_BACK,
         *SCATTERED_REPETITIONS,
         *REFUSED_DURING_A_HOLD,
+        *CLOSED_WITH_THE_MOTION,
         *HALF_A_SECOND,
     ],
 )
