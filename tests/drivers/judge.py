@@ -19,6 +19,8 @@ REFUSALS = (oracle.DRIVE_OFF_REQUEST, oracle.FOLLOWING_ERROR)
 MODE_FIELDS = {1: (1, 2, 4, 5), 2: (4, 5), 4: (1, 2), 5: (1, 2), 7: (1,), 8: (4,), 9: (5,)}
 """Fields of an answer in open mode (facts, section 6); every other one is zero."""
 POSITION_MODES = (1, 4, 5)
+LOSS_WINDOW = 100
+"""Cycles in which more than `max_gap` replies that were not accepted stop a motion."""
 EPS = np.finfo(np.float64).eps
 
 
@@ -68,7 +70,8 @@ class Conduct:
     repeats: int = 0
     arm_share: float = 1.0
     answered: np.ndarray | None = None
-    lost: int = 0
+    cycle: int = 0
+    lost: list[tuple[int, int]] = field(default_factory=list)
     exiting: bool = False
     missed: int = 0
     at_most: int = 0
@@ -136,6 +139,7 @@ class Conduct:
             if slot not in self.slots or not ready[self.slots.index(slot)]:
                 assert answer.axes[slot] == safe.axes[slot], f"slot {slot}: not the safe answer"
         self.stopping = self.stopping or max(missed, at_most) > self.max_gap
+        self.cycle = int(record["cycle"])
         self.missed = missed
         self.at_most = max(missed, at_most)
         # The record's word counts for nothing but this: set-points end with the exit.
@@ -266,7 +270,7 @@ class Conduct:
             self.sent = [q, q, q, q]
             self.motors = []
             self.lag = 0
-            self.lost = 0
+            self.lost = []
             self.repeats = 0
         else:
             rounding_of_target = 0.0
@@ -383,23 +387,27 @@ class Conduct:
         """Check a set-point sent again because it was not accepted: the motion waits."""
         lag = self._lag(target)
         assert lag > self.lag, "sent again although it was accepted"
-        self.lost += 1 if self.repeats else lag - self.lag
+        self._lose(1 if self.repeats else lag - self.lag)
         self._note_arm(velocity)
         self.repeats += 1
-        self.stopping = self.stopping or self.lost > self.max_gap
         self._count("again")
 
     def _count_lost(self, target: np.ndarray) -> None:
-        """Count replies not accepted; more than `max_gap` allow a stop.
+        """Count replies not accepted.
 
         The motion continues with a target further behind only in small steps or while stopping.
         """
         lag = self._lag(target)
         slow = np.abs(self._last_step()).max() <= 4.0 * self.limits.standstill * (1 + 1e-6)
         assert lag <= self.lag or slow or self.stopping, "a leap after lost answers"
-        self.lost += max(0, lag - self.lag)
+        self._lose(max(0, lag - self.lag))
         self.lag = self.lag if self.repeats and not lag else lag
-        self.stopping = self.stopping or self.lost > self.max_gap
+
+    def _lose(self, count: int) -> None:
+        """Count replies not accepted: more than `max_gap` in `LOSS_WINDOW` cycles are a stop."""
+        self.lost.append((self.cycle, count))
+        self.lost = [loss for loss in self.lost if loss[0] > self.cycle - LOSS_WINDOW]
+        self.stopping = self.stopping or sum(number for _, number in self.lost) > self.max_gap
 
     def _factors(self) -> tuple[float, float]:
         """Return the factors on acceleration and jerk."""

@@ -225,6 +225,7 @@ CLOCK_SET_BACK = (101575,)  # a start timeout of an hour, with the drive off
 SCATTERED_REPETITIONS = (100232,)  # they rejected one another in turn
 REFUSED_DURING_A_HOLD = (700132,)  # the run waited forever for the hold to be released
 CLOSED_WITH_THE_MOTION = (2000098,)  # the last cycles were not archived
+LOST_BEFORE_THE_WINDOW = (2000606,)  # the law counted a reply lost 123 cycles before others
 HALF_A_SECOND = (400869, 102383)  # see `TestHalfASecond`
 
 
@@ -242,6 +243,7 @@ HALF_A_SECOND = (400869, 102383)  # see `TestHalfASecond`
         *SCATTERED_REPETITIONS,
         *REFUSED_DURING_A_HOLD,
         *CLOSED_WITH_THE_MOTION,
+        *LOST_BEFORE_THE_WINDOW,
         *HALF_A_SECOND,
     ],
 )
