@@ -57,7 +57,7 @@ class Measured:
     wanted: Wanted
     values: Array  #: (k,)
     half: Array  #: (k,)
-    noise: Array  #: share of the variance that differs between repetitions (k,)
+    noise: Array  #: share of the variance that falls with repetitions (k,)
     estimate: Estimate  #: of all parameters, those of chosen effects included
 
 
@@ -214,10 +214,11 @@ def noise_shares(
     moved: Array,
     earlier: Factor | None = None,
 ) -> Array:
-    """Return the share of the variances (k,) that differs between repetitions of a motion.
+    """Return the share of the variances (k,) that differs from one repetition to the next.
 
-    The rest is the same in all of them, or of the `earlier` recordings. `moved` (p, k) are the
-    inverse information times the directions. NaN for one repetition.
+    The rest is the same in all of them, or changes slowly, as the friction of an arm that gets warm
+    (von Neumann 1941), or is of the `earlier` recordings. `moved` (p, k) are the inverse
+    information times the directions. NaN for one repetition.
     """
     count = len(factors)
     if count < 2:
@@ -227,7 +228,7 @@ def noise_shares(
     whole = np.sum(pulls.sum(axis=0) ** 2, axis=0)
     if earlier is not None:
         whole += np.sum((earlier.scores(weights, values) @ moved) ** 2, axis=0)
-    scatter = np.sum((pulls - pulls.mean(axis=0)) ** 2, axis=(0, 1)) * count / (count - 1)
+    scatter = 0.5 * np.sum(np.diff(pulls, axis=0) ** 2, axis=(0, 1)) * count / (count - 1)
     return np.asarray(np.clip(scatter / np.where(whole > 0.0, whole, 1.0), 0.0, 1.0))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal, Self
@@ -17,6 +18,10 @@ IN_A_ROW: Final = 2
 narrow by chance, the more often one looks (Simons 1968 adds observations after the first look)."""
 FEWEST: Final = 3
 """Repetitions before a campaign ends because more of them do not help."""
+OVERDUE: Final = 2
+"""Times as many repetitions as were predicted, after which more of them count as no help: the
+prediction takes for noise what differs between repetitions in another way, such as friction that
+falls while the arm gets warm."""
 _VERSION: Final = 1
 
 
@@ -107,10 +112,13 @@ class PrecisionRecord:
 
     def with_look(self, look: Look, limit: int) -> PrecisionRecord:
         """Return the record after another repetition, of at most `limit`."""
-        looks = (
-            *(earlier for earlier in self.looks if earlier.repetitions < look.repetitions),
-            look,
+        before = tuple(each for each in self.looks if each.repetitions < look.repetitions)
+        reached = tuple(
+            replace(each, more=None) if _is_overdue(before, look, k) else each
+            for k, each in enumerate(look.reached)
         )
+        look = replace(look, reached=reached)
+        looks = (*before, look)
         longer = replace(self, looks=looks)
         last = looks[-IN_A_ROW:]
         if len(last) == IN_A_ROW and all(recent.met for recent in last):
@@ -161,3 +169,16 @@ class PrecisionRecord:
                 "(hil design --given, with the same --precision)"
             )
         return text
+
+
+def _is_overdue(before: Sequence[Look], look: Look, index: int) -> bool:
+    """Return whether a requirement is unmet `OVERDUE` times as long as was predicted."""
+    if look.reached[index].ratio <= 1.0:
+        return False
+    for earlier in reversed(before):
+        reached = earlier.reached[index]
+        if reached.ratio <= 1.0:
+            return False
+        if reached.more and look.repetitions - earlier.repetitions >= OVERDUE * reached.more:
+            return True
+    return False

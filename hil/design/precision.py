@@ -51,6 +51,10 @@ NOISE_SHARE: Final = 0.01
 _CYCLE: Final = 0.001  # s, of a cell without controller
 _REFERENCE_PERIOD: Final = 0.04  # s
 _ARM_TIME: Final = 60.0  # s of motion, from which an arm is assumed to be known
+_RESERVE: Final = 0.85
+"""Predicted over required interval for which a motion is made long enough. An interval is itself
+estimated, from some sixty blocks of time: to 9 % (1 / sqrt(2 * 60)). It is to be met for sure, not
+by every second motion: two standard deviations."""
 _YEAR: Final = 3.156e7  # s
 _MEASURED: Final = 3  # recordings whose torque error is measured
 _MOST: Final = 1000  # repetitions that are counted
@@ -191,8 +195,8 @@ class PrecisionDesign:
     def lengthened(self, settings: DesignSettings, repetitions: float) -> DesignSettings:
         """Return settings of a longer motion, if repetitions of one as long as theirs are too few.
 
-        That is so if random motions of that length do not meet all requirements. Via points are
-        added at equal density, up to `MOST_VIA_POINTS`.
+        That is so if random motions of that length do not meet all requirements with a reserve. Via
+        points are added at equal density, up to `MOST_VIA_POINTS`.
         """
         points = settings.via_points
         longest = settings.constraints.max_duration
@@ -202,7 +206,7 @@ class PrecisionDesign:
         rate = self.reference.information(precision.density)
         for count in range(points.n_via, MOST_VIA_POINTS + 1):
             seconds = longest * count / points.n_via
-            if precision.ratios(seconds * rate).max() <= 1.0:
+            if precision.ratios(seconds * rate).max() <= _RESERVE:
                 break
         return settings.replaced(
             via_points={"n_via": count}, constraints={"max_duration": round(seconds, 1)}

@@ -124,13 +124,16 @@ class TestPromise:
             promise(cell, motions, "parameters 1e-9%")
 
     def test_a_motion_is_longer_where_a_short_one_is_too_short(self, cell, motions) -> None:
-        """Intervals fall with the root of the time; there are as many via points per second."""
+        """Intervals fall with the root of the time; there are as many via points per second.
+
+        The motion is as long as 85 % of the required intervals take.
+        """
         made = promise(cell, motions, "parameters 5%")
         short = short_search()
         rate = made.reference.information(made.precision(4).density)
         seconds = short.constraints.max_duration
         ratio = made.precision(4).ratios(seconds * rate).max()
-        for share, longer in ((1.1, 1.0), (1.0 / 1.5, 2.25)):
+        for share, longer in ((1.1 / 0.85, 1.0), (1.0 / 0.85 / 1.5, 2.25)):
             strict = promise(cell, motions, f"parameters {share * 5.0 * ratio}%")
             settings = strict.lengthened(short, 4)
             assert settings.via_points.n_via == pytest.approx(8 * longer, abs=1)

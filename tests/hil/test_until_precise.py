@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from hil.campaign import Campaign
 from hil.campaign.operator import Stop
 from hil.campaign.plan import design
-from hil.campaign.precision import PrecisionMeter, further, requirements_of
+from hil.campaign.precision import PrecisionMeter, further, noise_shares, requirements_of
 from hil.campaign.precision_record import Look, PrecisionRecord, Reached
 from hil.cli import app
 from hil.errors import ExecutionError, InputError
@@ -130,6 +130,9 @@ class TestRecord:
             ((0.07, 0.07, 0.07), (None, 30, 30), "out of reach"),
             ((0.07, 0.07), (None, None), "going on"),
             ((0.07, 0.06, 0.055, 0.052), (3, 3, 2, 1), "going on"),
+            ((0.051, 0.051, 0.051), (None, 1, 1), "going on"),
+            ((0.051, 0.051, 0.051, 0.051), (None, 1, 1, 1), "out of reach"),
+            ((0.051, 0.051, 0.049, 0.051, 0.051), (None, 1, 0, 1, 1), "going on"),
         ],
     )
     def test_outcomes(self, halves, more, outcome) -> None:
@@ -143,6 +146,14 @@ class TestRecord:
         for count in range(1, 5):
             record = record.with_look(Look(count, (reached(0.06, 1),)), limit=4)
         assert record.outcome == "limit"
+
+    def test_what_is_overdue_is_not_promised_again(self) -> None:
+        """Twice as many repetitions as were predicted did not meet it: more of them will not."""
+        record = PrecisionRecord("hash", ("parameters 5 %",))
+        for count in (2, 3, 4):
+            record = record.with_look(Look(count, (reached(0.051, 1),)), limit=30)
+        assert "which repeating this motion does not improve enough" in record.message
+        assert "another motion" in record.message
 
     def test_one_requirement_in_reach_continues(self) -> None:
         """The one that repetitions do not meet is no reason to leave the other unmet."""
@@ -170,6 +181,47 @@ class TestForecast:
         assert further(4, 2.0, 0.5) is None
         assert further(4, 1.1, 0.5) == 3  # (0.5 * 4 / 7 + 0.5) * 1.1**2 is below one
         assert further(1, 2.0, np.nan) is None
+
+
+class Repetition:
+    """Scores (blocks, 1) of a repetition of a motion."""
+
+    def __init__(self, scores: np.ndarray) -> None:
+        self._scores = scores
+
+    def __len__(self) -> int:
+        return len(self._scores)
+
+    def scores(self, *_: object) -> np.ndarray:
+        return self._scores
+
+
+class TestNoiseShare:
+    BLOCKS = 2000
+
+    def share(self, count: int, *, drift: float = 0.0) -> float:
+        """Of repetitions with an error of 1 that repeats, noise of 0.5, and a drift of each."""
+        random = np.random.default_rng(1)
+        repeated = random.standard_normal((self.BLOCKS, 1))
+        slope = random.standard_normal((self.BLOCKS, 1))
+        repetitions = [
+            Repetition(
+                repeated
+                + 0.5 * random.standard_normal((self.BLOCKS, 1))
+                + drift * (k - 0.5 * (count - 1)) * slope
+            )
+            for k in range(count)
+        ]
+        (share,) = noise_shares(repetitions, np.ones(1), np.ones(1), np.ones((1, 1)))
+        return float(share)
+
+    @pytest.mark.parametrize("count", [2, 4, 10, 20])
+    def test_it_is_that_of_the_mean_of_repetitions(self, count) -> None:
+        assert self.share(count) == pytest.approx(0.25 / (count + 0.25), rel=0.15)
+
+    def test_a_drift_is_no_noise(self) -> None:
+        """Over ten repetitions it is as large as the noise, and from one to the next small."""
+        assert self.share(10, drift=0.15) == pytest.approx(self.share(10), rel=0.15)
 
 
 class TestRefusals:
