@@ -24,6 +24,9 @@ from planner import (
 Array = NDArray[np.float64]
 Motion: TypeAlias = PiecewiseCubic | FourierSeries
 
+_TOGETHER: Final = 48
+"""Motions planned together: the arrays of more do not fit the processor's caches (294 motions of 50
+legs at once took twice the time)."""
 # Spacing [rad] of the checked postures of a straight path.
 _PATH_SPACING: Final = 0.1
 # Draws of one via point before the last one is used even if it collides.
@@ -80,11 +83,20 @@ class ViaPointGenome:
         """Number of genes, K n + n."""
         return (self.n_via + 1) * self.limits.n_joints
 
+    @property
+    def n_point_genes(self) -> int:
+        """Number of the first genes, coordinates of via points, K n."""
+        return self.n_via * self.limits.n_joints
+
+    def point_of(self, genes: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the indices of the via points, home included, of genes that are coordinates."""
+        return genes // self.limits.n_joints + (self.home is not None)
+
     def decode(self, genes: ArrayLike) -> tuple[Array, Array]:
         """Return via points (m, n_points, n) [rad], home included, and speeds (m, n)."""
         rows = np.atleast_2d(genes)
-        coordinates, rates = np.split(rows, [self.n_via * self.limits.n_joints], axis=1)
-        points = self._points(coordinates.reshape(len(rows), self.n_via, -1))
+        coordinates, rates = np.split(rows, [self.n_point_genes], axis=1)
+        points = self._points(coordinates.reshape(len(rows), self.n_via, self.limits.n_joints))
         if self.home is not None:
             home = np.broadcast_to(self.home, (len(rows), 1, self.limits.n_joints))
             points = np.concatenate((home, points, home), axis=1)
@@ -96,7 +108,15 @@ class ViaPointGenome:
         Errors are in place of their motion. It does not depend on the other rows, to the last bit.
         """
         points, speed = self.decode(genes)
-        return plan_chunk(list(points), speed, self.limits, self.fly)
+        return self.planned(list(points), speed)
+
+    def planned(self, points: Sequence[Array], speed: Array) -> list[PiecewiseCubic | PlannerError]:
+        """Plan motions through points (m_k, n) [rad] at speeds (k, n); see :meth:`motions`."""
+        motions = list[PiecewiseCubic | PlannerError]()
+        for first in range(0, len(points), _TOGETHER):
+            part = slice(first, first + _TOGETHER)
+            motions += plan_chunk(points[part], speed[part], self.limits, self.fly)
+        return motions
 
     def sample(self, random: np.random.Generator, count: int) -> Array:
         """Draw a first population (count, n_genes), uniform or with collision-free paths."""

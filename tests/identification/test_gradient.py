@@ -118,6 +118,26 @@ def test_the_gradient_predicts_changes_of_the_criteria(population, start, with_g
     assert np.corrcoef(changes @ gradient, expected)[0, 1] > 0.95
 
 
+@pytest.mark.parametrize("home", [False, True], ids=["open", "closed"])
+@pytest.mark.parametrize("n_via", [2, 3, 9])
+@pytest.mark.parametrize("fly", [0.0, 0.5, 1.0])
+def test_a_via_point_changes_only_the_moves_around_it(home, n_via, fly):
+    """The slopes are those of motions that are planned as a whole, to rounding."""
+    problem_ = limited(problem())
+    limits = problem_.genome.limits
+    middle = 0.5 * (limits.lower + limits.upper) if home else None
+    genome = replace(problem_.genome, n_via=n_via, fly=fly, home=middle)
+    problem_ = replace(problem_, genome=genome)
+    genes = genome.sample(np.random.default_rng(n_via), 1)[0]
+    tangent = problem_.tangent(genes, WEIGHTS)
+    assert tangent.moves is not None
+    every = np.arange(genome.n_genes)
+    whole = gene_slopes(problem_, replace(tangent, moves=None), genes, every)
+    local = gene_slopes(problem_, tangent, genes, every)
+    assert np.abs(whole[: genome.n_point_genes]).max() > 0.0
+    np.testing.assert_allclose(local, whole, rtol=1e-7, atol=1e-8 * np.abs(whole).max())
+
+
 def test_margins_are_those_of_duration_and_currents(population, start):
     genes, _ = start
     linear_model = population.linearise(genes, WEIGHTS)

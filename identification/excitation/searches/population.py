@@ -414,7 +414,7 @@ def _score(packed: bytes, genes: Array) -> Array:
     return _problem(packed).score(genes).rows
 
 
-def _slopes(packed: bytes, tangent: bytes, genes: Array, which: Array) -> Array:
+def _slopes(packed: bytes, tangent: bytes, genes: Array, which: NDArray[np.intp]) -> Array:
     return gene_slopes(_problem(packed), _tangent(tangent), genes, which)
 
 

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from identification.excitation.collision import CollisionChecker
 from identification.excitation.constraints import Constraints, CurrentModel
 from identification.excitation.criteria import Objective
-from identification.excitation.genomes import Genome
+from identification.excitation.genomes import Genome, ViaPointGenome
+from identification.excitation.searches.local_change import PlannedMoves
 from identification.model.motion import Motion
 from planner import FourierSeries, PiecewiseCubic, PlannerError
 
@@ -75,14 +76,15 @@ class Tangent:
     by_duration: float
     margins: tuple[Pull, ...]  #: of what is left to the bounds of loads and distances, (c,)
     left: Array  #: (1 + c,) to the longest duration [s], then of `margins`; negative if violated
+    moves: PlannedMoves | None  #: of the motion; None where a gene changes all of it
 
-    def slopes(self, motion: PiecewiseCubic | FourierSeries, step: float) -> Array:
+    def slopes(self, states: Array, duration: float, step: float) -> Array:
         """Return the slopes (2 + c,) of criterion, duration's and other margins for one gene.
 
-        `motion` is planned with a gene changed by `step`.
+        `states` (3, N, n) and `duration` [s] are those with the gene changed by `step`.
         """
-        change = (states_of(motion) - self.states) / step
-        longer = (motion.duration - self.duration) / step
+        change = (states - self.states) / step
+        longer = (duration - self.duration) / step
         margins = (margin.along(change) for margin in self.margins)
         criterion = self.criterion.along(change) + self.by_duration * longer
         return np.array((criterion, -longer, *margins))
@@ -133,7 +135,10 @@ def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent
         problem.objective, states, steps, weights, motion.duration / N_SAMPLES
     )
     criterion = Pull(np.arange(N_SAMPLES), slope)
-    return Tangent(states, motion.duration, criterion, by_duration, tuple(pulls), np.array(left))
+    moves = PlannedMoves.of(problem.genome, genes, motion)
+    return Tangent(
+        states, motion.duration, criterion, by_duration, tuple(pulls), np.array(left), moves
+    )
 
 
 def gene_steps(genes: Array) -> Array:
@@ -141,16 +146,32 @@ def gene_steps(genes: Array) -> Array:
     return np.where(genes > 0.5, -_GENE_STEP, _GENE_STEP)
 
 
-def gene_slopes(problem: Problem, tangent: Tangent, genes: Array, which: Array) -> Array:
-    """Return the slopes (k, 2 + c) for some genes (k,); 0 for one whose step cannot be planned."""
+def gene_slopes(problem: Problem, tangent: Tangent, genes: Array, which: NDArray[np.intp]) -> Array:
+    """Return the slopes (k, 2 + c) for some genes (k,), in ascending order.
+
+    They are 0 for a gene whose step cannot be planned.
+    """
     steps = gene_steps(genes)[which]
     rows = np.repeat(genes[None], len(which), axis=0)
     rows[np.arange(len(which)), which] += steps
     slopes = np.zeros((len(which), 1 + len(tangent.left)))
-    for row, (motion, step) in enumerate(zip(problem.genome.motions(rows), steps, strict=True)):
-        if not isinstance(motion, PlannerError):
-            slopes[row] = tangent.slopes(motion, float(step))
+    changes = _changes(problem.genome, tangent, rows, which)
+    for row, (change, step) in enumerate(zip(changes, steps.tolist(), strict=True)):
+        if change is not None:
+            slopes[row] = tangent.slopes(*change, step)
     return slopes
+
+
+def _changes(
+    genome: Genome, tangent: Tangent, rows: Array, which: NDArray[np.intp]
+) -> Iterator[tuple[Array, float] | None]:
+    """Yield states (3, N, n) and duration [s] of each row of genes, of which one is changed."""
+    local = 0
+    if tangent.moves is not None and isinstance(genome, ViaPointGenome):
+        local = int(np.searchsorted(which, genome.n_point_genes))
+        yield from tangent.moves.changed(genome, rows[:local], which[:local], N_SAMPLES)
+    for motion in genome.motions(rows[local:]):
+        yield None if isinstance(motion, PlannerError) else (states_of(motion), motion.duration)
 
 
 def _neighbours(states: Array, steps: Array) -> Iterator[tuple[int, int, Array, Array, float]]:

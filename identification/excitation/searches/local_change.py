@@ -1,0 +1,100 @@
+"""Change of a motion through via points with one of its points.
+
+A via point belongs to two moves and three corners. The motion before them stays as it is, and that
+after them is the same, only earlier or later. Hence these alone are planned, from rest to rest
+between the points two before and two after. In the middle of the first and of the last of these
+moves, which no corner reaches, they meet the whole motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.excitation.genomes import Genome, ViaPointGenome
+from planner import FourierSeries, PiecewiseCubic, PlannerError
+
+Array = NDArray[np.float64]
+
+_REACH: Final = 2  # points before and after one that the motion changes with it
+_ROUNDING: Final = 1e-9  # of the duration, relative
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedMoves:
+    """A motion through via points, with the times of its moves."""
+
+    motion: PiecewiseCubic
+    points: Array  #: via points (m, n) [rad], both ends included
+    speed: Array  #: fraction of each joint's velocity limit (n,)
+    lengths: Array  #: of the moves from rest to rest (m - 1,) [s]
+    middles: Array  #: when half of each of these is over (m - 1,) [s]
+
+    @classmethod
+    def of(
+        cls, genome: Genome, genes: Array, motion: PiecewiseCubic | FourierSeries
+    ) -> Self | None:
+        """Return the moves of the motion of genes (n_genes,).
+
+        None if it has no via points, or its moves alone do not add up to its duration.
+        """
+        if not isinstance(genome, ViaPointGenome) or not isinstance(motion, PiecewiseCubic):
+            return None
+        (points,), (speed,) = genome.decode(genes)
+        moves = [points[k : k + 2] for k in range(len(points) - 1)]
+        pairs = [points[k : k + 3] for k in range(len(points) - 2)]
+        planned = genome.planned([*moves, *pairs], np.tile(speed, (len(moves) + len(pairs), 1)))
+        if any(isinstance(each, PlannerError) for each in planned):
+            return None
+        durations = np.array(
+            [each.duration for each in planned if isinstance(each, PiecewiseCubic)]
+        )
+        lengths = durations[: len(moves)]
+        apart = durations[len(moves) :] - 0.5 * (lengths[:-1] + lengths[1:])
+        middles = 0.5 * lengths[0] + np.concatenate(([0.0], np.cumsum(apart)))
+        duration = motion.duration
+        if abs(middles[-1] + 0.5 * lengths[-1] - duration) > _ROUNDING * duration:
+            return None
+        return cls(motion, points, speed, lengths, middles)
+
+    def changed(
+        self, genome: ViaPointGenome, genes: Array, which: NDArray[np.intp], n_samples: int
+    ) -> Iterator[tuple[Array, float] | None]:
+        """Yield states (3, N, n) and duration [s] for each row of genes (k, n_genes).
+
+        In each row one gene of `which` (k,), a coordinate of a via point, differs from those of the
+        motion. States are those in the middles of N equal steps; None for what cannot be planned.
+        """
+        points, _ = genome.decode(genes)
+        moved = genome.point_of(which)
+        first = np.maximum(moved - _REACH, 0)
+        last = np.minimum(moved + _REACH, len(self.points) - 1)
+        parts = genome.planned(
+            [row[a : b + 1] for row, a, b in zip(points, first, last, strict=True)],
+            np.tile(self.speed, (len(points), 1)),
+        )
+        step = (np.arange(n_samples, dtype=np.float64) + 0.5) / n_samples
+        whole = self.motion.duration
+        for part, point, a, b in zip(
+            parts, moved.tolist(), first.tolist(), last.tolist(), strict=True
+        ):
+            if isinstance(part, PlannerError):
+                yield None
+                continue
+            begin = float(self.middles[a] - 0.5 * self.lengths[a])
+            enter = float(self.middles[a]) if a == point - _REACH else 0.0
+            leave = begin + part.duration
+            left = whole
+            if b == point + _REACH:
+                leave -= 0.5 * float(self.lengths[b - 1])
+                left = float(self.middles[b - 1])
+            later = leave - left
+            time = step * (whole + later)
+            inside = slice(*np.searchsorted(time, (enter, leave)).tolist())
+            states = np.array(self.motion.sample(np.where(time >= leave, time - later, time)))
+            states[:, inside] = part.sample(time[inside] - begin)
+            yield states, whole + later
