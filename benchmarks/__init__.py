@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 from collections.abc import Callable, Mapping
 from time import process_time
 from typing import Any
@@ -36,3 +37,9 @@ def timed(function: Callable[[], object]) -> float:
     start = process_time()
     function()
     return process_time() - start
+
+
+def processor_time() -> float:
+    """Return the processor time [s] of this process and of its children that have ended."""
+    usages = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)

@@ -24,7 +24,6 @@ Processor time of one thread but for the search; alternating repetitions; median
 from __future__ import annotations
 
 import math
-import resource
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -33,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from benchmarks import parser_of, show, timed
+from benchmarks import parser_of, processor_time, show, timed
 from benchmarks.regressor import common_columns, pinocchio_gram
 from hil import Cell
 from hil.design.problem import problem_of, search_settings
@@ -178,11 +177,11 @@ def time_search(cell: Cell, population: int, generations: int) -> dict[str, floa
     for workers, name in ((1, "ga_one_worker_s"), (2, "ga_two_workers_s")):
         with Population(problem, workers=workers) as individuals:
             start = time.perf_counter()
-            used = _processor_time()
+            used = processor_time()
             design = search(individuals, settings)
             durations[name] = round(time.perf_counter() - start, 2)
         # A child's time is known when it has ended.
-        durations[name.removesuffix("_s") + "_processor_s"] = round(_processor_time() - used, 2)
+        durations[name.removesuffix("_s") + "_processor_s"] = round(processor_time() - used, 2)
         fitness.append(design.excitation.criteria.fitness)
     if fitness[0] != fitness[1]:
         raise SystemExit(f"the number of workers changed the result: {fitness}")
@@ -213,12 +212,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     result["repetitions"] = options.repetitions
     result["clock"] = "processor time of one thread; searches: wall time"
     show(result, only_json=options.json)
-
-
-def _processor_time() -> float:
-    """Return the processor time [s] of this process and of its children that have ended."""
-    usages = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
 def _judge(objective: Objective, motion: PiecewiseCubic | FourierSeries) -> None:

@@ -17,13 +17,12 @@ methods.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, Final
 
-from benchmarks import parser_of, show
+from benchmarks import parser_of, processor_time, show
 from hil.cell import Cell
 from hil.design.problem import problem_of, search_settings
 from hil.design.settings import DesignSettings, preset
@@ -82,7 +81,7 @@ def run(
         settings = settings.replaced(search=effort)
     row: dict[str, Any] = {"case": name, "seed": seed}
     begin = time.perf_counter()
-    used = os.times()
+    used = processor_time()
     with Population(problem_of(cell, settings), workers=workers) as population:
         try:
             design = search(population, search_settings(settings))
@@ -98,13 +97,8 @@ def run(
         "evaluated": design.excitation.tried,
         "infeasible": dict(design.excitation.rejected),
         "seconds": round(time.perf_counter() - begin, 1),
-        "processor_seconds": round(_processor(os.times()) - _processor(used), 1),
+        "processor_seconds": round(processor_time() - used, 1),
     }
-
-
-def _processor(times: os.times_result) -> float:
-    """Return the processor time of this process and of the children that have ended [s]."""
-    return times.user + times.system + times.children_user + times.children_system
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
