@@ -124,3 +124,4 @@ class Folds:
 
 
 PredictedRows = Literal["all", "fitted", "moving"]
+"""Rows that are predicted; moving ones are those that slide, whichever are fitted."""

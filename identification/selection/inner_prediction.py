@@ -101,17 +101,8 @@ TERM_WORTHWHILE: Final = 0.02
 SPRING_WORTHWHILE: Final = 0.3  # of the error of its own joint
 _MOST_SWEEPS: Final = 2
 
-
-"""Rows that are predicted; moving ones are those that slide, whichever are fitted."""
-
-"""Prepares the fitted data for a model, averaged to `RATE`."""
-
-"""Friction of a model, periods of its torque ripple per motor turn, joints with a spring."""
-
 LowPasses = Callable[[RobotModel, Preprocessing], Sequence[Preprocessing]]
 """Returns settings with candidate low-passes of the torque."""
-
-"""Mean and standard deviation of parameters that are known beforehand."""
 
 
 class SuggestedDelay(NamedTuple):
@@ -433,11 +424,12 @@ def _rows_for_motion(
     """Choose among the candidates that predict all rows as well by the rows in motion.
 
     Static friction holds a joint at rest with any torque: its rows cannot be predicted, and decide
-    the error over all rows. Fitted, they spoil the friction at speed.
+    the error over all rows. Fitted, they spoil the friction at speed. Any significant gain decides:
+    friction that is wrong by its interval changes the error of prediction by a hundredth.
     """
     limit = trial.errors(now).overall * (1.0 + WORTHWHILE)
     others = [each for each in candidates if each != now and trial.errors(each).overall < limit]
-    return trial.decide(ROWS_IN_MOTION, [now, *others], rows="moving", certainty=certainty)
+    return trial.decide(ROWS_IN_MOTION, [now, *others], 0.0, rows="moving", certainty=certainty)
 
 
 class _Swept(NamedTuple):

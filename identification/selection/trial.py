@@ -59,11 +59,13 @@ _POSTURES: Final = 50  # of a recording in which the inertia of the joints is ju
 _FAR_BETTER: Final = 0.5  # share of an error, of what shows in spite of doubts
 # Variance inflation from which on two columns are one (James et al. 2013, section 3.3.3): 5 to 10.
 _COLLINEAR: Final = 5.0
+
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
-
+"""Prepares the fitted data for a model, averaged to a common rate."""
 Columns = tuple[tuple[FrictionLaw, ...], tuple[int, ...], tuple[str, ...]]
-
+"""Friction of a model, periods of its torque ripple per motor turn, joints with a spring."""
 Known = Mapping[str, tuple[float, float]]
+"""Mean and standard deviation of parameters that are known beforehand."""
 
 
 class Decision(NamedTuple):

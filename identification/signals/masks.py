@@ -39,6 +39,11 @@ _FALL: Final = 16.0
 # an arm with a balancer fitting long rests doubles the prediction error.
 LONGEST_HALT: Final = 0.25  # s
 
+# The time around a reversal in which no row shows dry friction: two rows at the rate to which
+# recordings are averaged for the choice of rows (`inner_prediction.RATE`), so that the fit of a
+# faster recording leaves out as much as was judged.
+TURN: Final = 0.016  # s
+
 LeftOut = Literal["rests", "halts", "slow", "none"]
 
 EDGE: Final = "beside a gap or an end of the recording"
@@ -98,9 +103,10 @@ def mask_rows(
     low-pass of torque and regressor; `current_limit` (n,) [A] of motors. `left_out` excludes
 
     - "rests": rows in which no joint moves for more than `LONGEST_HALT`: a joint that stands while
-        another moves holds its load; and the two rows at each reversal of a joint;
-    - "halts": rows of a joint slower than standstill for more than `LONGEST_HALT`, and the two rows
-        at a change of its velocity's sign;
+        another moves holds its load; and the two rows at each reversal of a joint, or more in
+        `TURN`;
+    - "halts": rows of a joint slower than standstill for more than `LONGEST_HALT`, and those at a
+        change of its velocity's sign, likewise;
     - "slow": all rows slower than standstill, or near a velocity reversal;
     - "none": no slow rows.
     """
@@ -119,7 +125,8 @@ def mask_rows(
     reversal = near_any_reversal(model, motion, REVERSAL_PERIODS / bandwidth)
     reasons = {EDGE: np.broadcast_to(edge[:, None], shape)}
     # Errors of velocity and delay turn dry friction there, always to less of it at low speed.
-    turning = near_any_reversal(model, motion, np.zeros(shape[1]))
+    reach = max(0.0, 0.5 * TURN - float(np.median(np.diff(recording.time))))
+    turning = near_any_reversal(model, motion, np.full(shape[1], reach))
     halts = long_rests(motion.time, still)
     if left_out == "rests":
         resting = long_rests(motion.time, np.all(still, axis=1)[:, None])

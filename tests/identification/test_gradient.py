@@ -15,11 +15,13 @@ from identification.excitation.criteria import (
     correlation,
     log10_det,
 )
+from identification.excitation.precision import Precision, Quantities
 from identification.excitation.searches import run
 from identification.excitation.searches.gradient import Ascent, improve
+from identification.excitation.searches.local_change import Change
 from identification.excitation.searches.population import Population, Scores, SearchSettings
 from identification.excitation.searches.run import search
-from identification.excitation.searches.tangent import gene_slopes, states_of
+from identification.excitation.searches.tangent import gene_slopes, n_samples, states_of
 from identification.model.motion import Motion
 from planner import PlannerError
 from tests.identification.searching import bits, problem
@@ -95,47 +97,89 @@ def smoothed_coupling(gram):
     return np.hypot(correlation(gram)[np.tril_indices(len(gram), -1)], SMALL_CORRELATION).sum()
 
 
-@pytest.mark.parametrize("with_given", [False, True], ids=["alone", "beside-earlier-recordings"])
-def test_the_gradient_predicts_changes_of_the_criteria(population, start, with_given):
+@pytest.mark.parametrize("kind", ["alone", "beside-earlier-recordings", "for-a-precision"])
+def test_the_gradient_predicts_changes_of_the_criteria(population, start, kind):
     """In random directions, along which no kink of the interpolator lies."""
     genes, _ = start
     problem_ = population.problem
     random = np.random.default_rng(2)
-    if with_given:
+    objective = problem_.objective
+    weights = WEIGHTS
+    if kind == "beside-earlier-recordings":
         root = random.standard_normal((13, 40))
-        given = Given(root @ root.T / 40.0, 2.0)
-        problem_ = replace(problem_, objective=replace(problem_.objective, given=given))
-    tangent = problem_.tangent(genes, WEIGHTS)
+        objective = replace(objective, given=Given(root @ root.T / 40.0, 2.0))
+    if kind == "for-a-precision":
+        weights = None
+        wanted = Precision(Quantities(np.eye(13), np.ones(13)), np.ones(2), np.eye(13))
+        objective = replace(objective, precision=wanted)
+    problem_ = replace(problem_, objective=objective)
+    tangent = problem_.tangent(genes, weights)
     gradient = gene_slopes(problem_, tangent, genes, np.arange(len(genes)))[:, 0]
 
     def value(row):
         (motion,) = problem_.genome.motions(row[None])
         assert not isinstance(motion, PlannerError)
-        return WEIGHTS @ problem_.objective.criteria(motion, 1e-3).measures
+        if weights is None:
+            sampled = midpoints(motion, 1e-3)
+            return -np.log(objective.precision.criterion(objective.precise_information(sampled)))
+        return weights @ objective.criteria(motion, 1e-3).measures
 
     changes = 1e-3 * random.standard_normal((12, len(genes)))
     expected = [(value(genes + d) - value(genes - d)) / 2.0 for d in changes]
     assert np.corrcoef(changes @ gradient, expected)[0, 1] > 0.95
 
 
+def test_a_part_that_takes_longer_counts_more_often(population, start):
+    """By a fiftieth: its samples 51 times beside the others 50 times, against 49 times."""
+    genes, _ = start
+    problem_ = population.problem
+    tangent = problem_.tangent(genes, np.array([1.0, 0.0]))
+    count = tangent.states.shape[1]
+    part = slice(count // 4, count // 2)
+    length = (part.stop - part.start) * tangent.duration / count
+    slopes = tangent.slopes(Change(part, tangent.states[:, part], length / 50.0), 1.0)
+
+    def value(times):
+        repeated = np.full(count, 50)
+        repeated[part] = times
+        states = np.repeat(tangent.states, repeated, axis=1)
+        motion = Motion(np.arange(states.shape[1], dtype=float), *states)
+        return problem_.objective.measures(motion)["log10_det"]
+
+    assert slopes[0] == pytest.approx(0.5 * (value(51) - value(49)), rel=1e-3)
+    assert slopes[1] == -length / 50.0
+
+
 @pytest.mark.parametrize("home", [False, True], ids=["open", "closed"])
 @pytest.mark.parametrize("n_via", [2, 3, 9])
 @pytest.mark.parametrize("fly", [0.0, 0.5, 1.0])
 def test_a_via_point_changes_only_the_moves_around_it(home, n_via, fly):
-    """The slopes are those of motions that are planned as a whole, to rounding."""
+    """Planned as a whole, the motion is the same before them, and after them only later."""
     problem_ = limited(problem())
     limits = problem_.genome.limits
     middle = 0.5 * (limits.lower + limits.upper) if home else None
     genome = replace(problem_.genome, n_via=n_via, fly=fly, home=middle)
-    problem_ = replace(problem_, genome=genome)
     genes = genome.sample(np.random.default_rng(n_via), 1)[0]
-    tangent = problem_.tangent(genes, WEIGHTS)
+    tangent = replace(problem_, genome=genome).tangent(genes, WEIGHTS)
     assert tangent.moves is not None
-    every = np.arange(genome.n_genes)
-    whole = gene_slopes(problem_, replace(tangent, moves=None), genes, every)
-    local = gene_slopes(problem_, tangent, genes, every)
-    assert np.abs(whole[: genome.n_point_genes]).max() > 0.0
-    np.testing.assert_allclose(local, whole, rtol=1e-7, atol=1e-8 * np.abs(whole).max())
+    which = np.arange(genome.n_point_genes)
+    rows = np.repeat(genes[None], len(which), axis=0)
+    rows[which, which] += np.where(genes[which] > 0.5, -0.03, 0.03)
+    count = tangent.states.shape[1]
+    step = tangent.duration / count
+    changes = list(tangent.moves.changed(genome, rows, which, count))
+    parts = [change.samples for change in changes]
+    assert n_via < 9 or min(part.stop - part.start for part in parts) < count
+    for change, motion in zip(changes, genome.motions(rows), strict=True):
+        assert motion.duration == pytest.approx(tangent.duration + change.later, rel=1e-12)
+        first, after = change.samples.start, change.samples.stop
+        within = np.linspace(first * step, after * step + change.later, 2 * (after - first) + 1)
+        time = (np.arange(count) + 0.5) * step
+        time[first:after] = within[1::2]
+        time[after:] += change.later
+        expected = tangent.states.copy()
+        expected[:, change.samples] = change.states
+        np.testing.assert_allclose(np.array(motion.sample(time)), expected, rtol=1e-7, atol=1e-7)
 
 
 def test_margins_are_those_of_duration_and_currents(population, start):
@@ -143,7 +187,7 @@ def test_margins_are_those_of_duration_and_currents(population, start):
     linear_model = population.linearise(genes, WEIGHTS)
     (motion,) = population.problem.genome.motions(genes[None])
     constraints = population.problem.constraints
-    states = states_of(motion)
+    states = states_of(motion, n_samples(motion.duration))
     loads = constraints.currents.loads(Motion(np.arange(states.shape[1]), *states)).max(axis=0)
     np.testing.assert_allclose(
         linear_model.left[0], 0.999 * constraints.max_duration - motion.duration

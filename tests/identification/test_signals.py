@@ -13,7 +13,9 @@ from scipy.signal import butter, sosfiltfilt
 from identification.errors import ShapeError
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
 from identification.model.robot import RobotModel
+from identification.selection.inner_prediction import RATE
 from identification.signals.clock import time_base, true_times
 from identification.signals.masks import (
     EDGE,
@@ -23,6 +25,7 @@ from identification.signals.masks import (
     REVERSAL,
     SATURATED,
     STANDSTILL,
+    TURN,
     flat_topped,
     mask_rows,
 )
@@ -606,6 +609,16 @@ EVERYWHERE = np.ones((1, 1), dtype=np.bool_)
 SLIDING = RobotModel.from_urdf(URDF, friction=FrictionLaw(standstill=0.05))
 
 
+def rows_at_reversals(speed):
+    """Return the rows (m,) within half of `TURN` of a change of sign, or beside it."""
+    last = np.flatnonzero(speed[1:] * speed[:-1] < 0.0)
+    reach = max(0.0, 0.5 * TURN - (TIME[1] - TIME[0])) + 1e-9
+    rows = np.zeros(len(TIME), dtype=np.bool_)
+    for begin, end in zip(TIME[last] - reach, TIME[last + 1] + reach, strict=True):
+        rows[(begin <= TIME) & (end >= TIME)] = True
+    return rows
+
+
 def motion_and_recording(clip=np.inf):
     rate = np.array([2.0, 3.1])
     rng = np.random.default_rng(2)
@@ -693,22 +706,35 @@ class TestExcludedRows:
         halt[len(TIME) // 4 : 3 * len(TIME) // 4] = True
         motion.velocity[halt, 1] = 1e-6 * (-1.0) ** np.arange(np.count_nonzero(halt))
         mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), left_out="rests")
-        turns = np.flatnonzero(motion.velocity[1:, 0] * motion.velocity[:-1, 0] < 0.0)
-        expected = np.zeros(len(TIME), dtype=np.bool_)
-        expected[[*turns, *(turns + 1)]] = True
-        assert turns.size
-        np.testing.assert_array_equal(mask.reasons[REVERSAL][:, 0], expected)
+        turning = rows_at_reversals(motion.velocity[:, 0])
+        assert turning.any()
+        np.testing.assert_array_equal(mask.reasons[REVERSAL][:, 0], turning)
         assert not mask.reasons[REVERSAL][halt, 1].any()
 
     def test_halts_exclude_two_rows_at_a_reversal(self):
         motion, recording = motion_and_recording()
         mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), left_out="halts")
         for joint, speed in enumerate(motion.velocity.T):
-            last = np.flatnonzero(speed[1:] * speed[:-1] < 0.0)
-            assert last.size
-            np.testing.assert_array_equal(
-                np.flatnonzero(mask.reasons[REVERSAL][:, joint]), np.sort([*last, *(last + 1)])
-            )
+            turning = rows_at_reversals(speed)
+            assert turning.any()
+            np.testing.assert_array_equal(mask.reasons[REVERSAL][:, joint], turning)
+
+    @pytest.mark.parametrize("rate", [50.0, RATE, 2.0 * RATE, 1000.0])
+    def test_a_reversal_excludes_as_much_time_as_in_recordings_averaged_for_the_choice(self, rate):
+        time = np.arange(0.0, 2.0, 1.0 / rate)
+        position = np.stack((np.sin(3.0 * time), np.cos(3.0 * time)), axis=1)
+        velocity = 3.0 * np.stack((np.cos(3.0 * time), -np.sin(3.0 * time)), axis=1)
+        motion = Motion(time, position, velocity, -9.0 * position)
+        recording = Recording(
+            time=time, position=position, joint_names=SLIDING.joint_names, torque=position
+        )
+        mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), left_out="rests")
+        at = time[mask.reasons[REVERSAL][:, 0]]
+        assert TURN == 2.0 / RATE
+        for turn in (np.pi / 6.0, np.pi / 2.0):
+            around = at[np.abs(at - turn) < 0.1]
+            assert len(around) / rate == pytest.approx(max(2.0 / rate, TURN), abs=2.01 / rate)
+            assert around.mean() == pytest.approx(turn, abs=1.01 / rate)
 
     @pytest.mark.parametrize("friction", [True, False])
     def test_reversals_of_coupled_motors_are_excluded(self, friction):

@@ -8,9 +8,10 @@ moves, which no corner reaches, they meet the whole motion.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,11 +64,11 @@ class PlannedMoves:
 
     def changed(
         self, genome: ViaPointGenome, genes: Array, which: NDArray[np.intp], n_samples: int
-    ) -> Iterator[tuple[Array, float] | None]:
-        """Yield states (3, N, n) and duration [s] for each row of genes (k, n_genes).
+    ) -> Iterator[Change | None]:
+        """Yield the change of the motion with each row of genes (k, n_genes).
 
         In each row one gene of `which` (k,), a coordinate of a via point, differs from those of the
-        motion. States are those in the middles of N equal steps; None for what cannot be planned.
+        motion. None for what cannot be planned.
         """
         points, _ = genome.decode(genes)
         moved = genome.point_of(which)
@@ -77,24 +78,63 @@ class PlannedMoves:
             [row[a : b + 1] for row, a, b in zip(points, first, last, strict=True)],
             np.tile(self.speed, (len(points), 1)),
         )
-        step = (np.arange(n_samples, dtype=np.float64) + 0.5) / n_samples
-        whole = self.motion.duration
-        for part, point, a, b in zip(
-            parts, moved.tolist(), first.tolist(), last.tolist(), strict=True
-        ):
-            if isinstance(part, PlannerError):
+        planned = [
+            None if isinstance(part, PlannerError) else self._part(part, point, a, b, n_samples)
+            for part, point, a, b in zip(
+                parts, moved.tolist(), first.tolist(), last.tolist(), strict=True
+            )
+        ]
+        times = [part.time - part.later * (part.time >= part.leave) for part in planned if part]
+        if not times:
+            yield from (None for _ in planned)
+            return
+        around = np.array(self.motion.sample(np.concatenate(times)))
+        begin = 0
+        for part in planned:
+            if part is None:
                 yield None
                 continue
-            begin = float(self.middles[a] - 0.5 * self.lengths[a])
-            enter = float(self.middles[a]) if a == point - _REACH else 0.0
-            leave = begin + part.duration
-            left = whole
-            if b == point + _REACH:
-                leave -= 0.5 * float(self.lengths[b - 1])
-                left = float(self.middles[b - 1])
-            later = leave - left
-            time = step * (whole + later)
-            inside = slice(*np.searchsorted(time, (enter, leave)).tolist())
-            states = np.array(self.motion.sample(np.where(time >= leave, time - later, time)))
-            states[:, inside] = part.sample(time[inside] - begin)
-            yield states, whole + later
+            states = around[:, begin : begin + len(part.time)]
+            begin += len(part.time)
+            inside = slice(*np.searchsorted(part.time, (part.enter, part.leave)).tolist())
+            states[:, inside] = part.motion.sample(part.time[inside] - part.begin)
+            yield Change(part.samples, states, part.later)
+
+    def _part(
+        self, motion: PiecewiseCubic | FourierSeries, point: int, first: int, last: int, count: int
+    ) -> _Part:
+        """Return a part between two points, with one of them moved, of a motion of some samples."""
+        begin = float(self.middles[first] - 0.5 * self.lengths[first])
+        enter = float(self.middles[first]) if first == point - _REACH else 0.0
+        leave = begin + motion.duration
+        left = self.motion.duration
+        if last == point + _REACH:
+            leave -= 0.5 * float(self.lengths[last - 1])
+            left = float(self.middles[last - 1])
+        step = self.motion.duration / count
+        samples = slice(math.floor(enter / step), min(math.ceil(left / step), count))
+        cells = samples.stop - samples.start
+        later = leave - left
+        stretched = (cells * step + later) / cells
+        time = samples.start * step + (np.arange(cells, dtype=np.float64) + 0.5) * stretched
+        return _Part(motion, samples, time, begin, enter, leave, later)
+
+
+class Change(NamedTuple):
+    """Change of a sampled motion: each sample stays at its place between two via points."""
+
+    samples: slice  #: that change; those after them are only later
+    states: Array  #: of these (3, k, n)
+    later: float  #: by how much the motion takes longer, all of it in these samples [s]
+
+
+class _Part(NamedTuple):
+    """Part of a changed motion, planned from rest to rest."""
+
+    motion: PiecewiseCubic | FourierSeries
+    samples: slice  # of the whole motion that change with it
+    time: Array  # of these samples in the changed motion (k,) [s]
+    begin: float  # of the part in it [s]
+    enter: float  # from here on it is that of the part [s]
+    leave: float  # to here [s]
+    later: float  # by how much the rest of the motion is later [s]

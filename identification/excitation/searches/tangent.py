@@ -8,6 +8,7 @@ change with a gene follows from the interpolator, which plans each gene with a s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
@@ -19,7 +20,7 @@ from identification.excitation.collision import CollisionChecker
 from identification.excitation.constraints import Constraints, CurrentModel
 from identification.excitation.criteria import Objective
 from identification.excitation.genomes import Genome, ViaPointGenome
-from identification.excitation.searches.local_change import PlannedMoves
+from identification.excitation.searches.local_change import Change, PlannedMoves
 from identification.model.motion import Motion
 from planner import FourierSeries, PiecewiseCubic, PlannerError
 
@@ -42,9 +43,8 @@ class Problem(Protocol):
         """Of every motion."""
 
 
-N_SAMPLES: Final = 900
-"""Samples of a motion, the middles of equal steps: 22 ms of a motion of 20 s."""
-
+_SAMPLE_PERIOD: Final = 0.022  # s, at most; steps along slopes of twice that gain less
+_FEWEST_SAMPLES: Final = 900
 _GENE_STEP: Final = 1e-4
 _POSITION_STEP: Final = 1e-3  # rad or m
 _ACCELERATION_STEP: Final = 1.0  # exact: the regressor is linear in accelerations
@@ -54,15 +54,12 @@ _NEAR: Final = 0.08  # pairs of bodies closer than this to their least distance 
 _RESERVE: Final = 1e-3  # margin to each bound, relative, above the rounding of a check
 
 
-class Pull(NamedTuple):
-    """Slopes (3, k, n) of one quantity by position, velocity and acceleration at k samples."""
+class Margin(NamedTuple):
+    """What is left to the bound of a load or a distance, and its slopes by the states there."""
 
-    samples: NDArray[np.intp]
-    slope: Array
-
-    def along(self, change: Array) -> float:
-        """Return the change of the quantity for a change of all states (3, N, n)."""
-        return float(np.einsum("ikn,ikn->", self.slope, change[:, self.samples]))
+    sample: int
+    slope: Array  # by position, velocity and acceleration (3, n)
+    left: float  # negative if violated
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,23 +68,33 @@ class Tangent:
 
     states: Array  #: position, velocity and acceleration (3, N, n)
     duration: float  #: of the motion [s]
-    criterion: Pull  #: of the criterion
+    criterion: Array  #: slopes of the criterion by the states (3, N, n)
+    values: Array  #: first-order share of each sample in the criterion (N,)
     #: of the criterion by the duration [1/s]: a longer motion counts for more beside what is given
     by_duration: float
-    margins: tuple[Pull, ...]  #: of what is left to the bounds of loads and distances, (c,)
-    left: Array  #: (1 + c,) to the longest duration [s], then of `margins`; negative if violated
+    samples: NDArray[np.intp]  #: of the margins (c,)
+    margins: Array  #: their slopes (3, c, n)
+    left: Array  #: (1 + c,) to the longest duration [s], then of the margins; negative if violated
     moves: PlannedMoves | None  #: of the motion; None where a gene changes all of it
 
-    def slopes(self, states: Array, duration: float, step: float) -> Array:
+    def slopes(self, change: Change, step: float) -> Array:
         """Return the slopes (2 + c,) of criterion, duration's and other margins for one gene.
 
-        `states` (3, N, n) and `duration` [s] are those with the gene changed by `step`.
+        `change` is that of the motion with the gene changed by `step`.
         """
-        change = (states - self.states) / step
-        longer = (duration - self.duration) / step
-        margins = (margin.along(change) for margin in self.margins)
-        criterion = self.criterion.along(change) + self.by_duration * longer
-        return np.array((criterion, -longer, *margins))
+        part = change.samples
+        states = (change.states - self.states[:, part]) / step
+        longer = change.later / step
+        slopes = np.zeros(2 + len(self.samples))
+        # A longer part has a larger share in the motion, and the others have smaller ones.
+        length = (part.stop - part.start) * self.duration / self.states.shape[1]
+        share = self.values[part].sum() / length - self.values.sum() / self.duration
+        slopes[0] = np.sum(self.criterion[:, part] * states) + (share + self.by_duration) * longer
+        slopes[1] = -longer
+        inside = np.flatnonzero((self.samples >= part.start) & (self.samples < part.stop))
+        along = states[:, self.samples[inside] - part.start]
+        slopes[2 + inside] = np.sum(self.margins[:, inside] * along, axis=(0, 2))
+        return slopes
 
 
 class Linearisation(NamedTuple):
@@ -98,9 +105,14 @@ class Linearisation(NamedTuple):
     left: Array  #: the margins (1 + c,); negative if violated
 
 
-def states_of(motion: PiecewiseCubic | FourierSeries) -> Array:
-    """Return position, velocity and acceleration (3, N, n) in the middles of equal steps."""
-    time = (np.arange(N_SAMPLES, dtype=np.float64) + 0.5) * (motion.duration / N_SAMPLES)
+def n_samples(duration: float) -> int:
+    """Return the number N of samples of a motion of a duration [s]."""
+    return max(_FEWEST_SAMPLES, math.ceil(duration / _SAMPLE_PERIOD))
+
+
+def states_of(motion: PiecewiseCubic | FourierSeries, count: int) -> Array:
+    """Return position, velocity and acceleration (3, N, n) in the middles of N equal steps."""
+    time = (np.arange(count, dtype=np.float64) + 0.5) * (motion.duration / count)
     return np.array(motion.sample(time))
 
 
@@ -115,7 +127,7 @@ def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent
     (motion,) = problem.genome.motions(genes[None])
     if isinstance(motion, PlannerError):
         raise motion
-    states = states_of(motion)
+    states = states_of(motion, n_samples(motion.duration))
     constraints = problem.constraints
     # Steps of velocity as wide as its change between two samples: sgn(qd) jumps between them.
     swing = np.abs(np.diff(states[1], axis=0)).max(axis=0)
@@ -123,21 +135,32 @@ def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent
     steps = np.array(
         (np.full(n, _POSITION_STEP), np.maximum(swing, 1e-3), np.full(n, _ACCELERATION_STEP))
     )
-    left = [(1.0 - _RESERVE) * constraints.max_duration - motion.duration]
-    margins: list[tuple[Pull, float]] = []
+    margins: list[Margin] = []
     if constraints.currents is not None:
         margins += _loads(constraints.currents, states, steps)
     if constraints.checker is not None:
         margins += _distances(constraints.checker, states[0])
-    pulls = [pull for pull, _ in margins]
-    left += [margin for _, margin in margins]
-    slope, by_duration = _excitation(
-        problem.objective, states, steps, weights, motion.duration / N_SAMPLES
+    criterion, values, by_duration = _excitation(
+        problem.objective, states, steps, weights, motion.duration / states.shape[1]
     )
-    criterion = Pull(np.arange(N_SAMPLES), slope)
-    moves = PlannedMoves.of(problem.genome, genes, motion)
     return Tangent(
-        states, motion.duration, criterion, by_duration, tuple(pulls), np.array(left), moves
+        states=states,
+        duration=motion.duration,
+        criterion=criterion,
+        values=values,
+        by_duration=by_duration,
+        samples=np.array([margin.sample for margin in margins], np.intp),
+        margins=np.array([margin.slope for margin in margins])
+        .reshape(-1, 3, n)
+        .transpose(1, 0, 2)
+        .copy(),
+        left=np.array(
+            [
+                (1.0 - _RESERVE) * constraints.max_duration - motion.duration,
+                *(margin.left for margin in margins),
+            ]
+        ),
+        moves=PlannedMoves.of(problem.genome, genes, motion),
     )
 
 
@@ -158,20 +181,25 @@ def gene_slopes(problem: Problem, tangent: Tangent, genes: Array, which: NDArray
     changes = _changes(problem.genome, tangent, rows, which)
     for row, (change, step) in enumerate(zip(changes, steps.tolist(), strict=True)):
         if change is not None:
-            slopes[row] = tangent.slopes(*change, step)
+            slopes[row] = tangent.slopes(change, step)
     return slopes
 
 
 def _changes(
     genome: Genome, tangent: Tangent, rows: Array, which: NDArray[np.intp]
-) -> Iterator[tuple[Array, float] | None]:
-    """Yield states (3, N, n) and duration [s] of each row of genes, of which one is changed."""
+) -> Iterator[Change | None]:
+    """Yield the change of the motion with each row of genes, of which one is changed."""
+    count = tangent.states.shape[1]
     local = 0
     if tangent.moves is not None and isinstance(genome, ViaPointGenome):
         local = int(np.searchsorted(which, genome.n_point_genes))
-        yield from tangent.moves.changed(genome, rows[:local], which[:local], N_SAMPLES)
+        yield from tangent.moves.changed(genome, rows[:local], which[:local], count)
     for motion in genome.motions(rows[local:]):
-        yield None if isinstance(motion, PlannerError) else (states_of(motion), motion.duration)
+        if isinstance(motion, PlannerError):
+            yield None
+        else:
+            later = motion.duration - tangent.duration
+            yield Change(slice(0, count), states_of(motion, count), later)
 
 
 def _neighbours(states: Array, steps: Array) -> Iterator[tuple[int, int, Array, Array, float]]:
@@ -187,8 +215,11 @@ def _neighbours(states: Array, steps: Array) -> Iterator[tuple[int, int, Array, 
 
 def _excitation(
     objective: Objective, states: Array, steps: Array, weights: Array | None, period: float
-) -> tuple[Array, float]:
-    """Return the slopes of the weighted criteria by the states (3, N, n), and by the duration."""
+) -> tuple[Array, Array, float]:
+    """Return the slopes of the weighted criteria by the states, and by the duration.
+
+    Between them stands the share (N,) of each sample: that of a change in how often it counts.
+    """
     by_duration = 0.0
     of_joints = None
     if weights is None:
@@ -197,7 +228,7 @@ def _excitation(
         whole = objective.precise_information(_motion(states, period))
         matrix = precision.slope(whole)
         of_joints = period / precision.density
-        by_duration = float(np.sum(matrix * whole) / (N_SAMPLES * period))
+        by_duration = float(np.sum(matrix * whole) / (states.shape[1] * period))
     else:
         matrix = objective.slope(objective.information(_motion(states, period)), weights)
         if objective.given is not None:
@@ -205,17 +236,17 @@ def _excitation(
                 np.array([*objective.measures(_motion(states, factor * period)).values()]) @ weights
                 for factor in (1.0 + _DURATION_STEP, 1.0 - _DURATION_STEP)
             )
-            change = 2.0 * _DURATION_STEP * N_SAMPLES * period
+            change = 2.0 * _DURATION_STEP * states.shape[1] * period
             by_duration = float((longer - shorter) / change)
     slope = np.zeros_like(states)
     for kind, joint, above, below, gap in _neighbours(states, steps):
         difference = objective.along(_motion(above), matrix, of_joints)
         difference -= objective.along(_motion(below), matrix, of_joints)
         slope[kind, :, joint] = difference / gap
-    return slope, by_duration
+    return slope, objective.along(_motion(states), matrix, of_joints), by_duration
 
 
-def _loads(currents: CurrentModel, states: Array, steps: Array) -> Iterator[tuple[Pull, float]]:
+def _loads(currents: CurrentModel, states: Array, steps: Array) -> Iterator[Margin]:
     """Yield slope and margin, as a fraction, of each peak of the load of a motor or joint."""
     loads = currents.loads(_motion(states))
     peaks = [
@@ -228,12 +259,12 @@ def _loads(currents: CurrentModel, states: Array, steps: Array) -> Iterator[tupl
     sample, column = np.array(peaks).T
     samples, row = np.unique(sample, return_inverse=True)
     chosen = states[:, samples]
-    slope = np.zeros((len(peaks), 3, 1, states.shape[2]))
+    slope = np.zeros((len(peaks), 3, states.shape[2]))
     for kind, joint, above, below, gap in _neighbours(chosen, steps):
         change = (currents.loads(_motion(above)) - currents.loads(_motion(below))) / gap
-        slope[:, kind, 0, joint] = -change[row, column]
+        slope[:, kind, joint] = -change[row, column]
     for peak, at, which in zip(slope, sample, column, strict=True):
-        yield Pull(np.array([at]), peak), float(1.0 - _RESERVE - loads[at, which])
+        yield Margin(int(at), peak, float(1.0 - _RESERVE - loads[at, which]))
 
 
 def _runs(which: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
@@ -244,7 +275,7 @@ def _runs(which: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
     return np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
 
 
-def _distances(checker: CollisionChecker, q: Array) -> Iterator[tuple[Pull, float]]:
+def _distances(checker: CollisionChecker, q: Array) -> Iterator[Margin]:
     """Yield slope and margin [m] of each approach of two bodies along postures (N, n)."""
     path = checker.path(q)
     n = q.shape[1]
@@ -264,9 +295,9 @@ def _distances(checker: CollisionChecker, q: Array) -> Iterator[tuple[Pull, floa
             here = checker.distance(index, path, int(nearest))
             if not (np.isfinite(here) and np.all(np.isfinite(distance))):
                 continue
-            slope = np.zeros((3, 1, n))
-            slope[0, 0] = (distance[:n] - distance[n:]) / (2.0 * _POSITION_STEP)
-            yield Pull(np.array([nearest]), slope), here - (1 + _RESERVE) * checker.required[index]
+            slope = np.zeros((3, n))
+            slope[0] = (distance[:n] - distance[n:]) / (2.0 * _POSITION_STEP)
+            yield Margin(int(nearest), slope, here - (1 + _RESERVE) * checker.required[index])
 
 
 def _motion(states: Array, period: float = 1.0) -> Motion:
