@@ -233,6 +233,8 @@ class ArchiveProcess:
         )
         if self._live is not None:
             self._live.drive_train = command.drive_train
+        # Who asks for a motion now needs a recent heartbeat, even after a disk that hung.
+        self._progress = control.archive_heartbeat = time.monotonic()
         control.archive_state = ArchiveState.READY
         self._reply(Opened(command.job))
 

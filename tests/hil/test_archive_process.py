@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -21,13 +22,15 @@ from drivers.events import MotionEnded, MotionStarted, PacketRejected, RepliesLo
 from drivers.exchange import control as control_memory
 from drivers.exchange import event_log
 from drivers.exchange.control import OUTCOMES, ArchiveState, SharedState
-from drivers.exchange.event_log import EventWriter
-from drivers.record import CycleRing, cycle_dtype
+from drivers.exchange.event_log import EventReader, EventWriter
+from drivers.record import CycleRing, RingReader, cycle_dtype
 from hil.archive import Archive, ArchiveOutcome, ArchiveSpec, ArchiveWriter, open_archive
+from hil.archive.process import ArchiveProcess
 from hil.archive.recorder import Recorded
 from hil.archive.supervised import (
     Answer,
     ArchiveProcessHandle,
+    Channel,
     Close,
     Closed,
     Open,
@@ -231,6 +234,29 @@ class TestArchiveProcess:
         assert rig.closed(2).reason == "enough"
         assert outcome(second).outcome == "completed"
         assert rig.memory.control.archive_state == ArchiveState.NONE
+
+    def test_an_open_archive_comes_with_a_heartbeat(self, rig: Rig, monkeypatch) -> None:
+        """After a disk that hung for longer than heartbeats go on, a motion can begin at once."""
+        memory = rig.memory
+        supervisor, own = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        exchange = os.pidfd_open(memory.pid)
+        with supervisor, own:
+            process = ArchiveProcess(
+                RingReader(memory.ring_fd, 2), EventReader(memory.event_fd), memory.control,
+                Channel(own), exchange,
+            )  # fmt: skip
+            path = rig.folder / NAME
+            spec = ArchiveSpec(
+                path, joint_names=("a", "b"), period=PERIOD, metadata={}, durable=False
+            )
+            clock = time.monotonic()
+            monkeypatch.setattr(time, "monotonic", lambda: clock + 100.0)
+            process._open(Open(1, spec, drive_train(), False, True))
+            assert Channel(supervisor).receive() == Opened(1)
+            assert memory.control.archive_heartbeat == clock + 100.0
+            assert process._progress == clock + 100.0
+            process._close("completed", "enough")
+        os.close(exchange)
 
     def test_dead_process_is_reported(self, rig: Rig) -> None:
         rig.process.process.kill()
