@@ -2,10 +2,11 @@
 
 Run with ``python -m benchmarks.excitation_study [--seeds 3] [--quick] [--workers 2]
 [--only NAME ...] [--weights OF_LOG_DET OF_I_C] [--via-points N --duration S] [--json]``. Every
-search is that of ``hil design`` with the preset of its method: ``B (eq. 7)`` and ``front`` with
-nothing but joint limits to keep, as in the paper; ``+ motor currents`` closed at the cell's home,
-clear of floor and itself, and within 80 % of the currents. ``--via-points`` and ``--duration`` of
-the longest motion replace those of the preset.
+search is that of ``hil design`` with the preset of its method: ``B (eq. 7)``, ``gradient`` and
+``front`` with nothing but joint limits to keep, as in the paper; ``+ motor currents`` and ``all
+constraints`` closed at the cell's home, clear of floor and itself, and within 80 % of the currents.
+Motions with a number of via points take at most 1.25 s for each and are improved from one start.
+``--via-points`` and ``--duration`` of the longest motion replace those of a case.
 
 log10 det and I_c are those of the motion sampled every millisecond; ``with_rests`` are both as they
 were counted before, when a joint that rests had dry friction of full size. Seconds are wall clock,
@@ -36,10 +37,26 @@ from identification.excitation import (
 from identification.model.friction import JointFriction
 from sim_fixtures.ns16 import CELL_PATH
 
+_PACE: Final = 1.25  # s for each via point
+
+
+def _longer(
+    settings: DesignSettings, via_points: int, steps: int, weight: float = 0.75
+) -> DesignSettings:
+    """Return settings of a longer motion, improved by some steps from one start."""
+    return settings.replaced(
+        search={"gradient": steps, "starts": 1, "weights": (weight, 1.0 - weight)},
+        via_points={"n_via": via_points},
+        constraints={"max_duration": _PACE * via_points},
+    )
+
+
 CASES: Final[dict[str, DesignSettings]] = {
     "B (eq. 7)": preset("b").kinematic(),
     "gradient": preset("gradient").kinematic(),
     "gradient, all constraints": preset("gradient"),
+    "gradient, 60 via points": _longer(preset("gradient").kinematic(), 60, 75),
+    "gradient, all constraints, 32 via points": _longer(preset("gradient"), 32, 110, 0.8),
     "front": preset("front").kinematic(),
     "+ motor currents": preset("front").replaced(
         constraints={"closed": True, "collision": True, "current": True}

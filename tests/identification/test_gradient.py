@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from identification.excitation.constraints import CurrentModel, midpoints
+from identification.excitation.constraints import CurrentModel, midpoints, sampled
 from identification.excitation.criteria import (
     CRITERIA,
     SENSE,
@@ -17,11 +17,11 @@ from identification.excitation.criteria import (
 )
 from identification.excitation.precision import Precision, Quantities
 from identification.excitation.searches import run
-from identification.excitation.searches.gradient import Ascent, improve
+from identification.excitation.searches.gradient import Ascent, _Cut, _step, improve
 from identification.excitation.searches.local_change import Change
 from identification.excitation.searches.population import Population, Scores, SearchSettings
 from identification.excitation.searches.run import search
-from identification.excitation.searches.tangent import gene_slopes, n_samples, states_of
+from identification.excitation.searches.tangent import Linearisation, gene_slopes
 from identification.model.motion import Motion
 from planner import PlannerError
 from tests.identification.searching import bits, problem
@@ -134,20 +134,30 @@ def test_a_part_that_takes_longer_counts_more_often(population, start):
     genes, _ = start
     problem_ = population.problem
     tangent = problem_.tangent(genes, np.array([1.0, 0.0]))
-    count = tangent.states.shape[1]
+    (motion,) = problem_.genome.motions(genes[None])
+    count = len(tangent.time)
     part = slice(count // 4, count // 2)
-    length = (part.stop - part.start) * tangent.duration / count
-    slopes = tangent.slopes(Change(part, tangent.states[:, part], length / 50.0), 1.0)
+    step = tangent.duration / count
+    enter, left = part.start * step, part.stop * step
+
+    class Longer(Change):
+        """The same states, as if a gene changed nothing but the time."""
+
+        def states(self, time):
+            return np.array(motion.sample(time))
+
+    slopes = tangent.slopes(Longer(motion, 0.0, enter, left, (left - enter) / 50.0), 1.0)
 
     def value(times):
         repeated = np.full(count, 50)
         repeated[part] = times
         states = np.repeat(tangent.states, repeated, axis=1)
-        motion = Motion(np.arange(states.shape[1], dtype=float), *states)
-        return problem_.objective.measures(motion)["log10_det"]
+        return problem_.objective.measures(
+            Motion(np.arange(states.shape[1], dtype=float), *states)
+        )["log10_det"]
 
     assert slopes[0] == pytest.approx(0.5 * (value(51) - value(49)), rel=1e-3)
-    assert slopes[1] == -length / 50.0
+    assert slopes[1] == -(left - enter) / 50.0
 
 
 @pytest.mark.parametrize("home", [False, True], ids=["open", "closed"])
@@ -165,38 +175,73 @@ def test_a_via_point_changes_only_the_moves_around_it(home, n_via, fly):
     which = np.arange(genome.n_point_genes)
     rows = np.repeat(genes[None], len(which), axis=0)
     rows[which, which] += np.where(genes[which] > 0.5, -0.03, 0.03)
-    count = tangent.states.shape[1]
-    step = tangent.duration / count
-    changes = list(tangent.moves.changed(genome, rows, which, count))
-    parts = [change.samples for change in changes]
-    assert n_via < 9 or min(part.stop - part.start for part in parts) < count
+    changes = list(tangent.moves.changed(genome, rows, which))
+    assert n_via < 9 or min(change.length for change in changes) < 0.7 * tangent.duration
     for change, motion in zip(changes, genome.motions(rows), strict=True):
         assert motion.duration == pytest.approx(tangent.duration + change.later, rel=1e-12)
-        first, after = change.samples.start, change.samples.stop
-        within = np.linspace(first * step, after * step + change.later, 2 * (after - first) + 1)
-        time = (np.arange(count) + 0.5) * step
-        time[first:after] = within[1::2]
-        time[after:] += change.later
+        part = (tangent.time >= change.enter) & (tangent.time <= change.left)
         expected = tangent.states.copy()
-        expected[:, change.samples] = change.states
+        expected[:, part] = change.states(tangent.time[part])
+        stretch = 1.0 + change.later / change.length
+        time = np.where(part, change.enter + stretch * (tangent.time - change.enter), tangent.time)
+        time[tangent.time > change.left] += change.later
         np.testing.assert_allclose(np.array(motion.sample(time)), expected, rtol=1e-7, atol=1e-7)
 
 
 def test_margins_are_those_of_duration_and_currents(population, start):
+    """Of each peak of each load, at the samples by which the motion is checked."""
     genes, _ = start
     linear_model = population.linearise(genes, WEIGHTS)
     (motion,) = population.problem.genome.motions(genes[None])
     constraints = population.problem.constraints
-    states = states_of(motion, n_samples(motion.duration))
-    loads = constraints.currents.loads(Motion(np.arange(states.shape[1]), *states)).max(axis=0)
     np.testing.assert_allclose(
         linear_model.left[0], 0.999 * constraints.max_duration - motion.duration
     )
-    followed = 0.999 - loads[loads > 0.75]
-    assert len(followed) > 0
-    assert all(np.any(np.isclose(linear_model.left[1:], margin)) for margin in followed)
-    assert np.all((linear_model.left[1:] >= np.min(followed)) & (linear_model.left[1:] < 0.25))
+    loads = constraints.currents.loads(sampled(motion, population.problem.period))
+    assert loads.max() > 0.75
+    peaks = [
+        load
+        for column in loads.T
+        for before, load, after in zip([-1.0, *column], column, [*column[1:], -1.0], strict=False)
+        if load > 0.75 and load > before and load >= after
+    ]
+    np.testing.assert_allclose(np.sort(linear_model.left[1:]), np.sort(0.999 - np.array(peaks)))
     assert linear_model.rows.shape == (len(linear_model.left), len(genes))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_slopes_of_a_load_are_those_of_its_peak(population, seed):
+    """Of motions whose largest load is not at a reversal, where friction jumps."""
+    problem_ = population.problem
+    genes = problem_.genome.sample(np.random.default_rng(seed), 4)[3]
+    linear_model = population.linearise(genes, WEIGHTS)
+    peak = 1 + int(np.argmin(linear_model.left[1:]))
+
+    def most(row):
+        (motion,) = problem_.genome.motions(row[None])
+        return problem_.constraints.currents.loads(sampled(motion, 1e-3)).max()
+
+    steps = np.where(genes > 0.5, -1e-4, 1e-4)
+    rows = genes + np.diag(steps)
+    expected = [(most(genes) - most(row)) / step for row, step in zip(rows, steps, strict=True)]
+    np.testing.assert_allclose(linear_model.rows[peak], expected, atol=0.1)
+
+
+def test_a_cautious_step_stays_away_from_the_bounds():
+    """By a share of what the box would change of each margin, unless no step can."""
+    gradient = np.array([1.0, 0.0])
+    genes = np.full(2, 0.5)
+
+    def step(rows, left, caution):
+        slopes = Linearisation(gradient, np.array(rows), np.array(left))
+        return _step([_Cut(genes, 0.0, slopes)], genes, 0.0, 0.1, caution)[0]
+
+    bound = [[-1.0, 0.0]], [0.05]
+    np.testing.assert_allclose(step(*bound, 0.0), [0.05, 0.0], atol=1e-6)
+    np.testing.assert_allclose(step(*bound, 0.3), [0.02, 0.0], atol=1e-6)
+    np.testing.assert_allclose(step([[-1.0, 0.0]], [0.0], 0.3), [-0.03, 0.0], atol=1e-6)
+    opposed = [[-1.0, 0.0], [1.0, 0.0]], [0.0, 0.0]
+    np.testing.assert_allclose(step(*opposed, 0.3), np.zeros(2), atol=1e-6)
 
 
 class Watched:

@@ -6,7 +6,8 @@ since criterion and duration have kinks: the slowest joint sets the time of a mo
 .. math:: \max_d \; \min_i (\alpha_i + g_i^T d) - \tfrac{\rho}{2} d^T d
 
 over changes d of the genes in a box, with the linearised constraints of all motions i of the
-bundle. A step that fails adds the linearisation there.
+bundle. A step that fails adds the linearisation there; after one that breaks a constraint the next
+ones keep away from all bounds by a share of what the box would change.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ _NONCONVEX: Final = 5.0  # least offset of the linearisation at a distance of 1
 _BUNDLE_SIZE: Final = 20  # linearisations in the bundle
 _SHARE: Final = 0.05  # of the predicted gain that makes a step
 _PATIENCE: Final = 4  # failures before the box is made smaller
+_CAUTION: Final = 0.1  # by which each infeasible step raises the share of margins that is kept
+_MOST_CAUTION: Final = 0.5
 _FRACTIONS: Final = np.array((1.0, 0.4))  # of a step that are scored
 
 TRIED: Final = len(_FRACTIONS)
@@ -81,6 +84,7 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
         return best
     bundle = [_Cut(best[0], value, slopes)]
     failures = 0
+    caution = 0.0
     box = _BOX
     for _ in range(steps):
         if box < _SMALLEST or ascent.stop():
@@ -89,7 +93,7 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
         here = next(cut for cut in bundle if cut.genes is centre)
         near = [c for c in bundle if c is not here and np.abs(c.genes - centre).max() <= 2 * box]
         bundle = [here, *near[-_BUNDLE_SIZE:]]
-        change, gain = _step(bundle, centre, value, box)
+        change, gain = _step(bundle, centre, value, box, caution)
         tried = np.clip(centre + _FRACTIONS[:, None] * change, 0.0, 1.0)
         trial_scores = ascent.score(tried.copy())
         values = np.where(trial_scores.usable, ascent.fitness(trial_scores), -np.inf)
@@ -101,12 +105,15 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
             best = (tried[index].copy(), trial_scores.take(index))
             value = values[index]
             failures = 0
+            caution *= 0.5
             slopes = ascent.linearise(best[0], best[1])
             if slopes is None:
                 break
             bundle.append(_Cut(best[0], float(value), slopes))
             continue
         failures += 1
+        if not np.any(trial_scores.feasible):
+            caution = min(caution + _CAUTION, _MOST_CAUTION)
         refused = _refused(ascent, tried[0].copy(), trial_scores.take(0))
         if refused is not None:
             bundle.append(refused)
@@ -125,15 +132,22 @@ def _refused(ascent: Ascent, genes: Array, scores: Scores) -> _Cut | None:
     return None if slopes is None else _Cut(genes, value, slopes)
 
 
-def _step(bundle: list[_Cut], genes: Array, fitness: float, box: float) -> tuple[Array, float]:
-    """Return the change of genes (n_genes,) with the best of the model, and its predicted gain."""
+def _step(
+    bundle: list[_Cut], genes: Array, fitness: float, box: float, caution: float
+) -> tuple[Array, float]:
+    """Return the change of genes (n_genes,) with the best of the model, and its predicted gain.
+
+    Of each margin the share `caution` of its largest change in the box is kept.
+    """
     import clarabel  # slow to import
 
     n = len(genes)
     offsets = [0.0] + [cut.offset(genes, fitness) for cut in bundle[1:]]
     rows = np.concatenate([-cut.slopes.rows for cut in bundle])
     left = np.concatenate([np.maximum(cut.left(genes), 0.0) for cut in bundle])
-    within = left < box * np.abs(rows).sum(axis=1)  # the others hold in all of the box
+    reach = box * np.abs(rows).sum(axis=1)
+    left -= caution * reach
+    within = left < reach  # the others hold in all of the box
     rows = rows[within]
     left = left[within]
     gradients = np.array([-cut.slopes.gradient for cut in bundle])
@@ -163,6 +177,8 @@ def _step(bundle: list[_Cut], genes: Array, fitness: float, box: float) -> tuple
         cones,
         settings,
     ).solve()
+    if solution.status == clarabel.SolverStatus.PrimalInfeasible and caution > 0.0:
+        return _step(bundle, genes, fitness, box, 0.0)
     optimum = np.array(solution.x)
     if not np.all(np.isfinite(optimum)):
         return np.zeros(n), 0.0

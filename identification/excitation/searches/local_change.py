@@ -8,7 +8,6 @@ moves, which no corner reaches, they meet the whole motion.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
@@ -41,7 +40,8 @@ class PlannedMoves:
     ) -> Self | None:
         """Return the moves of the motion of genes (n_genes,).
 
-        None if it has no via points, or its moves alone do not add up to its duration.
+        None if it has no via points, a move without length, or moves that do not add up to its
+        duration.
         """
         if not isinstance(genome, ViaPointGenome) or not isinstance(motion, PiecewiseCubic):
             return None
@@ -55,6 +55,8 @@ class PlannedMoves:
             [each.duration for each in planned if isinstance(each, PiecewiseCubic)]
         )
         lengths = durations[: len(moves)]
+        if not np.all(lengths > 0.0):
+            return None
         apart = durations[len(moves) :] - 0.5 * (lengths[:-1] + lengths[1:])
         middles = 0.5 * lengths[0] + np.concatenate(([0.0], np.cumsum(apart)))
         duration = motion.duration
@@ -63,7 +65,7 @@ class PlannedMoves:
         return cls(motion, points, speed, lengths, middles)
 
     def changed(
-        self, genome: ViaPointGenome, genes: Array, which: NDArray[np.intp], n_samples: int
+        self, genome: ViaPointGenome, genes: Array, which: NDArray[np.intp]
     ) -> Iterator[Change | None]:
         """Yield the change of the motion with each row of genes (k, n_genes).
 
@@ -78,63 +80,40 @@ class PlannedMoves:
             [row[a : b + 1] for row, a, b in zip(points, first, last, strict=True)],
             np.tile(self.speed, (len(points), 1)),
         )
-        planned = [
-            None if isinstance(part, PlannerError) else self._part(part, point, a, b, n_samples)
-            for part, point, a, b in zip(
-                parts, moved.tolist(), first.tolist(), last.tolist(), strict=True
-            )
-        ]
-        times = [part.time - part.later * (part.time >= part.leave) for part in planned if part]
-        if not times:
-            yield from (None for _ in planned)
-            return
-        around = np.array(self.motion.sample(np.concatenate(times)))
-        begin = 0
-        for part in planned:
-            if part is None:
+        for part, point, a, b in zip(
+            parts, moved.tolist(), first.tolist(), last.tolist(), strict=True
+        ):
+            if isinstance(part, PlannerError):
                 yield None
                 continue
-            states = around[:, begin : begin + len(part.time)]
-            begin += len(part.time)
-            inside = slice(*np.searchsorted(part.time, (part.enter, part.leave)).tolist())
-            states[:, inside] = part.motion.sample(part.time[inside] - part.begin)
-            yield Change(part.samples, states, part.later)
-
-    def _part(
-        self, motion: PiecewiseCubic | FourierSeries, point: int, first: int, last: int, count: int
-    ) -> _Part:
-        """Return a part between two points, with one of them moved, of a motion of some samples."""
-        begin = float(self.middles[first] - 0.5 * self.lengths[first])
-        enter = float(self.middles[first]) if first == point - _REACH else 0.0
-        leave = begin + motion.duration
-        left = self.motion.duration
-        if last == point + _REACH:
-            leave -= 0.5 * float(self.lengths[last - 1])
-            left = float(self.middles[last - 1])
-        step = self.motion.duration / count
-        samples = slice(math.floor(enter / step), min(math.ceil(left / step), count))
-        cells = samples.stop - samples.start
-        later = leave - left
-        stretched = (cells * step + later) / cells
-        time = samples.start * step + (np.arange(cells, dtype=np.float64) + 0.5) * stretched
-        return _Part(motion, samples, time, begin, enter, leave, later)
+            begin = float(self.middles[a] - 0.5 * self.lengths[a])
+            enter = float(self.middles[a]) if a == point - _REACH else 0.0
+            end = begin + part.duration
+            left = self.motion.duration
+            if b == point + _REACH:
+                end -= 0.5 * float(self.lengths[b - 1])
+                left = float(self.middles[b - 1])
+            yield Change(part, begin, enter, left, end - left)
 
 
 class Change(NamedTuple):
-    """Change of a sampled motion: each sample stays at its place between two via points."""
+    """Change of a motion in a part of it; what follows is only later."""
 
-    samples: slice  #: that change; those after them are only later
-    states: Array  #: of these (3, k, n)
-    later: float  #: by how much the motion takes longer, all of it in these samples [s]
+    motion: PiecewiseCubic | FourierSeries  #: planned instead of the part, and of some before it
+    begin: float  #: when that begins [s]
+    enter: float  #: when the part begins [s]
+    left: float  #: when it ended before the change [s]
+    later: float  #: how much longer it takes [s]
 
+    @property
+    def length(self) -> float:
+        """Duration of the part before the change [s]."""
+        return self.left - self.enter
 
-class _Part(NamedTuple):
-    """Part of a changed motion, planned from rest to rest."""
+    def states(self, time: Array) -> Array:
+        """Return position, velocity and acceleration (3, k, n) for times in the part (k,) [s].
 
-    motion: PiecewiseCubic | FourierSeries
-    samples: slice  # of the whole motion that change with it
-    time: Array  # of these samples in the changed motion (k,) [s]
-    begin: float  # of the part in it [s]
-    enter: float  # from here on it is that of the part [s]
-    leave: float  # to here [s]
-    later: float  # by how much the rest of the motion is later [s]
+        Each is that of the changed motion when as large a share of the part is over.
+        """
+        stretched = self.enter + (time - self.enter) * (1.0 + self.later / self.length)
+        return np.array(self.motion.sample(stretched - self.begin))

@@ -9,20 +9,20 @@ change with a gene follows from the interpolator, which plans each gene with a s
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.collision import CollisionChecker
-from identification.excitation.constraints import Constraints, CurrentModel
+from identification.excitation.constraints import Constraints, CurrentModel, sampled
 from identification.excitation.criteria import Objective
 from identification.excitation.genomes import Genome, ViaPointGenome
 from identification.excitation.searches.local_change import Change, PlannedMoves
 from identification.model.motion import Motion
-from planner import FourierSeries, PiecewiseCubic, PlannerError
+from planner import PlannerError
 
 Array = NDArray[np.float64]
 
@@ -42,58 +42,90 @@ class Problem(Protocol):
     def constraints(self) -> Constraints:
         """Of every motion."""
 
+    @property
+    def period(self) -> float:
+        """Of the samples at which loads are checked [s]."""
+
 
 _SAMPLE_PERIOD: Final = 0.022  # s, at most; steps along slopes of twice that gain less
 _FEWEST_SAMPLES: Final = 900
 _GENE_STEP: Final = 1e-4
 _POSITION_STEP: Final = 1e-3  # rad or m
+_VELOCITY_STEP: Final = 1e-3  # rad/s or m/s, at least
 _ACCELERATION_STEP: Final = 1.0  # exact: the regressor is linear in accelerations
 _DURATION_STEP: Final = 1e-3  # relative
 _LOADED: Final = 0.75  # loads above this fraction of the limit are followed
 _NEAR: Final = 0.08  # pairs of bodies closer than this to their least distance are followed [m]
 _RESERVE: Final = 1e-3  # margin to each bound, relative, above the rounding of a check
+_SPARE: Final = 1e-3  # m, likewise: the check of a motion does not resolve a distance at its bound
 
 
 class Margin(NamedTuple):
     """What is left to the bound of a load or a distance, and its slopes by the states there."""
 
-    sample: int
-    slope: Array  # by position, velocity and acceleration (3, n)
+    time: float  # s
+    states: Array  # position, velocity and acceleration (3, n)
+    slope: Array  # by these (3, n)
     left: float  # negative if violated
+
+
+class Margins(NamedTuple):
+    """The margins of a motion, (c,) each."""
+
+    time: Array  # s
+    states: Array  # (3, c, n)
+    slope: Array  # (3, c, n)
+    left: Array
+
+    @classmethod
+    def of(cls, margins: Sequence[Margin], n: int) -> Self:
+        """Stack the margins of an arm of n joints."""
+        states, slope = (
+            np.array(each).reshape(-1, 3, n).transpose(1, 0, 2)
+            for each in ([m.states for m in margins], [m.slope for m in margins])
+        )
+        time, left = (
+            np.array(each) for each in ([m.time for m in margins], [m.left for m in margins])
+        )
+        return cls(time, states, slope, left)
 
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
     """Slopes of a motion's criterion and constraints by its states."""
 
-    states: Array  #: position, velocity and acceleration (3, N, n)
+    time: Array  #: the middles of equal steps (N,) [s]
+    states: Array  #: position, velocity and acceleration then (3, N, n)
     duration: float  #: of the motion [s]
     criterion: Array  #: slopes of the criterion by the states (3, N, n)
-    values: Array  #: first-order share of each sample in the criterion (N,)
+    values: Array  #: first-order share of each state in the criterion (N,)
     #: of the criterion by the duration [1/s]: a longer motion counts for more beside what is given
     by_duration: float
-    samples: NDArray[np.intp]  #: of the margins (c,)
-    margins: Array  #: their slopes (3, c, n)
+    margins: Margins  #: of loads and distances
     left: Array  #: (1 + c,) to the longest duration [s], then of the margins; negative if violated
     moves: PlannedMoves | None  #: of the motion; None where a gene changes all of it
 
     def slopes(self, change: Change, step: float) -> Array:
         """Return the slopes (2 + c,) of criterion, duration's and other margins for one gene.
 
-        `change` is that of the motion with the gene changed by `step`.
+        `change` is that of the motion with the gene changed by `step`. States keep their places in
+        the part that changes.
         """
-        part = change.samples
-        states = (change.states - self.states[:, part]) / step
+        part = slice(*np.searchsorted(self.time, (change.enter, change.left)).tolist())
+        margins = self.margins
+        near = np.flatnonzero((margins.time >= change.enter) & (margins.time <= change.left))
+        states = change.states(np.concatenate((self.time[part], margins.time[near])))
+        before = np.concatenate((self.states[:, part], margins.states[:, near]), axis=1)
+        by_step = (states - before) / step
         longer = change.later / step
-        slopes = np.zeros(2 + len(self.samples))
         # A longer part has a larger share in the motion, and the others have smaller ones.
-        length = (part.stop - part.start) * self.duration / self.states.shape[1]
-        share = self.values[part].sum() / length - self.values.sum() / self.duration
-        slopes[0] = np.sum(self.criterion[:, part] * states) + (share + self.by_duration) * longer
+        share = self.values[part].sum() / change.length - self.values.sum() / self.duration
+        count = part.stop - part.start
+        slopes = np.zeros(1 + len(self.left))
+        slopes[0] = np.sum(self.criterion[:, part] * by_step[:, :count])
+        slopes[0] += (share + self.by_duration) * longer
         slopes[1] = -longer
-        inside = np.flatnonzero((self.samples >= part.start) & (self.samples < part.stop))
-        along = states[:, self.samples[inside] - part.start]
-        slopes[2 + inside] = np.sum(self.margins[:, inside] * along, axis=(0, 2))
+        slopes[2 + near] = np.sum(margins.slope[:, near] * by_step[:, count:], axis=(0, 2))
         return slopes
 
 
@@ -110,12 +142,6 @@ def n_samples(duration: float) -> int:
     return max(_FEWEST_SAMPLES, math.ceil(duration / _SAMPLE_PERIOD))
 
 
-def states_of(motion: PiecewiseCubic | FourierSeries, count: int) -> Array:
-    """Return position, velocity and acceleration (3, N, n) in the middles of N equal steps."""
-    time = (np.arange(count, dtype=np.float64) + 0.5) * (motion.duration / count)
-    return np.array(motion.sample(time))
-
-
 def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent:
     """Return the slopes of `weights` (d,) times the criteria, and of the margins, by the states.
 
@@ -127,39 +153,38 @@ def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent
     (motion,) = problem.genome.motions(genes[None])
     if isinstance(motion, PlannerError):
         raise motion
-    states = states_of(motion, n_samples(motion.duration))
+    count = n_samples(motion.duration)
+    period = motion.duration / count
+    time = (np.arange(count, dtype=np.float64) + 0.5) * period
+    states = np.array(motion.sample(time))
     constraints = problem.constraints
     # Steps of velocity as wide as its change between two samples: sgn(qd) jumps between them.
     swing = np.abs(np.diff(states[1], axis=0)).max(axis=0)
     n = states.shape[2]
     steps = np.array(
-        (np.full(n, _POSITION_STEP), np.maximum(swing, 1e-3), np.full(n, _ACCELERATION_STEP))
+        (
+            np.full(n, _POSITION_STEP),
+            np.maximum(swing, _VELOCITY_STEP),
+            np.full(n, _ACCELERATION_STEP),
+        )
     )
     margins: list[Margin] = []
     if constraints.currents is not None:
-        margins += _loads(constraints.currents, states, steps)
+        margins += _loads(constraints.currents, sampled(motion, problem.period))
     if constraints.checker is not None:
-        margins += _distances(constraints.checker, states[0])
-    criterion, values, by_duration = _excitation(
-        problem.objective, states, steps, weights, motion.duration / states.shape[1]
-    )
+        margins += _distances(constraints.checker, time, states)
+    criterion, values, by_duration = _excitation(problem.objective, states, steps, weights, period)
+    stacked = Margins.of(margins, n)
+    longest = (1.0 - _RESERVE) * constraints.max_duration
     return Tangent(
+        time=time,
         states=states,
         duration=motion.duration,
         criterion=criterion,
         values=values,
         by_duration=by_duration,
-        samples=np.array([margin.sample for margin in margins], np.intp),
-        margins=np.array([margin.slope for margin in margins])
-        .reshape(-1, 3, n)
-        .transpose(1, 0, 2)
-        .copy(),
-        left=np.array(
-            [
-                (1.0 - _RESERVE) * constraints.max_duration - motion.duration,
-                *(margin.left for margin in margins),
-            ]
-        ),
+        margins=stacked,
+        left=np.concatenate(([longest - motion.duration], stacked.left)),
         moves=PlannedMoves.of(problem.genome, genes, motion),
     )
 
@@ -189,17 +214,16 @@ def _changes(
     genome: Genome, tangent: Tangent, rows: Array, which: NDArray[np.intp]
 ) -> Iterator[Change | None]:
     """Yield the change of the motion with each row of genes, of which one is changed."""
-    count = tangent.states.shape[1]
     local = 0
     if tangent.moves is not None and isinstance(genome, ViaPointGenome):
         local = int(np.searchsorted(which, genome.n_point_genes))
-        yield from tangent.moves.changed(genome, rows[:local], which[:local], count)
+        yield from tangent.moves.changed(genome, rows[:local], which[:local])
+    duration = tangent.duration
     for motion in genome.motions(rows[local:]):
         if isinstance(motion, PlannerError):
             yield None
         else:
-            later = motion.duration - tangent.duration
-            yield Change(slice(0, count), states_of(motion, count), later)
+            yield Change(motion, 0.0, 0.0, duration, motion.duration - duration)
 
 
 def _neighbours(states: Array, steps: Array) -> Iterator[tuple[int, int, Array, Array, float]]:
@@ -246,25 +270,28 @@ def _excitation(
     return slope, objective.along(_motion(states), matrix, of_joints), by_duration
 
 
-def _loads(currents: CurrentModel, states: Array, steps: Array) -> Iterator[Margin]:
-    """Yield slope and margin, as a fraction, of each peak of the load of a motor or joint."""
-    loads = currents.loads(_motion(states))
-    peaks = [
-        (int(run[np.argmax(loads[run, column])]), column)
-        for column in range(loads.shape[1])
-        for run in _runs(loads[:, column] > _LOADED)
-    ]
-    if not peaks:
+def _loads(currents: CurrentModel, motion: Motion) -> Iterator[Margin]:
+    """Yield the margin, as a fraction, at each peak of the load of a motor or joint."""
+    loads = currents.loads(motion)
+    before, after = (np.full((1, loads.shape[1]), -np.inf) for _ in range(2))
+    is_peak = loads > np.maximum(_LOADED, np.concatenate((before, loads[:-1])))
+    is_peak &= loads >= np.concatenate((loads[1:], after))
+    sample, column = np.nonzero(is_peak)
+    if len(sample) == 0:
         return
-    sample, column = np.array(peaks).T
     samples, row = np.unique(sample, return_inverse=True)
-    chosen = states[:, samples]
-    slope = np.zeros((len(peaks), 3, states.shape[2]))
+    chosen = np.array(motion[1:4])[:, samples]
+    n = chosen.shape[2]
+    steps = np.repeat([[_POSITION_STEP], [_VELOCITY_STEP], [_ACCELERATION_STEP]], n, axis=1)
+    slope = np.zeros((len(sample), 3, n))
     for kind, joint, above, below, gap in _neighbours(chosen, steps):
         change = (currents.loads(_motion(above)) - currents.loads(_motion(below))) / gap
+        if kind == 1:  # no slope where sgn(qd) jumps
+            change[np.abs(chosen[1, :, joint]) <= _VELOCITY_STEP] = 0.0
         slope[:, kind, joint] = -change[row, column]
-    for peak, at, which in zip(slope, sample, column, strict=True):
-        yield Margin(int(at), peak, float(1.0 - _RESERVE - loads[at, which]))
+    for peak, at, which, place in zip(slope, sample, column, row, strict=True):
+        left = float(1.0 - _RESERVE - loads[at, which])
+        yield Margin(float(motion.time[at]), chosen[:, place], peak, left)
 
 
 def _runs(which: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
@@ -275,8 +302,9 @@ def _runs(which: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
     return np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
 
 
-def _distances(checker: CollisionChecker, q: Array) -> Iterator[Margin]:
-    """Yield slope and margin [m] of each approach of two bodies along postures (N, n)."""
+def _distances(checker: CollisionChecker, time: Array, states: Array) -> Iterator[Margin]:
+    """Yield the margin [m] of each approach of two bodies along states (3, N, n)."""
+    q = states[0]
     path = checker.path(q)
     n = q.shape[1]
     pairs = len(checker.required)
@@ -297,7 +325,8 @@ def _distances(checker: CollisionChecker, q: Array) -> Iterator[Margin]:
                 continue
             slope = np.zeros((3, n))
             slope[0] = (distance[:n] - distance[n:]) / (2.0 * _POSITION_STEP)
-            yield Margin(int(nearest), slope, here - (1 + _RESERVE) * checker.required[index])
+            left = here - checker.required[index] - _SPARE
+            yield Margin(float(time[nearest]), states[:, nearest], slope, left)
 
 
 def _motion(states: Array, period: float = 1.0) -> Motion:
