@@ -44,6 +44,7 @@ class Conduct:
         entitled: a motion was requested and accepted, and has not ended.
         stopping: a stop was asked for (or a long gap was, or too many replies were not accepted) in
             this interval.
+        held: a hold, or its end, was asked for in this interval; the bounds are those of a stop.
         overridden: a change of override was accepted in this interval.
         tally: how often each law was applied.
     """
@@ -60,6 +61,7 @@ class Conduct:
     usable: bool = True
     entitled: bool = False
     stopping: bool = False
+    held: bool = False
     overridden: bool = False
     barrier: bool = True
     sent: list[np.ndarray] = field(default_factory=list)
@@ -178,7 +180,7 @@ class Conduct:
         self.sent = []
         self.motor = None
         self.exiting = False
-        self.stopping = self.overridden = False
+        self.stopping = self.held = self.overridden = False
         self._count(what)
 
     def _count(self, what: str) -> None:
@@ -399,7 +401,7 @@ class Conduct:
         """
         lag = self._lag(target)
         slow = np.abs(self._last_step()).max() <= 4.0 * self.limits.standstill * (1 + 1e-6)
-        assert lag <= self.lag or slow or self.stopping, "a leap after lost answers"
+        assert lag <= self.lag or slow or self.stopping or self.held, "a leap after lost answers"
         self._lose(max(0, lag - self.lag))
         self.lag = self.lag if self.repeats and not lag else lag
 
@@ -412,7 +414,7 @@ class Conduct:
     def _factors(self) -> tuple[float, float]:
         """Return the factors on acceleration and jerk."""
         limits = self.limits
-        if self.stopping:
+        if self.stopping or self.held:
             return limits.stop_acceleration, limits.stop_jerk
         if self.overridden:
             return limits.override_acceleration, limits.override_jerk

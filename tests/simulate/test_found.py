@@ -226,6 +226,12 @@ SCATTERED_REPETITIONS = (100232,)  # they rejected one another in turn
 REFUSED_DURING_A_HOLD = (700132,)  # the run waited forever for the hold to be released
 CLOSED_WITH_THE_MOTION = (2000098,)  # the last cycles were not archived
 LOST_BEFORE_THE_WINDOW = (2000606,)  # the law counted a reply lost 123 cycles before others
+LOST_AFTER_A_HOLD = (2007201,)  # the law took a motion that had been resumed for one that stops
+MOTION_WITHOUT_ROWS = (2003736,)  # of half a second, too slow to fit: another scene is drawn
+WEAK_MOTORS = (
+    2006488,
+)  # where the arm stands, its straight way is beyond their currents: likewise
+RECORDED_AS_CORRUPT = (2002976,)  # one position of 280 was plausible: the law compared the estimate
 HALF_A_SECOND = (400869, 102383)  # see `TestHalfASecond`
 
 
@@ -244,6 +250,10 @@ HALF_A_SECOND = (400869, 102383)  # see `TestHalfASecond`
         *REFUSED_DURING_A_HOLD,
         *CLOSED_WITH_THE_MOTION,
         *LOST_BEFORE_THE_WINDOW,
+        *LOST_AFTER_A_HOLD,
+        *MOTION_WITHOUT_ROWS,
+        *WEAK_MOTORS,
+        *RECORDED_AS_CORRUPT,
         *HALF_A_SECOND,
     ],
 )

@@ -25,7 +25,11 @@ from hil.archive import writer
 from hil.campaign import Campaign, VirtualLink, link, operator_control
 from hil.campaign import folder as campaign_folder
 from hil.campaign.dry_run import DryRunRecord
-from hil.campaign.errors import MotionFailedError, RepetitionsRejectedError
+from hil.campaign.errors import (
+    MotionFailedError,
+    MotionRefusedError,
+    RepetitionsRejectedError,
+)
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.campaign.run import RunResult
@@ -535,6 +539,8 @@ def _check_usable(scene: Scene, life: Life) -> None:
         raise SceneError(f"{scene.words}: {error}")
     if isinstance(error, MotionFailedError) and Check.STANDSTILL.quantity in error.reason:
         raise SceneError(f"{scene.words}: {error}")
+    if isinstance(error, MotionRefusedError) and "jog the arm" in str(error):
+        raise SceneError(f"{scene.words}: {error}")  # where it stands, not by the scene's plan
     if result is None or not result.complete:
         how = f"{type(error).__name__}: {error}" if error is not None else "incomplete"
         raise UndisturbedError(f"{scene.words}: undisturbed, it ended {how}")
@@ -548,6 +554,8 @@ def _twin(scene: Scene, folder: Path) -> Twin:
     _check_usable(scene, life)
     estimate, why = estimated(folder)
     if estimate is None:
+        if "record a longer or faster motion" in why:
+            raise SceneError(f"{scene.words}: {why}")
         raise UndisturbedError(f"{scene.words}: complete, and not identified: {why}")
     if estimate.result.pooled.undetermined:
         raise SceneError(f"{scene.words}: its motion does not determine all parameters")

@@ -92,9 +92,10 @@ def _note(conduct: Conduct, what: str) -> None:
     """Apply a request, or the end of a motion."""
     if what in ("request", "ended"):
         conduct.entitled = what == "request"
-        conduct.stopping = False
-        conduct.overridden = False
-    elif what in ("stop", "hold", "resume"):
+        conduct.stopping = conduct.held = conduct.overridden = False
+    elif what == "stop":
         conduct.stopping = conduct.entitled
+    elif what in ("hold", "resume"):
+        conduct.held = conduct.entitled
     elif what == "override":
         conduct.overridden = True
