@@ -1,8 +1,8 @@
 """The estimate of a campaign uses its valid archives, and agrees with that without faults.
 
 Parameters are compared by `tests.laws.estimates`. Their degrees of freedom are few, since standard
-deviations come from some blocks of residuals. If nothing changed what is measured, the torques predicted
-by both models for the motion are compared as well. From m samples with white noise of standard
+deviations come from some blocks of residuals. If nothing changed what is measured, the torques that
+both models predict for the motion are compared as well. From m samples with white noise of standard
 deviation r, the predictions of models with p parameters differ by r sqrt(2 p / m) (rms); correlated
 residuals are in both covariances. `ALLOWED` times both together is the limit.
 """
