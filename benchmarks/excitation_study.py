@@ -40,12 +40,10 @@ from sim_fixtures.ns16 import CELL_PATH
 _PACE: Final = 1.25  # s for each via point
 
 
-def _longer(
-    settings: DesignSettings, via_points: int, steps: int, weight: float = 0.75
-) -> DesignSettings:
+def _longer(settings: DesignSettings, via_points: int, steps: int) -> DesignSettings:
     """Return settings of a longer motion, improved by some steps from one start."""
     return settings.replaced(
-        search={"gradient": steps, "starts": 1, "weights": (weight, 1.0 - weight)},
+        search={"gradient": steps, "starts": 1},
         via_points={"n_via": via_points},
         constraints={"max_duration": _PACE * via_points},
     )
@@ -56,7 +54,7 @@ CASES: Final[dict[str, DesignSettings]] = {
     "gradient": preset("gradient").kinematic(),
     "gradient, all constraints": preset("gradient"),
     "gradient, 60 via points": _longer(preset("gradient").kinematic(), 60, 75),
-    "gradient, all constraints, 32 via points": _longer(preset("gradient"), 32, 110, 0.8),
+    "gradient, all constraints, 36 via points": _longer(preset("gradient"), 36, 110),
     "front": preset("front").kinematic(),
     "+ motor currents": preset("front").replaced(
         constraints={"closed": True, "collision": True, "current": True}
