@@ -720,7 +720,7 @@ class TestExcludedRows:
             np.testing.assert_array_equal(mask.reasons[REVERSAL][:, joint], turning)
 
     @pytest.mark.parametrize("rate", [50.0, RATE, 2.0 * RATE, 1000.0])
-    def test_a_reversal_excludes_as_much_time_as_in_recordings_averaged_for_the_choice(self, rate):
+    def test_a_reversal_excludes_as_much_time_at_any_rate(self, rate):
         time = np.arange(0.0, 2.0, 1.0 / rate)
         position = np.stack((np.sin(3.0 * time), np.cos(3.0 * time)), axis=1)
         velocity = 3.0 * np.stack((np.cos(3.0 * time), -np.sin(3.0 * time)), axis=1)
