@@ -177,7 +177,7 @@ def _step(
         cones,
         settings,
     ).solve()
-    if solution.status == clarabel.SolverStatus.PrimalInfeasible and caution > 0.0:
+    if solution.status != clarabel.SolverStatus.Solved and caution > 0.0:
         return _step(bundle, genes, fitness, box, 0.0)
     optimum = np.array(solution.x)
     if not np.all(np.isfinite(optimum)):

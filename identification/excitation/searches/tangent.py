@@ -80,14 +80,11 @@ class Margins(NamedTuple):
     @classmethod
     def of(cls, margins: Sequence[Margin], n: int) -> Self:
         """Stack the margins of an arm of n joints."""
-        states, slope = (
-            np.array(each).reshape(-1, 3, n).transpose(1, 0, 2)
-            for each in ([m.states for m in margins], [m.slope for m in margins])
-        )
-        time, left = (
-            np.array(each) for each in ([m.time for m in margins], [m.left for m in margins])
-        )
-        return cls(time, states, slope, left)
+        time = np.array([margin.time for margin in margins])
+        states = np.array([margin.states for margin in margins]).reshape(-1, 3, n)
+        slope = np.array([margin.slope for margin in margins]).reshape(-1, 3, n)
+        left = np.array([margin.left for margin in margins])
+        return cls(time, states.transpose(1, 0, 2), slope.transpose(1, 0, 2), left)
 
 
 @dataclass(frozen=True, eq=False)
