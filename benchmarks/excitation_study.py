@@ -40,10 +40,12 @@ from sim_fixtures.ns16 import CELL_PATH
 _PACE: Final = 1.25  # s for each via point
 
 
-def _longer(settings: DesignSettings, via_points: int, steps: int) -> DesignSettings:
+def _longer(
+    settings: DesignSettings, via_points: int, steps: int, weight: float = 0.75
+) -> DesignSettings:
     """Return settings of a longer motion, improved by some steps from one start."""
     return settings.replaced(
-        search={"gradient": steps, "starts": 1},
+        search={"gradient": steps, "starts": 1, "weights": (weight, 1.0 - weight)},
         via_points={"n_via": via_points},
         constraints={"max_duration": _PACE * via_points},
     )
@@ -53,7 +55,7 @@ CASES: Final[dict[str, DesignSettings]] = {
     "B (eq. 7)": preset("b").kinematic(),
     "gradient": preset("gradient").kinematic(),
     "gradient, all constraints": preset("gradient"),
-    "gradient, 60 via points": _longer(preset("gradient").kinematic(), 60, 75),
+    "gradient, 60 via points": _longer(preset("gradient").kinematic(), 60, 75, 0.8),
     "gradient, all constraints, 36 via points": _longer(preset("gradient"), 36, 110),
     "front": preset("front").kinematic(),
     "+ motor currents": preset("front").replaced(
