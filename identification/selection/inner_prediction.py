@@ -424,8 +424,8 @@ def _rows_for_motion(
     """Choose among the candidates that predict all rows as well by the rows in motion.
 
     Static friction holds a joint at rest with any torque: its rows cannot be predicted, and decide
-    the error over all rows. Fitted, they spoil the friction at speed. Any significant gain decides:
-    friction that is wrong by its interval changes the error of prediction by a hundredth.
+    the error over all rows. Fitted, they spoil the friction at speed. Any gain above its standard
+    error decides: friction that is wrong by its interval changes the prediction by a hundredth.
     """
     limit = trial.errors(now).overall * (1.0 + WORTHWHILE)
     others = [each for each in candidates if each != now and trial.errors(each).overall < limit]

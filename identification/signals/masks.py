@@ -125,7 +125,8 @@ def mask_rows(
     reversal = near_any_reversal(model, motion, REVERSAL_PERIODS / bandwidth)
     reasons = {EDGE: np.broadcast_to(edge[:, None], shape)}
     # Errors of velocity and delay turn dry friction there, always to less of it at low speed.
-    reach = max(0.0, 0.5 * TURN - float(np.median(np.diff(recording.time))))
+    # Half a period less, so that it ends between two rows.
+    reach = max(0.0, 0.5 * (TURN - float(np.median(np.diff(recording.time)))))
     turning = near_any_reversal(model, motion, np.full(shape[1], reach))
     halts = long_rests(motion.time, still)
     if left_out == "rests":

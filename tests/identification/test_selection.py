@@ -460,7 +460,7 @@ class TestChosenSettings:
     def test_rests_that_no_law_predicts_are_not_fitted(self, noise, least, most):
         """They decide the error over all rows, and say nothing of the friction in motion.
 
-        A significant gain in motion decides, be it as small as the second one.
+        A gain in motion above its standard error decides, be it as small as the second one.
         """
         motion, standing = a_motion_with_halts(LONG)
         recording = a_recording(motion=motion, noise=noise)

@@ -7,6 +7,7 @@ import hashlib
 import math
 import os
 import random
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -539,7 +540,9 @@ def _check_usable(scene: Scene, life: Life) -> None:
         raise SceneError(f"{scene.words}: {error}")
     if isinstance(error, MotionFailedError) and Check.STANDSTILL.quantity in error.reason:
         raise SceneError(f"{scene.words}: {error}")
-    if isinstance(error, MotionRefusedError) and "jog the arm" in str(error):
+    if isinstance(error, MotionRefusedError) and re.search(
+        r"current of motor .* jog the arm", str(error)
+    ):
         raise SceneError(f"{scene.words}: {error}")  # where it stands, not by the scene's plan
     if result is None or not result.complete:
         how = f"{type(error).__name__}: {error}" if error is not None else "incomplete"

@@ -98,8 +98,7 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
         trial_scores = ascent.score(tried.copy())
         values = np.where(trial_scores.usable, ascent.fitness(trial_scores), -np.inf)
         index = int(np.argmax(values))
-        least = 0.0 if failures >= _PATIENCE else _SHARE * max(gain, 0.0)
-        if values[index] > value + least:
+        if values[index] > value + _SHARE * max(gain, 0.0):
             if values[index] - value > 0.5 * gain:
                 box = min(1.5 * box, _WIDEST)
             best = (tried[index].copy(), trial_scores.take(index))

@@ -281,14 +281,24 @@ def _loads(currents: CurrentModel, motion: Motion) -> Iterator[Margin]:
     n = chosen.shape[2]
     steps = np.repeat([[_POSITION_STEP], [_VELOCITY_STEP], [_ACCELERATION_STEP]], n, axis=1)
     slope = np.zeros((len(sample), 3, n))
+    reversing = _near_reversal(currents, chosen[1])
     for kind, joint, above, below, gap in _neighbours(chosen, steps):
         change = (currents.loads(_motion(above)) - currents.loads(_motion(below))) / gap
         if kind == 1:  # no slope where sgn(qd) jumps
-            change[np.abs(chosen[1, :, joint]) <= _VELOCITY_STEP] = 0.0
+            change[reversing[:, joint]] = 0.0
         slope[:, kind, joint] = -change[row, column]
     for peak, at, which, place in zip(slope, sample, column, row, strict=True):
         left = float(1.0 - _RESERVE - loads[at, which])
         yield Margin(float(motion.time[at]), chosen[:, place], peak, left)
+
+
+def _near_reversal(currents: CurrentModel, velocity: Array) -> NDArray[np.bool_]:
+    """Return which joints (k, n), or coupled motors that they move, are as slow as a step."""
+    slow = np.abs(velocity) <= _VELOCITY_STEP
+    for share in currents.model.friction.motor_speeds():
+        motor = np.abs(velocity @ share) <= _VELOCITY_STEP * np.abs(share).max()
+        slow |= motor[:, None] & (share != 0.0)
+    return slow
 
 
 def _runs(which: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
