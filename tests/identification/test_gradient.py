@@ -227,14 +227,14 @@ def test_slopes_of_a_load_are_those_of_its_peak(population, seed):
     np.testing.assert_allclose(linear_model.rows[peak], expected, atol=0.1)
 
 
-def test_a_cautious_step_stays_away_from_the_bounds():
+def test_a_step_backs_off_from_the_bounds():
     """By a share of what the box would change of each margin, unless no step can."""
     gradient = np.array([1.0, 0.0])
     genes = np.full(2, 0.5)
 
-    def step(rows, left, caution):
+    def step(rows, left, backoff):
         slopes = Linearisation(gradient, np.array(rows), np.array(left))
-        return _step([_Cut(genes, 0.0, slopes)], genes, 0.0, 0.1, caution)[0]
+        return _step([_Cut(genes, 0.0, slopes)], genes, 0.0, 0.1, backoff)[0]
 
     bound = [[-1.0, 0.0]], [0.05]
     np.testing.assert_allclose(step(*bound, 0.0), [0.05, 0.0], atol=1e-6)

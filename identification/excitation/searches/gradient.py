@@ -7,7 +7,7 @@ since criterion and duration have kinks: the slowest joint sets the time of a mo
 
 over changes d of the genes in a box, with the linearised constraints of all motions i of the
 bundle. A step that fails adds the linearisation there; after one that breaks a constraint the next
-ones keep away from all bounds by a share of what the box would change.
+ones back off from all bounds, by a share of what the box would change.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _NONCONVEX: Final = 5.0  # least offset of the linearisation at a distance of 1
 _BUNDLE_SIZE: Final = 20  # linearisations in the bundle
 _SHARE: Final = 0.05  # of the predicted gain that makes a step
 _PATIENCE: Final = 4  # failures before the box is made smaller
-_CAUTION: Final = 0.1  # by which each infeasible step raises the share of margins that is kept
-_MOST_CAUTION: Final = 0.5
+_BACKOFF: Final = 0.1  # from the bounds; by so much more after each infeasible step
+_MOST_BACKOFF: Final = 0.5
 _FRACTIONS: Final = np.array((1.0, 0.4))  # of a step that are scored
 
 TRIED: Final = len(_FRACTIONS)
@@ -84,7 +84,7 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
         return best
     bundle = [_Cut(best[0], value, slopes)]
     failures = 0
-    caution = 0.0
+    backoff = 0.0
     box = _BOX
     for _ in range(steps):
         if box < _SMALLEST or ascent.stop():
@@ -93,7 +93,7 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
         here = next(cut for cut in bundle if cut.genes is centre)
         near = [c for c in bundle if c is not here and np.abs(c.genes - centre).max() <= 2 * box]
         bundle = [here, *near[-_BUNDLE_SIZE:]]
-        change, gain = _step(bundle, centre, value, box, caution)
+        change, gain = _step(bundle, centre, value, box, backoff)
         tried = np.clip(centre + _FRACTIONS[:, None] * change, 0.0, 1.0)
         trial_scores = ascent.score(tried.copy())
         values = np.where(trial_scores.usable, ascent.fitness(trial_scores), -np.inf)
@@ -104,7 +104,7 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
             best = (tried[index].copy(), trial_scores.take(index))
             value = values[index]
             failures = 0
-            caution *= 0.5
+            backoff *= 0.5
             slopes = ascent.linearise(best[0], best[1])
             if slopes is None:
                 break
@@ -112,7 +112,7 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
             continue
         failures += 1
         if not np.any(trial_scores.feasible):
-            caution = min(caution + _CAUTION, _MOST_CAUTION)
+            backoff = min(backoff + _BACKOFF, _MOST_BACKOFF)
         refused = _refused(ascent, tried[0].copy(), trial_scores.take(0))
         if refused is not None:
             bundle.append(refused)
@@ -132,11 +132,11 @@ def _refused(ascent: Ascent, genes: Array, scores: Scores) -> _Cut | None:
 
 
 def _step(
-    bundle: list[_Cut], genes: Array, fitness: float, box: float, caution: float
+    bundle: list[_Cut], genes: Array, fitness: float, box: float, backoff: float
 ) -> tuple[Array, float]:
     """Return the change of genes (n_genes,) with the best of the model, and its predicted gain.
 
-    Of each margin the share `caution` of its largest change in the box is kept.
+    Each margin stays above the share `backoff` of its largest change in the box.
     """
     import clarabel  # slow to import
 
@@ -145,7 +145,7 @@ def _step(
     rows = np.concatenate([-cut.slopes.rows for cut in bundle])
     left = np.concatenate([np.maximum(cut.left(genes), 0.0) for cut in bundle])
     reach = box * np.abs(rows).sum(axis=1)
-    left -= caution * reach
+    left -= backoff * reach
     within = left < reach  # the others hold in all of the box
     rows = rows[within]
     left = left[within]
@@ -176,7 +176,7 @@ def _step(
         cones,
         settings,
     ).solve()
-    if solution.status != clarabel.SolverStatus.Solved and caution > 0.0:
+    if solution.status != clarabel.SolverStatus.Solved and backoff > 0.0:
         return _step(bundle, genes, fitness, box, 0.0)
     optimum = np.array(solution.x)
     if not np.all(np.isfinite(optimum)):

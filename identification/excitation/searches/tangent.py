@@ -8,7 +8,6 @@ change with a gene follows from the interpolator, which plans each gene with a s
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol, Self
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.collision import CollisionChecker
-from identification.excitation.constraints import Constraints, CurrentModel, sampled
+from identification.excitation.constraints import Constraints, CurrentModel, midpoints, sampled
 from identification.excitation.criteria import Objective
 from identification.excitation.genomes import Genome, ViaPointGenome
 from identification.excitation.searches.local_change import Change, PlannedMoves
@@ -70,12 +69,11 @@ class Margin(NamedTuple):
 
 
 class Margins(NamedTuple):
-    """The margins of a motion, (c,) each."""
+    """Times, states and slopes of the c margins of a motion."""
 
-    time: Array  # s
+    time: Array  # (c,) [s]
     states: Array  # (3, c, n)
     slope: Array  # (3, c, n)
-    left: Array
 
     @classmethod
     def of(cls, margins: Sequence[Margin], n: int) -> Self:
@@ -83,8 +81,7 @@ class Margins(NamedTuple):
         time = np.array([margin.time for margin in margins])
         states = np.array([margin.states for margin in margins]).reshape(-1, 3, n)
         slope = np.array([margin.slope for margin in margins]).reshape(-1, 3, n)
-        left = np.array([margin.left for margin in margins])
-        return cls(time, states.transpose(1, 0, 2), slope.transpose(1, 0, 2), left)
+        return cls(time, states.transpose(1, 0, 2), slope.transpose(1, 0, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,11 +131,6 @@ class Linearisation(NamedTuple):
     left: Array  #: the margins (1 + c,); negative if violated
 
 
-def n_samples(duration: float) -> int:
-    """Return the number N of samples of a motion of a duration [s]."""
-    return max(_FEWEST_SAMPLES, math.ceil(duration / _SAMPLE_PERIOD))
-
-
 def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent:
     """Return the slopes of `weights` (d,) times the criteria, and of the margins, by the states.
 
@@ -150,10 +142,9 @@ def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent
     (motion,) = problem.genome.motions(genes[None])
     if isinstance(motion, PlannerError):
         raise motion
-    count = n_samples(motion.duration)
-    period = motion.duration / count
-    time = (np.arange(count, dtype=np.float64) + 0.5) * period
-    states = np.array(motion.sample(time))
+    middles = midpoints(motion, min(_SAMPLE_PERIOD, motion.duration / _FEWEST_SAMPLES))
+    time = middles.time
+    states = np.array(middles[1:4])
     constraints = problem.constraints
     # Steps of velocity as wide as its change between two samples: sgn(qd) jumps between them.
     swing = np.abs(np.diff(states[1], axis=0)).max(axis=0)
@@ -170,8 +161,9 @@ def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent
         margins += _loads(constraints.currents, sampled(motion, problem.period))
     if constraints.checker is not None:
         margins += _distances(constraints.checker, time, states)
-    criterion, values, by_duration = _excitation(problem.objective, states, steps, weights, period)
-    stacked = Margins.of(margins, n)
+    criterion, values, by_duration = _excitation(
+        problem.objective, states, steps, weights, motion.duration / len(time)
+    )
     longest = (1.0 - _RESERVE) * constraints.max_duration
     return Tangent(
         time=time,
@@ -180,8 +172,8 @@ def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent
         criterion=criterion,
         values=values,
         by_duration=by_duration,
-        margins=stacked,
-        left=np.concatenate(([longest - motion.duration], stacked.left)),
+        margins=Margins.of(margins, n),
+        left=np.array([longest - motion.duration, *(margin.left for margin in margins)]),
         moves=PlannedMoves.of(problem.genome, genes, motion),
     )
 
