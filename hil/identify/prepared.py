@@ -6,7 +6,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -17,7 +17,13 @@ from hil.cell.robot import ripples
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter, Silent
 from identification.errors import IdentificationError
-from identification.estimators.delay import LONGEST_DELAY, DelayEstimate, estimate_delay
+from identification.estimators.delay import (
+    CLOSED_LOOP_BIAS,
+    LONGEST_DELAY,
+    CombinedDelay,
+    DelayEstimate,
+    estimate_delay,
+)
 from identification.estimators.torque_channel import possible_low_passes
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
@@ -165,13 +171,10 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
         delay = _DelayChoice.of(_delays(loaded, stated, options, reporter), loaded, stated, options)
         chosen = delay.applied_to(chosen)
     estimate, notes = delay.confirmed_by(chosen.preprocessing)
-    variance = 0.0
-    if delay.doubt and chosen.preprocessing.torque_delay == stated.stated_delay:
-        variance = delay.doubt
-        notes += delay.contradiction if estimate is not None else ()
-    elif estimate is not None and notes and chosen.preprocessing.torque_delay == estimate.applied:
-        variance = estimate.variance
-    return Decided(replace(chosen, delay_variance=variance), estimate, notes)
+    error = delay.errors.get(chosen.preprocessing.torque_delay, 0.0)
+    if estimate is None and sources.cell.file.controller is None:
+        error = 0.0  # the lag of a low-pass
+    return Decided(replace(chosen, delay_variance=error), estimate, notes)
 
 
 def renewed_delay_variance(sources: Sources, settings: Settings, options: Options) -> float:
@@ -188,9 +191,15 @@ def renewed_delay_variance(sources: Sources, settings: Settings, options: Option
     if estimate is None:
         return settings.delay_variance
     used = settings.preprocessing.torque_delay
-    is_controllers = sources.cell.file.controller is not None and used == stated.stated_delay
-    bound = Thresholds().delay * estimate.cycle if is_controllers else LONGEST_DELAY
-    return estimate.mean_square_error(used, bound)
+    if sources.cell.file.controller is None:
+        return estimate.combined(used, LONGEST_DELAY).mean_square_error(used)
+    return _with_stated(estimate, settings.stated_delay).mean_square_error(used)
+
+
+def _with_stated(estimate: DelayEstimate, stated: float) -> CombinedDelay:
+    """Return the delay by an estimate and by what is stated of a controller [s]."""
+    bound, bias = (share * estimate.cycle for share in (Thresholds().delay, CLOSED_LOOP_BIAS))
+    return estimate.combined(stated, bound, bias)
 
 
 def _as_stated(sources: Sources, options: Options) -> tuple[Sources, Settings]:
@@ -215,18 +224,8 @@ class _DelayChoice:
     assumed: float  # that the choice begins with [s]
     suggested: tuple[SuggestedDelay, ...]  # that it may choose as well
     notes: tuple[str, ...]
-    doubt: float = 0.0  # mean square error of a controller's stated delay, by the estimate [s²]
-
-    @property
-    def contradiction(self) -> tuple[str, ...]:
-        """The note on a stated delay that the estimate contradicts."""
-        estimate = self.estimate
-        if estimate is None or not (estimate.significant and estimate.determined):
-            return ()
-        return (
-            f"the intervals allow for a delay of {estimate.delay * 1e3:.3g} ms, which the "
-            f"data show, beside the stated {self.assumed * 1e3:.3g} ms",
-        )
+    #: mean square error of a delay that is used, by its value [s²]
+    errors: Mapping[float, float] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -239,22 +238,28 @@ class _DelayChoice:
         described = _described(estimate)
         if options.delay == "auto":
             if not estimate.significant:
-                return replace(unused, notes=described)
+                return replace(unused, notes=described, errors={unused.assumed: estimate.variance})
             notes = (*described, _compensated(estimate.delay))
-            return replace(unused, assumed=estimate.delay, notes=notes)
-        # A controller's delay is known; the estimate replaces it only if well determined and
-        # different by more than its bias in closed loop.
-        bound = Thresholds().delay * estimate.cycle
-        far = abs(estimate.delay - estimate.assumed) > bound
+            errors = {estimate.delay: estimate.variance}
+            return replace(unused, assumed=estimate.delay, notes=notes, errors=errors)
         if options.delay is not None:
             return unused
+        applied, error = estimate.delay, estimate.variance
         if sources.cell.file.controller is not None:
-            unused = replace(unused, doubt=estimate.mean_square_error(unused.assumed, bound))
-            if not (far and estimate.determined):
-                return unused
-        delay = SuggestedDelay(estimate.delay, estimate.determined)
-        suggested = (delay,) if estimate.significant else ()
-        return replace(unused, suggested=suggested, notes=described)
+            combined = _with_stated(estimate, stated.stated_delay)
+            applied, error = combined.mean, combined.variance
+            # Inner prediction decides on an estimate that is far from the stated delay.
+            bound = Thresholds().delay * estimate.cycle
+            if not estimate.determined or abs(estimate.delay - stated.stated_delay) <= bound:
+                notes = _combined_notes(described, stated.stated_delay, applied)
+                return replace(unused, assumed=applied, notes=notes, errors={applied: error})
+            unapplied = combined.mean_square_error(stated.stated_delay)
+            unused = replace(unused, errors={stated.stated_delay: unapplied})
+        if not estimate.significant:
+            return replace(unused, notes=described, errors={unused.assumed: error, **unused.errors})
+        delay = SuggestedDelay(applied, estimate.determined)
+        errors = {**unused.errors, applied: error}
+        return replace(unused, suggested=(delay,), notes=described, errors=errors)
 
     def applied_to(self, chosen: Settings) -> Settings:
         """Return settings with the determined delay, whatever others they were chosen beside."""
@@ -293,6 +298,13 @@ class _DelayChoice:
 
 def _compensated(delay: float) -> str:
     return f"a delay of {delay * 1e3:.3g} ms of all axes was compensated"
+
+
+def _combined_notes(described: Sequence[str], stated: float, applied: float) -> tuple[str, ...]:
+    """Return the notes on a delay by a controller's stated one and an estimate."""
+    if applied == stated:
+        return tuple(described)
+    return described[0], f"{_compensated(applied)}, by this and the stated {stated * 1e3:.3g} ms"
 
 
 def carried_over(settings: Settings, sources: Sources, options: Options) -> Settings:

@@ -58,6 +58,9 @@ _FOLDS: Final = 5
 _BLOCKS: Final = 80  # blocks of time
 _ROWS_AT_ONCE: Final = 8192
 _CHANCE: Final = 0.005  # one-sided probability of a false delay
+CLOSED_LOOP_BIAS: Final = 0.2
+"""Standard deviation of an estimate's error beside its interval, in cycles of a controller: encoder
+noise, elastic gears. Six simulated NS 16 with effects: 0.05 to 0.32, on average 0.17."""
 
 
 def read_at(time: Array, values: Array, at: Array) -> Array:
@@ -132,6 +135,18 @@ def with_uncertain_delay(
     )
 
 
+@dataclass(frozen=True)
+class CombinedDelay:
+    """Delay of the torque of all axes by an estimate and a stated value."""
+
+    mean: float  # [s]
+    variance: float  # [s²]
+
+    def mean_square_error(self, used: float) -> float:
+        """Return the mean square error of a delay that is used [s²]."""
+        return (self.mean - used) ** 2 + self.variance
+
+
 @dataclass(frozen=True, eq=False)
 class DelayEstimate:
     """Delay of the torque of all axes relative to the position."""
@@ -168,18 +183,29 @@ class DelayEstimate:
         """
         return float(np.fmin(self.std**2, LONGEST_DELAY**2 / 3.0))
 
-    def mean_square_error(self, used: float, bound: float) -> float:
-        """Return the mean square error of a delay that is used [s²].
+    def combined(self, stated: float, bound: float, bias: float = 0.0) -> CombinedDelay:
+        """Return the delay by this estimate and by a stated value together [s].
 
-        Before the data the true one is as likely anywhere within the bound, either way [s]: a
-        Gaussian of that variance is multiplied by the estimate, whether significant or not. A
-        minimum at a limit, or beside another one, tells nothing.
+        Without the estimate the true one is as likely anywhere within the `bound` of the stated
+        value, either way: a Gaussian of that variance is multiplied by the estimate, whether
+        significant or not. Or else, as likely, the stated value is wrong, which takes a determined
+        estimate. `bias` is a standard deviation beside that of the estimate. A minimum at a limit,
+        or beside another one, tells nothing.
         """
-        prior = bound**2 / 3.0
+        near = bound**2 / 3.0
         if not self.determined and self.half_interval <= WIDEST_INTERVAL:
-            return prior
-        mean = prior / (prior + self.std**2) * (self.delay - used)
-        return mean**2 + 1.0 / (1.0 / prior + 1.0 / self.std**2)
+            return CombinedDelay(stated, near)
+        variance = self.std**2 + bias**2
+        difference = self.delay - stated
+        priors = np.array([near, LONGEST_DELAY**2 / 3.0] if self.determined else [near])
+        spreads = priors + variance
+        shares = priors / spreads
+        logarithms = -0.5 * (difference**2 / spreads + np.log(spreads))
+        odds = np.exp(logarithms - logarithms.max()) if self.determined else np.ones(1)
+        odds /= odds.sum()
+        mean = float(odds @ shares) * difference
+        variances = 1.0 / (1.0 / priors + 1.0 / variance) + (shares * difference - mean) ** 2
+        return CombinedDelay(stated + mean, float(odds @ variances))
 
     def describe(self) -> str:
         """Return the result as a sentence."""

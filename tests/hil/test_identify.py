@@ -173,17 +173,22 @@ class TestCampaign:
         assert without.results.consistency is without.results.essential is None
 
 
-def test_a_stated_delay_that_data_contradict_widens_intervals(campaign):
-    """By less than a cycle: the estimate is not that accurate, so that the stated one is used."""
+@pytest.mark.parametrize("wrong_by", [-0.35, 1.5])
+def test_a_stated_delay_that_data_contradict_is_corrected(campaign, wrong_by):
+    """In cycles; the interval allows for what is left."""
     sources = gather_sources(paths(campaign), 0.7)
+    period = sources.cell.period
     right = sources.cell.file.controller.current_delay_cycles
-    settings = decide(sources, Options(), Silent()).settings
-    assert 0.0 < np.sqrt(settings.delay_variance) / sources.cell.period < 0.3
-    wrong = sources.cell.with_values({"controller.current_delay_cycles": right - 0.35})
+    wrong = sources.cell.with_values({"controller.current_delay_cycles": right + wrong_by})
     chosen = decide(replace(sources, cell=wrong), Options(), Silent())
-    assert chosen.settings.preprocessing.torque_delay == stated_delay(wrong)
-    assert 0.3 < np.sqrt(chosen.settings.delay_variance) / wrong.period < 0.7
-    assert any("allow for a delay of" in note for note in chosen.notes)
+    assert any("was compensated" in note for note in chosen.notes)
+    error = chosen.settings.preprocessing.torque_delay - right * period
+    uncertainty = np.sqrt(chosen.settings.delay_variance)
+    assert 0.1 * period < uncertainty < 0.3 * period
+    assert abs(error) < 2.0 * uncertainty
+    stated = Options(delay="stated")
+    fixed = decide(replace(sources, cell=wrong), stated, Silent()).settings
+    assert fixed.preprocessing.torque_delay == stated_delay(wrong)
 
 
 def test_other_recordings_renew_the_error_of_a_chosen_delay(campaign):
@@ -193,9 +198,12 @@ def test_other_recordings_renew_the_error_of_a_chosen_delay(campaign):
     settings = decide(first, Options(), Silent()).settings
     again = renewed_delay_variance(first, settings, Options())
     assert again == pytest.approx(settings.delay_variance)
-    by_all = decide(sources, Options(), Silent()).settings.delay_variance
-    assert by_all != pytest.approx(again)
-    assert renewed_delay_variance(sources, settings, Options()) == pytest.approx(by_all)
+    by_all = decide(sources, Options(), Silent()).settings
+    assert by_all.delay_variance != pytest.approx(again)
+    difference = by_all.preprocessing.torque_delay - settings.preprocessing.torque_delay
+    assert renewed_delay_variance(sources, settings, Options()) == pytest.approx(
+        by_all.delay_variance + difference**2
+    )
     known = replace(settings, delay_variance=0.0)
     assert renewed_delay_variance(sources, known, Options()) == 0.0
 

@@ -1311,20 +1311,32 @@ class TestDelay:
         assert every.delay == pytest.approx(1.6e-3, abs=1.5 * every.half_interval)
         assert every.half_interval < 0.7 * single.half_interval
 
-    def test_the_error_of_a_delay_that_is_used_needs_no_significance(self):
-        """Between what the estimate says and what was believed before, as each is certain."""
+    def test_it_is_combined_with_a_stated_delay_by_their_certainty(self):
+        """Between the two, significant or not; a stated one that is impossible does not count."""
         estimate = DelayEstimate(
             delay=3e-4, std=1e-9, assumed=0.0, cycle=1e-3, interval_factor=2.0, reason=None,
             significant=False,
         )  # fmt: skip
-        assert estimate.mean_square_error(0.0, 1e-3) == pytest.approx(3e-4**2)
-        assert estimate.mean_square_error(3e-4, 1e-3) < 1e-17
+        certain = estimate.combined(0.0, 1e-3)
+        assert certain.mean == pytest.approx(3e-4)
+        assert certain.mean_square_error(0.0) == pytest.approx(3e-4**2)
+        assert certain.mean_square_error(3e-4) < 1e-17
         believed = 1e-3**2 / 3.0
-        equal = replace(estimate, std=np.sqrt(believed))
-        assert equal.mean_square_error(0.0, 1e-3) == pytest.approx(1.5e-4**2 + believed / 2.0)
+        for equal in (
+            replace(estimate, std=np.sqrt(believed)).combined(0.0, 1e-3),
+            estimate.combined(0.0, 1e-3, bias=np.sqrt(believed)),
+        ):
+            assert equal.mean == pytest.approx(1.5e-4, rel=0.05)
+            assert equal.mean_square_error(0.0) == pytest.approx(
+                1.5e-4**2 + believed / 2.0, rel=0.06
+            )
+        far = replace(estimate, delay=5e-3, std=1e-4).combined(0.0, 1e-3)
+        assert far.mean == pytest.approx(5e-3, abs=1e-5)
+        assert far.variance == pytest.approx(1e-4**2, rel=0.01)
         for std, reason in ((np.inf, "not separated"), (1e-4, "at a limit")):
-            unknown = replace(estimate, std=std, reason=reason)
-            assert unknown.mean_square_error(0.0, 1e-3) == pytest.approx(believed)
+            unknown = replace(estimate, std=std, reason=reason).combined(0.0, 1e-3)
+            assert unknown.mean == 0.0
+            assert unknown.variance == pytest.approx(believed)
 
     def test_a_delay_beyond_the_range_is_undetermined(self):
         estimate = estimate_delay(delayed(0.06), MODEL)

@@ -142,7 +142,8 @@ class DelayFacts:
         beyond = max(limits.delay * delays.cycle, SIGMAS * delays.std)
         differs = abs(delays.delay - assumed) > beyond
         outcome: _DelayOutcome | None = None
-        if delays.significant and assumed == delays.applied:
+        replaced = abs(assumed - delays.assumed) > limits.delay * delays.cycle
+        if delays.significant and (assumed == delays.applied or replaced):
             outcome = "compensated"
         elif delays.determined and not poor:
             outcome = "differs" if differs else "as assumed"
@@ -187,10 +188,12 @@ class DelayFacts:
                 "cause",
             )
         elif self.outcome == "as assumed":
+            used = "" if self.assumed == self.stated else f", {self.assumed:.3g} ms in the fit"
             yield Finding(
                 "delay",
                 "good",
-                f"the delay of the torque is as assumed: {estimate} ({self.stated:.3g} ms assumed)",
+                f"the delay of the torque is as assumed: {estimate} ({self.stated:.3g} ms"
+                f" assumed{used})",
             )
 
 
