@@ -27,6 +27,7 @@ from benchmarks import parser_of, processor_time, show
 from hil.cell import Cell
 from hil.design.problem import problem_of, search_settings
 from hil.design.settings import DesignSettings, preset
+from hil.errors import InputError
 from identification.excitation import (
     RESCORE_PERIOD,
     NoFeasibleMotionError,
@@ -135,7 +136,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = []
     for name in options.only:
         for seed in range(1, options.seeds + 1):
-            rows.append(run(cell, name, seed, **effort))
+            try:
+                rows.append(run(cell, name, seed, **effort))
+            except InputError as error:
+                parser.error(str(error))
             if not options.json:
                 print(*(f"{key} {value}" for key, value in rows[-1].items()), sep=", ", flush=True)
     show({"rows": rows}, only_json=True)

@@ -20,21 +20,19 @@ from hil.plots.plan_picture import draw_motion
 from hil.report.chart import label
 from identification.excitation import (
     CRITERIA,
+    RESCORE_PERIOD,
     Design,
+    Objective,
     correlation,
     coupling_index,
     coupling_index_max,
-    information,
+    midpoints,
 )
-from identification.excitation.constraints import sampled
-from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from planner import Trajectory
 
 Array = NDArray[np.float64]
 
-_PERIOD: Final = 0.001
-"""Sampling period of the correlations, s."""
 _WHITE: Final[dict[str, Any]] = {"linestyle": "none", "markerfacecolor": "white"}
 # inch
 _WIDTH = 11.8
@@ -87,9 +85,7 @@ def draw_front(axes: Axes, design: Design) -> None:
 
 def draw_correlation(axes: Axes, trajectory: Trajectory, model: RobotModel) -> None:
     """Draw ``|psi_ij| / sqrt(psi_ii psi_jj)`` of the base parameters, 0 white, 1 black."""
-    motion = sampled(trajectory, _PERIOD)
-    unknown = np.zeros_like(motion.position)  # the criteria do not depend on torque
-    gram = information(Factor.from_samples(model, motion, unknown))
+    gram = Objective(model).information(midpoints(trajectory, RESCORE_PERIOD))
     names = model.base.names
     p = model.n_parameters
     matrix = np.abs(correlation(gram)[: len(names), : len(names)])
