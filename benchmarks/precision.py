@@ -11,7 +11,8 @@ Four independent parts, each with its number of seeds:
   that every repetition has: coverage of all intervals when the rule has stopped, and after six
   repetitions without looking. Required are 1.1 times the intervals after six repetitions.
 - ``--weighings N``: loads of `benchmarks.payload` weighed by payload campaigns of the NS 16 in
-  virtual time, scaled to 3 to 12 kg, with one design for 12 kg, until ``--require-mass`` is met.
+  virtual time, scaled to 3 to 12 kg, with one design for 12 kg, until ``--require-mass`` is met, or
+  after ``--pairs`` of a bare and a loaded motion.
 - ``--payloads N``: loads of `benchmarks.payload` weighed without a bare recording, against the
   model of three bare recordings of other motions. Friction differs by 4 % between recordings.
 """
@@ -305,13 +306,14 @@ def payloads(count: int) -> dict[str, Any]:
     }
 
 
-def weighings(count: int, required: str) -> dict[str, Any]:
+def weighings(count: int, required: str, most: int) -> dict[str, Any]:
     """Weigh loads of 3 to 12 kg by payload campaigns of the NS 16 in virtual time, 12 kg assumed.
 
+    Each ends when it is precise, after at most so many pairs of a bare and a loaded motion.
     The arm is as modelled: its currents have noise, its servo errors, and it has no other effects.
     """
     requirements = requirements_from([required])
-    cell = Cell.load(CELL_PATH).with_campaign(repetitions=_MOST)
+    cell = Cell.load(CELL_PATH).with_campaign(repetitions=most)
     cell = cell.with_values({"campaign.approach_speed": 1.0, "campaign.standstill_s": 1.0})
     assumed = assumed_payload(cell, _HEAVIEST)
     settings = payload_search()
@@ -411,6 +413,7 @@ def main() -> None:
     parser.add_argument("--stops", type=int, default=0)
     parser.add_argument("--weighings", type=int, default=0)
     parser.add_argument("--require-mass", default="mass of payload 1 %")
+    parser.add_argument("--pairs", type=int, default=_MOST, help="of motions at most to weigh")
     parser.add_argument("--payloads", type=int, default=0)
     options = parser.parse_args()
     figures: dict[str, Any] = {}
@@ -419,7 +422,7 @@ def main() -> None:
     if options.stops:
         figures["stops"] = stops(options.stops)
     if options.weighings:
-        figures["weighings"] = weighings(options.weighings, options.require_mass)
+        figures["weighings"] = weighings(options.weighings, options.require_mass, options.pairs)
     if options.payloads:
         figures["payloads"] = payloads(options.payloads)
     show(figures, only_json=options.json)
