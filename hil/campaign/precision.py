@@ -29,14 +29,14 @@ from hil.identify.prepared import (
     Prepared,
     decide,
     prepared_with,
-    renewed_delay_variance,
+    renewed_delay,
     samples_of,
 )
 from hil.identify.sources import Source, gather_sources
 from hil.progress import Reporter, Silent
 from hil.reading import path_exists
 from hil.terminal_text import plural
-from identification.estimators.delay import rate_products
+from identification.estimators.delay import delay_sensitivity, rate_products
 from identification.excitation import midpoints
 from identification.factor.estimate import Estimate, inverse_variance
 from identification.factor.factor import Factor
@@ -121,15 +121,23 @@ class PrecisionMeter:
                 self._repetitions[path] = self._reduced(source)
         repetitions = [self._repetitions[path] for path in paths]
         recordings = (*self._earlier, *repetitions)
-        prepared = self._prepared_of(recordings)
+        prepared, later = self._prepared_of(recordings)
         factors = [recording.factor for recording in recordings]
         rates = [each.products for each in recordings if each.products is not None]
         products = np.sum(rates, axis=0) if rates else None
         estimation = estimate_with(prepared, self._options, Silent(), factors, products)
-        values = estimation.result.pooled.values
-        noise_std = estimation.result.pooled.noise_std
+        pooled = estimation.result.pooled
         posterior = estimation.posterior
         stated = estimation.stated
+        if products is not None and later:
+            moved = later * delay_sensitivity(
+                pooled, estimation.result.factor, products, posterior.precision
+            )
+            pooled, stated = (
+                replace(estimate, values=estimate.values + moved) for estimate in (pooled, stated)
+            )
+        values = pooled.values
+        noise_std = pooled.noise_std
         weights = inverse_variance(noise_std**2)
         information = estimation.result.factor.weighted(weights).A + posterior.precision
         wanted = self._reference.wanted(
@@ -157,21 +165,23 @@ class PrecisionMeter:
             estimate=stated,
         )
 
-    def _prepared_of(self, recordings: Sequence[_Reduced]) -> Prepared:
-        """Return recordings by the settings of all looks, with the error of the delay by them."""
+    def _prepared_of(self, recordings: Sequence[_Reduced]) -> tuple[Prepared, float]:
+        """Return recordings by the settings of all looks, and how much later the torque is [s].
+
+        The delay by all of them is another one than that of the settings, and has its own error.
+        """
         training = tuple(recording.source for recording in recordings)
         settings = self._prepared.settings
-        doubt = renewed_delay_variance(
-            replace(self._sources, training=training), settings, self._options
-        )
-        return replace(
+        delay = renewed_delay(replace(self._sources, training=training), settings, self._options)
+        prepared = replace(
             self._prepared,
             sources=replace(
                 self._prepared.sources, training=training, same_motion=not self._earlier
             ),
             fitted=tuple(recording.samples for recording in recordings),
-            settings=replace(settings, delay_variance=doubt),
+            settings=replace(settings, delay_variance=delay.variance),
         )
+        return prepared, delay.mean - settings.preprocessing.torque_delay
 
     def _choose(self, path: Path) -> None:
         """Choose the settings from a repetition, as `hil identify` does, for all looks."""

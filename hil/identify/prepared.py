@@ -177,23 +177,24 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
     return Decided(replace(chosen, delay_variance=error), estimate, notes)
 
 
-def renewed_delay_variance(sources: Sources, settings: Settings, options: Options) -> float:
-    """Return the mean square error of the delay in chosen settings by other sources [s²].
+def renewed_delay(sources: Sources, settings: Settings, options: Options) -> CombinedDelay:
+    """Return the delay in chosen settings by other sources [s].
 
-    Zero if it is known; unchanged if they do not let it be estimated.
+    That of the settings if it is known, or if they do not let it be estimated.
     """
+    used = settings.preprocessing.torque_delay
+    unchanged = CombinedDelay(used, settings.delay_variance)
     if not settings.delay_variance:
-        return 0.0
+        return unchanged
     sources, stated = _as_stated(sources, options)
     if _adds_load(sources.cell, settings):
         sources = replace(sources, cell=sources.cell.with_friction(**settings.friction))
     estimate = _delays(sources, stated, options, Silent())
     if estimate is None:
-        return settings.delay_variance
-    used = settings.preprocessing.torque_delay
+        return unchanged
     if sources.cell.file.controller is None:
-        return estimate.combined(used, LONGEST_DELAY).mean_square_error(used)
-    return _with_stated(estimate, settings.stated_delay).mean_square_error(used)
+        return estimate.combined(used, LONGEST_DELAY)
+    return _with_stated(estimate, settings.stated_delay)
 
 
 def _with_stated(estimate: DelayEstimate, stated: float) -> CombinedDelay:

@@ -111,6 +111,23 @@ def rate_products(model: RobotModel, samples: Samples) -> Array:
     return products
 
 
+def delay_sensitivity(
+    estimate: Estimate, factor: Factor, products: Array, precision: Array | None = None
+) -> Array:
+    """Return the change of the parameters (p,) with the given delay, per second.
+
+    They change by the fit of the torque's rate; `products` are the `rate_products` of the factor's
+    samples (n, p, p + 1), `precision` (p, p) is that of a prior beside them.
+    """
+    weights = inverse_variance(estimate.noise_std**2)
+    rate = np.tensordot(weights, products, axes=1) @ np.append(estimate.values, 1.0)
+    equations = factor.weighted(weights)._replace(b=rate)
+    if precision is not None:
+        equations = equations._replace(A=equations.A + precision)
+    moved = solve(equations).values
+    return np.where(np.isfinite(np.diag(estimate.covariance)), moved, 0.0)
+
+
 def with_uncertain_delay(
     estimate: Estimate,
     factor: Factor,
@@ -120,16 +137,9 @@ def with_uncertain_delay(
 ) -> Estimate:
     """Return the estimate with the variance [s²] of its given delay in the covariance.
 
-    The parameters change by the fit of the torque's rate; `products` are the `rate_products` of the
-    factor's samples (n, p, p + 1), `precision` (p, p) is that of a prior beside them.
+    The other arguments are those of :func:`delay_sensitivity`.
     """
-    weights = inverse_variance(estimate.noise_std**2)
-    rate = np.tensordot(weights, products, axes=1) @ np.append(estimate.values, 1.0)
-    equations = factor.weighted(weights)._replace(b=rate)
-    if precision is not None:
-        equations = equations._replace(A=equations.A + precision)
-    moved = solve(equations).values
-    sensitivity = np.where(np.isfinite(np.diag(estimate.covariance)), moved, 0.0)
+    sensitivity = delay_sensitivity(estimate, factor, products, precision)
     return replace(
         estimate, covariance=estimate.covariance + variance * np.outer(sensitivity, sensitivity)
     )

@@ -26,7 +26,7 @@ from hil.identify.prepared import (
     _DelayChoice,
     decide,
     prepare_sources,
-    renewed_delay_variance,
+    renewed_delay,
     stated_delay,
 )
 from hil.identify.sources import gather_sources
@@ -191,21 +191,19 @@ def test_a_stated_delay_that_data_contradict_is_corrected(campaign, wrong_by):
     assert fixed.preprocessing.torque_delay == stated_delay(wrong)
 
 
-def test_other_recordings_renew_the_error_of_a_chosen_delay(campaign):
-    """A look at more repetitions of a campaign: the error is as if chosen from all of them."""
+def test_other_recordings_renew_a_chosen_delay(campaign):
+    """A look at more repetitions of a campaign: the delay is as if chosen from all of them."""
     sources = gather_sources(paths(campaign), 0.7)
     first = replace(sources, training=sources.training[:1])
     settings = decide(first, Options(), Silent()).settings
-    again = renewed_delay_variance(first, settings, Options())
-    assert again == pytest.approx(settings.delay_variance)
     by_all = decide(sources, Options(), Silent()).settings
-    assert by_all.delay_variance != pytest.approx(again)
-    difference = by_all.preprocessing.torque_delay - settings.preprocessing.torque_delay
-    assert renewed_delay_variance(sources, settings, Options()) == pytest.approx(
-        by_all.delay_variance + difference**2
-    )
+    for recordings, chosen in ((first, settings), (sources, by_all)):
+        again = renewed_delay(recordings, settings, Options())
+        assert again.mean == pytest.approx(chosen.preprocessing.torque_delay)
+        assert again.variance == pytest.approx(chosen.delay_variance)
+    assert by_all.delay_variance != pytest.approx(settings.delay_variance)
     known = replace(settings, delay_variance=0.0)
-    assert renewed_delay_variance(sources, known, Options()) == 0.0
+    assert renewed_delay(sources, known, Options()).variance == 0.0
 
 
 class TestOutcome:

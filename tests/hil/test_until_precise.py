@@ -74,14 +74,18 @@ class TestEnd:
         assert "requirements are met" in steps["repetitions"].details[0]
 
     def test_the_last_look_is_what_identify_finds(self, met) -> None:
-        """Settings that are chosen and errors of the model that are allowed for are the same."""
+        """Settings that are chosen and errors of the model that are allowed for are the same.
+
+        The delay by all repetitions is applied to the parameters to the first order.
+        """
         campaign, _ = met
         identified = identify_campaign(campaign.folder.root, Silent()).estimation
         meter = PrecisionMeter(campaign, requirements_of(campaign, LOOSE))
         measured = meter.estimate(campaign.folder.completed("excitation")).estimate
         assert measured.names == identified.stated.names
-        np.testing.assert_allclose(measured.values, identified.stated.values, rtol=1e-9)
-        np.testing.assert_allclose(measured.std, identified.stated.std, rtol=1e-9)
+        std = identified.stated.std
+        np.testing.assert_allclose(measured.values / std, identified.stated.values / std, atol=0.05)
+        np.testing.assert_allclose(measured.std, std, rtol=0.05)
 
     def test_a_stricter_requirement_continues(self, met) -> None:
         campaign, _ = met
@@ -260,11 +264,9 @@ def continued(met, tmp_path_factory):
 class TestEarlierRecordings:
     """A motion that `hil design --given` designed continues what was recorded before it."""
 
-    def test_they_count_for_its_precision(self, continued, met, monkeypatch) -> None:
-        """The delay apart, whose error is in every recording and may be as large in all of them."""
-        monkeypatch.setattr("hil.campaign.precision.renewed_delay_variance", lambda *_: 0.0)
+    def test_they_count_for_its_precision(self, continued, met) -> None:
         campaign, heard = continued
-        earlier = len(met[0].folder.completed("excitation"))
+        before = met[0].folder.completed("excitation")
         required = requirements_of(campaign, ("parameters 20%",))
         paths = campaign.folder.completed("excitation")[:1]
         together = PrecisionMeter(campaign, required).estimate(paths)
@@ -272,9 +274,11 @@ class TestEarlierRecordings:
         aside = design_file.rename(design_file.with_suffix(".aside"))
         alone = PrecisionMeter(campaign, required).estimate(paths)
         aside.rename(design_file)
-        ratio = together.half / alone.half  # of each parameter; 1 if they did not count
-        assert np.median(ratio) < 1.0
-        assert any(f"counts the {earlier} earlier recordings" in line for line in heard.lines)
+        assert np.all(together.estimate.samples > 1.5 * alone.estimate.samples)
+        assert np.linalg.det(together.estimate.covariance) < np.linalg.det(
+            alone.estimate.covariance
+        )
+        assert any(f"counts the {len(before)} earlier recordings" in line for line in heard.lines)
 
     def test_without_them_the_run_is_refused(self, continued, met) -> None:
         campaign, _ = continued
