@@ -64,6 +64,20 @@ class Clustered:
     interval_factor: float  # standard deviations in half a 95 % interval
     description: str
     blocks: int  # number of blocks
+    shares: Array  # of the blocks in the information, (B, k, k): ``S' A_b S``
+
+    def interval_factors(self, rows: Array) -> Array:
+        """Return standard deviations in half a 95 % interval of functions (d, p) of the parameters.
+
+        The variance of each is as uncertain as one from as many scores as there are blocks that
+        determine it, those of a prior not counted (Satterthwaite 1946; Bell and McCaffrey 2002).
+        """
+        directions = rows @ self.root
+        of_blocks = np.einsum("dk,bkl,dl->bd", directions, self.shares, directions, optimize=True)
+        whole = (directions**2).sum(axis=1)
+        squares = (of_blocks**2).sum(axis=0)
+        counts = np.divide(whole**2, squares, out=np.full(len(rows), 2.0), where=squares > 0.0)
+        return np.asarray(student_limit(0.025, np.maximum(1.0, counts - 1.0)))
 
 
 def block_covariance(
@@ -158,6 +172,7 @@ def _sandwich(
         interval_factor=float(student_limit(0.025, max(1, count - 1))),
         description=f"cluster-robust covariance over {count} blocks of {duration:g} s",
         blocks=count,
+        shares=shares,
     )
 
 

@@ -21,11 +21,13 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.distributions import normal_limit
 from identification.errors import IdentificationError
 from identification.estimators.payload_problem import (
     N_BODY,
     PARTICIPATION,
     ROUNDING,
+    BodyFit,
     KnownArm,
     Run,
     about_frame,
@@ -45,9 +47,11 @@ Array = NDArray[np.float64]
 
 _INERTIA: Final = np.arange(6)
 _DIAGONAL: Final = [4, 7, 9]  # of a tensor, among `NAMES`
+_STATED: Final = float(normal_limit(0.025))  # standard deviations in half a 95 % interval
 _DENSITY: Final = 1000.0  # kg/m³; a ball of it is the least inertia worth determining
 
-CONTRADICTION_SIGMAS: Final = 5.0
+CONTRADICTION_HALVES: Final = 2.5
+"""Halves of 95 % intervals, five standard deviations, that two weighings may differ by."""
 SAME_MASS: Final = 0.1
 """Share of the mass by which two weighings may differ: pairs of recordings of a real arm differ by
 2 %, and friction by `DRIFT`."""
@@ -112,15 +116,12 @@ def identify_payload(
         return PayloadEstimate(
             estimate.values, None, intervals, estimate.moment, undetermined, (), estimate.method
         )
-    total, by_scale = (
-        estimate.variance_of_mass(part) for part in (estimate.spread, estimate.by_scale)
-    )
     intervals[1:4] = estimate.centre_intervals
     open_ended = np.isinf(intervals[:, 1])
     centre = np.where(open_ended[1:4], 0.0, estimate.values[6:9] / mass)
     to_centre = about_frame(np.eye(3), -centre)[_INERTIA]
     six = to_centre @ estimate.values
-    halves = estimate.factor * estimate.std(to_centre)
+    halves = estimate.halves(to_centre)
     lower, upper = _off_centre(mass, (intervals[1:4, 1] - intervals[1:4, 0]) / 2.0)
     intervals[4:] = np.column_stack([six - halves - lower, six + halves + upper])
     negative = _impossible(intervals, ROUNDING * mass * (1.0 + float(centre @ centre)))
@@ -143,7 +144,7 @@ def identify_payload(
         undetermined=tuple(np.array(NAMES)[open_ended].tolist()),
         impossible=tuple(np.array(NAMES)[negative].tolist()),
         method=estimate.method,
-        scale_share=by_scale / total,
+        scale_share=estimate.scale_share_of_mass,
     )
 
 
@@ -188,10 +189,9 @@ def contradiction(
     """Return two loaded, or two bare recordings that carry different bodies; None if all agree.
 
     Each loaded recording is weighed by itself against all bare ones, each bare one against the
-    first. Bodies differ if a difference of mass or first moments is above
-    `CONTRADICTION_SIGMAS` standard deviations and above the shares of what was weighed that
-    friction and model errors explain (`SAME_MASS`, `SAME_CENTRE`). The torque scale is the same in
-    all recordings.
+    first. Bodies differ if a difference of mass or first moments is above `CONTRADICTION_HALVES`
+    of 95 % intervals and above the shares of what was weighed that friction and model errors
+    explain (`SAME_MASS`, `SAME_CENTRE`). The torque scale is the same in all recordings.
     """
     bare, loaded = ([run for run in runs if run.loaded == kind] for kind in (False, True))
     mass = float(estimate.parameters[9])
@@ -214,17 +214,17 @@ def _differs(first: _BodyEstimate | None, second: _BodyEstimate, limits: Array) 
     """Return whether first moments and mass (4,) differ, beyond chance and limits; None is zero."""
     rows = np.eye(N_BODY)[6:]
     change = rows @ second.values
-    variance = second.std(rows) ** 2
+    squares = second.halves(rows) ** 2
     if first is not None:
         change = change - rows @ first.values
-        variance = variance + first.std(rows) ** 2
-    # Infinite variances are never exceeded.
-    beyond = np.abs(change) > np.maximum(limits, CONTRADICTION_SIGMAS * np.sqrt(variance))
+        squares = squares + first.halves(rows) ** 2
+    # Infinite intervals are never exceeded.
+    beyond = np.abs(change) > np.maximum(limits, CONTRADICTION_HALVES * np.sqrt(squares))
     return bool(beyond.any())
 
 
 def _weighing(name: str, estimate: _BodyEstimate) -> Weighing:
-    determined = np.isfinite(estimate.std(np.eye(N_BODY)[6:]))
+    determined = estimate.is_determined(np.eye(N_BODY)[6:])
     centre = (
         estimate.values[6:9] / estimate.values[9]
         if estimate.values[9] != 0.0
@@ -285,35 +285,52 @@ class _BodyEstimate(NamedTuple):
 
     values: Array  # (10,)
     determined: Array  # determined combinations (r, 10)
-    spread: Array  # covariance of those (r, r)
-    by_scale: Array  # part of it that the torque scale makes (r, r)
-    factor: float  # standard deviations in half a 95 % interval
-    method: str
+    fit: BodyFit  # of those
+    by_scale: Array  # covariance of those that the torque scale makes (r, r)
 
-    def variance_of_mass(self, spread: Array) -> float:
-        """Return the variance of the mass [kg²] by a part of `spread`."""
-        row = np.linalg.pinv(self.determined)[9]
-        return float(row @ spread @ row)
+    @property
+    def method(self) -> str:
+        """Description of the intervals."""
+        return self.fit.clustered.description
 
-    def covariance(self, rows: Array) -> Array:
-        """Return the covariance of functions (k, 10) of the parameters, determined part (k, k)."""
-        combinations = rows @ np.linalg.pinv(self.determined)
-        return np.asarray(combinations @ self.spread @ combinations.T)
+    @property
+    def scale_share_of_mass(self) -> float:
+        """Share of the squared interval of the mass that the torque scale makes."""
+        mass = np.linalg.pinv(self.determined)[9]
+        by_scale = _STATED**2 * float(mass @ self.by_scale @ mass)
+        return by_scale / float(self._squares(mass[None])[0, 0])
 
-    def std(self, rows: Array) -> Array:
-        """Return standard deviations of functions (k, 10), infinite if undetermined."""
+    def _squares(self, combinations: Array) -> Array:
+        """Return the matrix (k, k) whose diagonal are squared halves of 95 % intervals.
+
+        Of functions (k, r) of what is determined: Student's factor is for variances that are
+        estimated from blocks, that of the scale is stated.
+        """
+        scaled = combinations * self.fit.interval_factors(combinations)[:, None]
+        by_scale = _STATED**2 * combinations @ self.by_scale @ combinations.T
+        return np.asarray(scaled @ self.fit.covariance @ scaled.T + by_scale)
+
+    def squares(self, rows: Array) -> Array:
+        """Return the same of functions (k, 10) of the parameters, determined part."""
+        return self._squares(rows @ np.linalg.pinv(self.determined))
+
+    def halves(self, rows: Array) -> Array:
+        """Return halves of 95 % intervals of functions (k, 10), infinite if undetermined."""
+        return np.where(self.is_determined(rows), np.sqrt(np.diag(self.squares(rows))), np.inf)
+
+    def is_determined(self, rows: Array) -> NDArray[np.bool_]:
+        """Return whether functions (k, 10) of the parameters are determined."""
         scale = np.linalg.norm(self.determined, axis=0)  # for equal units
         scale = np.where(scale > ROUNDING * scale.max(initial=0.0), scale, 1.0)
         lost = (rows - rows @ np.linalg.pinv(self.determined) @ self.determined) / scale
         size = np.linalg.norm(rows / scale, axis=1)
-        determined = np.linalg.norm(lost, axis=1) < PARTICIPATION * size
-        return np.where(determined, np.sqrt(np.diag(self.covariance(rows))), np.inf)
+        return np.asarray(np.linalg.norm(lost, axis=1) < PARTICIPATION * size)
 
     @property
     def mass(self) -> tuple[float, float, float]:
         """Mass and its interval [kg], infinite if undetermined."""
         value = float(self.values[9])
-        half = self.factor * float(self.std(np.eye(N_BODY)[[9]])[0])
+        half = float(self.halves(np.eye(N_BODY)[[9]])[0])
         return value, value - half, value + half
 
     @property
@@ -323,14 +340,14 @@ class _BodyEstimate(NamedTuple):
         length = float(np.linalg.norm(first))
         row = np.zeros((1, N_BODY))
         row[0, 6:9] = first / length if length > 0.0 else 1.0 / np.sqrt(3.0)
-        half = self.factor * float(self.std(row)[0])
+        half = float(self.halves(row)[0])
         return length, max(0.0, length - half), length + half
 
     @property
     def centre_intervals(self) -> Array:
         """95 % intervals of the centre (3, 2), a ratio (Fieller 1954)."""
-        determined = np.isfinite(self.std(np.eye(N_BODY)))
-        covariance = self.factor**2 * self.covariance(np.eye(N_BODY))
+        determined = self.is_determined(np.eye(N_BODY))
+        covariance = self.squares(np.eye(N_BODY))
         first = self.values[6:9]
         mass = self.values[9]
         a = mass**2 - covariance[9, 9]
@@ -353,18 +370,12 @@ def _body_estimate(
     if len(directions) < N_BODY:
         determined = directions
         fit = fit_body(model, runs, np.asarray(np.linalg.pinv(determined)), arm)
-    std = np.zeros(model.n_joints)
-    factor = fit.clustered.interval_factor
-    if scale_std is not None:
-        std = scale_std
-    by_scale = scale_covariance(fit.sensitivity, std, factor)
+    std = np.zeros(model.n_joints) if scale_std is None else scale_std
     return _BodyEstimate(
         values=np.linalg.pinv(determined) @ fit.values,
         determined=determined,
-        spread=fit.covariance + by_scale,
-        by_scale=by_scale,
-        factor=factor,
-        method=fit.clustered.description,
+        fit=fit,
+        by_scale=scale_covariance(fit.sensitivity, std),
     )
 
 

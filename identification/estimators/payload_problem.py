@@ -125,6 +125,13 @@ class BodyFit(NamedTuple):
     covariance: Array  # (r, r)
     sensitivity: Array  # change per relative change of each joint's torques (r, n)
     clustered: Clustered
+    part: NDArray[np.intp]  # places of the unknowns among those of the problem (r,)
+
+    def interval_factors(self, rows: Array) -> Array:
+        """Return standard deviations in half a 95 % interval of functions (d, r) of them."""
+        whole = np.zeros((len(rows), len(self.clustered.root)))
+        whole[:, self.part] = rows
+        return self.clustered.interval_factors(whole)
 
     @property
     def determined(self) -> Array:
@@ -274,6 +281,7 @@ def fit_body(
         covariance=clustered.covariance[np.ix_(part, part)],
         sensitivity=solution.root[part] @ (solution.root.T @ pulls),
         clustered=clustered,
+        part=part,
     )
 
 
