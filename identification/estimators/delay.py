@@ -214,7 +214,7 @@ class DelayEstimate:
         odds = np.exp(logarithms - logarithms.max()) if self.determined else np.ones(1)
         odds /= odds.sum()
         mean = float(odds @ shares) * difference
-        variances = 1.0 / (1.0 / priors + 1.0 / variance) + (shares * difference - mean) ** 2
+        variances = priors * (1.0 - shares) + (shares * difference - mean) ** 2
         return CombinedDelay(stated + mean, float(odds @ variances))
 
     def describe(self) -> str:
