@@ -19,7 +19,6 @@ from hil.progress import Reporter, Silent
 from identification.errors import IdentificationError
 from identification.estimators.delay import (
     CLOSED_LOOP_BIAS,
-    LONGEST_DELAY,
     CombinedDelay,
     DelayEstimate,
     estimate_delay,
@@ -135,6 +134,7 @@ def _array(figures: tuple[float, ...] | None) -> Array | None:
 MAX_RECORDINGS: Final = 32
 """Recordings that settings are chosen from."""
 _DELAY_RATE: Final = 250.0  # Hz, to which it is averaged; both positions and torques, without bias
+_SAME_DELAY: Final = 0.05  # cycles, by which a delay in use may differ from the stated one unsaid
 _SAME_STEP: Final = 0.1  # of sampling intervals of recordings that are estimated together
 _DELAY_TIME: Final = 64.0  # s, in which a delay that nobody asked for is looked for
 RIPPLE: Final = ((1,), (2,), (1, 2))
@@ -172,15 +172,16 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
         chosen = delay.applied_to(chosen)
     estimate, notes = delay.confirmed_by(chosen.preprocessing)
     error = delay.errors.get(chosen.preprocessing.torque_delay, 0.0)
-    if estimate is None and sources.cell.file.controller is None:
-        error = 0.0  # the lag of a low-pass
+    if estimate is None and (sources.cell.file.controller is None or options.delay == "auto"):
+        error = 0.0  # the estimate may be the lag of a low-pass, and nothing is known beside it
     return Decided(replace(chosen, delay_variance=error), estimate, notes)
 
 
 def renewed_delay(sources: Sources, settings: Settings, options: Options) -> CombinedDelay:
-    """Return the delay in chosen settings by other sources [s].
+    """Return the delay in chosen settings of a controller's torque by other sources [s].
 
-    That of the settings if it is known, or if they do not let it be estimated.
+    That of the settings if it is known, or if they do not let it be estimated. One that was kept
+    as stated stays so, with its error by the other sources.
     """
     used = settings.preprocessing.torque_delay
     unchanged = CombinedDelay(used, settings.delay_variance)
@@ -192,9 +193,10 @@ def renewed_delay(sources: Sources, settings: Settings, options: Options) -> Com
     estimate = _delays(sources, stated, options, Silent())
     if estimate is None:
         return unchanged
-    if sources.cell.file.controller is None:
-        return estimate.combined(used, LONGEST_DELAY)
-    return _with_stated(estimate, settings.stated_delay)
+    combined = _with_stated(estimate, settings.stated_delay)
+    if used == settings.stated_delay:
+        return CombinedDelay(used, combined.mean_square_error(used))
+    return combined
 
 
 def _with_stated(estimate: DelayEstimate, stated: float) -> CombinedDelay:
@@ -249,15 +251,22 @@ class _DelayChoice:
         if sources.cell.file.controller is not None:
             combined = _with_stated(estimate, stated.stated_delay)
             applied, error = combined.mean, combined.variance
-            # Inner prediction decides on an estimate that is far from the stated delay.
             bound = Thresholds().delay * estimate.cycle
-            if not estimate.determined or abs(estimate.delay - stated.stated_delay) <= bound:
-                notes = _combined_notes(described, stated.stated_delay, applied)
-                return replace(unused, assumed=applied, notes=notes, errors={applied: error})
-            unapplied = combined.mean_square_error(stated.stated_delay)
-            unused = replace(unused, errors={stated.stated_delay: unapplied})
+            far = abs(estimate.delay - stated.stated_delay) > bound
+            # Inner prediction decides on a determined one that is far from the stated delay. Beside
+            # a low-pass of the torque the stated one is kept: the estimate may contain its lag.
+            if not (far and estimate.determined and estimate.significant):
+                filtered = stated.preprocessing.torque_bandwidth is not None
+                if not (filtered or _asks_low_pass(sources, options)):
+                    notes = _combined_notes(described, estimate, applied)
+                    return replace(unused, assumed=applied, notes=notes, errors={applied: error})
+                error = combined.mean_square_error(unused.assumed)
+                return replace(unused, notes=described, errors={unused.assumed: error})
+            unused = replace(
+                unused, errors={unused.assumed: combined.mean_square_error(unused.assumed)}
+            )
         if not estimate.significant:
-            return replace(unused, notes=described, errors={unused.assumed: error, **unused.errors})
+            return replace(unused, notes=described, errors={unused.assumed: error})
         delay = SuggestedDelay(applied, estimate.determined)
         errors = {**unused.errors, applied: error}
         return replace(unused, suggested=(delay,), notes=described, errors=errors)
@@ -301,9 +310,12 @@ def _compensated(delay: float) -> str:
     return f"a delay of {delay * 1e3:.3g} ms of all axes was compensated"
 
 
-def _combined_notes(described: Sequence[str], stated: float, applied: float) -> tuple[str, ...]:
-    """Return the notes on a delay by a controller's stated one and an estimate."""
-    if applied == stated:
+def _combined_notes(
+    described: Sequence[str], estimate: DelayEstimate, applied: float
+) -> tuple[str, ...]:
+    """Return the notes on a delay by an estimate and a controller's stated one."""
+    stated = estimate.assumed
+    if abs(applied - stated) < _SAME_DELAY * estimate.cycle:
         return tuple(described)
     return described[0], f"{_compensated(applied)}, by this and the stated {stated * 1e3:.3g} ms"
 
@@ -326,6 +338,16 @@ def _with_noise_of(settings: Settings, sources: Sources) -> Settings:
     return replace(settings, noise_variance=position, torque_variance=torque)
 
 
+def _asks_low_pass(sources: Sources, options: Options) -> bool:
+    """Return whether a low-pass of the torque may be chosen; currents of a controller have none."""
+    first = sources.training[0].recording
+    return (
+        options.torque_bandwidth == "auto"
+        and options.method == "default"
+        and first.motor_current is None
+    )
+
+
 def _questions(
     sources: Sources, options: Options, suggested: Sequence[SuggestedDelay]
 ) -> set[Question]:
@@ -342,10 +364,7 @@ def _questions(
         "friction": options.friction == "auto" and sources.cell.file.drive_train is None,
         "ripple": options.friction == "auto" and bool(_ripples(sources.cell)),
         "springs": options.friction == "auto" and bool(_spring_joints(sources.cell)),
-        # Currents of a controller are unfiltered.
-        "low-pass": options.torque_bandwidth == "auto"
-        and options.method == "default"
-        and recorded[0].motor_current is None,
+        "low-pass": _asks_low_pass(sources, options),
         "estimator": options.estimator == "auto",
     }
     return {question for question, wanted in questions.items() if wanted}

@@ -69,14 +69,17 @@ class Clustered:
     def interval_factors(self, rows: Array) -> Array:
         """Return standard deviations in half a 95 % interval of functions (d, p) of the parameters.
 
-        The variance of each is as uncertain as one from as many scores as there are blocks that
-        determine it, those of a prior not counted (Satterthwaite 1946; Bell and McCaffrey 2002).
+        The variance of each is about as uncertain as one from as many scores as there are equal
+        blocks that would determine it as well (Satterthwaite 1946; Bell and McCaffrey 2002). What a
+        prior determines is certain, and the variance of a block of high leverage is that of the
+        others (`leverage_corrected`).
         """
         directions = rows @ self.root
-        of_blocks = np.einsum("dk,bkl,dl->bd", directions, self.shares, directions, optimize=True)
         whole = (directions**2).sum(axis=1)
-        squares = (of_blocks**2).sum(axis=0)
-        counts = np.divide(whole**2, squares, out=np.full(len(rows), 2.0), where=squares > 0.0)
+        of_blocks = np.einsum("dk,bkl,dl->bd", directions, self.shares, directions, optimize=True)
+        leverage = np.divide(of_blocks, whole, out=np.zeros_like(of_blocks), where=whole > 0.0)
+        squares = (_trusted(leverage) * leverage**2).sum(axis=0)
+        counts = 1.0 / np.maximum(squares, 1.0 / max(2, self.blocks))
         return np.asarray(student_limit(0.025, np.maximum(1.0, counts - 1.0)))
 
 
@@ -235,9 +238,7 @@ def leverage_corrected(shares: Array, scores: Array, *, symmetric: bool = True) 
     factors = _without_by_eigenvectors if symmetric else _without_by_singular_vectors
     for b in dependent:
         u, singular, vt = factors(shares[b])
-        trusted = np.clip(
-            (singular - (1.0 - _HIGH_LEVERAGE)) / (_HIGH_LEVERAGE - _LOW_LEVERAGE), 0.0, 1.0
-        )
+        trusted = _trusted(1.0 - singular)
         without_own = (u.T @ scores[b]) / np.maximum(singular, 1.0 - _HIGH_LEVERAGE)
         squares += float((trusted * without_own**2 * singular).sum())
         leverage += float((trusted * (1.0 - singular)).sum())
@@ -246,6 +247,11 @@ def leverage_corrected(shares: Array, scores: Array, *, symmetric: bool = True) 
         added.append((replaced[:, None] * vt)[trusted < 1.0])
     effect = max(1.0, squares / leverage) if leverage > 0.0 else 1.0
     return np.concatenate([*rows, *(np.sqrt(effect) * vectors for vectors in added)])
+
+
+def _trusted(leverage: Array) -> Array:
+    """Return the share of the variance that a block's own residual gives, by its leverage."""
+    return np.clip((_HIGH_LEVERAGE - leverage) / (_HIGH_LEVERAGE - _LOW_LEVERAGE), 0.0, 1.0)
 
 
 def _without_by_singular_vectors(share: Array) -> tuple[Array, Array, Array]:

@@ -196,14 +196,14 @@ class DelayEstimate:
     def combined(self, stated: float, bound: float, bias: float = 0.0) -> CombinedDelay:
         """Return the delay by this estimate and by a stated value together [s].
 
-        Without the estimate the true one is as likely anywhere within the `bound` of the stated
-        value, either way: a Gaussian of that variance is multiplied by the estimate, whether
-        significant or not. Or else, as likely, the stated value is wrong, which takes a determined
-        estimate. `bias` is a standard deviation beside that of the estimate. A minimum at a limit,
-        or beside another one, tells nothing.
+        Errors of the stated value are Gaussian, with the variance of uniform ones of up to `bound`
+        either way; the estimate, significant or not, has its own and a `bias` (standard deviation).
+        A determined estimate may also show the stated value to be wrong: before it, errors of up to
+        `LONGEST_DELAY` are as likely. A minimum at a limit, or beside another one, tells nothing.
         """
         near = bound**2 / 3.0
-        if not self.determined and self.half_interval <= WIDEST_INTERVAL:
+        narrow = self.half_interval <= WIDEST_INTERVAL
+        if not np.isfinite(self.std) or (narrow and not self.determined):
             return CombinedDelay(stated, near)
         variance = self.std**2 + bias**2
         difference = self.delay - stated

@@ -50,8 +50,7 @@ _DIAGONAL: Final = [4, 7, 9]  # of a tensor, among `NAMES`
 _STATED: Final = float(normal_limit(0.025))  # standard deviations in half a 95 % interval
 _DENSITY: Final = 1000.0  # kg/m³; a ball of it is the least inertia worth determining
 
-CONTRADICTION_HALVES: Final = 2.5
-"""Halves of 95 % intervals, five standard deviations, that two weighings may differ by."""
+CONTRADICTION_SIGMAS: Final = 5.0
 SAME_MASS: Final = 0.1
 """Share of the mass by which two weighings may differ: pairs of recordings of a real arm differ by
 2 %, and friction by `DRIFT`."""
@@ -88,7 +87,7 @@ class PayloadEstimate:
     # of those, moments of inertia whose 95 % interval lies below zero: no body has them
     impossible: tuple[str, ...]
     method: str  # description of the covariance
-    # share of the variance of the mass that the torque scale makes, and no recording reduces
+    # share of the squared interval of the mass that the torque scale makes; no recording reduces it
     scale_share: float = 0.0
 
 
@@ -189,9 +188,10 @@ def contradiction(
     """Return two loaded, or two bare recordings that carry different bodies; None if all agree.
 
     Each loaded recording is weighed by itself against all bare ones, each bare one against the
-    first. Bodies differ if a difference of mass or first moments is above `CONTRADICTION_HALVES`
-    of 95 % intervals and above the shares of what was weighed that friction and model errors
-    explain (`SAME_MASS`, `SAME_CENTRE`). The torque scale is the same in all recordings.
+    first. Bodies differ if a difference of mass or first moments is above
+    `CONTRADICTION_SIGMAS` standard deviations and above the shares of what was weighed that
+    friction and model errors explain (`SAME_MASS`, `SAME_CENTRE`). The torque scale is the same in
+    all recordings.
     """
     bare, loaded = ([run for run in runs if run.loaded == kind] for kind in (False, True))
     mass = float(estimate.parameters[9])
@@ -214,12 +214,12 @@ def _differs(first: _BodyEstimate | None, second: _BodyEstimate, limits: Array) 
     """Return whether first moments and mass (4,) differ, beyond chance and limits; None is zero."""
     rows = np.eye(N_BODY)[6:]
     change = rows @ second.values
-    squares = second.halves(rows) ** 2
+    variance = second.variances(rows)
     if first is not None:
         change = change - rows @ first.values
-        squares = squares + first.halves(rows) ** 2
-    # Infinite intervals are never exceeded.
-    beyond = np.abs(change) > np.maximum(limits, CONTRADICTION_HALVES * np.sqrt(squares))
+        variance = variance + first.variances(rows)
+    # Infinite variances are never exceeded.
+    beyond = np.abs(change) > np.maximum(limits, CONTRADICTION_SIGMAS * np.sqrt(variance))
     return bool(beyond.any())
 
 
@@ -298,25 +298,28 @@ class _BodyEstimate(NamedTuple):
         """Share of the squared interval of the mass that the torque scale makes."""
         mass = np.linalg.pinv(self.determined)[9]
         by_scale = _STATED**2 * float(mass @ self.by_scale @ mass)
-        return by_scale / float(self._squares(mass[None])[0, 0])
+        return by_scale / float(self.squares(np.eye(N_BODY)[[9]])[0, 0])
 
-    def _squares(self, combinations: Array) -> Array:
+    def squares(self, rows: Array) -> Array:
         """Return the matrix (k, k) whose diagonal are squared halves of 95 % intervals.
 
-        Of functions (k, r) of what is determined: Student's factor is for variances that are
-        estimated from blocks, that of the scale is stated.
+        Of functions (k, 10) of the parameters, determined part. Student's factor is for variances
+        that are estimated from blocks, that of the scale is stated.
         """
+        combinations = rows @ np.linalg.pinv(self.determined)
         scaled = combinations * self.fit.interval_factors(combinations)[:, None]
         by_scale = _STATED**2 * combinations @ self.by_scale @ combinations.T
         return np.asarray(scaled @ self.fit.covariance @ scaled.T + by_scale)
 
-    def squares(self, rows: Array) -> Array:
-        """Return the same of functions (k, 10) of the parameters, determined part."""
-        return self._squares(rows @ np.linalg.pinv(self.determined))
-
     def halves(self, rows: Array) -> Array:
         """Return halves of 95 % intervals of functions (k, 10), infinite if undetermined."""
         return np.where(self.is_determined(rows), np.sqrt(np.diag(self.squares(rows))), np.inf)
+
+    def variances(self, rows: Array) -> Array:
+        """Return variances of functions (k, 10) for a known scale, infinite if undetermined."""
+        combinations = rows @ np.linalg.pinv(self.determined)
+        variance = np.einsum("kr,rs,ks->k", combinations, self.fit.covariance, combinations)
+        return np.where(self.is_determined(rows), variance, np.inf)
 
     def is_determined(self, rows: Array) -> NDArray[np.bool_]:
         """Return whether functions (k, 10) of the parameters are determined."""

@@ -49,7 +49,7 @@ class Settings:
     #: of the torques (n,) [N²·m² or N²]; None estimates it in each recording
     torque_variance: tuple[float, ...] | None = None
     stated_delay: float = 0.0  #: of the torque, by cell or options [s]
-    delay_variance: float = 0.0  #: of an estimated delay [s²]; zero for a stated one
+    delay_variance: float = 0.0  #: mean square error of the delay [s²]; zero if it is known
     strength: Strength = Strength()
     choices: tuple[Choice, ...] = ()  #: made by inner prediction
     #: parameters (p,) of bodies and drives that load the gears, for friction that grows with it;

@@ -41,7 +41,7 @@ from identification.estimators.consistent import SolverError
 from identification.estimators.delay import DelayEstimate
 from identification.model.friction import FrictionLaw
 from identification.selection.inner_prediction import SuggestedDelay
-from identification.selection.settings import Strength
+from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Preprocessing
 from sim_fixtures.ns16 import URDF_PATH
 
@@ -189,6 +189,61 @@ def test_a_stated_delay_that_data_contradict_is_corrected(campaign, wrong_by):
     stated = Options(delay="stated")
     fixed = decide(replace(sources, cell=wrong), stated, Silent()).settings
     assert fixed.preprocessing.torque_delay == stated_delay(wrong)
+
+
+def estimated(delay: float, std: float = 2e-4, *, significant: bool = False) -> DelayEstimate:
+    return DelayEstimate(
+        delay=delay, std=std, assumed=0.0, cycle=1e-3, interval_factor=2.0, reason=None,
+        significant=significant,
+    )  # fmt: skip
+
+
+class TestDelayOfAController:
+    """What is stated of it, and what the recordings show."""
+
+    def choice(self, campaign, estimate, *, filtered: bool = False) -> _DelayChoice:
+        sources = gather_sources(paths(campaign)[:1], 0.7)
+        if filtered:  # imported torques: not those of a controller's currents
+            (source,) = sources.training
+            recording = replace(source.recording, motor_current=None)
+            sources = replace(sources, training=(replace(source, recording=recording),))
+        return _DelayChoice.of(estimate, sources, Settings(Preprocessing()), Options())
+
+    def test_an_estimate_that_is_not_significant_counts_alike_on_both_sides_of_the_bound(
+        self, campaign
+    ):
+        below, above = (self.choice(campaign, estimated(delay)) for delay in (5.9e-4, 6.1e-4))
+        assert above.assumed == pytest.approx(below.assumed, abs=3e-5)
+        assert above.errors[above.assumed] == pytest.approx(below.errors[below.assumed], rel=0.05)
+
+    def test_inner_prediction_decides_on_a_significant_one_that_is_far(self, campaign):
+        choice = self.choice(campaign, estimated(2e-3, significant=True))
+        assert choice.assumed == 0.0
+        assert [delay.value for delay in choice.suggested] == [pytest.approx(2e-3, abs=1e-4)]
+        assert choice.errors[0.0] > 1e-3**2  # as the estimate says
+
+    def test_beside_a_low_pass_the_stated_one_is_kept_with_its_error(self, campaign):
+        """The estimate may be the lag of the low-pass."""
+        choice = self.choice(campaign, estimated(5e-4), filtered=True)
+        combined = self.choice(campaign, estimated(5e-4))
+        assert choice.assumed == 0.0 < combined.assumed
+        assert choice.errors[0.0] == pytest.approx(
+            combined.errors[combined.assumed] + combined.assumed**2
+        )
+
+    def test_what_was_kept_as_stated_stays_so(self, campaign):
+        """In looks at more repetitions: with the error that these show."""
+        sources = gather_sources(paths(campaign), 0.7)
+        right = sources.cell.file.controller.current_delay_cycles
+        wrong = sources.cell.with_values({"controller.current_delay_cycles": right + 1.5})
+        sources = replace(sources, cell=wrong)
+        decided = decide(sources, Options(), Silent()).settings
+        stated = replace(
+            decided.preprocessed(torque_delay=decided.stated_delay), delay_variance=1e-8
+        )
+        again = renewed_delay(sources, stated, Options())
+        assert again.mean == stated.stated_delay
+        assert again.variance > wrong.period**2
 
 
 def test_other_recordings_renew_a_chosen_delay(campaign):

@@ -43,10 +43,11 @@ from identification import (
     with_uncertain_delay,
     write_urdf,
 )
+from identification.distributions import student_limit
 from identification.estimators import prior as prior_module
 from identification.estimators.consistent import consistent_values, is_consistent
-from identification.estimators.covariance import block_length, cluster_covariance, spread
-from identification.estimators.delay import LONGEST_DELAY
+from identification.estimators.covariance import Clustered, block_length, cluster_covariance, spread
+from identification.estimators.delay import LONGEST_DELAY, delay_sensitivity
 from identification.estimators.losses import Loss
 from identification.estimators.prior import (
     OFFSET_SHARE,
@@ -231,6 +232,48 @@ class TestBlocks:
         assert block_length(white) == 2
         assert 4 <= block_length(slow) <= 20
         assert block_length(white[:25]) == 1  # enough blocks remain
+
+    @pytest.mark.parametrize(
+        ("weights", "freedom"),
+        [
+            (np.ones(25), 24),  # all alike
+            (np.append(np.full(4, 1e6), np.ones(21)), 3),  # four determine it
+            (
+                np.append(1e6, np.ones(24)),
+                24,
+            ),  # of a block alone the variance is that of the others
+        ],
+    )
+    def test_the_interval_factor_of_a_parameter_is_that_of_the_blocks_that_determine_it(
+        self, weights, freedom
+    ):
+        """Beside one that all blocks determine; whatever the units."""
+        information = np.array([np.diag([1.0, weight]) for weight in weights])
+        root = np.diag(np.array([len(weights), weights.sum()]) ** -0.5)
+        clustered = Clustered(
+            covariance=np.eye(2), root=root, scores=np.zeros((25, 2)),
+            determined=np.ones(2, dtype=np.bool_), design_effect=1.0, interval_factor=2.0,
+            description="", blocks=25, shares=root @ information @ root,
+        )  # fmt: skip
+        expected = [student_limit(0.025, 24), student_limit(0.025, freedom)]
+        factors = clustered.interval_factors(np.eye(2))
+        np.testing.assert_allclose(factors, expected, rtol=1e-3)
+        np.testing.assert_allclose(clustered.interval_factors(1e3 * np.eye(2)), factors)
+
+    def test_what_a_prior_determines_is_certain(self):
+        """The more of the information is of a prior, the nearer is the factor to that of all."""
+        weights = np.append(np.ones(3), np.zeros(22))
+        factors = []
+        for prior in (0.0, 1.0, 100.0):
+            root = np.array([[(weights.sum() + prior) ** -0.5]])
+            clustered = Clustered(
+                covariance=np.eye(1), root=root, scores=np.zeros((25, 1)),
+                determined=np.ones(1, dtype=np.bool_), design_effect=1.0, interval_factor=2.0,
+                description="", blocks=25, shares=weights[:, None, None] * root**2,
+            )  # fmt: skip
+            factors.append(float(clustered.interval_factors(np.eye(1))[0]))
+        assert factors[0] == pytest.approx(student_limit(0.025, 2))
+        assert factors[0] > factors[1] > factors[2] == pytest.approx(student_limit(0.025, 24))
 
     def test_the_interval_factor_is_students_t_of_the_blocks(self):
         motion = a_motion()
@@ -1450,6 +1493,8 @@ class TestDelayUncertainty:
         wider = with_uncertain_delay(fitted, Factor.of(MODEL, middle), products, 0.25)
         ends = [self.fit(MODEL, samples(0.004 + side)).values for side in (-5e-4, 5e-4)]
         slope = (ends[1] - ends[0]) / 1e-3
+        sensitivity = delay_sensitivity(fitted, Factor.of(MODEL, middle), products)
+        np.testing.assert_allclose(sensitivity, slope, rtol=0.03, atol=1e-3)
         added = wider.covariance - fitted.covariance
         np.testing.assert_allclose(added, 0.25 * np.outer(slope, slope), rtol=0.06, atol=1e-6)
         np.testing.assert_array_equal(wider.values, fitted.values)

@@ -565,6 +565,25 @@ class TestJudgement:
         for unsure in (replace(wide, significant=False), replace(wide, std=4e-3)):
             assert not any(finding.check == "delay" for finding in judged(delays=unsure).findings)
 
+    @pytest.mark.parametrize(
+        ("used", "level", "words"),
+        [
+            (0.0026, "doubtful", "by 3 ± 0.2 ms (0 ms stated); 2.6 ms was compensated"),
+            (0.003, "doubtful", "by 3 ± 0.2 ms (0 ms stated); this was compensated"),
+        ],
+    )
+    def test_a_delay_far_from_the_stated_one_is_doubtful(self, used, level, words):
+        """Also where the fit has one between the two."""
+        around = {"delays": LATE, "assumed_delay": used}
+        finding = finding_of("delay", **around)
+        assert (finding.level, words in finding.words) == (level, True), finding.words
+
+    def test_a_delay_near_the_stated_one_is_as_assumed(self):
+        near = replace(LATE, delay=0.0005)
+        finding = finding_of("delay", delays=near, assumed_delay=0.0004)
+        assert finding.level == "good"
+        assert "(0 ms assumed, 0.4 ms in the fit)" in finding.words
+
     def test_models_of_the_same_fit_that_predict_apart_are_named(self):
         large = an_error(0.2)
         left_open = finding_of(LEFT_OPEN, held_out=large, open_share=0.25)

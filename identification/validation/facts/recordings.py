@@ -142,8 +142,10 @@ class DelayFacts:
         beyond = max(limits.delay * delays.cycle, SIGMAS * delays.std)
         differs = abs(delays.delay - assumed) > beyond
         outcome: _DelayOutcome | None = None
-        replaced = abs(assumed - delays.assumed) > limits.delay * delays.cycle
-        if delays.significant and (assumed == delays.applied or replaced):
+        far = abs(delays.delay - delays.assumed) > beyond  # and yet combined with what is stated
+        if delays.significant and (
+            assumed == delays.applied or (far and assumed != delays.assumed)
+        ):
             outcome = "compensated"
         elif delays.determined and not poor:
             outcome = "differs" if differs else "as assumed"
@@ -161,10 +163,11 @@ class DelayFacts:
         """Yield what was found of the delay."""
         estimate = f"{self.delay:.3g} ± {self.half_interval:.2g} ms"
         if self.outcome == "compensated":
+            what = "this" if self.assumed == self.delay else f"{self.assumed:.3g} ms"
             yield Finding(
                 "delay",
                 "doubtful",
-                f"the torque lags the position by {estimate} ({self.stated:.3g} ms stated); this"
+                f"the torque lags the position by {estimate} ({self.stated:.3g} ms stated); {what}"
                 " was compensated",
                 "state it (`hil identify --delay SECONDS`), or correct it at its source",
             )
