@@ -416,6 +416,8 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=_MOST, help="of motions at most to weigh")
     parser.add_argument("--payloads", type=int, default=0)
     options = parser.parse_args()
+    if options.pairs < FEWEST:
+        parser.error(f"--pairs {options.pairs}: at least {FEWEST} pairs weigh a load")
     figures: dict[str, Any] = {}
     if options.campaigns:
         figures["campaigns"] = campaigns(options.campaigns, options.require, options.first_seed)

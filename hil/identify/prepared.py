@@ -247,29 +247,42 @@ class _DelayChoice:
             return replace(unused, assumed=estimate.delay, notes=notes, errors=errors)
         if options.delay is not None:
             return unused
-        applied, error = estimate.delay, estimate.variance
         if sources.cell.file.controller is not None:
-            combined = _with_stated(estimate, stated.stated_delay)
-            applied, error = combined.mean, combined.variance
-            bound = Thresholds().delay * estimate.cycle
-            far = abs(estimate.delay - stated.stated_delay) > bound
-            # Inner prediction decides on a determined one that is far from the stated delay. Beside
-            # a low-pass of the torque the stated one is kept: the estimate may contain its lag.
-            if not (far and estimate.determined and estimate.significant):
-                filtered = stated.preprocessing.torque_bandwidth is not None
-                if not (filtered or _asks_low_pass(sources, options)):
-                    notes = _combined_notes(described, estimate, applied)
-                    return replace(unused, assumed=applied, notes=notes, errors={applied: error})
-                error = combined.mean_square_error(unused.assumed)
-                return replace(unused, notes=described, errors={unused.assumed: error})
-            unused = replace(
-                unused, errors={unused.assumed: combined.mean_square_error(unused.assumed)}
+            filtered = stated.preprocessing.torque_bandwidth is not None
+            return unused._beside_stated(
+                estimate, described, filtered=filtered or _asks_low_pass(sources, options)
             )
-        if not estimate.significant:
-            return replace(unused, notes=described, errors={unused.assumed: error})
-        delay = SuggestedDelay(applied, estimate.determined)
-        errors = {**unused.errors, applied: error}
-        return replace(unused, suggested=(delay,), notes=described, errors=errors)
+        delay = SuggestedDelay(estimate.delay, estimate.determined)
+        return replace(
+            unused,
+            suggested=(delay,) if estimate.significant else (),
+            notes=described,
+            errors={estimate.applied: estimate.variance},
+        )
+
+    def _beside_stated(
+        self, estimate: DelayEstimate, described: tuple[str, ...], *, filtered: bool
+    ) -> _DelayChoice:
+        """Use an estimate beside the stated delay of a controller: both together.
+
+        Inner prediction decides on a significant, determined one that is far from it. Beside a
+        low-pass of the torque the stated one is kept: the estimate may contain its lag.
+        """
+        stated = self.assumed
+        combined = _with_stated(estimate, stated)
+        errors = {stated: combined.mean_square_error(stated), combined.mean: combined.variance}
+        choice = replace(self, notes=described, errors=errors)
+        far = abs(estimate.delay - stated) > Thresholds().delay * estimate.cycle
+        if far and estimate.determined and estimate.significant:
+            return replace(choice, suggested=(SuggestedDelay(combined.mean, determined=True),))
+        if filtered:
+            return choice
+        if abs(combined.mean - stated) >= _SAME_DELAY * estimate.cycle:
+            beside = f"by this and the stated {stated * 1e3:.3g} ms"
+            choice = replace(
+                choice, notes=(described[0], f"{_compensated(combined.mean)}, {beside}")
+            )
+        return replace(choice, assumed=combined.mean)
 
     def applied_to(self, chosen: Settings) -> Settings:
         """Return settings with the determined delay, whatever others they were chosen beside."""
@@ -308,16 +321,6 @@ class _DelayChoice:
 
 def _compensated(delay: float) -> str:
     return f"a delay of {delay * 1e3:.3g} ms of all axes was compensated"
-
-
-def _combined_notes(
-    described: Sequence[str], estimate: DelayEstimate, applied: float
-) -> tuple[str, ...]:
-    """Return the notes on a delay by an estimate and a controller's stated one."""
-    stated = estimate.assumed
-    if abs(applied - stated) < _SAME_DELAY * estimate.cycle:
-        return tuple(described)
-    return described[0], f"{_compensated(applied)}, by this and the stated {stated * 1e3:.3g} ms"
 
 
 def carried_over(settings: Settings, sources: Sources, options: Options) -> Settings:
