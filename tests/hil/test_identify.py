@@ -209,14 +209,12 @@ class TestDelayOfAController:
             sources = replace(sources, training=(replace(source, recording=recording),))
         return _DelayChoice.of(estimate, sources, Settings(Preprocessing()), Options())
 
-    def test_an_estimate_that_is_not_significant_counts_alike_on_both_sides_of_the_bound(
-        self, campaign
-    ):
+    def test_insignificant_estimates_count_alike_beyond_the_bound(self, campaign):
         below, above = (self.choice(campaign, estimated(delay)) for delay in (5.9e-4, 6.1e-4))
         assert above.assumed == pytest.approx(below.assumed, abs=3e-5)
         assert above.errors[above.assumed] == pytest.approx(below.errors[below.assumed], rel=0.05)
 
-    def test_inner_prediction_decides_on_a_significant_one_that_is_far(self, campaign):
+    def test_inner_prediction_decides_on_a_far_significant_one(self, campaign):
         choice = self.choice(campaign, estimated(2e-3, significant=True))
         assert choice.assumed == 0.0
         assert [delay.value for delay in choice.suggested] == [pytest.approx(2e-3, abs=1e-4)]

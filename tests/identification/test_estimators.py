@@ -244,9 +244,7 @@ class TestBlocks:
             ),  # of a block alone the variance is that of the others
         ],
     )
-    def test_the_interval_factor_of_a_parameter_is_that_of_the_blocks_that_determine_it(
-        self, weights, freedom
-    ):
+    def test_interval_factors_count_the_blocks_that_determine_each(self, weights, freedom):
         """Beside one that all blocks determine; whatever the units."""
         information = np.array([np.diag([1.0, weight]) for weight in weights])
         root = np.diag(np.array([len(weights), weights.sum()]) ** -0.5)
