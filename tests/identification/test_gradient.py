@@ -129,6 +129,30 @@ def test_the_gradient_predicts_changes_of_the_criteria(population, start, kind):
     assert np.corrcoef(changes @ gradient, expected)[0, 1] > 0.95
 
 
+def test_slopes_of_slow_moves_are_not_smoothed():
+    """A joint that hardly moves between some points: by their differences friction turns."""
+    problem_ = problem()
+    problem_ = replace(problem_, genome=replace(problem_.genome, n_via=10))
+    slow = np.arange(7, 17, 2)  # coordinates of the second joint in five points
+
+    def value(row):
+        (motion,) = problem_.genome.motions(row[None])
+        return WEIGHTS @ problem_.objective.criteria(motion, 1e-3).measures
+
+    def errors():
+        for seed in range(8):
+            random = np.random.default_rng(seed)
+            genes = problem_.genome.sample(random, 1)[0]
+            genes[slow] = 0.3 + 0.01 * random.random(5)
+            tangent = problem_.tangent(genes, WEIGHTS)
+            slopes = gene_slopes(problem_, tangent, genes, slow)[:, 0]
+            changes = 1e-4 * np.eye(len(genes))[slow]
+            expected = [(value(genes + d) - value(genes - d)) / 2e-4 for d in changes]
+            yield np.linalg.norm(slopes - expected) / np.linalg.norm(expected)
+
+    assert np.median(list(errors())) < 0.15
+
+
 def test_a_part_that_takes_longer_counts_more_often(population, start):
     """By a fiftieth: its samples 51 times beside the others 50 times, against 49 times."""
     genes, _ = start

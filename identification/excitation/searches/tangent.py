@@ -20,6 +20,7 @@ from identification.excitation.constraints import Constraints, CurrentModel, mid
 from identification.excitation.criteria import Objective
 from identification.excitation.genomes import Genome, ViaPointGenome
 from identification.excitation.searches.local_change import Change, PlannedMoves
+from identification.model.friction import JointFriction
 from identification.model.motion import Motion
 from planner import PlannerError
 
@@ -53,6 +54,7 @@ _POSITION_STEP: Final = 1e-3  # rad or m
 _VELOCITY_STEP: Final = 1e-3  # rad/s or m/s, at least
 _ACCELERATION_STEP: Final = 1.0  # exact: the regressor is linear in accelerations
 _DURATION_STEP: Final = 1e-3  # relative
+_LEAST_SHARE: Final = 1e-3  # of a joint in the speed of a coupled motor, relative
 _LOADED: Final = 0.75  # loads above this fraction of the limit are followed
 _NEAR: Final = 0.08  # pairs of bodies closer than this to their least distance are followed [m]
 _RESERVE: Final = 1e-3  # margin to each bound, relative, above the rounding of a check
@@ -146,16 +148,10 @@ def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent
     time = middles.time
     states = np.array(middles[1:4])
     constraints = problem.constraints
-    # Steps of velocity as wide as its change between two samples: sgn(qd) jumps between them.
-    swing = np.abs(np.diff(states[1], axis=0)).max(axis=0)
     n = states.shape[2]
-    steps = np.array(
-        (
-            np.full(n, _POSITION_STEP),
-            np.maximum(swing, _VELOCITY_STEP),
-            np.full(n, _ACCELERATION_STEP),
-        )
-    )
+    steps = _steps(states)
+    friction = problem.objective.model.friction
+    steps[1] = np.maximum(steps[1], _swing(friction, states[1]))
     margins: list[Margin] = []
     if constraints.currents is not None:
         margins += _loads(constraints.currents, sampled(motion, problem.period))
@@ -215,10 +211,37 @@ def _changes(
             yield Change(motion, 0.0, 0.0, duration, motion.duration - duration)
 
 
-def _neighbours(states: Array, steps: Array) -> Iterator[tuple[int, int, Array, Array, float]]:
+def _steps(states: Array) -> Array:
+    """Return the step of each of the states (3, N, n)."""
+    steps = np.empty_like(states)
+    steps[:] = np.array((_POSITION_STEP, _VELOCITY_STEP, _ACCELERATION_STEP))[:, None, None]
+    return steps
+
+
+def _swing(friction: JointFriction, velocity: Array) -> Array:
+    """Return how much each velocity (N, n) changes from a sample to the next.
+
+    sgn(qd) jumps between two samples. A step of this width finds each jump in the two samples
+    beside it; a wider one would find it in slow moves nearby that do not reverse.
+    """
+
+    def change(speed: Array) -> Array:
+        steps = np.abs(np.diff(speed, axis=0))
+        before, after = (steps[:1], steps), (steps, steps[-1:])
+        return np.asarray(np.maximum(np.concatenate(before), np.concatenate(after)))
+
+    swing = change(velocity)
+    for share in friction.motor_speeds():
+        moved = np.abs(share) > _LEAST_SHARE * np.abs(share).max()
+        of_motor = change((velocity @ share)[:, None]) / np.abs(share[moved])
+        swing[:, moved] = np.maximum(swing[:, moved], of_motor)
+    return swing
+
+
+def _neighbours(states: Array, steps: Array) -> Iterator[tuple[int, int, Array, Array, Array]]:
     """Yield for each state of each joint the states (3, N, n) above and below, and their gap."""
-    for kind, joint in np.ndindex(steps.shape):
-        step = float(steps[kind, joint])
+    for kind, joint in np.ndindex(states.shape[0], states.shape[2]):
+        step = steps[kind, :, joint]
         above = states.copy()
         below = states.copy()
         above[kind, :, joint] += step
@@ -270,12 +293,11 @@ def _loads(currents: CurrentModel, motion: Motion) -> Iterator[Margin]:
         return
     samples, row = np.unique(sample, return_inverse=True)
     chosen = np.array(motion[1:4])[:, samples]
-    n = chosen.shape[2]
-    steps = np.repeat([[_POSITION_STEP], [_VELOCITY_STEP], [_ACCELERATION_STEP]], n, axis=1)
-    slope = np.zeros((len(sample), 3, n))
+    slope = np.zeros((len(sample), 3, chosen.shape[2]))
     reversing = _near_reversal(currents, chosen[1])
-    for kind, joint, above, below, gap in _neighbours(chosen, steps):
-        change = (currents.loads(_motion(above)) - currents.loads(_motion(below))) / gap
+    for kind, joint, above, below, gap in _neighbours(chosen, _steps(chosen)):
+        change = currents.loads(_motion(above)) - currents.loads(_motion(below))
+        change /= gap[:, None]
         if kind == 1:  # no slope where sgn(qd) jumps
             change[reversing[:, joint]] = 0.0
         slope[:, kind, joint] = -change[row, column]
