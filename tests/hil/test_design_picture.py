@@ -14,7 +14,7 @@ from hil.cell import Cell
 from hil.plots import save, style
 from hil.plots.design_picture import draw_design
 from identification.excitation import CRITERIA, Design, Objective, information
-from identification.excitation.constraints import sampled
+from identification.excitation.constraints import midpoints
 from identification.excitation.criteria import Criterion
 from identification.excitation.excitation import Excitation
 from identification.excitation.searches.population import Front
@@ -93,7 +93,7 @@ class TestPage:
         figure = draw_design(design, ns16)
         (axes,) = (axes for axes in figure.axes if axes.get_xlabel().startswith("parameters"))
         (image,) = axes.images
-        motion = sampled(design.excitation.trajectory, 0.001)
+        motion = midpoints(design.excitation.trajectory, 0.001)
         factor = Factor.from_samples(ns16.model, motion, np.zeros_like(motion.position))
         inverse = np.linalg.inv(information(factor))
         deviation = np.sqrt(np.diag(inverse))
