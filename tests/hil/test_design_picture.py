@@ -13,12 +13,11 @@ from matplotlib.text import Text
 from hil.cell import Cell
 from hil.plots import save, style
 from hil.plots.design_picture import draw_design
-from identification.excitation import CRITERIA, Design, Objective, information
+from identification.excitation import CRITERIA, Design, Objective
 from identification.excitation.constraints import midpoints
-from identification.excitation.criteria import Criterion
+from identification.excitation.criteria import Criterion, friction_of_excitation
 from identification.excitation.excitation import Excitation
 from identification.excitation.searches.population import Front
-from identification.factor.factor import Factor
 from planner import FourierSeries, Trajectory, plan
 from sim_fixtures.ns16 import CELL_PATH
 
@@ -94,8 +93,10 @@ class TestPage:
         (axes,) = (axes for axes in figure.axes if axes.get_xlabel().startswith("parameters"))
         (image,) = axes.images
         motion = midpoints(design.excitation.trajectory, 0.001)
-        factor = Factor.from_samples(ns16.model, motion, np.zeros_like(motion.position))
-        inverse = np.linalg.inv(information(factor))
+        friction = friction_of_excitation(ns16.model)  # less of it below standstill
+        direction = friction.direction(motion.time, motion.position, motion.velocity)
+        regressor = ns16.model.regressor(*motion[1:4], direction).dense(ns16.model.n_parameters)
+        inverse = np.linalg.inv(np.einsum("mnp,mnq->pq", regressor, regressor))
         deviation = np.sqrt(np.diag(inverse))
         expected = np.abs(inverse / np.outer(deviation, deviation))[:40, :40]
         np.testing.assert_allclose(np.asarray(image.get_array()), expected, atol=1e-5)
