@@ -306,7 +306,7 @@ def payloads(count: int) -> dict[str, Any]:
     }
 
 
-def weighings(count: int, required: str, most: int) -> dict[str, Any]:
+def weighings(count: int, required: str, most: int, first_seed: int) -> dict[str, Any]:
     """Weigh loads of 3 to 12 kg by payload campaigns of the NS 16 in virtual time, 12 kg assumed.
 
     Each ends when it is precise, after at most so many pairs of a bare and a loaded motion.
@@ -328,7 +328,7 @@ def weighings(count: int, required: str, most: int) -> dict[str, Any]:
     inside = []
     halves = []
     pairs = []
-    for seed in range(1, count + 1):
+    for seed in range(first_seed, first_seed + count):
         heavy = load_of(seed)  # of up to 16 kg
         share = _HEAVIEST / 16.0
         load = Body(share * heavy.mass, heavy.centre, share * heavy.inertia)
@@ -408,7 +408,7 @@ def main() -> None:
     """Print the figures of the parts that were asked for."""
     parser = parser_of(__doc__)
     parser.add_argument("--campaigns", type=int, default=0)
-    parser.add_argument("--first-seed", type=int, default=1, help="of the campaigns")
+    parser.add_argument("--first-seed", type=int, default=1, help="of campaigns and weighings")
     parser.add_argument("--require", default="torque 30, friction 10%")
     parser.add_argument("--stops", type=int, default=0)
     parser.add_argument("--weighings", type=int, default=0)
@@ -424,7 +424,9 @@ def main() -> None:
     if options.stops:
         figures["stops"] = stops(options.stops)
     if options.weighings:
-        figures["weighings"] = weighings(options.weighings, options.require_mass, options.pairs)
+        figures["weighings"] = weighings(
+            options.weighings, options.require_mass, options.pairs, options.first_seed
+        )
     if options.payloads:
         figures["payloads"] = payloads(options.payloads)
     show(figures, only_json=options.json)
