@@ -6,12 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from identification import RobotModel
 from identification.excitation.constraints import CurrentModel, midpoints, sampled
 from identification.excitation.criteria import (
     CRITERIA,
     SENSE,
     SMALL_CORRELATION,
     Given,
+    Objective,
     correlation,
     log10_det,
 )
@@ -22,13 +24,16 @@ from identification.excitation.searches.local_change import Change
 from identification.excitation.searches.population import Population, Scores, SearchSettings
 from identification.excitation.searches.run import search
 from identification.excitation.searches.tangent import Linearisation, gene_slopes
+from identification.model.coupling import Coupling
 from identification.model.motion import Motion
 from planner import PlannerError
 from tests.identification.searching import bits, problem
+from tests.identification.two_link import URDF
 
 pytestmark = pytest.mark.long
 
 WEIGHTS = np.array([0.75, -0.25])
+SMALL_SHARE = Coupling(np.array([[1.0, 0.0], [0.03, 1.0]]))
 SETTINGS = SearchSettings(
     method="gradient", population=12, generations=2, seed=3, weights=(0.75, 0.25), gradient=8
 )
@@ -129,22 +134,30 @@ def test_the_gradient_predicts_changes_of_the_criteria(population, start, kind):
     assert np.corrcoef(changes @ gradient, expected)[0, 1] > 0.95
 
 
-def test_slopes_of_slow_moves_are_not_smoothed():
+@pytest.mark.parametrize(
+    ("coupling", "joint"),
+    [(None, 1), (Coupling(np.array([[1.0, 0.0], [1.0, 1.0]])), 1), (SMALL_SHARE, 0)],
+    ids=["of-its-own-motor", "beside-a-coupled-motor", "a-small-share-of-a-motor"],
+)
+def test_slopes_of_slow_moves_are_not_smoothed(coupling, joint):
     """A joint that hardly moves between some points: by their differences friction turns."""
-    problem_ = problem()
-    problem_ = replace(problem_, genome=replace(problem_.genome, n_via=10))
-    slow = np.arange(7, 17, 2)  # coordinates of the second joint in five points
+    problem_ = replace(
+        problem(replace(problem().genome, n_via=10)),
+        objective=Objective(RobotModel.from_urdf(URDF, coupling=coupling)),
+    )
+    weights = np.array([1.0, 0.0])  # no I_c, whose slopes are smoothed
+    slow = np.arange(6 + joint, 16 + joint, 2)  # coordinates of the joint in five points
 
     def value(row):
         (motion,) = problem_.genome.motions(row[None])
-        return WEIGHTS @ problem_.objective.criteria(motion, 1e-3).measures
+        return weights @ problem_.objective.criteria(motion, 1e-3).measures
 
     def errors():
         for seed in range(8):
             random = np.random.default_rng(seed)
             genes = problem_.genome.sample(random, 1)[0]
             genes[slow] = 0.3 + 0.01 * random.random(5)
-            tangent = problem_.tangent(genes, WEIGHTS)
+            tangent = problem_.tangent(genes, weights)
             slopes = gene_slopes(problem_, tangent, genes, slow)[:, 0]
             changes = 1e-4 * np.eye(len(genes))[slow]
             expected = [(value(genes + d) - value(genes - d)) / 2e-4 for d in changes]

@@ -20,7 +20,6 @@ from identification.excitation.constraints import Constraints, CurrentModel, mid
 from identification.excitation.criteria import Objective
 from identification.excitation.genomes import Genome, ViaPointGenome
 from identification.excitation.searches.local_change import Change, PlannedMoves
-from identification.model.friction import JointFriction
 from identification.model.motion import Motion
 from planner import PlannerError
 
@@ -54,7 +53,6 @@ _POSITION_STEP: Final = 1e-3  # rad or m
 _VELOCITY_STEP: Final = 1e-3  # rad/s or m/s, at least
 _ACCELERATION_STEP: Final = 1.0  # exact: the regressor is linear in accelerations
 _DURATION_STEP: Final = 1e-3  # relative
-_LEAST_SHARE: Final = 1e-3  # of a joint in the speed of a coupled motor, relative
 _LOADED: Final = 0.75  # loads above this fraction of the limit are followed
 _NEAR: Final = 0.08  # pairs of bodies closer than this to their least distance are followed [m]
 _RESERVE: Final = 1e-3  # margin to each bound, relative, above the rounding of a check
@@ -150,8 +148,7 @@ def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent
     constraints = problem.constraints
     n = states.shape[2]
     steps = _steps(states)
-    friction = problem.objective.model.friction
-    steps[1] = np.maximum(steps[1], _swing(friction, states[1]))
+    steps[1] = np.maximum(steps[1], _swing(states[1]))
     margins: list[Margin] = []
     if constraints.currents is not None:
         margins += _loads(constraints.currents, sampled(motion, problem.period))
@@ -218,24 +215,16 @@ def _steps(states: Array) -> Array:
     return steps
 
 
-def _swing(friction: JointFriction, velocity: Array) -> Array:
-    """Return how much each velocity (N, n) changes from a sample to the next.
+def _swing(velocity: Array) -> Array:
+    """Return the larger change of each velocity (N, n) to one of the samples beside it.
 
-    sgn(qd) jumps between two samples. A step of this width finds each jump in the two samples
-    beside it; a wider one would find it in slow moves nearby that do not reverse.
+    sgn(qd) jumps between two samples. Steps of this width find each jump near it; wider ones would
+    find it in slow moves as well, which do not reverse. Where a law has no standstill speed, the
+    slopes of a joint at rest are those of a jump, too.
     """
-
-    def change(speed: Array) -> Array:
-        steps = np.abs(np.diff(speed, axis=0))
-        before, after = (steps[:1], steps), (steps, steps[-1:])
-        return np.asarray(np.maximum(np.concatenate(before), np.concatenate(after)))
-
-    swing = change(velocity)
-    for share in friction.motor_speeds():
-        moved = np.abs(share) > _LEAST_SHARE * np.abs(share).max()
-        of_motor = change((velocity @ share)[:, None]) / np.abs(share[moved])
-        swing[:, moved] = np.maximum(swing[:, moved], of_motor)
-    return swing
+    change = np.abs(np.diff(velocity, axis=0))
+    to_next = np.pad(change, ((0, 1), (0, 0)))
+    return np.asarray(np.maximum(to_next, np.pad(change, ((1, 0), (0, 0)))))
 
 
 def _neighbours(states: Array, steps: Array) -> Iterator[tuple[int, int, Array, Array, Array]]:
