@@ -238,10 +238,8 @@ class TestBlocks:
         [
             (np.ones(25), 24),  # all alike
             (np.append(np.full(4, 1e6), np.ones(21)), 3),  # four determine it
-            (
-                np.append(1e6, np.ones(24)),
-                24,
-            ),  # of a block alone the variance is that of the others
+            # of a block alone the variance is that of the others
+            (np.append(1e6, np.ones(24)), 24),
         ],
     )
     def test_interval_factors_count_the_blocks_that_determine_each(self, weights, freedom):

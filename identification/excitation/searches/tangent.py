@@ -148,7 +148,7 @@ def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent
     constraints = problem.constraints
     n = states.shape[2]
     steps = _steps(states)
-    steps[1] = np.maximum(steps[1], _swing(states[1]))
+    steps[1] = np.maximum(steps[1], _velocity_change(states[1]))
     margins: list[Margin] = []
     if constraints.currents is not None:
         margins += _loads(constraints.currents, sampled(motion, problem.period))
@@ -215,7 +215,7 @@ def _steps(states: Array) -> Array:
     return steps
 
 
-def _swing(velocity: Array) -> Array:
+def _velocity_change(velocity: Array) -> Array:
     """Return the larger change of each velocity (N, n) to one of the samples beside it.
 
     sgn(qd) jumps between two samples. Steps of this width find each jump near it; wider ones would
