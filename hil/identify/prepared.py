@@ -266,7 +266,8 @@ class _DelayChoice:
         """Use an estimate beside the stated delay of a controller: both together.
 
         Inner prediction decides on a significant, determined one that is far from it. Beside a
-        low-pass of the torque the stated one is kept, as the estimate may include the filter's delay.
+        low-pass of the torque the stated one is kept, as the estimate may include the delay of the
+        filter.
         """
         stated = self.assumed
         combined = _with_stated(estimate, stated)
