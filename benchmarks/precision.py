@@ -316,7 +316,7 @@ def weighings(count: int, required: str, most: int, first_seed: int) -> dict[str
     cell = Cell.load(CELL_PATH).with_campaign(repetitions=most)
     cell = cell.with_values({"campaign.approach_speed": 1.0, "campaign.standstill_s": 1.0})
     assumed = assumed_payload(cell, _HEAVIEST)
-    settings = payload_search()
+    settings = payload_search(cell.joint_limits)
     promise = PrecisionDesign.of(
         cell, requirements, [motion.trajectory for motion in _validation(cell)], (), _HEAVIEST
     )

@@ -149,7 +149,9 @@ def design(
     there = folder.resumed_settings() if resume else None
     if purpose is not None:
         precision = precision or ["mass of payload 1 %"]
-        asked = there or (payload_search() if settings is None else load_settings(settings))
+        asked = there or (
+            payload_search(loaded.joint_limits) if settings is None else load_settings(settings)
+        )
     elif quick:
         asked = short_search() if precision else quick_settings(loaded)
     elif settings is not None:

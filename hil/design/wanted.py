@@ -71,9 +71,15 @@ class ReferenceMotions:
         """Return the standard deviation of each joint's torque (n,)."""
         return np.asarray(np.std(self.torque(values), axis=0))
 
-    def information(self, density: Array) -> Array:
-        """Return the information per second (p, p) for densities of the torque error (n,)."""
-        total = np.einsum("jmp,jmq->pq", self.rows / density[:, None, None], self.rows)
+    def information(self, density: Array, *, has_offsets: bool = False) -> Array:
+        """Return the information per second (p, p) for densities of the torque error (n,).
+
+        With `has_offsets` each joint's torque has an unknown offset.
+        """
+        rows = self.rows
+        if has_offsets:
+            rows = rows - rows.mean(axis=1, keepdims=True)
+        total = np.einsum("jmp,jmq->pq", rows / density[:, None, None], rows)
         return np.asarray(total / len(self.position))
 
     def wanted(

@@ -300,6 +300,13 @@ class Given:
         return self.duration / step
 
 
+class _JointSums(NamedTuple):
+    """Sums over a motion, of each joint."""
+
+    grams: list[Array]  # Gram matrix of its columns
+    rows: list[Array]  # of its rows
+
+
 @dataclass(frozen=True, eq=False)
 class Objective:
     """Evaluates motions by the information on a model's parameters.
@@ -325,7 +332,7 @@ class Objective:
         Raises:
             ShapeError: an array of the motion has the wrong shape.
         """
-        return self._judged(motion, self._gram(self._joint_grams(motion)))
+        return self._judged(motion, self._gram(self._joint_sums(motion).grams))
 
     def _judged(self, motion: Motion, total: Array) -> Array:
         """Return the Gram matrix (e, e) of what is judged, with what is given."""
@@ -339,27 +346,51 @@ class Objective:
 
     def scores(self, motion: Motion) -> tuple[dict[str, float], float]:
         """Return the `CRITERIA` of a sampled motion, and the criterion of the precision, else 0."""
-        grams = self._joint_grams(motion)
+        sums = self._joint_sums(motion)
         values = measures(
-            self._judged(motion, self._gram(grams)), motion.n_samples + self.n_given(motion)
+            self._judged(motion, self._gram(sums.grams)), motion.n_samples + self.n_given(motion)
         )
         if self.precision is None:
             return values, 0.0
-        return values, self.precision.criterion(self._gram(grams, self._joint_weights(motion)))
+        return values, self.precision.criterion(self._precise(motion, sums))
 
-    def grams_by_joint(self, motion: Motion) -> Array:
-        """Return the Gram matrix of the rows of each joint (n, p, p)."""
+    def precise_grams(self, motion: Motion) -> Array:
+        """Return the Gram matrix (n, p, p) of the rows of each joint, as the precision has them."""
         p = self.model.n_parameters
         grams = np.zeros((self.model.n_joints, p, p))
-        for joint, (index, gram) in enumerate(
-            zip(self._block_indices, self._joint_grams(motion), strict=True)
-        ):
+        counted = self._counted(motion, self._joint_sums(motion))
+        for joint, (index, gram) in enumerate(zip(self._block_indices, counted, strict=True)):
             grams[joint][index] = gram
         return grams
 
     def precise_information(self, motion: Motion) -> Array:
         """Return the information (p, p) of a sampled motion by the stated torque error."""
-        return self._gram(self._joint_grams(motion), self._joint_weights(motion))
+        return self._precise(motion, self._joint_sums(motion))
+
+    def precise_means(self, motion: Motion) -> list[Array] | None:
+        """Return the mean of each joint's columns, from which the precision counts them.
+
+        None if it counts them from zero.
+        """
+        if self.precision is None or not self.precision.has_offsets:
+            return None
+        return [row / motion.n_samples for row in self._joint_sums(motion).rows]
+
+    def _precise(self, motion: Motion, sums: _JointSums) -> Array:
+        return self._gram(self._counted(motion, sums), self._joint_weights(motion))
+
+    def _counted(self, motion: Motion, sums: _JointSums) -> list[Array]:
+        """Return the Gram matrix of each joint's columns; from their mean if it has an offset.
+
+        What an unknown offset of the torque leaves: the offset is eliminated from the equations.
+        """
+        assert self.precision is not None
+        if not self.precision.has_offsets:
+            return sums.grams
+        return [
+            gram - np.outer(row, row) / motion.n_samples
+            for gram, row in zip(sums.grams, sums.rows, strict=True)
+        ]
 
     def _joint_weights(self, motion: Motion) -> Array:
         """Return the weight of a sample of each joint (n,) by the stated torque error."""
@@ -390,10 +421,17 @@ class Objective:
                     total += weight * criterion.slope(root)
         return total
 
-    def along(self, motion: Motion, matrix: Array, weights: Array | None = None) -> Array:
+    def along(
+        self,
+        motion: Motion,
+        matrix: Array,
+        weights: Array | None = None,
+        means: Sequence[Array] | None = None,
+    ) -> Array:
         r"""Return :math:`\mathrm{tr}(\Phi_t M \Phi_t^T)` of each sample (m,), M (e, e).
 
         With `weights` (n,) of the rows of the joints it is that of all parameters, M (p, p).
+        `means` are subtracted from each joint's columns.
         """
         model = self.model
         if self.parameters is not None and weights is None:
@@ -406,7 +444,9 @@ class Objective:
         total = np.zeros(motion.n_samples)
         q, qd, qdd = self._states(motion)
         for part, rows in model.chunks(q, qd, qdd, self._direction(q, qd)):
-            for columns, block in zip(rows, blocks, strict=True):
+            for joint, (columns, block) in enumerate(zip(rows, blocks, strict=True)):
+                if means is not None:
+                    columns = columns - means[joint][:, None]
                 total[part] += np.einsum("pm,pm->m", columns, block @ columns)
         return total
 
@@ -426,14 +466,16 @@ class Objective:
     def _direction(self, position: Array, velocity: Array) -> Array:
         return self._friction.direction(np.zeros(len(position)), position, velocity)
 
-    def _joint_grams(self, motion: Motion) -> list[Array]:
-        """Return the Gram matrix of the columns of each joint."""
-        sums = [np.zeros((len(used), len(used))) for used in self.model.plan.columns]
+    def _joint_sums(self, motion: Motion) -> _JointSums:
+        """Return the sums over the rows of each joint."""
+        grams = [np.zeros((len(used), len(used))) for used in self.model.plan.columns]
+        totals = [np.zeros(len(used)) for used in self.model.plan.columns]
         q, qd, qdd = self._states(motion)
         for _, rows in self.model.chunks(q, qd, qdd, self._direction(q, qd)):
             for joint, block in enumerate(rows):
-                sums[joint] += block @ block.T
-        return sums
+                grams[joint] += block @ block.T
+                totals[joint] += block.sum(axis=1)
+        return _JointSums(grams, totals)
 
     def _gram(self, grams: Sequence[Array], weights: Array | None = None) -> Array:
         """Return the Gram matrix (p, p) of all joints, of weights (n,) or equal ones."""

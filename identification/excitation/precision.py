@@ -53,6 +53,14 @@ class Precision:
     density: Array  #: of the torque error of each joint at low frequencies (n,) [(N m)² s]
     prior: Array  #: information of prior and earlier recordings (p, p)
 
+    @property
+    def has_offsets(self) -> bool:
+        """Whether each recording has an unknown offset of every joint's torque.
+
+        As it has where a payload is weighed (:mod:`identification.estimators.payload`).
+        """
+        return isinstance(self.quantities, LoadQuantities)
+
     def ratios(self, information: Array) -> Array:
         """Return predicted over wanted interval (k,) for the information (p, p) of a motion."""
         variance = self.spread(information).variance

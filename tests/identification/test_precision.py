@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from identification.estimators.payload import parameter_change
 from identification.excitation import (
     LoadQuantities,
     Precision,
@@ -16,6 +17,7 @@ from identification.excitation import (
     midpoints,
     search,
 )
+from identification.excitation.criteria import friction_of_excitation
 from identification.excitation.precision import INTERVAL
 from identification.excitation.searches.population import Population
 from identification.excitation.searches.tangent import gene_slopes
@@ -83,21 +85,52 @@ class TestVariances:
         assert slope == pytest.approx((above - below) / (2.0 * step), rel=1e-5)
 
 
-class TestSearch:
-    def problem(self):
-        problem = small_problem()
-        p = problem.objective.model.n_parameters
-        n = problem.objective.model.n_joints
-        precision = Precision(
-            Quantities(np.eye(p), np.ones(p)), np.linspace(1.0, 3.0, n), 1e-3 * np.eye(p)
-        )
-        return replace(problem, objective=replace(problem.objective, precision=precision))
+def search_problem(kind: str = "arm"):
+    """A search for all parameters of an arm, or for a mass at the end of its second link."""
+    problem = small_problem()
+    model = problem.objective.model
+    p = model.n_parameters
+    quantities: Quantities | LoadQuantities = Quantities(np.eye(p), np.ones(p))
+    if kind == "load":
+        mass = np.eye(10)[-1:]
+        quantities = LoadQuantities(mass, np.ones(1), parameter_change(model, None), np.eye(p))
+    density = np.linspace(1.0, 3.0, model.n_joints)
+    precision = Precision(quantities, density, 1e-3 * np.eye(p))
+    return replace(problem, objective=replace(problem.objective, precision=precision))
 
-    def test_the_gradient_predicts_changes_of_the_criterion(self) -> None:
+
+def random_genes(problem) -> np.ndarray:
+    return 0.3 + 0.4 * np.random.default_rng(3).random(problem.genome.n_genes)
+
+
+def test_a_load_is_weighed_beside_an_unknown_offset_of_each_torque() -> None:
+    """The information on the parameters when the offsets are eliminated from the equations."""
+    problem = search_problem("load")
+    model = problem.objective.model
+    (planned,) = problem.genome.motions(random_genes(problem)[None])
+    motion = midpoints(planned, 1e-2)
+    direction = friction_of_excitation(model).direction(*motion[:3])
+    rows = model.regressor(*motion[1:4], direction).dense(model.n_parameters)
+    m, n, p = rows.shape
+    beside = np.tile(np.eye(n), (m, 1))
+    whole = np.column_stack([rows.reshape(m * n, p), beside])
+    weights = np.tile((motion.time[1] - motion.time[0]) / problem.objective.precision.density, m)
+    total = whole.T @ (weights[:, None] * whole)
+    offsets = slice(p, None)
+    expected = total[:p, :p] - total[:p, offsets] @ np.linalg.solve(
+        total[offsets, offsets], total[offsets, :p]
+    )
+    information = problem.objective.precise_information(motion)
+    np.testing.assert_allclose(information, expected, atol=1e-9 * np.abs(expected).max())
+
+
+class TestSearch:
+    @pytest.mark.parametrize("kind", ["arm", "load"])
+    def test_the_gradient_predicts_changes_of_the_criterion(self, kind: str) -> None:
         """A motion that lasts longer informs more, so that the duration counts too."""
-        problem = self.problem()
-        random = np.random.default_rng(3)
-        genes = 0.3 + 0.4 * random.random(problem.genome.n_genes)
+        problem = search_problem(kind)
+        random = np.random.default_rng(4)
+        genes = random_genes(problem)
         tangent = problem.tangent(genes, None)
         gradient = gene_slopes(problem, tangent, genes, np.arange(len(genes)))[:, 0]
 
@@ -110,7 +143,7 @@ class TestSearch:
         assert np.corrcoef(changes @ gradient, expected)[0, 1] > 0.95
 
     def test_the_gradient_makes_a_motion_more_precise(self) -> None:
-        problem = self.problem()
+        problem = search_problem()
         effort = {"population": 16, "generations": 2, "mutation": 0.1}
         with Population(problem, 1) as population:
             short, longer = (

@@ -247,12 +247,15 @@ def _excitation(
     """
     by_duration = 0.0
     of_joints = None
+    means = None
     if weights is None:
         precision = objective.precision
         assert precision is not None
         whole = objective.precise_information(_motion(states, period))
         matrix = precision.slope(whole)
         of_joints = period / precision.density
+        # The sum over rows about their mean changes with a row as if the mean stayed.
+        means = objective.precise_means(_motion(states))
         by_duration = float(np.sum(matrix * whole) / (states.shape[1] * period))
     else:
         matrix = objective.slope(objective.information(_motion(states, period)), weights)
@@ -265,10 +268,10 @@ def _excitation(
             by_duration = float((longer - shorter) / change)
     slope = np.zeros_like(states)
     for kind, joint, above, below, gap in _neighbours(states, steps):
-        difference = objective.along(_motion(above), matrix, of_joints)
-        difference -= objective.along(_motion(below), matrix, of_joints)
+        difference = objective.along(_motion(above), matrix, of_joints, means)
+        difference -= objective.along(_motion(below), matrix, of_joints, means)
         slope[kind, :, joint] = difference / gap
-    return slope, objective.along(_motion(states), matrix, of_joints), by_duration
+    return slope, objective.along(_motion(states), matrix, of_joints, means), by_duration
 
 
 def _loads(currents: CurrentModel, motion: Motion) -> Iterator[Margin]:
