@@ -5,8 +5,9 @@ Four independent parts, each with its number of seeds:
 - ``--campaigns N``: campaigns of a warm NS 16 with effects in virtual time, by one quick design for
   ``--require``, as long as that of ``hil design --quick``, each of its own simulated arm, run with
   ``--until-precise``. Figures: outcomes, repetitions, robot time over that of thirty repetitions of
-  this motion and of one of 20 s, promised and reached intervals of the requirements, and the share
-  of parameters whose true value is in its 95 % interval at the end.
+  this motion and of one of 20 s, promised and reached intervals of the requirements, the share of
+  parameters whose true value is in its 95 % interval at the end, and the processor time of the last
+  update of the estimate.
 - ``--stops N``: the same rule on simulated torques of the NS 16 with coloured noise and an error
   that every repetition has: coverage of all intervals when the rule has stopped, and after six
   repetitions without looking. Required are 1.1 times the intervals after six repetitions.
@@ -20,6 +21,7 @@ Four independent parts, each with its number of seeds:
 from __future__ import annotations
 
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -127,6 +129,7 @@ def campaigns(count: int, required: str, first_seed: int) -> dict[str, Any]:
         "reached_over_promised": np.quantile(
             reached / promised, (0.05, 0.5, 0.95), axis=0
         ).T.tolist(),
+        "last_look_s": float(np.median([campaign.look for campaign in done])),
         "quantities_inside": np.mean([campaign.inside for campaign in done], axis=0).tolist(),
         "errors_within_required": float(np.mean([campaign.within for campaign in done])),
         "met_and_all_within": float(
@@ -149,6 +152,7 @@ class _Ended:
         inside: of each requirement, the share of quantities whose true value is in its interval.
         within: share of them whose error is at most what was required.
         all_within: whether that is so for all.
+        look: processor time of the last look [s].
     """
 
     outcome: str
@@ -157,6 +161,7 @@ class _Ended:
     inside: list[float]
     within: float
     all_within: bool
+    look: float
 
     def summary(self) -> dict[str, Any]:
         return asdict(self)
@@ -205,7 +210,11 @@ def _ended(cell: Cell, plan: CampaignPlan, requirements: Sequence[Requirement]) 
         assert record is not None
         number = record.looks[-1].repetitions
         paths = campaign.folder.completed("excitation")[:number]
-        measured = PrecisionMeter(campaign, requirements).estimate(paths)
+        meter = PrecisionMeter(campaign, requirements)
+        for count in range(1, number + 1):
+            begin = time.process_time()
+            measured = meter.estimate(paths[:count])
+            look = time.process_time() - begin
     model = cell.model
     scale = np.ones(model.n_parameters)
     drift = np.mean(warmth.factors, axis=0)
@@ -230,6 +239,7 @@ def _ended(cell: Cell, plan: CampaignPlan, requirements: Sequence[Requirement]) 
         ],
         within=float(np.mean(within)),
         all_within=bool(within.all()),
+        look=look,
     )
 
 

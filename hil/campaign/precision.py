@@ -1,7 +1,7 @@
 """Precision of a running campaign: measured after each repetition, and when it is enough.
 
 The estimate is the posterior that `hil identify` computes, with the settings that it would choose
-from the first repetition; the error of their delay is renewed by all of them. Its intervals are
+from the first repetition; the delay is renewed by the first `DELAY_TIME` of them. Its intervals are
 cluster-robust: what the model cannot explain in the same place of every repetition counts as one
 error, however often it is repeated. Only the rest falls with them.
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -26,6 +27,7 @@ from hil.errors import InputError
 from hil.identify.estimating import estimate_with, with_loading
 from hil.identify.options import Options
 from hil.identify.prepared import (
+    DELAY_TIME,
     Prepared,
     decide,
     prepared_with,
@@ -36,7 +38,8 @@ from hil.identify.sources import Source, gather_sources
 from hil.progress import Reporter, Silent
 from hil.reading import path_exists
 from hil.terminal_text import plural
-from identification.estimators.delay import delay_sensitivity, rate_products
+from identification.estimators.delay import CombinedDelay, delay_sensitivity, rate_products
+from identification.estimators.elasticity import ElasticTorque
 from identification.excitation import midpoints
 from identification.factor.estimate import Estimate, inverse_variance
 from identification.factor.factor import Factor
@@ -125,7 +128,11 @@ class PrecisionMeter:
         factors = [recording.factor for recording in recordings]
         rates = [each.products for each in recordings if each.products is not None]
         products = np.sum(rates, axis=0) if rates else None
-        estimation = estimate_with(prepared, self._options, Silent(), factors, products)
+        known = takewhile(lambda each: each.source.path in self._elastic, recordings)
+        elastic = [self._elastic[each.source.path] for each in known]
+        estimation = estimate_with(prepared, self._options, Silent(), factors, products, elastic)
+        for recording, torque in zip(recordings, estimation.elastic, strict=False):
+            self._elastic[recording.source.path] = torque
         pooled = estimation.result.pooled
         posterior = estimation.posterior
         stated = estimation.stated
@@ -172,7 +179,7 @@ class PrecisionMeter:
         """
         training = tuple(recording.source for recording in recordings)
         settings = self._prepared.settings
-        delay = renewed_delay(replace(self._sources, training=training), settings, self._options)
+        delay = self._delay_by(training[len(self._earlier) :] + training[: len(self._earlier)])
         prepared = replace(
             self._prepared,
             sources=replace(
@@ -182,6 +189,16 @@ class PrecisionMeter:
             settings=replace(settings, delay_variance=delay.variance),
         )
         return prepared, delay.mean - settings.preprocessing.torque_delay
+
+    def _delay_by(self, training: tuple[Source, ...]) -> CombinedDelay:
+        """Return the delay by the first recordings, as many as `DELAY_TIME` needs."""
+        ends = np.cumsum([np.ptp(source.recording.time) for source in training])
+        some = training[: 1 + int(np.searchsorted(ends, DELAY_TIME))]
+        paths = tuple(source.path for source in some)
+        if paths not in self._delays:
+            sources = replace(self._sources, training=some)
+            self._delays[paths] = renewed_delay(sources, self._prepared.settings, self._options)
+        return self._delays[paths]
 
     def _choose(self, path: Path) -> None:
         """Choose the settings from a repetition, as `hil identify` does, for all looks."""
@@ -200,6 +217,8 @@ class PrecisionMeter:
         self._reference = ReferenceMotions(model, motions, campaign.cell.model.parameter_names)
         self._earlier = [self._reduced(source) for source in self._given]
         self._repetitions: dict[Path, _Reduced] = {}
+        self._elastic: dict[Path, ElasticTorque] = {}
+        self._delays: dict[tuple[Path, ...], CombinedDelay] = {}
         self._first = path
 
     def _reduced(self, source: Source) -> _Reduced:

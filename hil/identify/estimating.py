@@ -97,6 +97,7 @@ class Estimation:
     #: elastic gears: no residual shows what they do to parameters
     stated: Estimate
     notes: tuple[str, ...]  #: what the intervals assume
+    elastic: tuple[ElasticTorque, ...]  #: of the first recordings, at most `_ALIKE` of one motion
 
 
 def fit_with_transmitted_load(
@@ -152,11 +153,12 @@ def estimate_with(
     reporter: Reporter,
     factors: Sequence[Factor] = (),
     products: Array | None = None,
+    elastic: Sequence[ElasticTorque] = (),
 ) -> Estimation:
     """Estimate the parameters by `options.estimator`, with all applicable tests.
 
-    `factors` by time of the fitted samples, and the sum of their `rate_products`, are computed
-    unless they are known (not for "iv").
+    `factors` by time of the fitted samples, the sum of their `rate_products`, and the torques of
+    elastic gears in the first of them are computed unless they are known (not for "iv").
 
     Raises:
         InputError: the archives lack data that the estimator needs.
@@ -194,7 +196,7 @@ def estimate_with(
         task.advance(1, "held-out motion")
         held_out = tuple(Factor.by_time(model, samples) for samples in prepared.held_out)
         task.advance(1)
-    stated, notes = _stated(prepared, result, fitted, posterior, precision)
+    stated, notes, elastic = _stated(prepared, result, fitted, posterior, precision, elastic)
     return Estimation(
         estimator=name,
         result=result,
@@ -205,6 +207,7 @@ def estimate_with(
         warnings=tuple(warnings),
         stated=stated,
         notes=notes,
+        elastic=elastic,
     )
 
 
@@ -251,22 +254,30 @@ def _stated(
     fitted: Sequence[Samples],
     posterior: Posterior,
     precision: Array | None,
-) -> tuple[Estimate, tuple[str, ...]]:
-    """Return the pooled estimate with what no residual shows in its covariance, and notes on it."""
+    elastic: Sequence[ElasticTorque],
+) -> tuple[Estimate, tuple[str, ...], tuple[ElasticTorque, ...]]:
+    """Return the pooled estimate with what no residual shows in its covariance, and notes on it.
+
+    Also the torques of elastic gears, of which `elastic` are known.
+    """
     sources = prepared.sources
     scale = torque_scale_of(sources)
     estimate = with_uncertain_scale(result.pooled, result.factor, precision, scale)
     note = f"the intervals of the parameters are computed {scale.message}"
     if sources.cell.file.drive_train is None:  # positions may be those of links, behind the gears
-        return estimate, (note,)
+        return estimate, (note,), ()
     model = posterior.model
+    values = estimate.values
     some = fitted[:_ALIKE] if sources.same_motion else fitted
-    compliance = expected_compliance(model, some[0], estimate.values)
-    torque = ElasticTorque.of(model, some, estimate.values, compliance)
-    torque = torque.times(len(fitted) / len(some))
+    compliance = expected_compliance(model, some[0], values)
+    elastic = (
+        *elastic[: len(some)],
+        *(ElasticTorque.of(model, more, values, compliance) for more in some[len(elastic) :]),
+    )
+    torque = ElasticTorque.total(elastic, len(fitted) / len(some))
     effect = posterior.design_effect
     estimate = with_elastic_gears(estimate, result.factor, torque, effect, precision)
-    return estimate, (note, "they allow for elastic gears between motors and links")
+    return estimate, (note, "they allow for elastic gears between motors and links"), elastic
 
 
 def _require_usable_rows(prepared: Prepared) -> None:
@@ -383,7 +394,7 @@ def _posterior(
         fitted,
         lambda *_: pooled,
         # The prior counts for a part as for the whole, so that the scatter is that of the noise.
-        each=lambda _, factor: posterior.fit(factor, share).estimate,
+        each=lambda _, factor: posterior.values(factor, share),
         factors=factors,
     )
 
@@ -393,8 +404,13 @@ def _by_factor(
 ) -> tuple[RepeatedEstimate, list[str]]:
     try:
         # The scatter over repetitions shows noise; least squares is enough for it.
-        each = fit_of(model, "wls" if name == "consistent" else name)
-        return estimate_repetitions(model, fitted, fit_of(model, name), each=each), []
+        fit = fit_of(model, "wls" if name == "consistent" else name)
+        return estimate_repetitions(
+            model,
+            fitted,
+            fit_of(model, name),
+            each=lambda some, factor: fit(some, factor).values,
+        ), []
     except IdentificationError as error:
         if name != "consistent":
             raise
@@ -474,7 +490,7 @@ def _instrumental(
                 plans.append((plan, planned.lag))
             factors.append(instrument_factor(model, samples, planned.motion, planned.usable))
         pooled = estimate_instrumental(model, sum(factors[1:], factors[0]))
-        each = tuple(estimate_instrumental(model, factor).estimate for factor in factors)
+        each = [estimate_instrumental(model, factor).estimate.values for factor in factors]
     except IdentificationError as error:
         problem = f"there are no instruments: {error}"
         remedy = "record the commanded positions as well, or use --estimator wls"

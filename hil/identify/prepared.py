@@ -136,7 +136,7 @@ MAX_RECORDINGS: Final = 32
 _DELAY_RATE: Final = 250.0  # Hz, to which it is averaged; both positions and torques, without bias
 _SAME_DELAY: Final = 0.05  # cycles, by which a delay in use may differ from the stated one unsaid
 _SAME_STEP: Final = 0.1  # of sampling intervals of recordings that are estimated together
-_DELAY_TIME: Final = 64.0  # s, in which a delay that nobody asked for is looked for
+DELAY_TIME: Final = 64.0  # s, in which a delay that nobody asked for is looked for
 RIPPLE: Final = ((1,), (2,), (1, 2))
 """Periods of a torque ripple per motor turn: rotor eccentricity, wave generator, both."""
 
@@ -498,7 +498,7 @@ def _delays(
         return None
     wanted = options.delay == "auto"
     in_order = sorted(sources.training, key=lambda source: -source.recording.n_samples)
-    averages = _averaged_for(np.inf if wanted else _DELAY_TIME, in_order)
+    averages = _averaged_for(np.inf if wanted else DELAY_TIME, in_order)
     longest = in_order[0]
     mean = replace(longest, recording=averages[0], context=None)
     with reporter.task("estimating the delay", 1) as task:

@@ -77,7 +77,7 @@ def summary(
         n_base=len(model.base.names),
         uncertainty=results.UncertaintyResult.of(estimation.stated),
         repetitions=[source.name for source in sources.training],
-        repetition_values=[repetition.values.tolist() for repetition in estimate.repetitions],
+        repetition_values=estimate.values.tolist(),
         noise_std=pooled.noise_std.tolist(),
         correlation=correlation(gram).tolist(),
         validation=[] if sources.in_sample else _validation(prepared, pooled.values),
@@ -221,7 +221,7 @@ def _parameters(
     estimate = estimation.result
     posterior = estimation.with_prior
     pooled = estimation.stated
-    many = len(estimate.repetitions) > 1
+    many = len(estimate.values) > 1
     # Rows 29 and 31 of the paper's Table 2 have the other sign.
     ids = {row.pivot or row.parameter: row.id for row in TABLE2}
     is_ns16 = cell.urdf == URDF_PATH.read_text(encoding="utf-8")

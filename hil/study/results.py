@@ -280,13 +280,12 @@ def _method(key: str, prepared: Prepared) -> MethodResult:
     motion = prepared.fitted[0].motion
     rows = parts[0]
     shown = motion.rows(_thinned(rows))
-    values = np.array([estimate.values for estimate in estimates.repetitions])
     return MethodResult(
         key=key,
         label=LABELS[key],
-        values=values.tolist(),
-        mean=values.mean(axis=0).tolist(),
-        std=values.std(axis=0, ddof=1).tolist(),
+        values=estimates.values.tolist(),
+        mean=estimates.mean.tolist(),
+        std=estimates.values.std(axis=0, ddof=1).tolist(),
         pooled=estimates.pooled.values.tolist(),
         pooled_std=estimates.pooled.std.tolist(),
         undetermined=list(estimates.pooled.undetermined),

@@ -13,7 +13,7 @@ to the covariance of the parameters, which stay those of rigid gears.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple, Self
 
@@ -45,32 +45,28 @@ class ElasticTorque(NamedTuple):
 
     products: Array  # W' E (n, p, n)
     squares: Array  # E' E (n, n, n)
-    errors: Array  # E' (t - W pi) (n, n)
+    measured: Array  # E' t (n, n)
 
     @classmethod
-    def of(
-        cls, model: RobotModel, recordings: Iterable[Samples], values: Array, compliance: Array
-    ) -> Self:
-        """Return the sums over recordings, with parameters (p,) and compliances (n,)."""
+    def of(cls, model: RobotModel, samples: Samples, values: Array, compliance: Array) -> Self:
+        """Return the sums over a recording, with parameters (p,) and compliances (n,)."""
         n = model.n_joints
         p = model.n_parameters
         sums = cls(np.zeros((n, p, n)), np.zeros((n, n, n)), np.zeros((n, n)))
-        for samples in recordings:
-            torque = elastic_torque(model, samples, values, compliance)
-            for part, tables in augmented_rows(model, samples):
-                for joint, (table, used) in enumerate(zip(tables, model.plan.columns, strict=True)):
-                    usable = samples.usable[part, joint]
-                    effect = torque[part][usable, joint]
-                    columns = table[:-1, usable]
-                    error = table[-1, usable] - values[used] @ columns
-                    sums.products[joint][used] += columns @ effect
-                    sums.squares[joint] += effect.T @ effect
-                    sums.errors[joint] += effect.T @ error
+        torque = elastic_torque(model, samples, values, compliance)
+        for part, tables in augmented_rows(model, samples):
+            for joint, (table, used) in enumerate(zip(tables, model.plan.columns, strict=True)):
+                usable = samples.usable[part, joint]
+                effect = torque[part][usable, joint]
+                sums.products[joint][used] += table[:-1, usable] @ effect
+                sums.squares[joint] += effect.T @ effect
+                sums.measured[joint] += effect.T @ table[-1, usable]
         return sums
 
-    def times(self, factor: float) -> ElasticTorque:
-        """Return the sums over so many times the rows."""
-        return ElasticTorque(*(factor * part for part in self))
+    @classmethod
+    def total(cls, recordings: Sequence[ElasticTorque], times: float = 1.0) -> ElasticTorque:
+        """Return the sums over recordings, each of which counts so many times."""
+        return cls(*(times * np.sum(parts, axis=0) for parts in zip(*recordings, strict=True)))
 
 
 def expected_compliance(model: RobotModel, samples: Samples, values: Array) -> Array:
@@ -130,7 +126,8 @@ def with_elastic_gears(
     (p, p) is that of a prior beside them. No gear has a negative compliance.
     """
     weights = inverse_variance(estimate.noise_std**2)
-    products, squares, errors = (np.tensordot(weights, part, axes=1) for part in torque)
+    products, squares, measured = (np.tensordot(weights, part, axes=1) for part in torque)
+    errors = measured - products.T @ estimate.values
     equations = factor.weighted(weights)
     if precision is not None:
         equations = equations._replace(A=equations.A + precision)

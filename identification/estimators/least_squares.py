@@ -79,26 +79,21 @@ class RepeatedEstimate:
     """Estimates from R repetitions of one motion."""
 
     pooled: Estimate  #: result, from all samples, with covariance clustered by time of the motion
-    repetitions: tuple[Estimate, ...]  #: from each alone
+    values: Array  #: parameters from each alone (R, p)
     factor: Factor  #: sum of the factors, by time of the motion
     classical_std: Array  #: of weighted least squares with white residuals (p,)
 
     @classmethod
     def of(
-        cls, model: RobotModel, pooled: Estimate, repetitions: Sequence[Estimate], factor: Factor
+        cls, model: RobotModel, pooled: Estimate, values: Sequence[Array], factor: Factor
     ) -> RepeatedEstimate:
-        """Combine an estimate from all repetitions with those from each."""
-        return cls(pooled, tuple(repetitions), factor, estimate(model, factor).std)
+        """Combine an estimate from all repetitions with the parameters (p,) from each."""
+        return cls(pooled, np.array(values), factor, estimate(model, factor).std)
 
     def with_scatter(self) -> RepeatedEstimate:
         """Widen the intervals to the scatter of repetitions, which can cancel in the covariance."""
         covariance = no_narrower(self.pooled.covariance, self.values)
         return replace(self, pooled=replace(self.pooled, covariance=covariance))
-
-    @property
-    def values(self) -> Array:
-        """Parameters of the repetitions (R, p)."""
-        return np.array([estimate.values for estimate in self.repetitions])
 
     @property
     def mean(self) -> Array:
@@ -108,7 +103,7 @@ class RepeatedEstimate:
     @property
     def std(self) -> Array:
         """Standard deviation over the repetitions (p,), NaN for one."""
-        if len(self.repetitions) == 1:
+        if len(self.values) == 1:
             return np.full(len(self.pooled.values), np.nan)
         return np.asarray(self.values.std(axis=0, ddof=1))
 
@@ -134,13 +129,14 @@ def estimate_repetitions(
     recordings: Sequence[Samples],
     fit: Fit | None = None,
     *,
-    each: Fit | None = None,
+    each: Callable[[Sequence[Samples], Factor], Array] | None = None,
     factors: Sequence[Factor] = (),
 ) -> RepeatedEstimate:
     """Estimate from each repetition and from all, by default by weighted least squares (eq. 4).
 
-    `each` is the estimator of single repetitions, by default the same; a single recording has the
-    estimate from all. `factors` are those of the recordings by time, if they are known.
+    `each` gives the parameters (p,) from a single repetition, by default the same estimator does; a
+    single recording has the estimate from all. `factors` are those of the recordings by time, if
+    they are known.
 
     Raises:
         IdentificationError: a repetition without a usable row.
@@ -153,10 +149,10 @@ def estimate_repetitions(
     factors = factors or [Factor.by_time(model, samples) for samples in recordings]
     total = sum(factors, Factor.zero(model))
     pooled = fit(recordings, total)
-    repetitions = [pooled]
+    values = [pooled.values]
     if len(recordings) > 1:
-        repetitions = [
-            (each or fit)([samples], factor)
+        values = [
+            fit([samples], factor).values if each is None else each([samples], factor)
             for samples, factor in zip(recordings, factors, strict=True)
         ]
-    return RepeatedEstimate.of(model, pooled, repetitions, total)
+    return RepeatedEstimate.of(model, pooled, values, total)

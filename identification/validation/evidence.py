@@ -199,7 +199,7 @@ def gather(
     values = pooled.values
     unseen = total_factor(model, held_out) if unseen is None else unseen
     gravity, load = _gravity_and_load(model, training, held_out)
-    repeated = same_motion and len(result.repetitions) > 1
+    repeated = same_motion and len(result.values) > 1
     noise = repetition_noise(model, values, training, SLOW) if repeated else None
     floor = noise_floor(model, values, training[:_MOST_RECORDINGS], noise)
     error = _error(model, values, held_out)
@@ -298,9 +298,7 @@ def _one_way(recordings: Sequence[Samples]) -> NDArray[np.bool_]:
 def _disagreement(result: RepeatedEstimate) -> Array:
     """Return the largest torque difference of repetitions to the pooled estimate (n,)."""
     gram = result.factor.gram
-    differences = (
-        np.array([repetition.values for repetition in result.repetitions]) - result.pooled.values
-    )
+    differences = result.values - result.pooled.values
     torque = np.einsum("ri,jik,rk->rj", differences, gram[:, :-1, :-1], differences)
     share = np.maximum(torque, 0.0) / np.maximum(gram[:, -1, -1], 1e-300)
     return np.asarray(np.sqrt(share.max(axis=0)))
@@ -317,9 +315,8 @@ def _open_share(estimate: Estimate, unseen: Factor) -> float | None:
 
 def _estimation_noise(result: RepeatedEstimate, held_out: Factor) -> Array:
     """Return the standard deviation (n,) of predicted torque by scatter of the estimates."""
-    values = np.array([repetition.values for repetition in result.repetitions])
-    differences = values - values.mean(axis=0)
-    count = len(values)
+    differences = result.values - result.mean
+    count = len(differences)
     torque = np.einsum("ri,jik,rk->j", differences, held_out.gram[:, :-1, :-1], differences)
     variance = torque / (count * (count - 1)) / np.maximum(held_out.samples, 1)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

@@ -455,7 +455,7 @@ class TestEstimators:
         # Expected by chance: 0.03 of 58, and three of a single motion.
         assert np.count_nonzero(np.abs(error) / pooled.std > 3.5) <= 3
         assert estimation.estimator == name
-        assert len(estimation.result.repetitions) == len(prepared.fitted)
+        assert len(estimation.result.values) == len(prepared.fitted)
 
     @pytest.mark.parametrize("name", ["auto", "wls", "ols", "prior", "consistent"])
     def test_refit_of_all_rows_is_the_estimate(self, name, estimations):

@@ -17,6 +17,8 @@ from hil.cli import app
 from hil.errors import ExecutionError, InputError
 from hil.identified_campaign import identify_campaign
 from hil.progress import Silent
+from identification.estimators.elasticity import ElasticTorque
+from identification.factor.factor import Factor
 from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell, pass_rehearsal
 from tests.messages import ALL_REQUIREMENTS_MET
 
@@ -86,6 +88,26 @@ class TestEnd:
         std = identified.stated.std
         np.testing.assert_allclose(measured.values / std, identified.stated.values / std, atol=0.05)
         np.testing.assert_allclose(measured.std, std, rtol=0.05)
+
+    def test_a_look_reads_and_reduces_what_is_new(self, met, monkeypatch) -> None:
+        campaign, _ = met
+        meter = PrecisionMeter(campaign, requirements_of(campaign, LOOSE))
+        paths = campaign.folder.completed("excitation")
+        meter.measure(paths[:1])
+        reduced: list[str] = []
+        for owner, name in ((Factor, "by_time"), (ElasticTorque, "of")):
+            original = getattr(owner, name)
+
+            def noting(*arguments, name=name, original=original):
+                reduced.append(name)
+                return original(*arguments)
+
+            monkeypatch.setattr(owner, name, noting)
+        meter.measure(paths)
+        assert reduced == ["by_time", "of"]
+        reduced.clear()
+        meter.measure(paths)
+        assert reduced == []
 
     def test_a_stricter_requirement_continues(self, met) -> None:
         campaign, _ = met

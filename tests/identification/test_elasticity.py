@@ -48,7 +48,7 @@ def fitted(samples):
     estimate = fit_least_squares(MODEL, [samples])
     factor = Factor.by_time(MODEL, samples)
     expected = expected_compliance(MODEL, samples, estimate.values)
-    torque = ElasticTorque.of(MODEL, [samples], estimate.values, expected)
+    torque = ElasticTorque.of(MODEL, samples, estimate.values, expected)
     return estimate, with_elastic_gears(estimate, factor, torque, 1.0)
 
 
@@ -87,9 +87,9 @@ def test_repetitions_count_like_more_rows():
     samples = recorded(COMPLIANCE, NOISE)
     estimate, _ = fitted(samples)
     expected = expected_compliance(MODEL, samples, estimate.values)
-    single = ElasticTorque.of(MODEL, [samples], estimate.values, expected)
-    double = ElasticTorque.of(MODEL, [samples, samples], estimate.values, expected)
-    for once, twice in zip(single.times(2.0), double, strict=True):
+    single = ElasticTorque.of(MODEL, samples, estimate.values, expected)
+    double = ElasticTorque.total([single, single])
+    for once, twice in zip(ElasticTorque.total([single], 2.0), double, strict=True):
         np.testing.assert_allclose(once, twice)
 
 
@@ -118,7 +118,7 @@ def test_an_undetermined_parameter_stays_so():
     covariance[0, 0] = np.inf
     unknown = replace(estimate, covariance=covariance)
     expected = expected_compliance(MODEL, samples, estimate.values)
-    torque = ElasticTorque.of(MODEL, [samples], estimate.values, expected)
+    torque = ElasticTorque.of(MODEL, samples, estimate.values, expected)
     wider = with_elastic_gears(unknown, Factor.by_time(MODEL, samples), torque, 1.0)
     assert np.isinf(wider.covariance[0, 0])
     np.testing.assert_array_equal(wider.covariance[0, 1:], 0.0)
