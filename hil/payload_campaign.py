@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -19,7 +20,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from hil.campaign.campaign import Campaign, campaign_of_design
-from hil.campaign.errors import MotionRefusedError
+from hil.campaign.errors import MotionRefusedError, RepetitionsRejectedError
 from hil.campaign.folder import PAYLOADS, SIDES, CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.link import MotionLink
@@ -310,15 +311,34 @@ class PayloadCampaign:
         # Only a dry run that was seen can be accepted, and each side has its own.
         seen = side.cell.only_simulated or path_exists(side.folder.dry_run)
         mounting.require(loaded, "--accept-dry-run" if seen else "--dry-run")
-        execute(
-            mounting.confirmed(side, loaded),
-            {
-                **choices,
-                "accept_dry_run": choices.get("accept_dry_run", False) and seen,
-                "repetitions": wanted,
-                "link": links(side, 2 * missing[0] + loaded),
-            },
-        )
+        with self._rejection_explained(loaded):
+            execute(
+                mounting.confirmed(side, loaded),
+                {
+                    **choices,
+                    "accept_dry_run": choices.get("accept_dry_run", False) and seen,
+                    "repetitions": wanted,
+                    "link": links(side, 2 * missing[0] + loaded),
+                },
+            )
+
+    @contextmanager
+    def _rejection_explained(self, loaded: bool) -> Iterator[None]:
+        """Say of rejected loaded motions with which payload they were checked."""
+        try:
+            yield
+        except RepetitionsRejectedError as error:
+            payload = self.loaded.cell.model.payload
+            if not loaded or payload is None:
+                raise
+            centre = ", ".join(f"{part:g}" for part in payload.centre)
+            raise RepetitionsRejectedError(
+                error.motion,
+                error.reasons,
+                f"The motion was checked with {self.name} of {payload.mass:g} kg, its centre at "
+                f"({centre}) m of the last link: if it is heavier or further out, design another "
+                "motion with --payload-mass and --payload-centre.",
+            ) from error
 
     def side(self, loaded: bool) -> Campaign:
         """Return the campaign of the loaded or the bare arm."""
@@ -425,8 +445,16 @@ def _require_allowed(cell: Cell, plan: CampaignPlan, name: str, assumed: Payload
     raise MotionRefusedError(
         f"the motion with {name} (assumed: {assumed.mass:g} kg at {centre} m in {assumed.frame})",
         problem,
-        f"design one with it (hil design --for payload --payload-mass {assumed.mass:g})",
+        f"design one with it (hil design {_design_options(assumed)})",
     )
+
+
+def _design_options(assumed: Payload) -> str:
+    """Return the options of `hil design` for a payload."""
+    options = f"--for payload --payload-mass {assumed.mass:g}"
+    if assumed.centre == CENTRE:
+        return options
+    return f"{options} --payload-centre={','.join(f'{part:g}' for part in assumed.centre)}"
 
 
 def _side(root: Path, cell: Cell, plan: CampaignPlan) -> Campaign:

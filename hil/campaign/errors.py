@@ -118,14 +118,19 @@ class AgainstGravityError(DryRunError):
 
 
 class RepetitionsRejectedError(HilError):
-    """A motion that failed its quality check in each attempt, for these reasons."""
+    """A motion that failed its quality check in each attempt, for these reasons.
+
+    `cause` is a sentence on another likely cause.
+    """
 
     exit_code: ClassVar[int] = 5
 
-    def __init__(self, motion: str, reasons: Sequence[str]) -> None:
+    def __init__(self, motion: str, reasons: Sequence[str], cause: str = "") -> None:
+        self.motion = motion
+        self.reasons = tuple(reasons)
         super().__init__(
             f"{motion} was rejected {plural(len(reasons), 'time')}, the last time because "
             f"{reasons[-1]}; all attempts are archived with their reasons. Check the arm: payload, "
             "tool, cables, belts, brakes, obstacles. Remove the cause and run the campaign again, "
-            "or begin a new one if the arm stays as it is."
+            f"or begin a new one if the arm stays as it is. {cause}".rstrip()
         )

@@ -17,6 +17,7 @@ from hil.campaign.plan import quick_settings, validation_motions
 from hil.campaign.trajectory_files import write_trajectories
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
+from hil.cli.weigh import centre_from
 from hil.design import METHODS, Method, load_settings, preset
 from hil.design.advice import criteria_text
 from hil.design.given import given_of
@@ -80,6 +81,7 @@ def design(
     precision: Annotated[list[str] | None, typer.Option(metavar="TEXT")] = None,
     purpose: Annotated[Literal["payload"] | None, typer.Option("--for", metavar="payload")] = None,
     payload_mass: Annotated[float, typer.Option(min=0.001, metavar="KG")] = 5.0,
+    payload_centre: Annotated[str | None, typer.Option(metavar="X,Y,Z")] = None,
     repetitions: Annotated[int | None, typer.Option(min=1, max=1000)] = None,
     seed: Annotated[int | None, typer.Option(min=0)] = None,
     workers: Annotated[int | None, typer.Option(min=1, max=256)] = None,
@@ -127,6 +129,8 @@ def design(
             an arm that is known, if possible from --given.
         payload_mass: With --for payload: expected mass, with which currents stay within their
             limits, too. Default: 5 kg.
+        payload_centre: Its centre of mass as it is expected, m in the frame of the flange. Default:
+            0,0,0.1.
         repetitions: Number of repetitions of the motion. Default: that of [campaign].
         seed: Seed of the search; the result depends on nothing else. Default: that of the settings.
         workers: Number of processes; the result does not depend on it. Default: one per processor.
@@ -167,6 +171,9 @@ def design(
         asked = asked.replaced(seed=seed)
     if limits_only:
         asked = asked.kinematic()
+    if payload_centre is not None and purpose is None:
+        remedy = "add --for payload"
+        raise InputError(None, "needs a payload", field="--payload-centre", remedy=remedy)
 
     recordings = [Path(name) for name in asked.objective.given]
     prior_knowledge = given_of(loaded, recordings) if recordings else None
@@ -199,6 +206,10 @@ def design(
             reporter.say(f"trajectory files in {folder.root}: {', '.join(files)}")
         elif lacking is None:
             command = f"hil rehearse {typed(folder.root)}"
+            if mass is not None:
+                centre = "" if payload_centre is None else f" --payload-centre={payload_centre}"
+                weighing = f"--payload NAME --payload-mass {mass:g}{centre} --rehearse"
+                command = f"hil run {typed(folder.root)} {weighing}"
             reporter.say(f"{folder.root} is now a campaign; next: {command}")
         else:
             reporter.say(f"note: no campaign was created: {lacking}")
@@ -231,7 +242,9 @@ def design(
             precision=None if promise is None else promise.precision(planned),
             carrying=None
             if mass is None
-            else loaded_cell(loaded, "payload", assumed_payload(loaded, mass)),
+            else loaded_cell(
+                loaded, "payload", assumed_payload(loaded, mass, centre_from(payload_centre))
+            ),
             promised=None
             if promise is None
             else lambda excitation: [

@@ -87,11 +87,15 @@ class Weighing:
                 remedy = "add --payload-mass KG"
                 raise InputError(None, problem, field="--payload-centre", remedy=remedy)
             return None
-        centre = CENTRE
-        if self.payload_centre is not None:
-            x, y, z = numbers(self.payload_centre, 3, "--payload-centre")
-            centre = (x, y, z)
-        return assumed_payload(campaign.cell, self.payload_mass, centre)
+        return assumed_payload(campaign.cell, self.payload_mass, centre_from(self.payload_centre))
+
+
+def centre_from(text: str | None) -> tuple[float, float, float]:
+    """Return the centre of a payload from `--payload-centre`, by default `CENTRE` (InputError)."""
+    if text is None:
+        return CENTRE
+    x, y, z = numbers(text, 3, "--payload-centre")
+    return x, y, z
 
 
 def weigh(

@@ -171,7 +171,8 @@ class PrecisionDesign:
         factor = Factor.from_samples(cell.model, whole, reference.torque(nominal))
         prior = Posterior.of(cell, factor, "auto", Strength()).prior.gaussian.information
         values = nominal
-        scale = torque_scale(cell, (), simulated=cell.only_simulated)
+        simulated = cell.file.controller is not None and cell.only_simulated
+        scale = torque_scale(cell, (), simulated=simulated)
         if cell.file.drive_train is not None:
             scale = replace(scale, of="torque constants")
         source = (
@@ -313,9 +314,9 @@ def payload_search(limits: JointLimits) -> DesignSettings:
     travel = float(np.max((limits.upper - limits.lower) / limits.velocity))
     count = round(_WEIGHING_TIME / (_MOVE_SHARE * travel)) - 1
     few, many = _WEIGHING_POINTS
-    # A heavy payload leaves fewer motions feasible: slow ones and more of them are tried.
+    # A heavy payload leaves few motions feasible: more of them, and slower ones, are tried.
     return short_search().replaced(
-        search={"population": 60},
+        search={"population": 60, "generations": 8},
         constraints={"max_duration": _WEIGHING_TIME},
         via_points={"n_via": min(max(count, few), many), "slowest": 0.2},
     )

@@ -18,7 +18,7 @@ from drivers.transports.simulated import SimulatedTransport
 from hil.archive import open_archive
 from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError, NotRehearsedError
 from hil.campaign.campaign import require_replaceable
-from hil.campaign.errors import MotionFailedError
+from hil.campaign.errors import MotionFailedError, RepetitionsRejectedError
 from hil.campaign.folder import SIDES, CampaignFolder
 from hil.campaign.operator import OperatorRequest, Stop
 from hil.campaign.run import RunResult
@@ -355,6 +355,21 @@ class TestLimits:
         other = assumed_payload(designed.cell, 1.0, CENTRE)
         with pytest.raises(CampaignFolderError, match="another name"):
             PayloadCampaign.of(designed, "weight", other)
+
+    def test_a_rejected_motion_names_the_payload_that_it_was_checked_with(self, designed) -> None:
+        weighed = begun(designed, "saturating")
+
+        def rejecting(side: Campaign, choices: Mapping[str, Any]) -> RunResult:
+            if side.cell.model.payload is None:
+                return execute(side, choices)
+            raise RepetitionsRejectedError("repetition 1", ["the current was at its limit"])
+
+        expected = (
+            r"at its limit; .*saturating of 2\.5 kg, its centre at \(0\.3, 0, 0\.05\) m.*"
+            "--payload-mass and --payload-centre"
+        )
+        with pytest.raises(RepetitionsRejectedError, match=expected):
+            run(weighed, rejecting)
 
 
 class TestChanged:

@@ -186,10 +186,13 @@ class TestCommand:
 
     def test_a_motion_for_a_payload_lasts_ten_seconds_at_most(self, cell, tmp_path: Path) -> None:
         out = tmp_path / "out"
-        arguments = ["design", str(cell.path), "--for", "payload", "--payload-mass", "2"]
+        stated = ["--payload-mass", "2", "--payload-centre=-0.05,0,0.2"]
+        arguments = ["design", str(cell.path), "--for", "payload", *stated]
         arguments += ["-o", str(out), "--workers", "1"]
         result = CliRunner().invoke(app, arguments, catch_exceptions=False)
         assert result.exit_code == 0, result.output
+        following = " ".join(["--payload NAME", *stated, "--rehearse"])
+        assert f"next: hil run {out} {following}" in result.output.replace("\n", " ")
         assert "mass of payload 1 %: mass " in result.output
         assert "after 2 repetitions" in result.output
         design = DesignResult.load(out)
@@ -201,6 +204,11 @@ class TestCommand:
         mixed = "mass of payload 1%, parameters 5%"
         arguments = ["design", str(cell.path), "--precision", mixed, *more]
         with pytest.raises(InputError, match=r"add --for payload, with no other requirement"):
+            CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "o")], catch_exceptions=False)
+
+    def test_a_centre_without_a_payload_is_refused(self, cell, tmp_path: Path) -> None:
+        arguments = ["design", str(cell.path), "--payload-centre", "0,0,0.2"]
+        with pytest.raises(InputError, match=r"--payload-centre: .*add --for payload"):
             CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "o")], catch_exceptions=False)
 
     def test_methods_without_gradient_are_refused(self, cell, tmp_path) -> None:

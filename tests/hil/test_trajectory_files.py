@@ -48,6 +48,17 @@ def new_cell(folder: Path, urdf: str) -> tuple[Path, dict[str, Any]]:
     return cell, json.loads(result.stdout)
 
 
+@pytest.mark.parametrize(
+    "wanted", [["--quick", "--precision", "parameters 5 %"], ["--for", "payload"]]
+)
+def test_a_cell_for_designs_has_motions_for_a_precision(tmp_path: Path, wanted: list[str]) -> None:
+    cell, _ = new_cell(tmp_path, WITH_SPEED)
+    arguments = ["design", str(cell), *wanted, "-o", str(tmp_path / "out"), "--workers", "1"]
+    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert "assuming the scale of the recorded torques to 3 %" in result.output.replace("\n", " ")
+
+
 def test_a_cell_for_designs_asks_only_for_missing_speeds(tmp_path: Path) -> None:
     _, summary = new_cell(tmp_path, TWO_JOINTS)
     names = ("velocity_deg", "acceleration_deg", "jerk_deg")
