@@ -328,16 +328,14 @@ class PayloadCampaign:
         try:
             yield
         except RepetitionsRejectedError as error:
-            payload = self.loaded.cell.model.payload
-            if not loaded or payload is None:
+            if not loaded:
                 raise
-            centre = ", ".join(f"{part:g}" for part in payload.centre)
             raise RepetitionsRejectedError(
                 error.motion,
                 error.reasons,
-                f"The motion was checked with {self.name} of {payload.mass:g} kg, its centre at "
-                f"({centre}) m of the last link: if it is heavier or further out, design another "
-                "motion with --payload-mass and --payload-centre.",
+                f"The motion was checked with the mass and centre that were stated for {self.name} "
+                f"([robot.payload] of {self.loaded.folder.cell}): if it is heavier or further out, "
+                "design another motion with --payload-mass and --payload-centre.",
             ) from error
 
     def side(self, loaded: bool) -> Campaign:

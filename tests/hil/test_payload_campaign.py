@@ -365,7 +365,7 @@ class TestLimits:
             raise RepetitionsRejectedError("repetition 1", ["the current was at its limit"])
 
         expected = (
-            r"at its limit; .*saturating of 2\.5 kg, its centre at \(0\.3, 0, 0\.05\) m.*"
+            r"at its limit; .*stated for saturating \(.*loaded/cell\.toml\).*"
             "--payload-mass and --payload-centre"
         )
         with pytest.raises(RepetitionsRejectedError, match=expected):
