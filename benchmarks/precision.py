@@ -336,7 +336,7 @@ def weighings(count: int, required: str, most: int, first_seed: int) -> dict[str
     assumed = assumed_payload(cell, _HEAVIEST, _FARTHEST)
     settings = payload_search(cell.joint_limits)
     promise = PrecisionDesign.of(
-        cell, requirements, [motion.trajectory for motion in _validation(cell)], (), _HEAVIEST
+        cell, requirements, [motion.trajectory for motion in _validation(cell)], (), assumed
     )
     problem = problem_of(
         loaded_cell(cell, "load", assumed), settings, None, promise.precision(FEWEST)

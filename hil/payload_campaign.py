@@ -333,9 +333,8 @@ class PayloadCampaign:
             raise RepetitionsRejectedError(
                 error.motion,
                 error.reasons,
-                f"The motion was checked with the mass and centre that were stated for {self.name} "
-                f"([robot.payload] of {self.loaded.folder.cell}): if it is heavier or further out, "
-                "design another motion with --payload-mass and --payload-centre.",
+                f"The motion was checked with {self.name} as --payload-mass and --payload-centre "
+                "stated it: if it is heavier or further out, design another motion with them.",
             ) from error
 
     def side(self, loaded: bool) -> Campaign:
@@ -443,13 +442,13 @@ def _require_allowed(cell: Cell, plan: CampaignPlan, name: str, assumed: Payload
     raise MotionRefusedError(
         f"the motion with {name} (assumed: {assumed.mass:g} kg at {centre} m in {assumed.frame})",
         problem,
-        f"design one with it (hil design {_design_options(assumed)})",
+        f"design one with it (hil design --for payload {payload_options(assumed)})",
     )
 
 
-def _design_options(assumed: Payload) -> str:
-    """Return the options of `hil design` for a payload."""
-    options = f"--for payload --payload-mass {assumed.mass:g}"
+def payload_options(assumed: Payload) -> str:
+    """Return the options of a command that state a payload."""
+    options = f"--payload-mass {assumed.mass:g}"
     if assumed.centre == CENTRE:
         return options
     return f"{options} --payload-centre={','.join(f'{part:g}' for part in assumed.centre)}"

@@ -27,12 +27,13 @@ from hil.design.run import Designed, DesignFolder, run_design
 from hil.design.settings import preset_text
 from hil.errors import HilError, InputError, OperatorStopError
 from hil.motion_checks import MotionChecks
-from hil.payload_campaign import assumed_payload, loaded_cell
+from hil.payload_campaign import assumed_payload, loaded_cell, payload_options
 from hil.plots import save
 from hil.plots.design_picture import draw_design
 from hil.progress import Reporter, say
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import printable, typed
+from identification.model.payload import Payload
 
 
 def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
@@ -101,11 +102,11 @@ def design(
 
     Writes `excitation.toml` (motion, criteria, settings), `excitation.png` (a picture of the
     motion) and a journal for --resume to OUTPUT, and makes OUTPUT a campaign; the next step is `hil
-    rehearse OUTPUT`. For a cell without [controller], trajectory files are written instead: CSV,
-    ROS 2 JointTrajectory and, for six axes, URScript with a player. Ctrl-C or SIGTERM ends the
-    search after the current generation (seconds; minutes if the evaluation of a motion hangs) and
-    saves the best motion so far; a second one exits at once. `hil demo --excitation OUTPUT` runs
-    the motion.
+    rehearse OUTPUT`, with --for payload `hil run OUTPUT --payload NAME`. For a cell without
+    [controller], trajectory files are written instead: CSV, ROS 2 JointTrajectory and, for six
+    axes, URScript with a player. Ctrl-C or SIGTERM ends the search after the current generation
+    (seconds; minutes if the evaluation of a motion hangs) and saves the best motion so far; a
+    second one exits at once. `hil demo --excitation OUTPUT` runs the motion.
 
     **Examples:**
 
@@ -151,6 +152,7 @@ def design(
     folder = DesignFolder(output)
     require_replaceable(output)
     there = folder.resumed_settings() if resume else None
+    stated = bool(precision)
     if purpose is not None:
         precision = precision or ["mass of payload 1 %"]
         asked = there or (
@@ -177,8 +179,10 @@ def design(
 
     recordings = [Path(name) for name in asked.objective.given]
     prior_knowledge = given_of(loaded, recordings) if recordings else None
-    mass = payload_mass if purpose is not None else None
-    promise = _promise(loaded, asked.objective.precision, recordings, reporter, mass)
+    assumed = None
+    if purpose is not None:
+        assumed = assumed_payload(loaded, payload_mass, centre_from(payload_centre))
+    promise = _promise(loaded, asked.objective.precision, recordings, reporter, assumed)
     planned = 1 if promise is None else 2 if purpose else loaded.campaign.repetitions
     if promise is not None and purpose is None and settings is None and there is None:
         usual_length = asked.constraints.max_duration
@@ -206,9 +210,10 @@ def design(
             reporter.say(f"trajectory files in {folder.root}: {', '.join(files)}")
         elif lacking is None:
             command = f"hil rehearse {typed(folder.root)}"
-            if mass is not None:
-                centre = "" if payload_centre is None else f" --payload-centre={payload_centre}"
-                weighing = f"--payload NAME --payload-mass {mass:g}{centre} --rehearse"
+            if assumed is not None:
+                weighing = f"--payload NAME {payload_options(assumed)} --rehearse"
+                if stated:
+                    weighing += " --until-precise"
                 command = f"hil run {typed(folder.root)} {weighing}"
             reporter.say(f"{folder.root} is now a campaign; next: {command}")
         else:
@@ -240,11 +245,7 @@ def design(
             stop=lambda: stop.requested,
             given=prior_knowledge,
             precision=None if promise is None else promise.precision(planned),
-            carrying=None
-            if mass is None
-            else loaded_cell(
-                loaded, "payload", assumed_payload(loaded, mass, centre_from(payload_centre))
-            ),
+            carrying=None if assumed is None else loaded_cell(loaded, "payload", assumed),
             promised=None
             if promise is None
             else lambda excitation: [
@@ -266,13 +267,15 @@ def _promise(
     requirements: Sequence[str],
     recordings: Sequence[Path],
     reporter: Reporter,
-    mass: float | None,
+    payload: Payload | None,
 ) -> PrecisionDesign | None:
     """Return the requirements about a cell, None without any, and report the torque error."""
     if not requirements:
         return None
     motions = [motion.trajectory for motion in validation_motions(cell, MotionChecks.of(cell))]
-    promise = PrecisionDesign.of(cell, requirements_from(requirements), motions, recordings, mass)
+    promise = PrecisionDesign.of(
+        cell, requirements_from(requirements), motions, recordings, payload
+    )
     reporter.say(f"torque error: {promise.source}")
     return promise
 

@@ -20,7 +20,6 @@ from hil.errors import InputError
 from hil.identify.cell_context import TorqueScale, torque_scale
 from hil.identify.estimating import Posterior
 from hil.identify.options import FIXED
-from hil.identify.payload_run import flange_of
 from hil.identify.prepared import samples_of, stated_settings
 from hil.terminal_text import plural
 from identification.estimators.payload import parameter_change
@@ -30,6 +29,7 @@ from identification.excitation.precision import Precision
 from identification.factor.estimate import inverse_variance
 from identification.factor.factor import Factor
 from identification.model.motion import Motion
+from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.selection.settings import Strength
 from planner import JointLimits, Trajectory
@@ -59,9 +59,9 @@ _YEAR: Final = 3.156e7  # s
 _MEASURED: Final = 3  # recordings whose torque error is measured
 _WEIGHING_TIME: Final = 10.0  # s, longest motion for a payload
 _WEIGHING_POINTS: Final = (4, 16)  # fewest and most via points of such a motion
-_MOVE_SHARE: Final = 0.9
-"""Time of a move to the next via point of a search for a payload, as a share of that in which the
-slowest joint crosses its range: 0.9 on the NS 16 with 12 kg, 0.7 on an arm of two joints."""
+_MOVE_SHARE: Final = 0.7
+"""Time at speed of a move to the next via point of a search for a payload, as a share of that in
+which the slowest joint crosses its range."""
 _MOST: Final = 1000  # repetitions that are counted
 _NORMAL: Final = 1.96  # standard deviations in half a 95 % interval of a stated variance
 _ENDLESS: Final = 1e9  # factor of the information of motions without end
@@ -92,7 +92,7 @@ class Forecast:
         shown = self.requirement.shown
         after = plural(planned, "repetition")
         text = f"{self.requirement}: {self.worst} {shown(self.half)} after {after}"
-        if self.limit > self.requirement.value:
+        if self.repetitions is None and self.limit > self.requirement.value:
             return (
                 f"{text}; no motion of this arm can meet it: {shown(self.limit)} remain, "
                 f"{scale.message} (weigh a known load with `hil torque-constants`, or state "
@@ -140,11 +140,11 @@ class PrecisionDesign:
         requirements: Sequence[Requirement],
         motions: Sequence[Trajectory],
         given: Sequence[Path],
-        payload: float | None = None,
+        payload: Payload | None = None,
     ) -> PrecisionDesign:
         """Return the requirements about a cell, on its validation motions; `given` are recordings.
 
-        With a `payload` of this mass [kg] they are about that, recorded on an arm that is known.
+        With a `payload` they are about its mass, recorded on an arm that is known.
 
         Raises:
             InputError: a requirement names no joint or parameter, or is beyond what can be had.
@@ -285,13 +285,17 @@ class PrecisionDesign:
 
 
 def _load(
-    model: RobotModel, requirement: Requirement, mass: float, values: Array, arm_information: Array
+    model: RobotModel,
+    requirement: Requirement,
+    payload: Payload,
+    values: Array,
+    arm_information: Array,
 ) -> tuple[Wanted, Array]:
-    """Return a mass at the flange as what is wanted, and the change of parameters (p,) by it.
+    """Return the mass of a payload as what is wanted, and its change of the parameters (p,).
 
     The arm is known with the information `arm_information` (p, p); its friction may drift.
     """
-    change = parameter_change(model, flange_of(model))
+    change = parameter_change(model, payload.frame)
     drift = np.where(model.friction_columns, DRIFT * values, 0.0)
     scale = 1.0 / np.sqrt(np.diag(arm_information))
     unit = np.linalg.inv(arm_information * scale[:, None] * scale)
@@ -300,10 +304,10 @@ def _load(
     root = size[:, None] * np.linalg.cholesky(covariance / size[:, None] / size)
     direction = np.zeros((1, change.shape[1]))
     direction[0, -1] = 1.0
-    allowed = np.array([requirement.value * (mass if requirement.relative else 1.0)])
+    allowed = np.array([requirement.value * (payload.mass if requirement.relative else 1.0)])
     quantities = LoadQuantities(direction, allowed, change, root)
     owners = np.zeros(1, dtype=np.intp)
-    return Wanted((requirement,), quantities, ("mass",), owners), mass * change[:, -1]
+    return Wanted((requirement,), quantities, ("mass",), owners), change @ payload.parameters
 
 
 def payload_search(limits: JointLimits) -> DesignSettings:
@@ -311,8 +315,9 @@ def payload_search(limits: JointLimits) -> DesignSettings:
 
     It has as many via points as random moves within these limits take that time.
     """
-    travel = float(np.max((limits.upper - limits.lower) / limits.velocity))
-    count = round(_WEIGHING_TIME / (_MOVE_SHARE * travel)) - 1
+    crossing = (limits.upper - limits.lower) / limits.velocity
+    move = float(np.max(_MOVE_SHARE * crossing + limits.velocity / limits.acceleration))
+    count = round(_WEIGHING_TIME / move) - 1
     few, many = _WEIGHING_POINTS
     # A heavy payload leaves few motions feasible: more of them, and slower ones, are tried.
     return short_search().replaced(

@@ -164,7 +164,9 @@ def run_design(
                 )
         else:
             folder.create(settings, force=force)
-        design = _searched(folder, cell, settings, reporter, problem, workers=workers, stop=stop)
+        design = _searched(
+            folder, carrying or cell, settings, reporter, problem, workers=workers, stop=stop
+        )
         trajectory = design.excitation.trajectory
         broken = problem.constraints.violations(trajectory, excitation.sampled(trajectory))
         if broken:
@@ -201,7 +203,10 @@ def _searched(
             "information": json_digest(given.mean.tolist()),
         }
     if (wanted := problem.objective.precision) is not None:
-        arrays = (wanted.quantities.directions, wanted.quantities.allowed, wanted.density)
+        quantities = wanted.quantities
+        arrays = [quantities.directions, quantities.allowed, wanted.density]
+        if isinstance(quantities, excitation.LoadQuantities):
+            arrays += [quantities.change, quantities.root]
         identity["precision"] = {"digest": json_digest([array.tolist() for array in arrays])}
     with folder.opened_journal() as file:
         journal = _journal(file, identity, reporter)

@@ -432,7 +432,7 @@ def _robust(
         return fits[-1].estimate
 
     result = estimate_repetitions(model, fitted, fit)
-    of_all = fits[-1]
+    of_all = fits[0]
     warnings = [
         f"{percentage(of_all.outlying[joint])} of the rows of {model.joint_names[joint]} deviate by"
         " more than four standard deviations: an unmodelled effect rather than outliers, which a"

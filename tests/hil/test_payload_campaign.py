@@ -364,10 +364,7 @@ class TestLimits:
                 return execute(side, choices)
             raise RepetitionsRejectedError("repetition 1", ["the current was at its limit"])
 
-        expected = (
-            r"at its limit; .*stated for saturating \(.*loaded/cell\.toml\).*"
-            "--payload-mass and --payload-centre"
-        )
+        expected = r"at its limit; .*saturating as --payload-mass and --payload-centre stated it"
         with pytest.raises(RepetitionsRejectedError, match=expected):
             run(weighed, rejecting)
 

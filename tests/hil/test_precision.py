@@ -15,7 +15,7 @@ from hil.cli import app
 from hil.design import DesignResult, load_settings, preset, problem_of
 from hil.design.precision import PrecisionDesign, short_search
 from hil.design.requirements import FORMS, Requirement, require_known, requirements_from
-from hil.errors import InputError
+from hil.errors import HilError, InputError
 from hil.motion_checks import MotionChecks
 from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell
 
@@ -205,6 +205,15 @@ class TestCommand:
         arguments = ["design", str(cell.path), "--precision", mixed, *more]
         with pytest.raises(InputError, match=r"add --for payload, with no other requirement"):
             CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "o")], catch_exceptions=False)
+
+    def test_a_search_for_another_centre_is_no_continuation(self, cell, tmp_path: Path) -> None:
+        """The journal has scores of motions checked with the payload that was stated."""
+        arguments = ["design", str(cell.path), "--for", "payload", "--payload-mass", "2"]
+        arguments += ["-o", str(tmp_path / "o"), "--workers", "1"]
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
+        arguments += ["--payload-centre", "0, 0, 0.3", "--resume"]
+        with pytest.raises(HilError, match="robot"):
+            CliRunner().invoke(app, arguments, catch_exceptions=False)
 
     def test_a_centre_without_a_payload_is_refused(self, cell, tmp_path: Path) -> None:
         arguments = ["design", str(cell.path), "--payload-centre", "0,0,0.2"]
