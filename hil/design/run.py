@@ -149,7 +149,6 @@ def run_design(
         UnsafeError: the motion does not pass the final check.
         HilError: see :func:`run_search`.
     """
-    # Before anything is replaced.
     problem = problem_of(carrying or cell, settings, given, precision)
     if problem.objective.given is not None:
         seconds = problem.objective.given.duration
@@ -164,9 +163,8 @@ def run_design(
                 )
         else:
             folder.create(settings, force=force)
-        design = _searched(
-            folder, carrying or cell, settings, reporter, problem, workers=workers, stop=stop
-        )
+        arm = carrying or cell
+        design = _searched(folder, arm, settings, reporter, problem, workers=workers, stop=stop)
         trajectory = design.excitation.trajectory
         broken = problem.constraints.violations(trajectory, excitation.sampled(trajectory))
         if broken:

@@ -164,10 +164,8 @@ def estimate_with(
         InputError: the archives lack data that the estimator needs.
         ArchiveError: a recording has no usable row.
     """
-    cell = prepared.sources.cell
-    name = options.estimator
+    cell, name = prepared.sources.cell, options.estimator
     model = cell.model
-    variance = prepared.settings.delay_variance
     _require_usable_rows(prepared)
     with reporter.task("estimating", 4) as task:
         fitted = smoothed_for_instruments(model, prepared) if name == "iv" else prepared.fitted
@@ -184,7 +182,7 @@ def estimate_with(
         if prepared.sources.same_motion:
             result = result.with_scatter()
         precision = posterior.precision if name in OF_PRIOR else None
-        if variance:
+        if variance := prepared.settings.delay_variance:
             result = _with_uncertain_delay(model, result, fitted, products, variance, precision)
         task.advance(1, "prior")
         if name in OF_PRIOR:

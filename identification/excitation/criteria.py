@@ -358,8 +358,8 @@ class Objective:
         """Return the Gram matrix (n, p, p) of the rows of each joint, as the precision has them."""
         p = self.model.n_parameters
         grams = np.zeros((self.model.n_joints, p, p))
-        counted = self._counted(motion, self._joint_sums(motion))
-        for joint, (index, gram) in enumerate(zip(self._block_indices, counted, strict=True)):
+        by_joint = self._precise_by_joint(motion, self._joint_sums(motion))
+        for joint, (index, gram) in enumerate(zip(self._block_indices, by_joint, strict=True)):
             grams[joint][index] = gram
         return grams
 
@@ -377,9 +377,9 @@ class Objective:
         return [row / motion.n_samples for row in self._joint_sums(motion).rows]
 
     def _precise(self, motion: Motion, sums: _JointSums) -> Array:
-        return self._gram(self._counted(motion, sums), self._joint_weights(motion))
+        return self._gram(self._precise_by_joint(motion, sums), self._joint_weights(motion))
 
-    def _counted(self, motion: Motion, sums: _JointSums) -> list[Array]:
+    def _precise_by_joint(self, motion: Motion, sums: _JointSums) -> list[Array]:
         """Return the Gram matrix of each joint's columns; from their mean if it has an offset.
 
         What an unknown offset of the torque leaves: the offset is eliminated from the equations.

@@ -356,7 +356,7 @@ class TestLimits:
         with pytest.raises(CampaignFolderError, match="another name"):
             PayloadCampaign.of(designed, "weight", other)
 
-    def test_a_rejected_motion_names_the_payload_that_it_was_checked_with(self, designed) -> None:
+    def test_a_rejected_loaded_motion_says_what_was_stated(self, designed) -> None:
         weighed = begun(designed, "saturating")
 
         def rejecting(side: Campaign, choices: Mapping[str, Any]) -> RunResult:

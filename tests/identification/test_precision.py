@@ -103,7 +103,7 @@ def random_genes(problem) -> np.ndarray:
     return 0.3 + 0.4 * np.random.default_rng(3).random(problem.genome.n_genes)
 
 
-def test_a_load_is_weighed_beside_an_unknown_offset_of_each_torque() -> None:
+def test_a_load_is_weighed_beside_unknown_offsets() -> None:
     """The information on the parameters when the offsets are eliminated from the equations."""
     problem = search_problem("load")
     model = problem.objective.model
