@@ -56,8 +56,11 @@ def draw_front(axes: Axes, design: Design) -> None:
     over = CRITERIA[upward]
     beside = CRITERIA[rightward]
     origin = front.measure(upward)[design.origin], front.measure(rightward)[design.origin]
+    x, y = front.measure(rightward), front.measure(upward)
+    # A required precision is a third criterion: its front is no line over the other two.
+    is_line = bool(np.all(np.diff(over.sense * y[np.argsort(-beside.sense * x)]) >= 0.0))
     axes.plot(
-        front.measure(rightward), front.measure(upward), drawstyle="steps-post",
+        x, y, drawstyle="steps-post", linestyle="-" if is_line else "none",
         color=style.POSITION, linewidth=1.0, marker="o", markersize=3.4,
         label=f"front, {len(front)} motion{'s' * (len(front) > 1)}",
     )  # fmt: skip

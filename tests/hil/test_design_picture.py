@@ -123,6 +123,17 @@ class TestPage:
         assert {"Spread of Φ (lower is better)", "chosen (8.000, 80.0)"} <= set(page_texts)
         assert any(f", κ {design.excitation.criteria.condition:.3f}" in text for text in page_texts)
 
+    @pytest.mark.parametrize(("index", "line"), [(80.0, "-"), (120.0, "None")])
+    def test_a_front_of_a_third_criterion_is_no_line(self, two_link, index, line):
+        """As that of a required precision: its second motion is worse in both of these."""
+        design = design_of(two_link, wandering(two_link))
+        measures = np.array([[100.0, 70.0], [105.7, index], [108.0, 110.0]])
+        front = Front(np.zeros((3, 1)), measures, np.arange(3.0), np.ones(3))
+        figure = draw_design(replace(design, front=front), two_link)
+        lines = [each for axes in figure.axes for each in axes.get_lines()]
+        (front_line,) = (each for each in lines if str(each.get_label()).startswith("front, 3"))
+        assert front_line.get_linestyle() == line
+
     def test_warnings_are_red(self, two_link):
         design = replace(design_of(two_link, wandering(two_link)), complete=False)
         page = draw_design(design, two_link, ("floor", "walls"))
