@@ -111,7 +111,8 @@ def _require_start(
     elif exceeded:
         worst = replace(max(exceeded, key=lambda violation: violation.excess), time=None)
         reason = f"at rest there, {violation_text(worst, frame)}"
-        remedy = f"correct [drive_train], [nominal] with its uncertainty, or {setting}"
+        payload = "" if cell.model.payload is None else "the payload, "
+        remedy = f"correct {payload}[drive_train], [nominal] with its uncertainty, or {setting}"
     else:
         return
     raise NoExcitationError(f"no motion can begin {where}: {reason}; {remedy} ({cell.path})")

@@ -215,6 +215,11 @@ class TestCommand:
         with pytest.raises(HilError, match="robot"):
             CliRunner().invoke(app, arguments, catch_exceptions=False)
 
+    def test_a_payload_that_the_arm_cannot_hold_is_refused(self, cell, tmp_path: Path) -> None:
+        arguments = ["design", str(cell.path), "--for", "payload", "--payload-mass", "400"]
+        with pytest.raises(HilError, match="begin at home: .* A.*correct the payload, "):
+            CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "o")], catch_exceptions=False)
+
     def test_a_centre_without_a_payload_is_refused(self, cell, tmp_path: Path) -> None:
         arguments = ["design", str(cell.path), "--payload-centre", "0,0,0.2"]
         with pytest.raises(InputError, match=r"--payload-centre: .*add --for payload"):
