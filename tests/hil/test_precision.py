@@ -217,7 +217,7 @@ class TestCommand:
 
     def test_a_payload_that_the_arm_cannot_hold_is_refused(self, cell, tmp_path: Path) -> None:
         arguments = ["design", str(cell.path), "--for", "payload", "--payload-mass", "400"]
-        with pytest.raises(HilError, match="begin at home: .* A.*correct the payload, "):
+        with pytest.raises(HilError, match=r"begin at home: .* A.*correct the payload, "):
             CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "o")], catch_exceptions=False)
 
     def test_a_centre_without_a_payload_is_refused(self, cell, tmp_path: Path) -> None:
