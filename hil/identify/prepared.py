@@ -180,8 +180,8 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
 def renewed_delay(sources: Sources, settings: Settings, options: Options) -> CombinedDelay:
     """Return the delay in chosen settings of a controller's torque by other sources [s].
 
-    That of the settings if it is known, or if it cannot be estimated from these. A delay that was
-    kept as stated is kept again, with its error by the other sources.
+    That of the settings if it is known, or if it cannot be estimated from these. A stated delay in
+    the settings stays in use, with its error by the other sources.
     """
     used = settings.preprocessing.torque_delay
     unchanged = CombinedDelay(used, settings.delay_variance)
@@ -266,7 +266,7 @@ class _DelayChoice:
         """Use an estimate beside the stated delay of a controller: both together.
 
         Inner prediction decides on a significant, determined one that is far from it. Beside a
-        low-pass of the torque the stated one is kept, as the estimate may include the delay of the
+        low-pass of the torque the stated one is used, as the estimate may include the delay of the
         filter.
         """
         stated = self.assumed
