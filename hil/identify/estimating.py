@@ -325,9 +325,15 @@ class Posterior:
         share = NOMINAL_SHARE if name == "prior" else BODY_SHARE
         if table is not None and "uncertainty" in table.model_fields_set:
             share = table.uncertainty or share
-        prior = body_prior(cell.model, factor, share, known_parameters(cell))
         if name != "auto":
             strength = Strength()
+        prior = body_prior(
+            cell.model,
+            factor,
+            share,
+            known_parameters(cell),
+            wide_rotors=strength.wide_rotors,
+        )
         effect = design_effect_of(factor, prior.gaussian)
         return cls(cell.model, prior.with_weight(strength.weight), effect, strength.consistent)
 

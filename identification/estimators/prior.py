@@ -409,6 +409,8 @@ def body_prior(
     factor: Factor,
     share: float = BODY_SHARE,
     stated: Mapping[str, tuple[float, float]] | None = None,
+    *,
+    wide_rotors: bool = False,
 ) -> BodyPrior:
     """Return the prior of an arm; its scale without masses, and of friction, is the torque's.
 
@@ -447,10 +449,8 @@ def body_prior(
         std[: layout.size] *= _torque_scale(model, factor, combinations[:, : layout.size], std)
         origin = f"bodies of the size of the torque, as {reason}"
     # Motors of a wrist are heavier, seen through their gears, than what they move.
-    for rotor in layout.rotors.tolist():
-        if rotor in model.base.pivots:
-            column = int(np.flatnonzero(model.base.pivots == rotor)[0])
-            std[rotor] = max(std[rotor], whole_torque[column])
+    widened = layout.rotors if wide_rotors else np.intersect1d(layout.rotors, model.base.pivots)
+    std[widened] = np.maximum(std[widened], _rotor_torque(model, factor, widened))
     pairs = [np.sqrt(std[layout.rotors][i] * std[layout.rotors][j]) for i, j in layout.pairs]
     std[layout.couplings] = pairs
     for name, (value, spread) in (stated or {}).items():
@@ -554,6 +554,23 @@ def _torque_over_columns(model: RobotModel, factor: Factor) -> Array:
     # Without a row that shows it, a coefficient of the size of the torque.
     rms = np.sqrt(power.sum() / max(1, int(factor.samples.sum()))) or 1.0
     return np.asarray(np.where(size > 0.0, size, rms))
+
+
+def _rotor_torque(model: RobotModel, factor: Factor, rotors: NDArray[np.intp]) -> Array:
+    """Return inertias of rotors (k,) that alone make half of the scatter of their joint's torque.
+
+    A slow motion does not allow more, as for friction.
+    """
+    joints = np.flatnonzero(np.isin(model.layout.rotors, rotors))
+    columns = model.base.grouping[:, rotors]
+    squares = np.zeros(len(rotors))
+    for k, joint in enumerate(joints):
+        gram = factor.gram[joint, : model.base.rank, : model.base.rank]
+        squares[k] = columns[:, k] @ gram @ columns[:, k]
+    rows = np.maximum(factor.samples[joints], 1)
+    squares = np.maximum(squares, rows * _USUAL_ACCELERATION**2)
+    power = (_FRICTION_SHARE * torque_scatter(model, factor)[joints]) ** 2 * rows
+    return np.asarray(np.sqrt(power / squares))
 
 
 def _usual_columns(model: RobotModel) -> Array:

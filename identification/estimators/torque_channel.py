@@ -38,6 +38,9 @@ _REFINED: Final = 5  # candidates between the neighbours of the best
 # Spacings about the vertex of a parabola, of the logarithm: for all shapes, then for the best. With
 # little noise the minimum is narrower than a parabola.
 _CLOSE: Final = (0.07, 0.02)
+# Of the bandwidth, in which a low-pass and its absence differ most.
+_OCTAVES: Final = ((1.0, 2.0), (2.0, 4.0))
+_THERE: Final = 0.5  # share of a low-pass from which on the torque is nearer to it than to none
 _RATE: Final = 250.0  # Hz; rows beyond it are averaged
 
 # Half a period of the lowest bandwidth: shorter stretches do not show it, and shorter rests between
@@ -119,7 +122,8 @@ def possible_low_passes(
     for kind_delays, shapes in ((delays, WITHOUT_PHASE), ((still,), FORWARDS)):
         kinds = [_Filter(delay, shape) for delay, shape in product(kind_delays, shapes)]
         misfit, best = spectra.best(kinds)
-        if misfit < enough:
+        share, std = spectra.attenuation(best, still)
+        if misfit < enough and share - std > _THERE:
             assert best.shape is not None
             possible.append(
                 replace(
@@ -145,23 +149,39 @@ class _Joint(NamedTuple):
     # Real and imaginary parts of the products of [W | known load] with the torque, and with the
     # torque in the window's slope, one below the other (4 B, c + 1).
     cross: Array
-    power: float  # squared torque
+    powers: Array  # squared torque (B,)
     slope_cross: Complex  # of the torque with itself in the window's slope (B,) [1/s]
     slope_power: Array  # squared torque in the window's slope (B,) [1/s²]
     rows: float  # sum of the squared window
 
+    duration: float  # of these rows [s]
+
+    @property
+    def power(self) -> float:
+        """Squared torque of all bands."""
+        return float(self.powers.sum())
+
+    def modelled(self, values: Array) -> tuple[Array, Complex]:
+        """Return power of the torque of parameters (p,) in the bands, and its product with y."""
+        own = np.append(values[self.columns], 1.0)
+        size = len(own)
+        bands = len(self.powers)
+        power = self.gram.reshape(bands, size, size) @ own @ own
+        return power, self.cross[:bands] @ own + 1j * (self.cross[bands : 2 * bands] @ own)
+
     @classmethod
-    def of(cls, columns: NDArray[np.intp], gram: Array, rows: float) -> _Joint:
+    def of(cls, columns: NDArray[np.intp], gram: Array, rows: float, step: float) -> _Joint:
         """Take apart the sums (B, c + 5, c + 5) of :meth:`_Segment.add`."""
         regressors = slice(0, -4)
         return cls(
             columns,
             np.ascontiguousarray(gram[:, regressors, regressors]).reshape(len(gram), -1),
             np.concatenate([gram[:, regressors, place] for place in (-4, -3, -2, -1)]),
-            float(gram[:, -4, -4].sum()),
+            gram[:, -4, -4],
             gram[:, -4, -2] + 1j * gram[:, -4, -1],
             gram[:, -2, -2],
             rows,
+            rows * step,
         )
 
 
@@ -201,7 +221,7 @@ class _Spectra:
                 table = np.vstack([block.T, load[part, joint], torque[part, joint]])
                 rows[joint] += segment.add(gram, table, usable[part, joint])
         joints = [
-            _Joint.of(used, gram[bands], weight)
+            _Joint.of(used, gram[bands], weight, step)
             for used, gram, weight in zip(columns, grams, rows.tolist(), strict=True)
             if weight > 0.0
         ]
@@ -224,6 +244,11 @@ class _Spectra:
 
         Of weighted least squares, as :func:`identification.factor.estimate.estimate`.
         """
+        variance, smallest, _ = self._fitted(filters)
+        return np.asarray(0.5 * np.log(np.maximum(variance, smallest)).mean(axis=1))
+
+    def _fitted(self, filters: Sequence[_Filter]) -> tuple[Array, Array, Array]:
+        """Return residual variances (k, j), the smallest (j,), and parameters (k, p) of filters."""
         responses = [self.response(channel) for channel in filters]
         gain, lag = (np.array(part) for part in zip(*responses, strict=True))
         sums = [_filtered(joint, gain, lag) for joint in self.joints]
@@ -238,7 +263,49 @@ class _Spectra:
                 for joint, products in zip(self.joints, sums, strict=True)
             ]
             variance = np.column_stack(squares) / rows
-        return np.asarray(0.5 * np.log(np.maximum(variance, smallest)).mean(axis=1))
+        return variance, smallest, values
+
+    def attenuation(self, channel: _Filter, undelayed: float) -> tuple[float, float]:
+        """Return how much of a low-pass is in the torque, and the standard deviation of that.
+
+        0: none of it, 1: all of it. In the two octaves above the bandwidth, where the two differ
+        most, the gain g of the recorded torque over that of a model fitted without low-pass, with
+        the delay `undelayed` [s], is ``log g / log |H|``. The gain is that of all joints, each
+        weighted by the inverse variance of what the model leaves unexplained there. Without torque
+        there the standard deviation is infinite.
+        """
+        values = self._fitted([_Filter(undelayed)])[2][0]
+        late = np.exp(2j * np.pi * self.frequency * (undelayed - self.delay))
+        response = self.response(channel)[0]
+        size = np.maximum(np.abs(response), np.finfo(np.float64).tiny)
+        # The phase is not judged: that of a delay fitted by mistake would hide the torque.
+        phases = (np.ones_like(response), response / size)
+        shares = []
+        for octave in _OCTAVES:
+            low, high = (factor * channel.bandwidth for factor in octave)
+            inside = (self.frequency >= low) & (self.frequency < high)
+            sums = np.zeros(3)  # information, and that times the gain of filter and torque
+            for joint in self.joints:
+                model, cross = joint.modelled(values)
+                power = float(model[inside].sum())
+                if power <= 0.0:
+                    continue
+                both = (cross * late)[inside]
+                gained = max(abs(np.vdot(phase[inside], both)) for phase in phases)
+                count = max(1.0, joint.duration * (high - low))
+                left = float(joint.powers[inside].sum()) - gained**2 / power
+                weight = 2.0 * count * power / max(left, _SMALLEST_NOISE * gained)
+                filtered = float((size * model)[inside].sum())
+                sums += weight * np.array([1.0, filtered / power, gained / power])
+            if sums[0] > 0.0:
+                expected = math.log(sums[1] / sums[0])
+                gain = max(float(sums[2] / sums[0]), _SMALLEST_NOISE)
+                std = 1.0 / (gain * math.sqrt(sums[0]))
+                shares.append((math.log(gain) / expected, std / abs(expected)))
+        if not shares:
+            return 0.0, math.inf
+        share, std = np.array(shares).T
+        return float(share.mean()), float(np.linalg.norm(std)) / len(std)
 
     def _solved(self, sums: Sequence[_Products], weights: Array) -> Array:
         """Return the parameters (k, p) of joint weights (k, j)."""

@@ -33,6 +33,7 @@ from identification.signals.samples import Preprocessing, VelocitySource
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 Question = Literal[
+    "rotors",
     "delay",
     "bandwidth",
     "velocity",
@@ -97,6 +98,8 @@ FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
     {"third": "none", "stribeck": 0.1},
 )
 LOW_PASS_WORTHWHILE: Final = 0.05
+ROTORS_WORTHWHILE: Final = 0.05
+"""Rotors far heavier than the links change the error to a fifth or to less than a tenth more."""
 TERM_WORTHWHILE: Final = 0.02
 SPRING_WORTHWHILE: Final = 0.3  # of the error of its own joint
 _MOST_SWEEPS: Final = 2
@@ -139,6 +142,8 @@ def choose_settings(
         asked -= IF_LONG
     first = now
     trial.weigh(first)
+    if "estimator" in asked and trial.has_grouped_rotors(first):
+        asked |= {"rotors"}
     now, choices = _sweep(trial, first, asked)
     if "delay" in asked:
         first, now, choices = _compare_delays(trial, first, now, choices, asked, delays)
@@ -395,18 +400,11 @@ def _sweep(
         before = now
         choices = []
         for swept in asked:
-            certainty = CERTAIN if short and swept.question in DETAILS else 1.0
+            certainty = CERTAIN if short and swept.question in DETAILS else swept.certainty
             candidates = swept.vary(now)
-            if short and swept.question == "bandwidth":
-                widths = [each.preprocessing.rigid_bandwidth for each in candidates]
-                candidates = [
-                    each
-                    for each, width in zip(candidates, widths, strict=True)
-                    if width >= widths[0]
-                ]
             if swept.size is not None:
                 candidates = [candidates[k] for k in trial.walk(candidates, swept.size)]
-            decision = trial.decide(swept.name, candidates, certainty=certainty)
+            decision = trial.decide(swept.name, candidates, swept.share, certainty=certainty)
             now = decision.settings
             choices = [*choices, decision.choice]
             if swept.question == "rows":
@@ -439,9 +437,21 @@ class _Swept(NamedTuple):
     name: str
     vary: Callable[[Settings], list[Settings]]  # settings with each candidate
     size: Callable[[Settings], float] | None = None  # of the setting, if it is a number
+    share: float | None = None  # by which another candidate must be better, if not as usual
+    certainty: float = 1.0  # in standard errors
 
 
 _SWEPT: Final = (
+    _Swept(
+        "rotors",
+        "largest inertia of rotors",
+        lambda now: [
+            replace(now, strength=replace(now.strength, wide_rotors=wide))
+            for wide in (False, True)
+        ],
+        share=ROTORS_WORTHWHILE,
+        certainty=CERTAIN,
+    ),
     _Swept(
         "presliding",
         "presliding displacement",

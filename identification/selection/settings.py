@@ -15,11 +15,16 @@ class Strength:
 
     weight: float = 1.0  #: of the described bodies, as a multiple of their information
     consistent: bool = False  #: whether parameters that no bodies have are excluded
+    #: whether rotors that act like a link's inertia may also make half of their joint's torque
+    wide_rotors: bool = False
 
-    def describe(self) -> str:
-        """Return the strength as a phrase."""
-        bodies = "physically consistent" if self.consistent else "not restricted to possible bodies"
-        return f"described bodies weigh {self.weight:g} times, {bodies}"
+    def describe(self) -> tuple[str, ...]:
+        """Return the strength as phrases."""
+        return (
+            f"described bodies weigh {self.weight:g} times",
+            "physically consistent" if self.consistent else "not restricted to possible bodies",
+            "rotors as heavy as the torque allows" if self.wide_rotors else "rotors like the links",
+        )
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -75,13 +76,6 @@ class Decision(NamedTuple):
     choice: Choice
 
 
-class _Reduced(NamedTuple):
-    """Rows of settings, with the prior of their model."""
-
-    folds: Folds
-    prior: BodyPrior
-
-
 class Trial:
     """Scores of settings, with cached factors."""
 
@@ -100,7 +94,8 @@ class Trial:
         self._known = stated
         self._samples: dict[Preprocessing, list[Samples]] = {}
         self._directed: dict[tuple[Preprocessing, tuple[float, ...]], list[Samples]] = {}
-        self._tables: dict[tuple[Columns, Preprocessing], _Reduced] = {}
+        self._tables: dict[tuple[Columns, Preprocessing], Folds] = {}
+        self._priors: dict[tuple[Columns, Preprocessing, bool], BodyPrior] = {}
         self._errors: dict[tuple[Columns, Preprocessing, Strength, str], Errors] = {}
         self._effect = 1.0
         self._weighed: tuple[Columns, Preprocessing] | None = None
@@ -143,7 +138,7 @@ class Trial:
         self._weighed = key
         model = self.model(settings)
         total = total_factor(model, self.samples(settings))
-        prior = self._reduced(settings).prior.gaussian
+        prior = self._prior(settings).gaussian
         self._effect = design_effect_of(total, prior) if total.samples.any() else 1.0
         self._errors.clear()
 
@@ -218,7 +213,12 @@ class Trial:
 
     def knows_bodies(self, settings: Settings) -> bool:
         """Return whether the description has the masses of this arm."""
-        return not self._reduced(settings).prior.placeholder
+        return not self._prior(settings).placeholder
+
+    def has_grouped_rotors(self, settings: Settings) -> bool:
+        """Return whether rotors of joints that moved act like the inertia of a link."""
+        wide = replace(settings, strength=replace(settings.strength, wide_rotors=True))
+        return not np.array_equal(self._prior(settings).std, self._prior(wide).std)
 
     def fits_impossible(self, settings: Settings, possible: Settings) -> bool:
         """Return whether bodies that cannot exist fit better than possible ones.
@@ -231,8 +231,7 @@ class Trial:
     def stiffness(self, joint: str, settings: Settings) -> float:
         """Return the fitted stiffness of the torsion spring of a joint [N·m/rad]."""
         model = self.model(settings)
-        reduced = self._reduced(settings)
-        values = self._estimator(settings, reduced)(reduced.folds.fitted)
+        values = self._values(settings)
         springs = [
             placed.part
             for placed in model.elements.identified
@@ -270,25 +269,24 @@ class Trial:
         return self._errors[key]
 
     def _predicted(self, settings: Settings, rows: PredictedRows) -> Errors:
-        reduced = self._reduced(settings)
+        folds = self._folds(settings)
         n = self.model(settings).n_joints
         unknown = Errors(np.full((FOLDS, n), np.inf), np.ones((FOLDS, n)))
-        if not reduced.folds.separable:
+        if not folds.separable:
             return unknown
-        estimate = self._estimator(settings, reduced)
-        targets = reduced.folds.predicted if rows == "all" else reduced.folds.fitted
+        targets = folds.predicted if rows == "all" else folds.fitted
         if rows == "moving":
-            targets = self._reduced(settings.preprocessed(left_out="slow")).folds.fitted
+            targets = self._folds(settings.preprocessed(left_out="slow")).fitted
         try:
-            return reduced.folds.errors(estimate, targets)
+            return folds.errors(self._estimator(settings), targets)
         except (IdentificationError, np.linalg.LinAlgError):
             return unknown
 
-    def _estimator(self, settings: Settings, reduced: _Reduced) -> Callable[[Factor], Array]:
+    def _estimator(self, settings: Settings) -> Callable[[Factor], Array]:
         effect = self._effect
-        prior = reduced.prior.with_weight(settings.strength.weight)
+        prior = self._prior(settings).with_weight(settings.strength.weight)
         model = self.model(settings)
-        _, of_all = posterior_values(reduced.folds.fitted, prior.gaussian, effect)
+        _, of_all = posterior_values(self._folds(settings).fitted, prior.gaussian, effect)
 
         def estimate(factor: Factor) -> Array:
             values, weights = posterior_values(factor, prior.gaussian, effect, of_all)
@@ -300,12 +298,15 @@ class Trial:
 
     def fitted_error(self, settings: Settings) -> float:
         """Return the error of the fitted rows themselves; infinite if none can be fitted."""
-        reduced = self._reduced(settings)
         try:
-            values = self._estimator(settings, reduced)(reduced.folds.fitted)
+            values = self._values(settings)
         except (IdentificationError, np.linalg.LinAlgError):
             return math.inf
-        return reduced.folds.fitted.relative_error(values)
+        return self._folds(settings).fitted.relative_error(values)
+
+    def _values(self, settings: Settings) -> Array:
+        """Return the parameters (p,) that all fitted rows give."""
+        return self._estimator(settings)(self._folds(settings).fitted)
 
     def fast_error(self, settings: Settings) -> float:
         """Return the error of fast motion predicted from slower one; zero if there is none.
@@ -319,7 +320,7 @@ class Trial:
         if not (folds.fitted.samples.any() and folds.predicted.samples.any()):
             return 0.0
         try:
-            values = self._estimator(settings, self._reduced(settings))(folds.fitted)
+            values = self._estimator(settings)(folds.fitted)
         except (IdentificationError, np.linalg.LinAlgError):
             return math.inf
         return folds.predicted.relative_error(values)
@@ -330,14 +331,13 @@ class Trial:
         Up to twice those recorded and at least to a usual one, which another motion may have.
         """
         model = self.model(settings)
-        reduced = self._reduced(settings)
-        values = self._estimator(settings, reduced)(reduced.folds.fitted)
+        values = self._values(settings)
         table = model.friction.table(values[model.friction_part])
         fastest = np.max(
             [np.abs(each.motion.velocity).max(axis=0) for each in self.samples(settings)], axis=0
         )
         fastest = np.maximum(_FASTER * fastest, USUAL_SPEED)
-        scatters = torque_scatter(model, reduced.folds.fitted)
+        scatters = torque_scatter(model, self._folds(settings).fitted)
         for law, coefficients, speed, scatter in zip(
             model.friction.laws, table, fastest, scatters, strict=False
         ):
@@ -375,8 +375,7 @@ class Trial:
         as bodies that cannot exist may be (Yoshida and Khalil 2000).
         """
         model = self.model(settings)
-        reduced = self._reduced(settings)
-        values = self._estimator(settings, reduced)(reduced.folds.fitted)
+        values = self._values(settings)
         samples = self.samples(settings)
         moved = [(each.motion.position, each.motion.acceleration) for each in samples]
         alike = np.flatnonzero(_correlation(moved) ** 2 > 1.0 - 1.0 / _COLLINEAR)
@@ -410,9 +409,8 @@ class Trial:
 
         Weighted by the torque of their joints: that of a joint with hardly any torque is open.
         """
-        reduced = self._reduced(settings)
-        values = self._estimator(settings, reduced)(reduced.folds.fitted)
-        power = reduced.folds.fitted.gram[:, -1, -1]
+        values = self._values(settings)
+        power = self._folds(settings).fitted.gram[:, -1, -1]
         model = self.model(settings)
         shares = [
             (value, power[term.owner])
@@ -440,8 +438,7 @@ class Trial:
         if not model.friction.has_load:
             return samples
         without = settings.with_friction(load=False)
-        reduced = self._reduced(without)
-        values = self._estimator(without, reduced)(reduced.folds.fitted)
+        values = self._values(without)
         return [each.with_load(self.model(without), values) for each in samples]
 
     def _retain_samples(self, settings: Settings) -> None:
@@ -450,14 +447,23 @@ class Trial:
         self._samples = {key: value for key, value in self._samples.items() if key == how}
         self._directed = {key: value for key, value in self._directed.items() if key[0] == how}
 
-    def _reduced(self, settings: Settings) -> _Reduced:
+    def _folds(self, settings: Settings) -> Folds:
         key = self.factor_key(settings)
         if key not in self._tables:
-            model = self.model(settings)
-            folds = Folds.of(model, self.samples(settings))
-            prior = body_prior(model, folds.fitted, stated=self._known)
-            self._tables[key] = _Reduced(folds, prior)
+            self._tables[key] = Folds.of(self.model(settings), self.samples(settings))
         return self._tables[key]
+
+    def _prior(self, settings: Settings) -> BodyPrior:
+        wide = settings.strength.wide_rotors
+        key = *self.factor_key(settings), wide
+        if key not in self._priors:
+            self._priors[key] = body_prior(
+                self.model(settings),
+                self._folds(settings).fitted,
+                stated=self._known,
+                wide_rotors=wide,
+            )
+        return self._priors[key]
 
 
 def _correlation(pairs: Sequence[tuple[Array, Array]]) -> Array:
@@ -506,7 +512,7 @@ def _description(model: RobotModel, settings: Settings) -> tuple[str, ...]:
         left_out.get(how.left_out or "", "by the friction law"),
         f"delay of {1e3 * how.torque_delay:.3g} ms",
         "no low-pass" if width is None else f"low-pass of {width:.3g} Hz, {how.torque_shape}",
-        settings.strength.describe(),
+        *settings.strength.describe(),
     )
 
 
