@@ -91,8 +91,10 @@ class IdentifiedModel:
                 field="--estimator",
                 remedy="use auto or prior",
             )
-        strength = self.prepared.settings.strength
-        return Posterior.of(self.cell, self.factor, self.estimator, strength)
+        settings = self.prepared.settings
+        return Posterior.of(
+            self.cell, self.factor, self.estimator, settings.strength, settings.average
+        )
 
     def predicted_residuals(self, shortest: float) -> list[Array]:
         """Return measured minus predicted torque (m, n) of each fitted recording.

@@ -51,7 +51,7 @@ from identification.factor.columns import instrument_factor
 from identification.factor.estimate import Estimate, inverse_variance
 from identification.factor.factor import QR_CONDITION, Factor, no_rows_message, total_factor
 from identification.factor.normal_equations import solve
-from identification.selection.settings import Settings, Strength
+from identification.selection.settings import Average, Settings, Strength
 from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.calibration import Refit
@@ -172,7 +172,8 @@ def estimate_with(
         task.advance(1, name)
         factors = factors or [Factor.by_time(model, samples) for samples in fitted]
         total = sum(factors, Factor.zero(model))
-        posterior = Posterior.of(cell, total, name, prepared.settings.strength)
+        settings = prepared.settings
+        posterior = Posterior.of(cell, total, name, settings.strength, settings.average)
         posterior, beside, unsolved = posterior.solved(total)
         if name in OF_PRIOR:
             result = _posterior(model, fitted, posterior, beside.estimate, factors)
@@ -313,10 +314,20 @@ class Posterior:
     prior: BodyPrior
     design_effect: float  #: rows that count as one
     consistent: bool  #: whether parameters that no bodies have are excluded
+    average: Average | None = None  #: over settings; None: over none
 
     @classmethod
-    def of(cls, cell: Cell, factor: Factor, name: str, strength: Strength) -> Posterior:
+    def of(
+        cls,
+        cell: Cell,
+        factor: Factor,
+        name: str,
+        strength: Strength,
+        average: Average | None = None,
+    ) -> Posterior:
         """Return the posterior of an estimator; all but "auto" have the strength of the residuals.
+
+        They are not averaged over settings, either.
 
         The bodies are as uncertain as `[nominal]` states; the estimator "prior" trusts them to
         `NOMINAL_SHARE` if it states nothing.
@@ -327,6 +338,7 @@ class Posterior:
             share = table.uncertainty or share
         if name != "auto":
             strength = Strength()
+            average = None
         prior = body_prior(
             cell.model,
             factor,
@@ -335,7 +347,8 @@ class Posterior:
             wide_rotors=strength.wide_rotors,
         )
         effect = design_effect_of(factor, prior.gaussian)
-        return cls(cell.model, prior.with_weight(strength.weight), effect, strength.consistent)
+        prior = prior.with_weight(strength.weight)
+        return cls(cell.model, prior, effect, strength.consistent, average)
 
     @property
     def precision(self) -> Array:
@@ -354,19 +367,23 @@ class Posterior:
     def fit(self, factor: Factor, share: float = 1.0) -> PosteriorEstimate:
         """Fit a factor that is this share of the rows, with the prior counting as for all."""
         result = self.free(factor, share)
-        if not self.consistent:
+        if not self.consistent and self.average is None:
             return result
         values = self.values(factor, share)
-        noise = factor.residual_rms(values)
-        return replace(result, estimate=replace(result.estimate, values=values, noise_std=noise))
+        changed = replace(result.estimate, values=values, noise_std=factor.residual_rms(values))
+        if self.average is not None:
+            covariance = changed.covariance + self.average.covariance
+            changed = replace(changed, covariance=covariance)
+        return replace(result, estimate=changed)
 
     def values(self, factor: Factor, share: float = 1.0) -> Array:
         """Return the parameters (p,) from a factor that is this share of the rows."""
         effect = share * self.design_effect
         values, weights = posterior_values(factor, self.prior.gaussian, effect)
-        if not self.consistent:
-            return values
-        return consistent_values(self.model, factor, weights, values, self.prior, effect)
+        shift = None if self.average is None else np.array(self.average.shift)
+        if self.consistent:
+            return consistent_values(self.model, factor, weights, values, self.prior, effect, shift)
+        return values if shift is None else values + shift
 
     def solved(self, factor: Factor) -> tuple[Posterior, PosteriorEstimate, list[str]]:
         """Fit a factor, without restriction to possible bodies if that fails, and say why."""

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
-from identification.selection.settings import Choice, Settings
+from identification.selection.settings import Average, Choice, Settings
 from identification.selection.trial import (
     IMPOSSIBLE_WORTHWHILE,
     MEANINGLESS,
+    TRANSFER,
     WORTHWHILE,
     Decision,
     Known,
@@ -54,9 +55,6 @@ a half show no period of an exciting motion."""
 IF_LONG: Final[frozenset[str]] = frozenset({"springs"})
 """Questions that are asked of long recordings only: their answers correct small errors, and a wrong
 one costs much on another motion."""
-DETAILS: Final[frozenset[str]] = frozenset({"bandwidth", "presliding"})
-"""Questions that a short recording must answer with `CERTAIN` standard errors. It is not asked for
-a narrower bandwidth: what is smoothed away is not predicted wrongly, but on another motion."""
 CERTAIN: Final = 3.0
 LOW_PASS: Final = "low-pass of the torque"
 REVERSAL: Final = "reversal of dry friction"
@@ -169,7 +167,25 @@ def choose_settings(
         for decision in _torsion_springs(trial, now, springs):
             now = decision.settings
             choices = [*choices, decision.choice]
+    if "estimator" in asked and (averaged := _average(trial, now, asked)):
+        average, choice = averaged
+        now = replace(now, average=average)
+        choices = [*choices, choice]
     return replace(now, choices=tuple(choice for choice in choices if len(choice.candidates) > 1))
+
+
+def _average(trial: Trial, now: Settings, asked: Collection[str]) -> tuple[Average, Choice] | None:
+    """Average over the answers to questions that leave the columns of the regressor as they are."""
+    others: list[Settings] = []
+    for swept in _SWEPT:
+        if not (swept.averaged and swept.question in asked):
+            continue
+        candidates = [now, *(each for each in swept.vary(now) if trial.key(each) != trial.key(now))]
+        tried = [*range(len(candidates))]
+        if swept.size is not None:
+            tried = trial.walk(candidates, swept.size)
+        others += [candidates[k] for k in tried if k > 0]
+    return trial.average(now, others)
 
 
 def _first_candidates(start: Settings, questions: Collection[Question]) -> Settings:
@@ -394,21 +410,25 @@ def _sweep(
 ) -> tuple[Settings, list[Choice]]:
     """Decide interdependent settings in turn until nothing changes."""
     asked = [swept for swept in _SWEPT if swept.question in questions]
-    short = trial.duration(now) < SHORT
     choices: list[Choice] = []
     for _ in range(_MOST_SWEEPS):
         before = now
         choices = []
         for swept in asked:
-            certainty = CERTAIN if short and swept.question in DETAILS else swept.certainty
             candidates = swept.vary(now)
             if swept.size is not None:
                 candidates = [candidates[k] for k in trial.walk(candidates, swept.size)]
-            decision = trial.decide(swept.name, candidates, swept.share, certainty=certainty)
+            decision = trial.decide(
+                swept.name,
+                candidates,
+                swept.share,
+                certainty=swept.certainty,
+                transfer=swept.transfer,
+            )
             now = decision.settings
             choices = [*choices, decision.choice]
             if swept.question == "rows":
-                decision = _rows_for_motion(trial, now, candidates, certainty)
+                decision = _rows_for_motion(trial, now, candidates)
                 now = decision.settings
                 choices = [*choices, decision.choice]
         if trial.key(now) == trial.key(before):
@@ -416,9 +436,7 @@ def _sweep(
     return now, choices
 
 
-def _rows_for_motion(
-    trial: Trial, now: Settings, candidates: Sequence[Settings], certainty: float
-) -> Decision:
+def _rows_for_motion(trial: Trial, now: Settings, candidates: Sequence[Settings]) -> Decision:
     """Choose among the candidates that predict all rows as well by the rows in motion.
 
     Static friction holds a joint at rest with any torque: its rows cannot be predicted, and decide
@@ -427,7 +445,7 @@ def _rows_for_motion(
     """
     limit = trial.errors(now).overall * (1.0 + WORTHWHILE)
     others = [each for each in candidates if each != now and trial.errors(each).overall < limit]
-    return trial.decide(ROWS_IN_MOTION, [now, *others], 0.0, rows="moving", certainty=certainty)
+    return trial.decide(ROWS_IN_MOTION, [now, *others], 0.0, rows="moving")
 
 
 class _Swept(NamedTuple):
@@ -439,6 +457,8 @@ class _Swept(NamedTuple):
     size: Callable[[Settings], float] | None = None  # of the setting, if it is a number
     share: float | None = None  # by which another candidate must be better, if not as usual
     certainty: float = 1.0  # in standard errors
+    transfer: float = 0.0  # relative standard deviation in addition
+    averaged: bool = False  # whether parameters are averaged over the candidates
 
 
 _SWEPT: Final = (
@@ -446,8 +466,7 @@ _SWEPT: Final = (
         "rotors",
         "largest inertia of rotors",
         lambda now: [
-            replace(now, strength=replace(now.strength, wide_rotors=wide))
-            for wide in (False, True)
+            replace(now, strength=replace(now.strength, wide_rotors=wide)) for wide in (False, True)
         ],
         share=ROTORS_WORTHWHILE,
         certainty=CERTAIN,
@@ -457,6 +476,7 @@ _SWEPT: Final = (
         "presliding displacement",
         lambda now: [now.with_friction(presliding=distance) for distance in PRESLIDING],
         lambda now: float(now.friction["presliding"]),
+        transfer=TRANSFER,
     ),
     _Swept(
         "rows",
@@ -473,6 +493,8 @@ _SWEPT: Final = (
         "bandwidth of the motion",
         lambda now: [now.preprocessed(rigid_bandwidth=width) for width in BANDWIDTHS],
         lambda now: now.preprocessing.rigid_bandwidth,
+        transfer=TRANSFER,
+        averaged=True,
     ),
 )
 
