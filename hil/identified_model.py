@@ -57,7 +57,7 @@ class IdentifiedModel:
 
     cell: Cell  #: with the friction law that was chosen
     arm: Arm  #: physically consistent
-    estimate: Estimate  #: with the uncertainty of the torque's scale
+    estimate: Estimate  #: in units of the torque of this arm, as its simulations need it
     estimator: str  #: of `hil.identify.options.Estimator`
     prepared: Prepared
     paths: tuple[Path, ...]  #: of the archives
