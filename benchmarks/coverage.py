@@ -1,10 +1,11 @@
 """Whether 95 % intervals of `hil identify` hold the truth of arms that were simulated without hil.
 
 Run with ``python -m benchmarks.coverage [--seeds N] [--arms NAME ...] [--delays MS ...]
-[--quadratic] [--load SHARE] [--white] [--rate HZ] [--speed SHARE] [--scale SHARE] [--json]``. Each
-run is a log of its own seed, imported and identified with default settings; another motion is held
-out. Motion, dynamics (pinocchio's RNEA), friction and noise share no code with what is tested, only
-the URDF; what the parameters are called and how they are grouped is the project's.
+[--quadratic] [--load SHARE] [--white] [--rate HZ] [--speed SHARE] [--scale SHARE] [--ensemble N]
+[--json]``. Each run is a log of its own seed, imported and identified with default settings;
+another motion is held out. Motion, dynamics (pinocchio's RNEA), friction and noise share no code
+with what is tested, only the URDF; what the parameters are called and how they are grouped is the
+project's.
 
 - The arm is not its URDF: masses differ by 10 to 20 %, centres and inertias alike, by a congruence
   of the pseudo-inertia, which keeps a body physically consistent. Its rotors are in no URDF.
@@ -32,6 +33,9 @@ Figures per arm and delay, and of all; a seed is the same arm, motion and noise 
   that of the Cramer-Rao bound of all rows, under the true covariance of their noise
   (`benchmarks.cramer_rao`); ``friction_least_squares``: the same of weighted least squares, which
   does not know that the noise is coloured.
+- ``ensemble`` (with ``--ensemble N``): spread of the held-out torque without noise of N arms drawn
+  from the posterior, over the error of the estimate there, both root mean squares over runs and
+  moving joints in shares of each joint's torque: one, if arms differ as much as they are uncertain.
 - ``delay_near``: runs whose applied delay is within 0.3 ms of the truth on every joint;
   ``delay_bias_ms``: mean of applied less true; ``delay_half_ms``: median half width of its interval
   where a run states one, ``delay_intervals`` their number, ``delay_held`` that of those which hold
@@ -65,6 +69,7 @@ from benchmarks.cramer_rao import PROJECT_ORDER, base_regressor, bound, least_sq
 from benchmarks.degradations import CAUSES
 from benchmarks.joint_log import JointLog
 from benchmarks.plain_fit import robot_from_urdf
+from hil.identified_model import IdentifiedModel, ensemble_of, model_of
 from hil.identify import identify_archives
 from hil.importers import IMPORTED_LAW, Robot
 from hil.progress import Silent
@@ -94,6 +99,7 @@ _DRY_SPEED: Final = 1e-3  # rad/s, below which dry friction is not full
 _SHAPE_SCATTER: Final = 0.05  # of the pseudo-inertia's congruence, each entry
 _MASS_SCATTER: Final = 0.12  # of the logarithm of a body's density
 _FRICTION_SCATTER: Final = 0.2  # of each coefficient
+_FEW_ROWS: Final = 5  # of which one is predicted by drawn arms
 _FRICTION_SYMBOLS: Final = ("f0", "f1", "f2", "fo", "fl")  # in the order of `Friction`
 
 
@@ -107,6 +113,7 @@ class Conditions(NamedTuple):
         speed: share of the URDF's largest speeds that motions may use.
         scale: standard deviation of the scale of each joint's logged torque, as a share.
         load: share of the rigid body's torque by which dry friction grows.
+        ensemble: number of arms that are drawn from each posterior.
     """
 
     quadratic: bool = False
@@ -115,6 +122,7 @@ class Conditions(NamedTuple):
     speed: float = 0.7
     scale: float = 0.03
     load: float = 0.0
+    ensemble: int = 0
 
 
 DEFAULTS: Final = Conditions()
@@ -425,6 +433,8 @@ class Run(NamedTuple):
         width: half widths of inertial intervals over the true values.
         delay_error: applied less true delay of each joint [s].
         delay_half: half width of its 95 % interval, where it is stated [s].
+        spread: of the held-out torque of drawn arms (n,), as shares of the torque; empty of none.
+        spread_error: error of the estimate there, likewise.
         blamed: names of findings that blame something which is not there.
         good: whether the verdict is.
         inside: share of held-out means inside their intervals.
@@ -444,6 +454,8 @@ class Run(NamedTuple):
     width: list[float]
     delay_error: list[float]
     delay_half: list[float]
+    spread: list[float]
+    spread_error: list[float]
     blamed: list[str]
     good: bool
     inside: float | None
@@ -466,10 +478,35 @@ def run(name: str, delay: float, seed: int, conditions: Conditions = DEFAULTS) -
             )
             archives.append(joint_log.imported(Path(scratch) / f"{part}.mcap"))
         start = time.process_time()
-        results = identify_archives(archives[:1], Silent(), predict=archives[1:]).results
+        found = identify_archives(archives[:1], Silent(), predict=archives[1:])
         seconds = time.process_time() - start
+        identified = model_of(found) if conditions.ensemble else None
     model = RobotModel.from_urdf(robot.urdf, locked=kind.locked, friction=law)
-    return compared(results, truth_of(arm, model, seed, delay, conditions), delay, seconds)
+    truth = truth_of(arm, model, seed, delay, conditions)
+    outcome = compared(found.results, truth, delay, seconds)
+    if identified is None:
+        return outcome
+    spread, error = ensemble_spread(identified, arm, seed, conditions)
+    return outcome._replace(spread=spread.tolist(), spread_error=error.tolist())
+
+
+def ensemble_spread(
+    identified: IdentifiedModel, arm: Arm, seed: int, conditions: Conditions
+) -> tuple[Array, Array]:
+    """Spread of the held-out torque of drawn arms (n,), and the error of the estimate there."""
+    model = identified.cell.model
+    _, motion, time = _part(arm, seed, 1, HELD_OUT_TIME, conditions)
+    states = motion.at(time[::_FEW_ROWS])
+    torque = arm.torque(*states) * torque_scale(arm, seed, conditions)
+    moving = model.moving(states[1])
+
+    def rms(values: Array) -> Array:
+        return np.asarray(np.sqrt(np.mean(values**2, axis=0, where=moving)) / torque.std(axis=0))
+
+    arms = ensemble_of(identified, conditions.ensemble, seed)
+    drawn = np.array([model.torque(values, *states) for values in arms.values])
+    estimated = model.torque(identified.estimate.values, *states)
+    return rms(drawn.std(axis=0, ddof=1)), rms(estimated - torque)
 
 
 def compared(results: Results, truth: Truth, delay: float, seconds: float) -> Run:
@@ -533,6 +570,8 @@ def compared(results: Results, truth: Truth, delay: float, seconds: float) -> Ru
         width=width,
         delay_error=(applied - delay).tolist(),
         delay_half=half_widths,
+        spread=[],
+        spread_error=[],
         blamed=list(dict.fromkeys(blamed)),
         good=results.verdict.good,
         inside=None if results.calibration is None else results.calibration.inside,
@@ -566,6 +605,10 @@ def figures(draws: Sequence[Sequence[Run]]) -> dict[str, Any]:
         "undetermined": sum(run.undetermined for run in runs),
         "dropped": sum(run.dropped for run in runs),
         "width": _rounded(np.median([share for run in runs for share in run.width])),
+        "ensemble": _ratio_of_squares(
+            [share for run in runs for share in run.spread],
+            [share for run in runs for share in run.spread_error],
+        ),
         "delay_near": sum(near),
         "delay_bias_ms": _rounded(1e3 * bias),
         "delay_half_ms": _rounded(1e3 * np.median(halves)) if halves else None,
@@ -592,6 +635,10 @@ def _coverage(name: str, intervals: Sequence[Sequence[Sequence[bool]]]) -> dict[
     return {name: _rounded(np.mean(held)), f"{name}_unsure": unsure}
 
 
+def _ratio_of_squares(spread: Sequence[float], error: Sequence[float]) -> float | None:
+    return _rounded(np.linalg.norm(spread) / np.linalg.norm(error)) if spread else None
+
+
 def _median(figures: Sequence[Sequence[float]]) -> float | None:
     every = [figure for figures_of_run in figures for figure in figures_of_run]
     return _rounded(np.median(every)) if every else None
@@ -614,6 +661,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--rate", type=float, default=DEFAULTS.rate, metavar="HZ")
     parser.add_argument("--speed", type=float, default=DEFAULTS.speed, metavar="SHARE")
     parser.add_argument("--scale", type=float, default=DEFAULTS.scale, metavar="SHARE")
+    parser.add_argument("--ensemble", type=int, default=DEFAULTS.ensemble, metavar="N")
     options = parser.parse_args(arguments)
     conditions = Conditions(
         options.quadratic,
@@ -622,6 +670,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options.speed,
         options.scale,
         options.load,
+        options.ensemble,
     )
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     cells: dict[str, dict[str, Any]] = {}
@@ -654,7 +703,7 @@ def _line(cell: str, row: Mapping[str, Any]) -> str:
         within = "" if unsure is None else f" ± {unsure:.1%}"
         shown.append(f"{name} " + ("-" if share is None else f"{share:.1%}{within}"))
     bounds = ("inertial_over_bound", "friction_over_bound", "friction_least_squares")
-    shown += [f"{name} {row[name]}" for name in (*bounds, "undetermined", "dropped")]
+    shown += [f"{name} {row[name]}" for name in (*bounds, "ensemble", "undetermined", "dropped")]
     shown.append(f"delay near {row['delay_near']} of {row['runs']}, bias {row['delay_bias_ms']} ms")
     shown.append(f"in {row['delay_held']} of {row['delay_intervals']} intervals")
     shown.append(f"false causes {row['false_causes'] or 'none'}")

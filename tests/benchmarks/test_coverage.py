@@ -162,6 +162,8 @@ CLEAN = Run(
     width=[0.1, 0.3],
     delay_error=[0.0, 0.0],
     delay_half=[1e-4],
+    spread=[0.02, 0.01],
+    spread_error=[0.01, 0.02],
     blamed=[],
     good=True,
     inside=0.9,
@@ -182,6 +184,7 @@ class TestFigures:
         assert (figures["inertial_absolute"], figures["friction_absolute"]) == (1.0, 0.5)
         assert figures["inertial_over_bound"] == pytest.approx(1.1)
         assert figures["friction_over_bound"] == pytest.approx(1.2)
+        assert figures["ensemble"] == pytest.approx(1.0)
         assert figures["delay_near"] == 1  # a run with a late axis is not near
         assert figures["delay_bias_ms"] == pytest.approx(0.1)
         assert (figures["delay_held"], figures["delay_intervals"]) == (1, 2)
