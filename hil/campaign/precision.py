@@ -152,11 +152,8 @@ class PrecisionMeter:
             self._requirements, values, information / posterior.design_effect
         )
         directions = wanted.quantities.directions
-        variance = np.where(
-            wanted.absolute,
-            _variances(directions, absolute(stated)),
-            _variances(directions, stated),
-        )
+        own, with_scale = (_variances(directions, each) for each in (stated, absolute(stated)))
+        variance = np.where(wanted.absolute, with_scale, own)
         # The errors of delay, gears and torque scale, which are in it as well, do not fall.
         of_rows = _variances(directions, posterior.free(estimation.result.factor).estimate)
         moved = np.asarray(np.linalg.solve(information, directions.T))

@@ -186,7 +186,7 @@ def test_a_band_holds_its_share() -> None:
     assert coverage(ensemble, np.zeros(shape))[0] == 0.0
 
 
-def test_dry_friction_of_a_standing_joint_is_no_torque_that_moves_it() -> None:
+def test_dry_friction_at_rest_is_no_torque_that_moves() -> None:
     """Half of it is held either way; beyond it, and where a joint moves, nothing is."""
     arm = an_arm(coulomb=5.0)
     time = np.arange(0.0, 1.0, 0.01)
