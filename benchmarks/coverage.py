@@ -1,10 +1,11 @@
 """Whether 95 % intervals of `hil identify` hold the truth of arms that were simulated without hil.
 
 Run with ``python -m benchmarks.coverage [--seeds N] [--arms NAME ...] [--delays MS ...]
-[--quadratic] [--load SHARE] [--white] [--rate HZ] [--speed SHARE] [--scale SHARE] [--json]``. Each
-run is a log of its own seed, imported and identified with default settings; another motion is held
-out. Motion, dynamics (pinocchio's RNEA), friction and noise share no code with what is tested, only
-the URDF; what the parameters are called and how they are grouped is the project's.
+[--quadratic] [--load SHARE] [--white] [--rate HZ] [--speed SHARE] [--scale SHARE] [--ensemble N]
+[--json]``. Each run is a log of its own seed, imported and identified with default settings;
+another motion is held out. Motion, dynamics (pinocchio's RNEA), friction and noise share no code
+with what is tested, only the URDF; what the parameters are called and how they are grouped is the
+project's.
 
 - The arm is not its URDF: masses differ by 10 to 20 %, centres and inertias alike, by a congruence
   of the pseudo-inertia, which keeps a body physically consistent. Its rotors are in no URDF.
@@ -21,10 +22,20 @@ the URDF; what the parameters are called and how they are grouped is the project
 
 Figures per arm and delay, and of all; a seed is the same arm, motion and noise at every delay:
 
-- ``inertial``, ``friction``: share of 95 % intervals that hold the true value, over all determined
-  parameters and runs, with two standard errors over the draws. ``undetermined``: parameters without
-  an interval. ``dropped``: coefficients of true friction that the model does not have. ``width``:
-  median half width of an inertial interval over the true value.
+- ``inertial``, ``friction``: share of 95 % intervals in units of the arm's torque that hold the
+  true value, over all determined parameters and runs, with two standard errors over the draws. True
+  are the parameters that fit the torques in the scale of the log without noise best, by the
+  weights of the identification; with ``--scale 0`` they are the arm's. ``inertial_absolute``,
+  ``friction_absolute``: of absolute intervals and the parameters of the arm.
+- ``undetermined``: parameters without an interval. ``dropped``: coefficients of true friction that
+  the model does not have. ``width``: median half width of an inertial interval over the true value.
+- ``inertial_over_bound``, ``friction_over_bound``: median half width of the former intervals over
+  that of the Cramer-Rao bound of all rows, under the true covariance of their noise
+  (`benchmarks.cramer_rao`); ``friction_least_squares``: the same of weighted least squares, which
+  does not know that the noise is coloured.
+- ``ensemble`` (with ``--ensemble N``): spread of the held-out torque without noise of N arms drawn
+  from the posterior, over the error of the estimate there, both root mean squares over runs and
+  moving joints in shares of each joint's torque: one, if arms differ as much as they are uncertain.
 - ``delay_near``: runs whose applied delay is within 0.3 ms of the truth on every joint;
   ``delay_bias_ms``: mean of applied less true; ``delay_half_ms``: median half width of its interval
   where a run states one, ``delay_intervals`` their number, ``delay_held`` that of those which hold
@@ -54,9 +65,11 @@ from numpy.typing import NDArray
 from benchmarks import parser_of, show
 from benchmarks.arms import ARMS, urdf
 from benchmarks.board import suspicious
+from benchmarks.cramer_rao import PROJECT_ORDER, base_regressor, bound, least_squares_deviations
 from benchmarks.degradations import CAUSES
 from benchmarks.joint_log import JointLog
 from benchmarks.plain_fit import robot_from_urdf
+from hil.identified_model import IdentifiedModel, ensemble_of, model_of
 from hil.identify import identify_archives
 from hil.importers import IMPORTED_LAW, Robot
 from hil.progress import Silent
@@ -70,6 +83,7 @@ FITTED_TIME: Final = 30.0  # s
 HELD_OUT_TIME: Final = 12.0  # s
 DELAYS: Final = (0.0, 1.3, 4.0, 10.0)  # ms
 NEAR: Final = 0.3e-3  # s
+_NORMAL: Final = 1.96  # standard deviations in half a 95 % interval of known variance
 QUADRATIC_LAW: Final = FrictionLaw(third="quadratic", offset=True)
 
 _BASE_FREQUENCY: Final = 0.1  # Hz
@@ -85,7 +99,8 @@ _DRY_SPEED: Final = 1e-3  # rad/s, below which dry friction is not full
 _SHAPE_SCATTER: Final = 0.05  # of the pseudo-inertia's congruence, each entry
 _MASS_SCATTER: Final = 0.12  # of the logarithm of a body's density
 _FRICTION_SCATTER: Final = 0.2  # of each coefficient
-_PROJECT_ORDER: Final = (4, 5, 7, 6, 8, 9, 1, 2, 3, 0)  # of pinocchio's ten parameters of a body
+_FEW_ROWS: Final = 5  # of which one is predicted by drawn arms
+_FRICTION_SYMBOLS: Final = ("f0", "f1", "f2", "fo", "fl")  # in the order of `Friction`
 
 
 class Conditions(NamedTuple):
@@ -98,6 +113,7 @@ class Conditions(NamedTuple):
         speed: share of the URDF's largest speeds that motions may use.
         scale: standard deviation of the scale of each joint's logged torque, as a share.
         load: share of the rigid body's torque by which dry friction grows.
+        ensemble: number of arms that are drawn from each posterior.
     """
 
     quadratic: bool = False
@@ -106,6 +122,7 @@ class Conditions(NamedTuple):
     speed: float = 0.7
     scale: float = 0.03
     load: float = 0.0
+    ensemble: int = 0
 
 
 DEFAULTS: Final = Conditions()
@@ -176,10 +193,14 @@ class Arm:
 
     def torque(self, position: Array, velocity: Array, acceleration: Array) -> Array:
         """Torque (m, n) of the joints, friction included."""
+        rigid = self.rigid_torque(position, velocity, acceleration)
+        return rigid + self.friction.torque(velocity, rigid)
+
+    def rigid_torque(self, position: Array, velocity: Array, acceleration: Array) -> Array:
+        """Torque (m, n) of bodies and rotors."""
         data = self.robot.createData()
         states = zip(position, velocity, acceleration, strict=True)
-        rigid = np.array([pin.rnea(self.robot, data, *state) for state in states])
-        return rigid + self.friction.torque(velocity, rigid)
+        return np.array([pin.rnea(self.robot, data, *state) for state in states])
 
 
 def drawn_arm(kind: ArmType, seed: int, conditions: Conditions = DEFAULTS) -> Arm:
@@ -283,33 +304,112 @@ def logged(
     arm: Arm, seed: int, part: int, duration: float, delay: float, conditions: Conditions
 ) -> Logged:
     """Log a motion with noise, the torque a delay [s] late."""
-    random = np.random.default_rng([seed, 2, part])
-    motion = drawn_motion(arm.robot, random, duration, conditions.speed)
-    time = np.arange(round(duration * conditions.rate)) / conditions.rate
+    random, motion, time = _part(arm, seed, part, duration, conditions)
     torque = arm.torque(*motion.at(time - delay))
     noise = random.standard_normal(torque.shape)
     if not conditions.white:
-        keep = np.exp(-1.0 / (_MEMORY * conditions.rate))
+        keep = _kept(conditions)
         drive = np.sqrt(1.0 - keep**2) * random.standard_normal(torque.shape)
         noise = np.sqrt(0.5) * (noise + scipy.signal.lfilter([1.0], [1.0, -keep], drive, axis=0))
     torque += _TORQUE_NOISE * torque.std(axis=0) * noise
-    # Of the sensors or torque constants of the arm, so that it is the same in all of its motions.
-    scale = np.random.default_rng([seed, 3]).standard_normal(torque.shape[1])
-    torque *= 1.0 + conditions.scale * scale
+    torque *= torque_scale(arm, seed, conditions)
     position = motion.at(time)[0]
     return Logged(time, position + _POSITION_NOISE * random.standard_normal(torque.shape), torque)
+
+
+def torque_scale(arm: Arm, seed: int, conditions: Conditions) -> Array:
+    """Logged over true torque (n,), of sensors or torque constants: the same in all motions."""
+    drawn = np.random.default_rng([seed, 3]).standard_normal(arm.robot.nv)
+    return np.asarray(1.0 + conditions.scale * drawn)
+
+
+def _part(
+    arm: Arm, seed: int, part: int, duration: float, conditions: Conditions
+) -> tuple[np.random.Generator, Motion, Array]:
+    """Draws of a log, of which the first are its motion, that motion, and the times (m,)."""
+    random = np.random.default_rng([seed, 2, part])
+    motion = drawn_motion(arm.robot, random, duration, conditions.speed)
+    return random, motion, np.arange(round(duration * conditions.rate)) / conditions.rate
+
+
+def _kept(conditions: Conditions) -> float:
+    """Correlation of the coloured half of the noise from one row to the next, 0 if it is white."""
+    return 0.0 if conditions.white else float(np.exp(-1.0 / (_MEMORY * conditions.rate)))
+
+
+class Truth(NamedTuple):
+    """What the log of a fitted motion can show, by the names of the parameters.
+
+    Attributes:
+        values: of the arm.
+        rows: its regressor without noise (n, m, p), parameters in the order of `values`.
+        noise: standard deviations of the torque's noise (n,).
+        keep: correlation of its coloured half from one row to the next.
+        scale: logged over true torque (n,).
+    """
+
+    values: Mapping[str, float]
+    rows: Array
+    noise: Array
+    keep: float
+    scale: Array
+
+    @property
+    def bound(self) -> dict[str, float]:
+        """Least standard deviations."""
+        return self._by_name(bound(self.rows, self.noise, self.keep))
+
+    @property
+    def least_squares(self) -> dict[str, float]:
+        """Standard deviations of weighted least squares."""
+        return self._by_name(least_squares_deviations(self.rows, self.noise, self.keep))
+
+    def in_scale(self, std: Array) -> dict[str, float]:
+        """Parameters that fit the torques in the scale of the log best, for residuals std (n,)."""
+        values = np.array([*self.values.values()])
+        weighted = self.rows / std[:, None, None]
+        information = np.einsum("jmp,jmq->pq", weighted, weighted)
+        # Solved for the change, which is exactly zero in the true scale.
+        pull = np.einsum(
+            "jmp,j,jmq,q->p", weighted, self.scale - 1.0, weighted, values, optimize=True
+        )
+        return self._by_name(values + np.linalg.solve(information, pull))
+
+    def _by_name(self, figures: Array) -> dict[str, float]:
+        return dict(zip(self.values, figures.tolist(), strict=True))
+
+
+def truth_of(arm: Arm, model: RobotModel, seed: int, delay: float, conditions: Conditions) -> Truth:
+    """What the log of the fitted motion can show, by pinocchio and the law of friction."""
+    _, motion, time = _part(arm, seed, 0, FITTED_TIME, conditions)
+    states = motion.at(time - delay)
+    values = true_values(arm, model)
+    rigid = arm.rigid_torque(*states)
+    noise = _TORQUE_NOISE * (rigid + arm.friction.torque(states[1], rigid)).std(axis=0)
+    base = base_regressor(arm.robot, model, *states)
+    rows = np.zeros((*base.shape[:2], len(values)))
+    rows[:, :, : base.shape[2]] = base
+    unit = np.eye(len(Friction._fields))
+    for place, name in enumerate(values):
+        symbol, _, joint = name.partition("_")
+        if symbol in _FRICTION_SYMBOLS:
+            only = Friction(*unit[_FRICTION_SYMBOLS.index(symbol)])
+            axis = int(joint) - 1
+            rows[axis, :, place] = only.torque(states[1], rigid)[:, axis]
+    scale = torque_scale(arm, seed, conditions)
+    return Truth(values, rows, noise * scale, _kept(conditions), scale)
 
 
 def true_values(arm: Arm, model: RobotModel) -> dict[str, float]:
     """Base parameters and friction coefficients of an arm by the project's names for them."""
     bodies = np.array([body.toDynamicParameters() for body in arm.robot.inertias[1:]])
     standard = np.zeros(model.layout.size)
-    standard[model.layout.links] = bodies[:, _PROJECT_ORDER]
+    standard[model.layout.links] = bodies[:, PROJECT_ORDER]
     standard[model.layout.rotors] = arm.robot.armature
     values = dict(
         zip(model.parameter_names, (model.base.grouping @ standard).tolist(), strict=False)
     )
-    symbols = dict(zip(("f0", "f1", "f2", "fo", "fl"), arm.friction, strict=True))
+    symbols = dict(zip(_FRICTION_SYMBOLS, arm.friction, strict=True))
     for symbol, coefficients in symbols.items():
         if symbol in ("f0", "f1", "fo") or coefficients.any():
             values |= {f"{symbol}_{j}": value for j, value in enumerate(coefficients.tolist(), 1)}
@@ -320,13 +420,21 @@ class Run(NamedTuple):
     """What became of one log.
 
     Attributes:
-        inertial: whether each determined base parameter is in its interval.
+        inertial: whether each determined base parameter is in its interval, in units of the torque
+            of the arm.
         friction: likewise of the friction coefficients.
+        inertial_absolute: likewise in absolute intervals.
+        friction_absolute: likewise.
+        inertial_over_bound: half widths of intervals over those of the Cramer-Rao bound.
+        friction_over_bound: likewise of true coefficients of friction.
+        friction_least_squares: the latter of weighted least squares.
         undetermined: number of parameters without an interval.
         dropped: number of true friction coefficients that the model does not have.
         width: half widths of inertial intervals over the true values.
         delay_error: applied less true delay of each joint [s].
         delay_half: half width of its 95 % interval, where it is stated [s].
+        spread: of the held-out torque of drawn arms (n,), as shares of the torque; empty of none.
+        spread_error: error of the estimate there, likewise.
         blamed: names of findings that blame something which is not there.
         good: whether the verdict is.
         inside: share of held-out means inside their intervals.
@@ -336,11 +444,18 @@ class Run(NamedTuple):
 
     inertial: list[bool]
     friction: list[bool]
+    inertial_absolute: list[bool]
+    friction_absolute: list[bool]
+    inertial_over_bound: list[float]
+    friction_over_bound: list[float]
+    friction_least_squares: list[float]
     undetermined: int
     dropped: int
     width: list[float]
     delay_error: list[float]
     delay_half: list[float]
+    spread: list[float]
+    spread_error: list[float]
     blamed: list[str]
     good: bool
     inside: float | None
@@ -363,13 +478,38 @@ def run(name: str, delay: float, seed: int, conditions: Conditions = DEFAULTS) -
             )
             archives.append(joint_log.imported(Path(scratch) / f"{part}.mcap"))
         start = time.process_time()
-        results = identify_archives(archives[:1], Silent(), predict=archives[1:]).results
+        found = identify_archives(archives[:1], Silent(), predict=archives[1:])
         seconds = time.process_time() - start
+        identified = model_of(found) if conditions.ensemble else None
     model = RobotModel.from_urdf(robot.urdf, locked=kind.locked, friction=law)
-    return compared(results, true_values(arm, model), delay, seconds)
+    truth = truth_of(arm, model, seed, delay, conditions)
+    outcome = compared(found.results, truth, delay, seconds)
+    if identified is None:
+        return outcome
+    spread, error = ensemble_spread(identified, arm, seed, conditions)
+    return outcome._replace(spread=spread.tolist(), spread_error=error.tolist())
 
 
-def compared(results: Results, truth: Mapping[str, float], delay: float, seconds: float) -> Run:
+def ensemble_spread(
+    identified: IdentifiedModel, arm: Arm, seed: int, conditions: Conditions
+) -> tuple[Array, Array]:
+    """Spread of the held-out torque of drawn arms (n,), and the error of the estimate there."""
+    model = identified.cell.model
+    _, motion, time = _part(arm, seed, 1, HELD_OUT_TIME, conditions)
+    states = motion.at(time[::_FEW_ROWS])
+    torque = arm.torque(*states) * torque_scale(arm, seed, conditions)
+    moving = model.moving(states[1])
+
+    def rms(values: Array) -> Array:
+        return np.asarray(np.sqrt(np.mean(values**2, axis=0, where=moving)) / torque.std(axis=0))
+
+    arms = ensemble_of(identified, conditions.ensemble, seed)
+    drawn = np.array([model.torque(values, *states) for values in arms.values])
+    estimated = model.torque(identified.estimate.values, *states)
+    return rms(drawn.std(axis=0, ddof=1)), rms(estimated - torque)
+
+
+def compared(results: Results, truth: Truth, delay: float, seconds: float) -> Run:
     """Compare results with the truth: parameters by name, and the delay [s].
 
     A coefficient that the truth does not have is zero. The interval is zero wide where a parameter
@@ -378,21 +518,35 @@ def compared(results: Results, truth: Mapping[str, float], delay: float, seconds
     Raises:
         KeyError: the results have another base parameter.
     """
-    inertial: list[bool] = []
-    friction: list[bool] = []
+    n_base = results.n_base
+    factor = results.uncertainty.interval_factor
+    known = [
+        (index >= n_base, parameter)
+        for index, parameter in enumerate(results.parameters)
+        if not parameter.undetermined and np.isfinite(parameter.std)
+    ]
+    in_scale = truth.in_scale(np.array(results.noise_std))
+    least = truth.bound
+    least_squares = truth.least_squares
+    own: tuple[list[bool], list[bool]] = [], []
+    absolute: tuple[list[bool], list[bool]] = [], []
+    over: tuple[list[float], list[float]] = [], []
     width: list[float] = []
-    undetermined = 0
-    for index, parameter in enumerate(results.parameters):
-        if parameter.undetermined or not np.isfinite(parameter.std):
-            undetermined += 1
-            continue
-        is_inertial = index < results.n_base
-        value = truth[parameter.name] if is_inertial else truth.get(parameter.name, 0.0)
-        half = results.uncertainty.interval_factor * parameter.std
-        held = bool(abs(parameter.estimate - value) <= half)
-        (inertial if is_inertial else friction).append(held)
-        if is_inertial:
-            width.append(half / abs(value))
+    for is_friction, parameter in known:
+        name = parameter.name
+        half = factor * parameter.std
+        absolute_half = factor * (parameter.absolute_std or parameter.std)
+        values = [
+            values.get(name, 0.0) if is_friction else values[name]
+            for values in (in_scale, truth.values)
+        ]
+        errors = [abs(parameter.estimate - value) for value in values]
+        own[is_friction].append(bool(errors[0] <= half))
+        absolute[is_friction].append(bool(errors[1] <= absolute_half))
+        if name in least:
+            over[is_friction].append(half / (_NORMAL * least[name]))
+        if not is_friction:
+            width.append(half / abs(values[1]))
     delays = results.delays
     applied = np.zeros(len(results.joint_names)) if delays is None else np.array(delays.applied)
     half_widths = [] if delays is None else [half for half in delays.interval if half is not None]
@@ -400,13 +554,24 @@ def compared(results: Results, truth: Mapping[str, float], delay: float, seconds
     checks = [finding.check for finding in suspicious(results)]
     blamed = [check for check in checks if check in CAUSES - justified]
     return Run(
-        inertial=inertial,
-        friction=friction,
-        undetermined=undetermined,
-        dropped=len(truth.keys() - {parameter.name for parameter in results.parameters}),
+        inertial=own[0],
+        friction=own[1],
+        inertial_absolute=absolute[0],
+        friction_absolute=absolute[1],
+        inertial_over_bound=over[0],
+        friction_over_bound=over[1],
+        friction_least_squares=[
+            least_squares[name] / least[name]
+            for name in least
+            if name.partition("_")[0] in _FRICTION_SYMBOLS
+        ],
+        undetermined=len(results.parameters) - len(known),
+        dropped=len(truth.values.keys() - {parameter.name for parameter in results.parameters}),
         width=width,
         delay_error=(applied - delay).tolist(),
         delay_half=half_widths,
+        spread=[],
+        spread_error=[],
         blamed=list(dict.fromkeys(blamed)),
         good=results.verdict.good,
         inside=None if results.calibration is None else results.calibration.inside,
@@ -428,9 +593,22 @@ def figures(draws: Sequence[Sequence[Run]]) -> dict[str, Any]:
         "runs": len(runs),
         **_coverage("inertial", [[run.inertial for run in draw] for draw in draws]),
         **_coverage("friction", [[run.friction for run in draw] for draw in draws]),
+        **_coverage(
+            "inertial_absolute", [[run.inertial_absolute for run in draw] for draw in draws]
+        ),
+        **_coverage(
+            "friction_absolute", [[run.friction_absolute for run in draw] for draw in draws]
+        ),
+        "inertial_over_bound": _median([run.inertial_over_bound for run in runs]),
+        "friction_over_bound": _median([run.friction_over_bound for run in runs]),
+        "friction_least_squares": _median([run.friction_least_squares for run in runs]),
         "undetermined": sum(run.undetermined for run in runs),
         "dropped": sum(run.dropped for run in runs),
         "width": _rounded(np.median([share for run in runs for share in run.width])),
+        "ensemble": _ratio_of_squares(
+            [share for run in runs for share in run.spread],
+            [share for run in runs for share in run.spread_error],
+        ),
         "delay_near": sum(near),
         "delay_bias_ms": _rounded(1e3 * bias),
         "delay_half_ms": _rounded(1e3 * np.median(halves)) if halves else None,
@@ -457,6 +635,15 @@ def _coverage(name: str, intervals: Sequence[Sequence[Sequence[bool]]]) -> dict[
     return {name: _rounded(np.mean(held)), f"{name}_unsure": unsure}
 
 
+def _ratio_of_squares(spread: Sequence[float], error: Sequence[float]) -> float | None:
+    return _rounded(np.linalg.norm(spread) / np.linalg.norm(error)) if spread else None
+
+
+def _median(figures: Sequence[Sequence[float]]) -> float | None:
+    every = [figure for figures_of_run in figures for figure in figures_of_run]
+    return _rounded(np.median(every)) if every else None
+
+
 def _rounded(number: float | np.floating[Any]) -> float:
     return float(f"{number:.4g}")
 
@@ -474,6 +661,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--rate", type=float, default=DEFAULTS.rate, metavar="HZ")
     parser.add_argument("--speed", type=float, default=DEFAULTS.speed, metavar="SHARE")
     parser.add_argument("--scale", type=float, default=DEFAULTS.scale, metavar="SHARE")
+    parser.add_argument("--ensemble", type=int, default=DEFAULTS.ensemble, metavar="N")
     options = parser.parse_args(arguments)
     conditions = Conditions(
         options.quadratic,
@@ -482,6 +670,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options.speed,
         options.scale,
         options.load,
+        options.ensemble,
     )
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     cells: dict[str, dict[str, Any]] = {}
@@ -508,12 +697,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _line(cell: str, row: Mapping[str, Any]) -> str:
     """Return the figures of some runs as a line."""
     shown = [f"{cell:14}"]
-    for name in ("inertial", "friction"):
+    for name in ("inertial", "friction", "inertial_absolute", "friction_absolute"):
         share = row[name]
         unsure = row[f"{name}_unsure"]
         within = "" if unsure is None else f" ± {unsure:.1%}"
         shown.append(f"{name} " + ("-" if share is None else f"{share:.1%}{within}"))
-    shown += [f"{name} {row[name]}" for name in ("undetermined", "dropped")]
+    bounds = ("inertial_over_bound", "friction_over_bound", "friction_least_squares")
+    shown += [f"{name} {row[name]}" for name in (*bounds, "ensemble", "undetermined", "dropped")]
     shown.append(f"delay near {row['delay_near']} of {row['runs']}, bias {row['delay_bias_ms']} ms")
     shown.append(f"in {row['delay_held']} of {row['delay_intervals']} intervals")
     shown.append(f"false causes {row['false_causes'] or 'none'}")

@@ -84,8 +84,10 @@ class IdentifiedArm:
     def parameters(self) -> pandas.DataFrame:
         """Base parameters, friction and elements by name.
 
-        Estimate, ends of its 95 % interval and standard deviation in the unit of the row; whether
-        the motion leaves it undetermined; and its expression in parameters of the bodies.
+        Estimate, ends of its 95 % interval and standard deviation in the unit of the row, as
+        measured by the torque of this arm; the standard deviation with the uncertainty of the scale
+        of that torque; whether the motion leaves the parameter undetermined; and its expression in
+        parameters of the bodies.
         """
         import pandas  # only for this table
 
@@ -97,6 +99,7 @@ class IdentifiedArm:
                 "lower": [parameter.estimate - factor * parameter.std for parameter in parameters],
                 "upper": [parameter.estimate + factor * parameter.std for parameter in parameters],
                 "std": [parameter.std for parameter in parameters],
+                "absolute_std": [parameter.absolute_std for parameter in parameters],
                 "unit": [parameter.unit for parameter in parameters],
                 "undetermined": [parameter.undetermined for parameter in parameters],
                 "expression": [parameter.expression for parameter in parameters],

@@ -42,6 +42,7 @@ from identification.factor.factor import total_factor
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.pseudo_inertia import margin
 from identification.model.robot import RobotModel
+from identification.rollout.comparison import driving_residual
 from identification.selection.folds import FOLDS
 
 Array = NDArray[np.float64]
@@ -57,7 +58,7 @@ class IdentifiedModel:
 
     cell: Cell  #: with the friction law that was chosen
     arm: Arm  #: physically consistent
-    estimate: Estimate  #: with the uncertainty of the torque's scale
+    estimate: Estimate  #: in units of the torque of this arm, as its simulations need it
     estimator: str  #: of `hil.identify.options.Estimator`
     prepared: Prepared
     paths: tuple[Path, ...]  #: of the archives
@@ -97,10 +98,11 @@ class IdentifiedModel:
         )
 
     def predicted_residuals(self, shortest: float) -> list[Array]:
-        """Return measured minus predicted torque (m, n) of each fitted recording.
+        """Return what moves joints otherwise than predicted (m, n), for each fitted recording.
 
-        Each tenth of the rows is predicted from the others: what was fitted leaves too little. Of a
-        short recording the parts are fewer, so that none is shorter than `shortest` [s].
+        That is measured minus predicted torque (`driving_residual`). Each tenth of the rows is
+        predicted from the others: what was fitted leaves too little. Of a short recording the parts
+        are fewer, so that none is shorter than `shortest` [s].
 
         Raises:
             InputError: the estimator has no posterior.
@@ -119,7 +121,7 @@ class IdentifiedModel:
         for k in range(parts):
             values = self.posterior.values(total.without(fold == k))
             for samples, fold_of_row, residual in zip(fitted, folds, residuals, strict=True):
-                error = samples.torque - samples.predicted_torque(model, values)
+                error = driving_residual(model, samples, values)
                 residual[fold_of_row == k] = error[fold_of_row == k]
         return residuals
 

@@ -271,7 +271,7 @@ class ParameterResult(Frozen):
     unit: str
     table2_id: int | None
     estimate: float
-    std: float
+    std: float  #: In units of the torque of this arm
     repetition_mean: float
     repetition_std: float | None
     """Standard deviation of a single repetition."""
@@ -284,6 +284,8 @@ class ParameterResult(Frozen):
     """Posterior over prior standard deviation: 0 if determined by the data, 1 by the prior."""
     learned: bool | None = None
     """Whether at least three quarters of the information come from the data."""
+    absolute_std: float | None = None
+    """With the uncertainty of the torque's scale; null in files of earlier versions."""
 
     @property
     def label(self) -> str:

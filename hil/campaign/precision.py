@@ -40,6 +40,7 @@ from hil.reading import path_exists
 from hil.terminal_text import plural
 from identification.estimators.delay import CombinedDelay, delay_sensitivity, rate_products
 from identification.estimators.elasticity import ElasticTorque
+from identification.estimators.torque_scale import absolute
 from identification.excitation import midpoints
 from identification.factor.estimate import Estimate, inverse_variance
 from identification.factor.factor import Factor
@@ -151,7 +152,8 @@ class PrecisionMeter:
             self._requirements, values, information / posterior.design_effect
         )
         directions = wanted.quantities.directions
-        variance = _variances(directions, stated)
+        own, with_scale = (_variances(directions, each) for each in (stated, absolute(stated)))
+        variance = np.where(wanted.absolute, with_scale, own)
         # The errors of delay, gears and torque scale, which are in it as well, do not fall.
         of_rows = _variances(directions, posterior.free(estimation.result.factor).estimate)
         moved = np.asarray(np.linalg.solve(information, directions.T))

@@ -77,7 +77,8 @@ class Forecast:
         half: half of its 95 % interval after the planned repetitions, in units of the requirement.
         repetitions: of this motion that meet the requirement; None if none do.
         motions: different motions of this kind that meet it, once each; None if none do.
-        limit: half of the interval that the scale of the torque alone leaves.
+        limit: half of the interval that the scale of the torque alone leaves; zero if the interval
+            is in units of the torque of this arm.
     """
 
     requirement: Requirement
@@ -96,7 +97,7 @@ class Forecast:
             return (
                 f"{text}; no motion of this arm can meet it: {shown(self.limit)} remain, "
                 f"{scale.message} (weigh a known load with `hil torque-constants`, or state "
-                "torque_uncertainty)"
+                f"torque_uncertainty{self._own_units})"
             )
         if self.repetitions is not None:
             return f"{text}; met by {plural(self.repetitions, 'repetition')}"
@@ -104,6 +105,12 @@ class Forecast:
         if self.motions is None:
             return f"{text}, and no number of such motions does"
         return f"{text}: {plural(self.motions, 'different motion')} of this kind would"
+
+    @property
+    def _own_units(self) -> str:
+        if self.requirement.kind == "mass":
+            return ""
+        return ', or omit "absolute", in units of the torque of this arm'
 
     def to_dict(self) -> dict[str, Any]:
         """Return the forecast for JSON and TOML; what does not exist is left out."""
@@ -225,8 +232,9 @@ class PrecisionDesign:
         objective = Objective(self.cell.model, precision=self.precision(repetitions))
         grams = step * objective.precise_grams(motion)
         limits = np.zeros(len(self.wanted.labels))
-        if self.scale.std.any():
-            limits = self._ratios(grams, repetitions, _ENDLESS)
+        if self.scale.std.any() and self.wanted.absolute.any():
+            endless = self._ratios(grams, repetitions, _ENDLESS)
+            limits = np.where(self.wanted.absolute, endless, 0.0)
         forecasts = []
         worst = self.wanted.worst(self._ratios(grams, repetitions, 1.0))
         for k, (requirement, label, ratio) in enumerate(worst):
@@ -260,12 +268,13 @@ class PrecisionDesign:
         by_joint = motions * grams / precision.density[:, None, None]
         information = by_joint.sum(axis=0)
         ratios = precision.ratios(information)
-        if not self.scale.std.any():
+        is_absolute = self.wanted.absolute
+        if not self.scale.std.any() or not is_absolute.any():
             return ratios
         pulls = (by_joint @ self.subject).T
         moved = precision.spread(information).slope @ pulls * self.scale.std
         by_scale = _NORMAL * np.linalg.norm(moved, axis=1) / self.wanted.quantities.allowed
-        return np.asarray(np.hypot(ratios, by_scale))
+        return np.where(is_absolute, np.hypot(ratios, by_scale), ratios)
 
     def _require_possible(self) -> None:
         """Raise InputError for a requirement beyond what a year of different motions gives."""

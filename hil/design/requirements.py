@@ -1,10 +1,14 @@
-"""Requirements for the precision of an identification, as typed: `parameters 5%, torque 2`."""
+"""Requirements for the precision of an identification, as typed: `parameters 5%, torque 2`.
+
+Intervals are in units of the torque of the arm, unless `absolute` follows: then they have the
+uncertainty of the torque's scale as well, as the mass of a payload always has.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Final, Literal
 
@@ -20,12 +24,14 @@ FORMS: Final = (
     "friction of JOINT 5 %",
     "torque 2",
     "torque of JOINT 2",
+    "parameters 5 % absolute",
     "mass of payload 1 %",
     "mass of payload 0.05",
 )
 """What can be required; torque in N·m (N of a prismatic joint), mass in kg."""
 _FIGURE: Final = re.compile(
     r"(?P<name>\D.*?)\s+(?P<value>[-+]?[0-9.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>%|N·m|Nm|N m|N|kg)?"
+    r"(?P<absolute>\s+absolute)?"
 )
 _ABSOLUTE: Final = {"torque": ("N·m", "Nm", "N m", "N"), "mass": ("kg",)}
 _OF_JOINT: Final = re.compile(r"(friction|torque)(?:\s+of\s+(.+))?")
@@ -42,12 +48,15 @@ class Requirement:
         name: of the parameter or joint; "" for all.
         value: half of the interval: a fraction if `relative`, else N·m, N or kg.
         relative: whether it is relative to the quantity.
+        absolute: whether the interval has the uncertainty of the torque's scale, which is no error
+            in units of the torque of this arm.
     """
 
     kind: Kind
     name: str
     value: float
     relative: bool
+    absolute: bool = False
 
     def __str__(self) -> str:
         subject = {
@@ -55,7 +64,9 @@ class Requirement:
             "parameter": self.name,
             "mass": "mass of payload",
         }.get(self.kind, self.kind + (f" of {self.name}" if self.name else ""))
-        return f"{subject} {self.shown(self.value)}"
+        # The mass of a payload is nothing else.
+        suffix = " absolute" if self.absolute and self.kind != "mass" else ""
+        return f"{subject} {self.shown(self.value)}{suffix}"
 
     def shown(self, value: float) -> str:
         """Return a half width of an interval as text, such as "5 %" or "2 N·m"."""
@@ -73,8 +84,8 @@ def requirements_from(texts: Sequence[str]) -> tuple[Requirement, ...]:
     parts = [part.strip() for text in texts for part in text.split(",")]
     requirements = tuple(_requirement(part) for part in parts)
     for k, requirement in enumerate(requirements):
-        if (requirement.kind, requirement.name) in {
-            (other.kind, other.name) for other in requirements[:k]
+        if replace(requirement, value=0.0, relative=False) in {
+            replace(other, value=0.0, relative=False) for other in requirements[:k]
         }:
             raise InputError(
                 None, f"{parts[k]!r} is required twice", field=_FIELD, remedy="give it once"
@@ -105,7 +116,8 @@ def _requirement(text: str) -> Requirement:
         if kind == "parameter":  # which may be no parameter at all
             remedy += f"; {_known()}"
         raise InputError(None, f"{text!r} has {given}", field=_FIELD, remedy=remedy)
-    return Requirement(kind, subject, value, relative)
+    is_absolute = kind == "mass" or matched["absolute"] is not None
+    return Requirement(kind, subject, value, relative, is_absolute)
 
 
 def _kind(name: str, text: str) -> tuple[Kind, str]:

@@ -33,6 +33,11 @@ class Wanted:
     labels: tuple[str, ...]  #: of each quantity (k,)
     owners: NDArray[np.intp]  #: index of the requirement of each (k,)
 
+    @property
+    def absolute(self) -> NDArray[np.bool_]:
+        """Whether the interval of each quantity has the uncertainty of the torque's scale (k,)."""
+        return np.array([requirement.absolute for requirement in self.requirements])[self.owners]
+
     def worst(self, ratios: Array) -> list[tuple[Requirement, str, float]]:
         """Return for each requirement the quantity with the largest ratio (k,), and that ratio."""
         worst = []

@@ -93,8 +93,8 @@ class Estimation:
     with_prior: PosteriorEstimate
     refit: Refit  #: parameters by the estimator from a factor, to predict parts of the fitted rows
     warnings: tuple[str, ...]
-    #: the pooled result, with the uncertainty of the torque's scale in its covariance, and that of
-    #: elastic gears: no residual shows what they do to parameters
+    #: the pooled result, with the uncertainty of elastic gears in its covariance, and its change by
+    #: the scale of the torques: no residual shows what they do to parameters
     stated: Estimate
     notes: tuple[str, ...]  #: what the intervals assume
     elastic: tuple[ElasticTorque, ...]  #: of the first recordings, at most `_ALIKE` of one motion
@@ -262,7 +262,10 @@ def _stated(
     sources = prepared.sources
     scale = torque_scale_of(sources)
     estimate = with_uncertain_scale(result.pooled, result.factor, precision, scale)
-    note = f"the intervals of the parameters are computed {scale.message}"
+    note = (
+        "the intervals of the parameters are in units of the torque of this arm; absolute ones are"
+        f" computed {scale.message}"
+    )
     if sources.cell.file.drive_train is None:  # positions may be those of links, behind the gears
         return estimate, (note,), ()
     model = posterior.model
@@ -293,7 +296,7 @@ def _require_usable_rows(prepared: Prepared) -> None:
 def with_uncertain_scale(
     estimate: Estimate, factor: Factor, precision: Array | None, scale: TorqueScale
 ) -> Estimate:
-    """Return the estimate with the uncertainty of the torque's scale in its covariance.
+    """Return the estimate with its change by the uncertain scale of the torques.
 
     `precision` (p, p) is that of a prior beside the factor.
     """

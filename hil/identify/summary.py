@@ -13,6 +13,7 @@ from hil.cell import Cell
 from hil.errors import InputError
 from hil.version import software
 from identification import Factor, RobotModel
+from identification.estimators.torque_scale import absolute
 from identification.excitation import (
     Criteria,
     Excitation,
@@ -240,6 +241,7 @@ def _parameters(
         prior_std=posterior.prior_std,
         prior_ratio=posterior.ratio,
         learned=posterior.learned,
+        absolute_std=absolute(pooled).std,
     )
 
 

@@ -70,6 +70,7 @@ def report_bytes(
         "has_prior": any(p.data_share is not None for p in results.parameters),
         "warnings": grouped_warnings(results),
         "ranked": [warning for group in grouped_warnings(results).values() for warning in group],
+        "has_absolute": any(p.absolute_std not in (None, p.std) for p in results.parameters),
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
         "by_id": by_id,
         "joint_of": lambda parameter: joint_of(parameter, results.joint_names),

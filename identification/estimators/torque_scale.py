@@ -9,6 +9,10 @@ the change by s_j is the solution for the torque of joint j alone,
 and independent errors of standard deviation u_j add :math:`\sum_j u_j^2 (\partial \pi / \partial
 s_j)(\partial \pi / \partial s_j)^T` to the covariance. H may contain the information of a prior.
 No residual shows a common factor of all torques; it is exactly linear in the parameters.
+
+The covariance of an estimate is without it: in units of the arm's own torque, which is what a
+controller or a simulation of the same arm needs, the parameters have no such error. Estimates keep
+:math:`u_j \partial \pi / \partial s_j`, and :func:`absolute` adds it where masses are wanted.
 """
 
 from __future__ import annotations
@@ -63,21 +67,30 @@ def scale_covariance(sensitivity: Array, std: Array, interval_factor: float = _N
 def with_torque_scale(
     estimate: Estimate, factor: Factor, weights: Array, inverse: Array, std: Array
 ) -> Estimate:
-    """Return the estimate with the uncertainty of the torque scale in its covariance.
+    """Return the estimate with its change by the scale of torques; the covariance stays.
 
     `factor`, `weights` and `inverse` as for :func:`scale_sensitivity`, `std` relative (n,).
+    """
+    change = scale_sensitivity(factor, weights, inverse) * std
+    return replace(estimate, scale_change=change if std.any() else None)
+
+
+def absolute(estimate: Estimate) -> Estimate:
+    """Return the estimate with the uncertainty of the torque scale in its covariance.
+
     Infinite variances stay.
     """
-    sensitivity = scale_sensitivity(factor, weights, inverse)
-    added = scale_covariance(sensitivity, std, estimate.interval_factor)
+    change = estimate.scale_change
+    if change is None:
+        return estimate
+    added = scale_covariance(change, np.ones(change.shape[1]), estimate.interval_factor)
     determined = np.isfinite(np.diag(estimate.covariance))
-    both = np.outer(determined, determined)
+    added = np.where(np.outer(determined, determined), added, 0.0)
     return replace(
         estimate,
-        covariance=np.where(
-            both, estimate.covariance + np.where(both, added, 0.0), estimate.covariance
-        ),
-        method=f"{estimate.method}, with {described(std)}",
+        covariance=estimate.covariance + added,
+        method=f"{estimate.method}, with the uncertain scale of torques",
+        scale_change=None,
     )
 
 

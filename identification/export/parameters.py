@@ -15,6 +15,7 @@ import numpy as np
 
 from identification.errors import IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
+from identification.estimators.torque_scale import absolute
 from identification.export.urdf import not_in_urdf
 from identification.factor.estimate import Estimate
 from identification.model.link_wrenches import LINK_SYMBOLS
@@ -42,6 +43,7 @@ def parameters_json(
     Raises:
         IdentificationError: the estimate is of other parameters.
     """
+    change = estimate.scale_change
     content = {
         "schema": SCHEMA,
         "provenance": dict(provenance or {}),
@@ -73,12 +75,15 @@ def parameters_json(
                 "unit": unit,
                 "value": value,
                 "std": std,
+                "absolute_std": absolute_std,
                 "determined": name not in estimate.undetermined,
                 "essential": None if essential is None else name in essential,
             }
-            for name, expression, unit, value, std in _rows(model, estimate)
+            for name, expression, unit, value, std, absolute_std in _rows(model, estimate)
         ],
         "covariance": estimate.covariance.tolist(),
+        "absolute_covariance": absolute(estimate).covariance.tolist(),
+        "scale_change": None if change is None else change.tolist(),
         "standard": None if consistent is None else _standard(model, consistent),
     }
     return json.dumps(_finite(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
@@ -89,17 +94,21 @@ def parameters_csv(
 ) -> str:
     """Return a table with one row per parameter, its row of the covariance matrix last.
 
-    Provenance is in lines at the beginning that start with # (pandas: ``comment="#"``).
+    Standard deviation and covariance are in units of the torque of the arm; `absolute_std` has the
+    uncertainty of the scale of that torque as well. Provenance is in lines at the beginning that
+    start with # (pandas: ``comment="#"``).
 
     Raises:
         IdentificationError: the estimate is of other parameters.
     """
     remarks = {**(provenance or {}), "method": estimate.method, "convention": CONVENTION}
     covariances = [f"cov({name})" for name in estimate.names]
-    rows: list[list[object]] = [["name", "unit", "value", "std", "expression", *covariances]]
+    rows: list[list[object]] = [
+        ["name", "unit", "value", "std", "expression", "absolute_std", *covariances]
+    ]
     for line, row in zip(_rows(model, estimate), estimate.covariance.tolist(), strict=True):
-        name, expression, unit, value, std = line
-        rows.append([name, unit, value, std, expression, *row])
+        name, expression, unit, value, std, absolute_std = line
+        rows.append([name, unit, value, std, expression, absolute_std, *row])
     return _table(remarks, rows)
 
 
@@ -114,12 +123,12 @@ def _table(remarks: Mapping[str, str], rows: Iterable[Sequence[object]]) -> str:
     return out.getvalue()
 
 
-def _rows(model: RobotModel, estimate: Estimate) -> list[tuple[str, str, str, float, float]]:
-    """Return name, expression, unit, value and standard deviation of each parameter."""
+def _rows(model: RobotModel, estimate: Estimate) -> list[tuple[str, str, str, float, float, float]]:
+    """Return name, expression, unit, value, standard deviation, and the absolute one of each."""
     if estimate.names != model.parameter_names:
         raise IdentificationError("the estimate is not of the model's parameters")
     expressions = model.expressions()
-    numbers = estimate.values.tolist(), estimate.std.tolist()
+    numbers = estimate.values.tolist(), estimate.std.tolist(), absolute(estimate).std.tolist()
     return list(zip(estimate.names, expressions, estimate.units, *numbers, strict=True))
 
 
@@ -178,6 +187,7 @@ def estimate_in(content: Mapping[str, Any]) -> Estimate:
         LookupError, TypeError, ValueError: it is none.
     """
     parameters = content["parameters"]
+    change = content["scale_change"]  # not in files whose covariance has the scale of torques
     return Estimate(
         tuple(str(parameter["name"]) for parameter in parameters),
         tuple(str(parameter["unit"]) for parameter in parameters),
@@ -190,4 +200,5 @@ def estimate_in(content: Mapping[str, Any]) -> Estimate:
         float(content["condition"]),
         tuple(str(name) for name in content["undetermined"]),
         float(content["interval_factor"]),
+        None if change is None else np.array(change, dtype=np.float64),
     )

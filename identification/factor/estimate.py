@@ -42,7 +42,12 @@ def inverse_variance(variance: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Parameters with their covariance."""
+    """Parameters with their covariance, in units of the torque of this arm.
+
+    What the torque of a joint is called in N·m is known to the scale of its sensor or torque
+    constant only. That is no error of parameters that are used with the same torques; intervals of
+    masses need it as well, see :func:`identification.estimators.torque_scale.absolute`.
+    """
 
     names: tuple[str, ...]  #: (p,)
     units: tuple[str, ...]  #: (p,)
@@ -55,6 +60,9 @@ class Estimate:
     undetermined: tuple[str, ...] = ()  #: undetermined parameters, alone or in a combination
     #: standard deviations in half a 95 % interval: 1.96, more for covariances of few data
     interval_factor: float = 1.96
+    #: change of the parameters by a standard deviation of the scale of each joint's torque (p, n);
+    #: None: it is exact
+    scale_change: Array | None = None
 
     @property
     def std(self) -> Array:

@@ -134,13 +134,24 @@ class Samples:
 
     def with_friction_direction(self, model: RobotModel) -> Samples:
         """Return samples with the direction of dry friction by a model's law."""
-        if self.parent is not None:
-            parent, part = self.parent
-            parent = parent.with_friction_direction(model)
-            return replace(self, motion=parent.motion.rows(part), parent=(parent, part))
         direction = None
         if any(law.presliding > 0.0 for law in model.friction.laws):
-            direction = model.friction.direction(*self.motion[:3])
+            direction = model.friction.direction(*self.whole.motion[:3])
+        return self._with_direction(direction)
+
+    def sliding(self, model: RobotModel, sign: float) -> Samples:
+        """Return samples whose dry friction has the direction +1 or -1 throughout."""
+        motion = self.whole.motion
+        return self._with_direction(
+            np.full_like(model.friction.direction(*motion[:3]), np.sign(sign))
+        )
+
+    def _with_direction(self, direction: Array | None) -> Samples:
+        """Return samples with the direction of dry friction of all rows of their recording."""
+        if self.parent is not None:
+            parent, part = self.parent
+            parent = parent._with_direction(direction)
+            return replace(self, motion=parent.motion.rows(part), parent=(parent, part))
         return replace(self, motion=self.motion._replace(direction=direction))
 
     def with_load(self, model: RobotModel, values: Array) -> Samples:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.linalg
 
-from benchmarks import coverage, plain_fit
+from benchmarks import coverage, cramer_rao, plain_fit
 from benchmarks.arms import urdf
 from benchmarks.coverage import (
     ARM_TYPES,
@@ -62,6 +63,45 @@ class TestArm:
         assert np.array_equal(first.friction.offset, same.friction.offset)
 
 
+class TestBound:
+    @pytest.mark.parametrize("keep", [0.0, 0.8])
+    def test_innovations_have_the_information_of_the_noise(self, keep: float) -> None:
+        rows = np.random.default_rng(4).standard_normal((2, 60, 3))
+        noise = np.array([0.5, 2.0])
+        inverse = np.linalg.inv(scipy.linalg.toeplitz(cramer_rao.correlation(60, keep)))
+        information = sum(
+            joint.T @ inverse @ joint / std**2 for joint, std in zip(rows, noise, strict=True)
+        )
+        expected = np.sqrt(np.diag(np.linalg.inv(information)))
+        np.testing.assert_allclose(cramer_rao.bound(rows, noise, keep), expected)
+
+    def test_least_squares_is_efficient_where_noise_is_white(self) -> None:
+        rows = np.random.default_rng(5).standard_normal((2, 60, 3)).cumsum(axis=1)
+        least, usual = (
+            [figures(rows, np.ones(2), keep) for keep in (0.0, 0.9)]
+            for figures in (cramer_rao.bound, cramer_rao.least_squares_deviations)
+        )
+        np.testing.assert_allclose(usual[0], least[0])
+        assert np.all(usual[1] > least[1])
+
+    @pytest.mark.parametrize("name", ARMS)
+    def test_its_rows_make_the_torque_of_the_arm(self, name: str) -> None:
+        arm = drawn_arm(ARM_TYPES[name], 1, DEFAULTS._replace(load=0.05))
+        text = urdf(ARM_TYPES[name].urdf).read_text(encoding="utf-8")
+        model = RobotModel.from_urdf(text, locked=ARM_TYPES[name].locked, friction=IMPORTED_LAW)
+        truth = coverage.truth_of(arm, model, 1, 0.0, DEFAULTS._replace(rate=20.0))
+        motion = drawn_motion(
+            arm.robot, np.random.default_rng([1, 2, 0]), coverage.FITTED_TIME, SPEED
+        )
+        torque = arm.torque(*motion.at(np.arange(truth.rows.shape[1]) / 20.0))
+        modelled = np.einsum("jmp,p->mj", truth.rows, np.array([*truth.values.values()]))
+        np.testing.assert_allclose(modelled, torque, atol=1e-9 * np.abs(torque).max())
+        exact = truth._replace(scale=np.ones(model.n_joints))
+        assert exact.in_scale(truth.noise) == truth.values
+        twice = truth._replace(scale=np.full(model.n_joints, 2.0)).in_scale(truth.noise)
+        np.testing.assert_allclose([*twice.values()], 2.0 * np.array([*truth.values.values()]))
+
+
 class TestMotion:
     @pytest.mark.parametrize("name", ARMS)
     def test_it_is_within_limits_and_at_rest_at_both_ends(self, name: str) -> None:
@@ -112,11 +152,18 @@ class TestLog:
 CLEAN = Run(
     inertial=[True] * 19 + [False],
     friction=[True, True],
+    inertial_absolute=[True] * 20,
+    friction_absolute=[True, False],
+    inertial_over_bound=[1.0, 1.2],
+    friction_over_bound=[1.1, 1.3],
+    friction_least_squares=[1.1, 1.1],
     undetermined=0,
     dropped=0,
     width=[0.1, 0.3],
     delay_error=[0.0, 0.0],
     delay_half=[1e-4],
+    spread=[0.02, 0.01],
+    spread_error=[0.01, 0.02],
     blamed=[],
     good=True,
     inside=0.9,
@@ -134,6 +181,10 @@ class TestFigures:
         assert figures["inertial"] == pytest.approx(39 / 40)
         assert figures["inertial_unsure"] == pytest.approx(0.05)  # 2 x 0.0354 / sqrt(2)
         assert figures["friction"] == 1.0
+        assert (figures["inertial_absolute"], figures["friction_absolute"]) == (1.0, 0.5)
+        assert figures["inertial_over_bound"] == pytest.approx(1.1)
+        assert figures["friction_over_bound"] == pytest.approx(1.2)
+        assert figures["ensemble"] == pytest.approx(1.0)
         assert figures["delay_near"] == 1  # a run with a late axis is not near
         assert figures["delay_bias_ms"] == pytest.approx(0.1)
         assert (figures["delay_held"], figures["delay_intervals"]) == (1, 2)

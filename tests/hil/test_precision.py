@@ -110,14 +110,29 @@ class TestPromise:
         assert halves[0] <= 2.0 < halves[1]
 
     def test_the_scale_of_the_torque_is_a_limit(self, tmp_path, motions) -> None:
-        """Torque constants to 4 % leave at least 8 % of some parameter; the remedy is named."""
+        """Of absolute parameters: constants to 4 % leave at least 8 %; the remedy is named."""
         uncertain_cell = fast_cell(tmp_path).with_values({"drive_train.torque_uncertainty": 0.04})
-        made = promise(uncertain_cell, motions, "parameters 5%")
+        made = promise(uncertain_cell, motions, "parameters 5% absolute")
         (forecast,) = made.forecasts(_Excitation(motions[0]), 30)
         assert forecast.limit > 1.96 * 0.04
         message = forecast.message(30, made.scale)
         assert "no motion of this arm can meet it" in message
         assert "torque constants to 4 %" in message and "torque_uncertainty" in message
+
+    def test_the_scale_is_no_error_in_units_of_the_arms_torque(self, tmp_path, motions) -> None:
+        excitation = _Excitation(motions[0])
+        halves = {}
+        for uncertainty in (0.0, 0.04):
+            cell = fast_cell(tmp_path).with_values({"drive_train.torque_uncertainty": uncertainty})
+            made = promise(cell, motions, "parameters 5%, parameters 5 % absolute, torque 2")
+            own, absolute, torque = made.forecasts(excitation, 2)
+            halves[uncertainty] = own.half, absolute.half, torque.half
+            assert own.limit == torque.limit == 0.0
+        exact = halves[0.0]
+        uncertain = halves[0.04]
+        assert exact[0] == exact[1] == uncertain[0]
+        assert uncertain[2] == exact[2]
+        assert uncertain[1] > max(uncertain[0], 1.96 * 0.04)
 
     def test_a_precision_beyond_a_year_of_motion_is_refused(self, cell, motions) -> None:
         with pytest.raises(InputError, match=r"a year of motion leaves .*; a day leaves"):

@@ -204,8 +204,10 @@ class TestDesign:
         cell = here / "cell.toml"
         before = cell.read_text()
         scale = "[drive_train]\ntorque_uncertainty = {}"
-        line = (*PRECISE, "--precision", "parameters 5 %", "-o")
+        line = (*PRECISE, "--precision", "parameters 5 % absolute", "-o")
         cell.write_text(before.replace("[drive_train]", scale.format(0.04)))
+        own = (*PRECISE, "--precision", "parameters 5 %", "-o")
+        assert "no motion of this arm can meet it" not in accepted(*own, "a")
         assert "no motion of this arm can meet it" in accepted(*line, "b")
         cell.write_text(before.replace("[drive_train]", scale.format(0.004)))
         assert "no motion of this arm can meet it" not in accepted(*line, "c")

@@ -8,6 +8,7 @@ import pytest
 from identification.estimators.consistent import is_consistent
 from identification.estimators.ensemble import UndeterminedError, draw_ensemble
 from identification.estimators.prior import body_prior, fit_posterior
+from identification.estimators.torque_scale import absolute
 from identification.factor.factor import Factor
 from identification.model.pseudo_inertia import margin
 from tests.identification.two_link import MODEL, NOISE, a_motion, simulated, truth
@@ -42,6 +43,16 @@ def test_torques_vary_as_the_stated_intervals(posterior, ensemble) -> None:
     stated = np.einsum("jab,ab->j", grams, estimate.covariance)
     assert np.sqrt(np.mean(drawn / stated)) == pytest.approx(1.0, abs=0.05)
     assert ensemble.spread == pytest.approx(np.sqrt(drawn / stated))
+
+
+def test_the_scale_of_the_torque_moves_no_arm(posterior, ensemble) -> None:
+    """They are for use with the torques of the same arm."""
+    prior, estimate, factor = posterior
+    uncertain = replace(estimate, scale_change=np.outer(estimate.values, [0.03, 0.03]))
+    assert np.all(absolute(uncertain).std >= estimate.std)
+    assert np.any(absolute(uncertain).std > 2.0 * estimate.std)
+    again = draw_ensemble(MODEL, prior, uncertain, factor, count=400, seed=5)
+    np.testing.assert_array_equal(again.values, ensemble.values)
 
 
 def test_a_seed_gives_one_ensemble(posterior) -> None:

@@ -16,6 +16,7 @@ from identification.rollout.comparison import (
     RecordedMotion,
     ToolFrame,
     coverage,
+    driving_residual,
     errors_of,
     horizon_rows,
     joint_inertia,
@@ -183,6 +184,23 @@ def test_a_band_holds_its_share() -> None:
     assert coverage(ensemble, rng.standard_normal(shape)) == pytest.approx(0.95, abs=0.02)
     ensemble[:, :, 0] = np.nan  # unstable: no band
     assert coverage(ensemble, np.zeros(shape))[0] == 0.0
+
+
+def test_dry_friction_at_rest_is_no_torque_that_moves() -> None:
+    """Half of it is held either way; beyond it, and where a joint moves, nothing is."""
+    arm = an_arm(coulomb=5.0)
+    time = np.arange(0.0, 1.0, 0.01)
+    motion = four_sines(time)
+    velocity = motion.velocity.copy()
+    velocity[:, 1] = 0.0
+    motion = motion._replace(velocity=velocity)
+    predicted = MODEL.torque(arm.values, *motion[1:])
+    for added, left in ((2.5, 0.0), (-2.5, 0.0), (7.0, 2.0), (-7.0, -2.0)):
+        samples = as_samples(MODEL, motion, predicted + added)
+        residual = driving_residual(MODEL, samples, arm.values)
+        np.testing.assert_allclose(residual[:, 1], left, atol=1e-9)
+        moving = MODEL.moving(velocity)[:, 0]
+        np.testing.assert_allclose(residual[moving, 0], added, atol=1e-9)
 
 
 def test_means_over_a_step_of_a_line_are_its_values() -> None:

@@ -8,6 +8,7 @@ import pytest
 from identification.estimators.payload import NAMES, identify_payload
 from identification.estimators.payload_problem import Run
 from identification.estimators.torque_scale import (
+    absolute,
     described,
     scale_covariance,
     scale_sensitivity,
@@ -76,18 +77,45 @@ class TestScaleCovariance:
         sensitivity = scale_sensitivity(factor, weights, inverse)
         np.testing.assert_allclose(sensitivity.sum(axis=1), values, rtol=1e-6, atol=1e-9)
 
-    def test_an_estimate_gets_wider_intervals_of_the_normal_factor(self, torque):
+    def test_intervals_in_units_of_the_arms_torque_do_not_have_it(self, torque):
+        motion, measured = torque
+        factor = Factor.by_time(MODEL, as_samples(MODEL, motion, measured))
+        weights = joint_weights(factor)
+        inverse = factor.solve(weights).inverse
+        estimated = estimate(MODEL, factor, weights)
+        widths = []
+        for std in (0.0 * SCALE_STD, SCALE_STD, 10.0 * SCALE_STD):
+            uncertain = with_torque_scale(estimated, factor, weights, inverse, std)
+            np.testing.assert_array_equal(uncertain.covariance, estimated.covariance)
+            widths.append(absolute(uncertain).std)
+        np.testing.assert_array_equal(widths[0], estimated.std)
+        assert np.all(widths[0] <= widths[1])
+        assert np.all(widths[1] <= widths[2])
+        assert np.any(widths[2] > 2.0 * widths[0])
+
+    def test_it_is_added_once(self, torque):
+        motion, measured = torque
+        factor = Factor.by_time(MODEL, as_samples(MODEL, motion, measured))
+        weights = joint_weights(factor)
+        inverse = factor.solve(weights).inverse
+        uncertain = with_torque_scale(
+            estimate(MODEL, factor, weights), factor, weights, inverse, SCALE_STD
+        )
+        once = absolute(uncertain)
+        np.testing.assert_array_equal(absolute(once).covariance, once.covariance)
+
+    def test_absolute_intervals_are_wider_by_the_normal_factor(self, torque):
         """Student's factor of the residual is not applied to a stated uncertainty."""
         motion, measured = torque
         factor = Factor.by_time(MODEL, as_samples(MODEL, motion, measured))
         weights = joint_weights(factor)
         inverse = factor.solve(weights).inverse
         estimated = replace(estimate(MODEL, factor, weights), interval_factor=2.5)
-        wider = with_torque_scale(estimated, factor, weights, inverse, SCALE_STD)
+        wider = absolute(with_torque_scale(estimated, factor, weights, inverse, SCALE_STD))
         added = scale_covariance(scale_sensitivity(factor, weights, inverse), SCALE_STD)
         half = (2.5 * estimated.std) ** 2 + 1.96**2 * np.diag(added)
         np.testing.assert_allclose((2.5 * wider.std) ** 2, half)
-        assert "3 to 5 %" in wider.method
+        assert "scale of torques" in wider.method
 
     def test_undetermined_parameters_stay_undetermined(self, torque):
         motion, measured = torque
@@ -98,8 +126,10 @@ class TestScaleCovariance:
         open_ended[0], open_ended[:, 0] = 0.0, 0.0
         open_ended[0, 0] = np.inf
         inverse = factor.solve(weights).inverse
-        wider = with_torque_scale(
-            replace(estimated, covariance=open_ended), factor, weights, inverse, SCALE_STD
+        wider = absolute(
+            with_torque_scale(
+                replace(estimated, covariance=open_ended), factor, weights, inverse, SCALE_STD
+            )
         )
         assert np.isinf(wider.covariance[0, 0])
         assert not wider.covariance[0, 1:].any()
