@@ -293,11 +293,18 @@ def logged(
         drive = np.sqrt(1.0 - keep**2) * random.standard_normal(torque.shape)
         noise = np.sqrt(0.5) * (noise + scipy.signal.lfilter([1.0], [1.0, -keep], drive, axis=0))
     torque += _TORQUE_NOISE * torque.std(axis=0) * noise
-    # Of the sensors or torque constants of the arm, so that it is the same in all of its motions.
-    scale = np.random.default_rng([seed, 3]).standard_normal(torque.shape[1])
-    torque *= 1.0 + conditions.scale * scale
+    torque *= torque_scale(seed, torque.shape[1], conditions)
     position = motion.at(time)[0]
     return Logged(time, position + _POSITION_NOISE * random.standard_normal(torque.shape), torque)
+
+
+def torque_scale(seed: int, joints: int, conditions: Conditions) -> Array:
+    """Factors (n,) of the logged torques.
+
+    Of the sensors or torque constants of the arm, so that they are the same in all of its motions.
+    """
+    random = np.random.default_rng([seed, 3])
+    return np.asarray(1.0 + conditions.scale * random.standard_normal(joints))
 
 
 def true_values(arm: Arm, model: RobotModel) -> dict[str, float]:

@@ -473,9 +473,10 @@ class TestJudgement:
     def test_a_constant_within_the_assumed_scale_is_no_cause(self, size, ratio, error, level):
         """Three standard deviations of the ratio of two torques known to 3 % are 13 %.
 
-        The ratio is that of both axes: the error of the second is multiplied by its square.
+        The scale of the other torque is in the deviation of the factor. The ratio is that of both
+        axes: the error of the second is multiplied by its square.
         """
-        causes = (Cause(Fault("gain", (1,)), ratio, size, 0.001),)
+        causes = (Cause(Fault("gain", (1,)), ratio, size, 0.03),)
         errors = {"held_out": an_error(error), "training": an_error(error)}
         verdict = judged(causes=causes, scale_std=np.full(2, 0.03), **errors)
         (finding,) = (each for each in verdict.findings if each.check == "torque constant")
