@@ -312,15 +312,18 @@ def logged(
         drive = np.sqrt(1.0 - keep**2) * random.standard_normal(torque.shape)
         noise = np.sqrt(0.5) * (noise + scipy.signal.lfilter([1.0], [1.0, -keep], drive, axis=0))
     torque += _TORQUE_NOISE * torque.std(axis=0) * noise
-    torque *= torque_scale(arm, seed, conditions)
+    torque *= torque_scale(seed, torque.shape[1], conditions)
     position = motion.at(time)[0]
     return Logged(time, position + _POSITION_NOISE * random.standard_normal(torque.shape), torque)
 
 
-def torque_scale(arm: Arm, seed: int, conditions: Conditions) -> Array:
-    """Logged over true torque (n,), of sensors or torque constants: the same in all motions."""
-    drawn = np.random.default_rng([seed, 3]).standard_normal(arm.robot.nv)
-    return np.asarray(1.0 + conditions.scale * drawn)
+def torque_scale(seed: int, joints: int, conditions: Conditions) -> Array:
+    """Factors (n,) of the logged torques.
+
+    Of the sensors or torque constants of the arm, so that they are the same in all of its motions.
+    """
+    random = np.random.default_rng([seed, 3])
+    return np.asarray(1.0 + conditions.scale * random.standard_normal(joints))
 
 
 def _part(
@@ -396,7 +399,7 @@ def truth_of(arm: Arm, model: RobotModel, seed: int, delay: float, conditions: C
             only = Friction(*unit[_FRICTION_SYMBOLS.index(symbol)])
             axis = int(joint) - 1
             rows[axis, :, place] = only.torque(states[1], rigid)[:, axis]
-    scale = torque_scale(arm, seed, conditions)
+    scale = torque_scale(seed, arm.robot.nv, conditions)
     return Truth(values, rows, noise * scale, _kept(conditions), scale)
 
 
@@ -497,7 +500,7 @@ def ensemble_spread(
     model = identified.cell.model
     _, motion, time = _part(arm, seed, 1, HELD_OUT_TIME, conditions)
     states = motion.at(time[::_FEW_ROWS])
-    torque = arm.torque(*states) * torque_scale(arm, seed, conditions)
+    torque = arm.torque(*states) * torque_scale(seed, arm.robot.nv, conditions)
     moving = model.moving(states[1])
 
     def rms(values: Array) -> Array:

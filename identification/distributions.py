@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
@@ -16,3 +17,11 @@ def normal_limit(share: ArrayLike) -> Any:
 def student_limit(share: ArrayLike, freedom: ArrayLike) -> Any:
     """Value that Student's t of so many degrees of freedom exceeds with probability `share`."""
     return -scipy.special.stdtrit(freedom, share)
+
+
+def fisher_limit(share: ArrayLike, freedom: ArrayLike, of_variance: ArrayLike) -> Any:
+    """Value that Fisher's F exceeds with probability `share`.
+
+    It is the mean of `freedom` squares over a variance of `of_variance` degrees of freedom.
+    """
+    return scipy.special.fdtri(freedom, of_variance, 1.0 - np.asarray(share))

@@ -5,8 +5,8 @@ The torque of all axes is recorded with a delay d, as by one logger:
 .. math:: \tau(t) = W\bigl(q, \dot q, \ddot q\bigr)(t - d)\,\pi + e(t)
 
 The minimum of a residual profile is refined by Gauss-Newton steps on parameters and delay together,
-with the column :math:`-d\tau/dt`, and on the scale of each joint's torque, known to `DATA_SHEET`:
-the error of a scale common to all rows of a joint is as large as the noise, but follows the motion.
+with the column :math:`-d\tau/dt`, and on what resembles a delay and is none, such as the scales of
+torques, zeros of encoders and friction that changes (:mod:`.delay_nuisances`).
 
 The motion is interpolated at other times, not the torque, whose noise that would smooth. Rows near
 a velocity reversal are left out: presliding friction is similar to a delay.
@@ -15,16 +15,17 @@ a velocity reversal are left out: presliding friction is similar to a delay.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.distributions import student_limit
+from identification.distributions import fisher_limit, student_limit
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread
+from identification.estimators.delay_nuisances import nuisances
 from identification.estimators.load_friction import fit_with_load
-from identification.estimators.torque_scale import DATA_SHEET
 from identification.factor.blocks import count_by_block, merged
 from identification.factor.estimate import Estimate, estimate, inverse_variance, residual_variance
 from identification.factor.factor import Factor, no_rows_message
@@ -255,7 +256,6 @@ def estimate_delay(
     ends = (-LONGEST_DELAY - assumed, LONGEST_DELAY - assumed)
     grid = np.linspace(*ends, 1 + 2 * int(np.ceil(LONGEST_DELAY / _PROFILE_STEP)))
     reader, (heights, values) = _profiled(model, samples, grid)
-    values = np.concatenate([values, np.zeros(model.n_joints)])
     shift = float(grid[np.argmin(heights)])
     for _ in range(_ITERATIONS):
         blocks = reader.linearised(shift, values)
@@ -309,13 +309,13 @@ def _other_minimum(grid: Array, heights: Array, shift: float, height: float) -> 
 def _undetermined_reason(half_interval: float, at_limit: bool, other: float) -> str | None:
     if not np.isfinite(half_interval):
         return "the motion does not separate a delay from the other parameters"
-    if at_limit:
-        return "the residual decreases up to the longest delay tested"
     if half_interval > WIDEST_INTERVAL:
         return (
             f"95 % interval of ± {half_interval * 1e3:.2g} ms: the torques change too slowly, or"
             " are too noisy"
         )
+    if at_limit:
+        return "the residual decreases up to the longest delay tested"
     if np.isfinite(other):
         return f"a delay of {other * 1e3:.0f} ms explains the torques as well"
     return None
@@ -325,49 +325,98 @@ def _undetermined_reason(half_interval: float, at_limit: bool, other: float) -> 
 class _Blocks:
     """Weighted normal equations by B blocks of time.
 
-    Columns: p parameters, a delay step, the scale of each joint's torque, and the torque.
+    Columns: p parameters, a delay step of each joint, r of what resembles a delay, and the torque.
     """
 
-    gram: Array  # (B, p + n + 2, p + n + 2)
-    delay: int  # index p of its column
+    by_joint: Array  # (B, p + n + r + 1, p + n + r + 1)
+    delay: int  # index p of the first delay
+    joints: int  # n
     weights: Array  # (n,)
     rows: int
 
+    @cached_property
+    def gram(self) -> Array:
+        """The same with one delay of all joints (B, p + r + 2, p + r + 2)."""
+        width = self.by_joint.shape[-1]
+        together = np.eye(width)
+        together[:, self.delay] = 0.0
+        delays = np.arange(self.delay, self.delay + self.joints)
+        together[delays, self.delay] = 1.0
+        together = np.delete(together, delays[1:], axis=1)
+        return np.asarray(together.T @ self.by_joint @ together)
+
     def solution(self) -> Solution:
         """Solve by least squares."""
-        return self._solved(self.gram.sum(axis=0), self.delay)
-
-    @staticmethod
-    def _solved(gram: Array, delay: int) -> Solution:
-        """Solve normal equations whose scales, after column `delay`, have unit variance."""
-        information = gram[:-1, :-1].copy()
-        scales = np.arange(len(information)) > delay
-        information[scales, scales] += 1.0
-        return solve(NormalEquations(information, gram[:-1, -1]))
+        return _solved(self.gram.sum(axis=0), self.delay + 1)
 
     def delay_std(self, solution: Solution) -> tuple[float, int]:
-        """Return the standard deviation of the delay, infinite if undetermined, and the blocks."""
-        gram = self.gram[self.gram[:, -1, -1] > 0.0]
-        augmented = np.append(-solution.values, 1.0)
-        gram = merged(gram, block_length(gram[:, :-1] @ augmented))
-        moved = spread(gram[:, :-1, :-1], gram[:, :-1] @ augmented, solution.root)[:, self.delay]
-        std = float(np.linalg.norm(moved)) if solution.determined[self.delay] else np.inf
-        return std, max(2, len(gram))
+        """Return the standard deviation of the delay, infinite if undetermined, and the blocks.
+
+        Errors of the model may make the delays of single joints differ by more than the scatter
+        over time shows. Then they are a random sample (DerSimonian and Laird 1986).
+        """
+        moved, count = _moved(self.gram, solution)
+        if not solution.determined[self.delay]:
+            return np.inf, count
+        variance = float((moved[:, self.delay] ** 2).sum())
+        places = np.arange(self.delay, self.delay + self.joints)
+        alone = _solved(self.by_joint.sum(axis=0), places[-1] + 1)
+        known = places[alone.determined[places]]
+        moved, blocks = _moved(self.by_joint, alone)
+        variances = (moved[:, known] ** 2).sum(axis=0)
+        variance += _between_joints(alone.values[known], variances, blocks - 1)
+        return float(np.sqrt(variance)), count
 
     def predicted(self, *, with_delay: bool = True) -> float:
-        """Return the mean weighted squared error of each fifth predicted from the others."""
+        """Return the mean weighted squared error of every fifth block predicted from the others.
+
+        They are spread over the recording, as friction that changes is not known beyond an end.
+        """
         gram = self.gram.copy()
         if not with_delay:
             gram[:, self.delay] = 0.0
             gram[:, :, self.delay] = 0.0
-        parts = np.array_split(gram, _FOLDS)
-        folds = np.array([part.sum(axis=0) for part in parts])
+        folds = np.array([gram[k::_FOLDS].sum(axis=0) for k in range(_FOLDS)])
         error = 0.0
         for fold in folds:
-            values = self._solved(folds.sum(axis=0) - fold, self.delay).values
+            values = _solved(folds.sum(axis=0) - fold, self.delay + 1).values
             augmented = np.append(-values, 1.0)
             error += float(augmented @ fold @ augmented)
         return error / self.rows
+
+
+def _solved(gram: Array, first: int) -> Solution:
+    """Solve normal equations; the coefficients from `first` on have unit variance."""
+    information = gram[:-1, :-1].copy()
+    others = np.arange(len(information)) >= first
+    information[others, others] += 1.0
+    return solve(NormalEquations(information, gram[:-1, -1]))
+
+
+def _moved(gram: Array, solution: Solution) -> tuple[Array, int]:
+    """Return rows (R, k) whose outer products sum to the covariance, and the number of blocks."""
+    gram = gram[gram[:, -1, -1] > 0.0]
+    augmented = np.append(-solution.values, 1.0)
+    gram = merged(gram, block_length(gram[:, :-1] @ augmented))
+    moved = spread(gram[:, :-1, :-1], gram[:, :-1] @ augmented, solution.root)
+    return moved, max(2, len(gram))
+
+
+def _between_joints(delays: Array, variances: Array, freedom: int) -> float:
+    """Return the variance of the mean of delays (k,) by what they differ beyond their variances.
+
+    Zero unless they differ significantly, by variances of so many degrees of freedom.
+    """
+    others = len(delays) - 1
+    if others < 1 or not np.all(variances > 0.0):
+        return 0.0
+    weights = 1.0 / variances
+    whole = float(weights.sum())
+    squares = float(weights @ (delays - weights @ delays / whole) ** 2)
+    if squares <= others * fisher_limit(2.0 * _CHANCE, others, freedom):
+        return 0.0
+    share = float((weights**2).sum()) / whole**2
+    return share * (squares - others) / (whole * (1.0 - share))
 
 
 class _Profile(NamedTuple):
@@ -461,27 +510,38 @@ class _Reader:
         return _Profile(heights, best)
 
     def linearised(self, shift: float, values: Array, weights: Array | None = None) -> _Blocks:
-        """Return normal equations at a shift, linear near p parameters and n scales (p + n,)."""
+        """Return normal equations at a shift, linear near parameters.
+
+        `values` are these (p,), or these and the coefficients of what resembles a delay (p + r,).
+        """
         model = self.model
         p = model.n_parameters
+        n = model.n_joints
         samples = self.at(shift)
         blocks, columns = samples.regressor(model)
         load = samples.known_torque(model)
+        beside = nuisances(model, samples, values[:p])
         tables = []
         for j, (block, used) in enumerate(zip(blocks, columns, strict=True)):
             torque = load[:, j] + block @ values[used]
             rate = predicted_rate(samples, torque)
-            table = np.column_stack([block, -rate, DATA_SHEET * torque, samples.torque[:, j]])
+            table = np.column_stack([block, -rate, beside.columns[j], samples.torque[:, j]])
             tables.append(np.where(samples.usable[:, j], table.T, 0.0))
         index = np.arange(len(samples.usable)) * _BLOCKS // max(1, len(samples.usable))
-        places = tuple(np.append(used, [p, p + 1 + joint]) for joint, used in enumerate(columns))
-        names = (*model.parameter_names, "delay", *(f"scale {name}" for name in model.joint_names))
+        places = tuple(
+            np.concatenate([used, [p + joint], p + n + others])
+            for joint, (used, others) in enumerate(zip(columns, beside.places, strict=True))
+        )
+        delays = tuple(f"delay {name}" for name in model.joint_names)
+        names = (*model.parameter_names, *delays, *beside.names)
         counts = count_by_block(index, samples.usable)
         factor = Factor.of_rows([(index, tables)], counts, places, names)
         if weights is None:
-            unmoved = np.insert(values, p, 0.0)
+            unmoved = np.zeros(len(names))
+            unmoved[:p] = values[:p]
+            unmoved[p + n :][: len(values) - p] = values[p:]
             nothing = np.zeros((len(unmoved), 0))
-            variance = residual_variance(factor, unmoved, nothing, np.ones(model.n_joints))
+            variance = residual_variance(factor, unmoved, nothing, np.ones(n))
             weights = inverse_variance(variance)
         rows = max(1, int(factor.samples.sum()))
-        return _Blocks(factor.by_block(weights), p, weights, rows)
+        return _Blocks(factor.by_block(weights), p, n, weights, rows)

@@ -313,7 +313,7 @@ def _compare_delays(
     questions: Collection[str],
     delays: Sequence[SuggestedDelay],
 ) -> tuple[Settings, Settings, list[Choice]]:
-    """Compensate a significant delay unless it predicts worse, and choose the other settings again.
+    """Compensate a significant delay unless it predicts clearly worse, and choose the rest again.
 
     Compared on sliding rows, as presliding is similar to a delay, by the geometric mean over the
     joints. Returns the settings before and after the sweep, and its decisions.
@@ -325,8 +325,10 @@ def _compare_delays(
         # A short recording has to show that the delay predicts better, and so has a wide interval.
         doubtful = trial.duration(now) < SHORT or not delay.determined
         pair = [sliding, late] if doubtful else [late, sliding]
-        # The unknown scale of one torque resembles a delay, but of that joint only.
-        decision = trial.decide(DELAY, pair, 0.0, by_joint=True, rows="fitted")
+        # The unknown scale of one torque resembles a delay, but of that joint only. One that was
+        # estimated beside friction which the law does not have is not refuted by that law at once.
+        certainty = 1.0 if doubtful else CERTAIN
+        decision = trial.decide(DELAY, pair, 0.0, by_joint=True, rows="fitted", certainty=certainty)
         compared.append(decision.choice)
         if decision.settings.preprocessing.torque_delay == delay.value:
             first = first.preprocessed(torque_delay=delay.value)

@@ -29,6 +29,7 @@ from identification.validation.fault_scores import (
     fault_score,
     size_of_fault,
 )
+from identification.validation.fault_sizes import estimated_size
 from identification.validation.fault_tables import BLOCKS, FaultTables, columns_of_fault, row_step
 from identification.validation.faults import (
     COUPLED,
@@ -57,6 +58,7 @@ _LITTLE_MORE: Final = 1.05
 _NOISE_OF: Final = 3  # recordings
 _CHANGED: Final = 2.0  # standard deviations of a payload that is one
 _MOST_CAUSES: Final = 4
+_DIVIDED: Final = 4  # parts of a block whose scatter gives the interval of a size
 _FEW_ROWS: Final = 600  # of all recordings together, on which faults of positions are tried first
 
 
@@ -68,6 +70,12 @@ class Cause(NamedTuple):
     ratio: float
     size: float | None  # delay [s], factor less one, or mass [kg]; None without size
     std: float  # standard deviation over the blocks
+    interval_factor: float = 2.0  # standard deviations in half a 95 % interval
+
+    @property
+    def half_interval(self) -> float:
+        """Half a 95 % interval of the size."""
+        return self.interval_factor * self.std
 
 
 def find_causes(
@@ -78,17 +86,19 @@ def find_causes(
     *,
     noise: Array | None = None,
     prior: ScorePrior | None = None,
+    scale_std: Array | None = None,
 ) -> tuple[Cause, ...]:
     """Find faults that explain the error of values (p,) from the recordings, by their effect.
 
     `noise` is the standard deviation of each joint's torque noise (n,) [N·m or N], by default that
     of the residual at high frequencies. With the prior of the arm, turned signs and exchanged
-    joints of a motion that determines little are seen, too.
+    joints of a motion that determines little are seen, too. `scale_std` are the relative standard
+    deviations (n,) of the scales of torques, which the intervals of sizes include.
     """
     if noise is None:
         noise = noise_floor(model, values, recordings[:_NOISE_OF])
     recording_names = tuple(names) or tuple(f"recording {k + 1}" for k in range(len(recordings)))
-    search = _Search(model, recordings, values, recording_names, noise, prior)
+    search = _Search(model, recordings, values, recording_names, noise, prior, scale_std)
     causes: list[Cause] = []
     while len(causes) < _MOST_CAUSES and (trial := _best(search.trials())) is not None:
         causes.append(search.resized(trial))
@@ -135,11 +145,11 @@ class _Pair(NamedTuple):
 
 
 def _trial(
-    fault: Fault, pair: _Pair, tables: FaultTables, added: Array, *, explains: bool
+    fault: Fault, pair: _Pair, tables: FaultTables, coefficients: int, *, explains: bool
 ) -> _Trial | None:
-    """Return the correction by added columns (B, n, q, r); None of a size that no fault has."""
+    """Return the correction by added coefficients; None of a size that no fault has."""
     score = pair.corrected
-    size, std = size_of_fault(fault, score, tables, added)
+    size, std = size_of_fault(fault, score, tables)
     if fault.kind == "load friction" and (size or 0.0) <= 0.0:
         return None  # friction dissipates
     if size is not None and fault.kind == "payload" and abs(size) < _CHANGED * std:
@@ -149,7 +159,7 @@ def _trial(
     return _Trial(
         cause=Cause(fault, ratio, size, std),
         highest=highest,
-        coefficients=added.shape[3],
+        coefficients=coefficients,
         left=float(np.sqrt(shares.max(initial=0.0))),
         values=score.values.mean(axis=0),
         explains=explains,
@@ -176,8 +186,11 @@ class _Search:
         names: Sequence[str],
         noise: Array | None = None,
         prior: ScorePrior | None = None,
+        scale_std: Array | None = None,
     ) -> None:
         self._model = model
+        self._prior = prior
+        self._scale_std = scale_std
         self._priors = (None,) if prior is None else (None, prior)
         self._values = values
         self._names = names
@@ -252,7 +265,7 @@ class _Search:
             explains = decisive.corrected.explains(
                 joints, decisive.usual, noise, separate.get(fault.part)
             )
-            trial = _trial(fault, decisive, tables, added, explains=explains)
+            trial = _trial(fault, decisive, tables, added.shape[3], explains=explains)
             trials += [] if trial is None else [trial]
         return trials
 
@@ -293,18 +306,28 @@ class _Search:
         return ("position order", "joint order", *COUPLED) if in_order else ()
 
     def resized(self, trial: _Trial) -> Cause:
-        """Return the cause of a trial; the load of friction is that of the parameters beside it."""
+        """Return the cause of a trial with the size that is most probable beside all parameters."""
         cause = trial.cause
-        if cause.fault.kind != "load friction":
+        if cause.fault.discrete or cause.fault.kind == "changed arm":
             return cause
-        tables = FaultTables.of(self._model, self._recordings, trial.values)
-        columns = [
-            columns_of_fault(tables, self._model, trial.values, fault)
-            for fault in (cause.fault, *self._known)
-        ]
-        score = fault_score(tables, np.concatenate(columns, axis=3), tables.torques)
-        size, std = size_of_fault(cause.fault, score, tables, columns[0])
-        return cause._replace(size=size, std=std)
+        model = self._model
+        tables = FaultTables.of(model, self._recordings, trial.values, divided=_DIVIDED)
+        found = estimated_size(
+            cause.fault,
+            tables,
+            model,
+            trial.values,
+            known=self._known,
+            prior=self._prior,
+            scale_std=self._scale_std,
+        )
+        return (
+            cause._replace(size=None, std=0.0)
+            if found is None
+            else cause._replace(
+                size=found.size, std=found.std, interval_factor=found.interval_factor
+            )
+        )
 
     def _faults(self, tables: FaultTables) -> Iterator[Fault]:
         kinds: tuple[Kind, ...] = ("delay", "gain", "torque sign", "axis sign")

@@ -208,24 +208,16 @@ def _solved(gram: Array) -> Array:
 
 
 def size_of_fault(
-    fault: Fault, score: FaultScore, tables: FaultTables, added: Array
+    fault: Fault, score: FaultScore, tables: FaultTables
 ) -> tuple[float | None, float]:
-    """Return the size of a fault of columns (B, n, q, r), and its jackknife deviation."""
-    if fault.discrete or fault.kind == "changed arm":
+    """Return about the size of a fault that adds a torque, and its jackknife deviation.
+
+    None of others; :mod:`~identification.validation.fault_sizes` has the size to be stated.
+    """
+    if fault.kind not in ("delay", "payload", "load friction"):
         return None, 0.0
-    p = score.values.shape[1]
     sizes = score.added[:, MASS if fault.kind == "payload" else 0]
     if fault.kind == "load friction":
         loaded = np.median(score.added[:, : tables.gram.shape[1]], axis=1)
         return float(loaded.mean()), float(np.sqrt((FOLDS - 1) * loaded.var()))
-    if fault.kind in ("gain", "changed gain", "changed friction"):
-        # Its column uses the pooled parameters, the fit finds others beside it.
-        columns = added[..., :p, 0].reshape(-1, p)
-        column = columns[np.argmax(columns.any(axis=1))]
-        power = tables.gram[:, fault.joints[0], :p, :p].sum(axis=0) @ column
-        size = power @ column
-        scale = (score.values * (column != 0.0)) @ power
-        if np.any(scale == 0.0):  # none of the torque is of the column
-            return None, 0.0
-        sizes = sizes * size / scale
     return float(sizes.mean()), float(np.sqrt((FOLDS - 1) * sizes.var()))

@@ -61,10 +61,28 @@ class FaultTables:
         """The same of each fold (F, n, p, p)."""
         return folded(self.of_parameters)
 
+    def mask_of(self, fault: Fault) -> Array:
+        """Return 1 for the blocks (B,) that a fault affects, 0 for the others.
+
+        Its part is one of undivided blocks.
+        """
+        blocks = len(self.gram)
+        if fault.part is None:
+            return np.ones(blocks)
+        mask = np.array(fault.part.blocks, dtype=np.float64)
+        return np.repeat(mask, blocks // len(mask))
+
     @classmethod
-    def of(cls, model: RobotModel, recordings: Sequence[Samples], values: Array) -> FaultTables:
-        """Reduce some thousand rows."""
-        count = -(-BLOCKS // len(recordings))
+    def of(
+        cls,
+        model: RobotModel,
+        recordings: Sequence[Samples],
+        values: Array,
+        *,
+        divided: int = 1,
+    ) -> FaultTables:
+        """Reduce some thousand rows, with each block `divided` into so many."""
+        count = divided * -(-BLOCKS // len(recordings))
         step = row_step(recordings, _MOST_ROWS)
         grams = []
         rows = []
@@ -156,7 +174,7 @@ def folded(blocks: Array) -> Array:
 
 def columns_of_fault(tables: FaultTables, model: RobotModel, values: Array, fault: Fault) -> Array:
     """Return the columns of a fault as combinations of those of a table (B, n, q, r)."""
-    blocks, n, width, _ = tables.gram.shape
+    _, n, width, _ = tables.gram.shape
     p = model.n_parameters
     joints = list(fault.joints or range(model.n_joints))
     count = {"payload": _LOAD, "changed arm": p, "load friction": n}.get(fault.kind, 1)
@@ -172,5 +190,4 @@ def columns_of_fault(tables: FaultTables, model: RobotModel, values: Array, faul
     else:
         friction = fault.kind == "changed friction"
         columns[joints, :p, 0] = values * model.friction_columns if friction else values
-    mask = np.ones(blocks) if fault.part is None else np.array(fault.part.blocks, dtype=np.float64)
-    return np.asarray(mask[:, None, None, None] * columns)
+    return np.asarray(tables.mask_of(fault)[:, None, None, None] * columns)

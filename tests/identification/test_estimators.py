@@ -1332,7 +1332,7 @@ class TestDelay:
         assert np.abs(errors).max() < 1.5
 
     def test_friction_that_grows_with_load_does_not_bias_it(self):
-        """A tenth of the transmitted torque, which resembles a delay without its term."""
+        """A tenth of the transmitted torque, whether or not the law has the term."""
         recording = delayed(1.6e-3, torque_noise=0.3)
         motion = four_sines_at(recording.time - 1.6e-3)
         grown = 0.1 * np.abs(MODEL.gear_torque(TRUTH, *motion)) * np.sign(motion[1])
@@ -1340,8 +1340,9 @@ class TestDelay:
         without, beside = (
             estimate_delay(loaded, MODEL.with_friction(load=load)) for load in (False, True)
         )
-        assert beside.delay == pytest.approx(1.6e-3, abs=beside.half_interval)
-        assert beside.half_interval < 0.5 * without.half_interval
+        for estimate in (without, beside):
+            assert estimate.delay == pytest.approx(1.6e-3, abs=estimate.half_interval)
+            assert estimate.half_interval < 2e-4
 
     def test_recordings_in_succession_determine_it_better(self):
         recordings = [delayed(1.6e-3, seed=seed) for seed in range(4)]
@@ -1458,7 +1459,7 @@ class TestUndeterminedDelay:
         assert replace(slow, std=1e-4).variance == pytest.approx(1e-8)
 
     def test_an_uncertain_significant_delay_is_applied(self):
-        estimate = estimate_delay(delayed(0.045, speed=0.2, seed=2), MODEL)
+        estimate = estimate_delay(delayed(0.045, speed=0.3, seed=2), MODEL)
         assert estimate.reason is not None and estimate.significant
         assert estimate.applied == estimate.delay
         line = estimate.describe()

@@ -23,7 +23,9 @@ from identification.validation.changes import Change
 from identification.validation.evidence import CellContext, Evidence, gather
 from identification.validation.facts.errors import LEFT_OPEN
 from identification.validation.fault_scores import ScorePrior
-from identification.validation.faults import Fault, Kind
+from identification.validation.fault_sizes import estimated_size
+from identification.validation.fault_tables import FaultTables
+from identification.validation.faults import Fault, Kind, Part
 from identification.validation.finding import Thresholds
 from identification.validation.gravity import CarriedLoad
 from identification.validation.nominal_scale import NominalScale
@@ -473,9 +475,10 @@ class TestJudgement:
     def test_a_constant_within_the_assumed_scale_is_no_cause(self, size, ratio, error, level):
         """Three standard deviations of the ratio of two torques known to 3 % are 13 %.
 
-        The ratio is that of both axes: the error of the second is multiplied by its square.
+        The scale of the other torque is in the deviation of the factor. The ratio is that of both
+        axes: the error of the second is multiplied by its square.
         """
-        causes = (Cause(Fault("gain", (1,)), ratio, size, 0.001),)
+        causes = (Cause(Fault("gain", (1,)), ratio, size, 0.03),)
         errors = {"held_out": an_error(error), "training": an_error(error)}
         verdict = judged(causes=causes, scale_std=np.full(2, 0.03), **errors)
         (finding,) = (each for each in verdict.findings if each.check == "torque constant")
@@ -798,6 +801,107 @@ class TestCausesOfWholeRecordings:
         (cause,) = causes([turn(short)])
         assert (cause.fault.kind, cause.fault.joints) == ("torque sign", (2,))
         assert causes([turn(short)], alone=True) == ()
+
+
+CONSTANT = 1.5  # of a motor, wrong by this factor
+
+
+def of_another_constant(samples, joint, factor=CONSTANT, first=0):
+    """Return samples whose torque of one joint is multiplied, from a row on."""
+    torque = samples.torque.copy()
+    torque[first:, joint] *= factor
+    return replace(samples, torque=torque)
+
+
+def misfit(samples, joint, factor):
+    """Return the weighted error of an ordinary fit with the torque of a joint divided by a factor.
+
+    The errors of that joint count as those of the torque as it was.
+    """
+    scale = np.ones(6)
+    scale[joint] = factor
+    blocks, columns = samples.regressor(MODEL)
+    noise = NOISE * np.array([np.std(samples.torque[:, j]) for j in range(6)]) / scale
+    rows = []
+    target = []
+    for j, (block, used) in enumerate(zip(blocks, columns, strict=True)):
+        table = np.zeros((len(block), MODEL.n_parameters))
+        table[:, used] = block
+        some = samples.usable[:, j]
+        rows.append(table[some] / noise[j])
+        target.append(samples.torque[some, j] / scale[j] / noise[j])
+    rows, target = np.concatenate(rows), np.concatenate(target)
+    size = np.linalg.norm(rows, axis=0)
+    solution = np.linalg.lstsq(rows / size, target, rcond=1e-9)[0]
+    return np.sum((target - rows / size @ solution) ** 2)
+
+
+def size_of(fault, samples, **known):
+    """Return the size that is estimated of a fault."""
+    values = estimate(MODEL, Factor.of(MODEL, samples)).values
+    tables = FaultTables.of(MODEL, [samples], values, divided=4)
+    return estimated_size(fault, tables, MODEL, values, **known)
+
+
+class TestPrintedSizes:
+    """A size in a verdict is one to correct the recording by."""
+
+    @pytest.mark.parametrize("joint", [0, 1, 2])
+    def test_dividing_by_the_printed_factor_heals_the_recording(self, joint):
+        spoilt = of_another_constant(recorded(1), joint)
+        cause = causes([spoilt])[0]
+        assert (cause.fault.kind, cause.fault.joints) == ("gain", (joint,))
+        factor = 1.0 + cause.size
+        assert factor == pytest.approx(CONSTANT, abs=cause.half_interval)
+        assert cause.half_interval < 0.15
+        # No better one is beyond the interval.
+        near = factor + cause.half_interval * np.array([-1.0, 0.0, 1.0])
+        errors = [misfit(spoilt, joint, each) for each in near]
+        assert np.argmin(errors) == 1
+        assert causes([of_another_constant(spoilt, joint, 1.0 / factor)]) == ()
+
+    def test_the_interval_of_a_factor_is_that_of_noise(self):
+        """Its deviation over the claimed one, of 16 motions: a chi-square of 16."""
+        fault = Fault("gain", (1,))
+        deviations = []
+        for seed in range(16):
+            found = size_of(fault, of_another_constant(recorded(seed), 1))
+            deviations.append((1.0 + found.size - CONSTANT) / found.std)
+        assert 0.6 < np.sqrt(np.mean(np.square(deviations))) < 1.5
+
+    def test_the_interval_of_a_factor_is_that_of_the_other_torques(self):
+        """They are known to 3 %, which is more than the noise."""
+        fault = Fault("gain", (1,))
+        deviations = []
+        for seed in range(16):
+            samples = recorded(seed)
+            scale = 1.0 + 0.03 * np.random.default_rng([seed, 5]).standard_normal(6)
+            scale[1] = CONSTANT
+            samples = replace(samples, torque=scale * samples.torque)
+            found = size_of(fault, samples, scale_std=np.full(6, 0.03))
+            deviations.append((1.0 + found.size - CONSTANT) / found.std)
+        assert 0.6 < np.sqrt(np.mean(np.square(deviations))) < 1.5
+
+    def test_a_factor_of_a_part_is_that_of_the_part(self):
+        part = Part("later", (False,) * 6 + (True,) * 4)
+        # Rows of blocks, of which there are ten.
+        spoilt = of_another_constant(recorded(1), 1, first=750)
+        found = size_of(Fault("changed gain", (1,), part), spoilt)
+        half = found.interval_factor * found.std
+        assert 1.0 + found.size == pytest.approx(CONSTANT, abs=half)
+        assert half < 0.02
+
+    def test_what_the_motion_leaves_open_has_no_size(self):
+        """A torque that is friction alone, of a joint that moves alone."""
+        motion = a_motion(1, duration=10.0, step=8e-3)
+        for array in motion[1:4]:
+            array[:, :5] = 0.0
+        motion.position[:, :5] = 0.3
+        torque = MODEL.torque(ns16_values(MODEL), *motion[1:])
+        usable = np.zeros(torque.shape, dtype=np.bool_)
+        usable[:, 5] = True
+        samples = as_samples(MODEL, motion, torque, usable=usable)
+        assert size_of(Fault("gain", (5,)), samples) is None
 
 
 class TestErrorsWithoutCause:

@@ -4,7 +4,7 @@ Only the NS 16's URDF is shared, so that errors of the project's model, smoothin
 not reproduced.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -143,6 +143,43 @@ def recorded(arm, seed, noise, delay, pace):
     return Recording(time, position, arm.joint_names, torque=torque)
 
 
+def with_stribeck_friction(arm, moves, time, recording):
+    """Two fifths of Coulomb friction more at rest, which falls to a third at 0.1 rad/s."""
+    velocity = moves(time)[1]
+    more = 0.4 * arm.coulomb * np.exp(-np.abs(velocity) / 0.1) * np.tanh(velocity / 1e-3)
+    return replace(recording, torque=recording.torque + more)
+
+
+def friction(arm, moves, time):
+    velocity = moves(time)[1]
+    return arm.coulomb * np.tanh(velocity / 1e-3) + arm.viscous * velocity
+
+
+def with_drift(arm, moves, time, recording):
+    """Friction that grows by 10 %."""
+    more = 0.1 * (time / time[-1] - 0.5)[:, None] * friction(arm, moves, time)
+    return replace(recording, torque=recording.torque + more)
+
+
+def with_jump(arm, moves, time, recording):
+    """Friction that is 30 % larger in the second half."""
+    more = 0.3 * (time > time.mean())[:, None] * friction(arm, moves, time)
+    return replace(recording, torque=recording.torque + more)
+
+
+def with_encoder_zero(arm, moves, time, recording):
+    """The third joint's encoder off by 0.05 rad."""
+    position = recording.position.copy()
+    position[:, 2] += 0.05
+    return replace(recording, position=position)
+
+
+def spoilt(arm, seed, delay, spoil):
+    """Return a recording with a fault."""
+    recording = recorded(arm, seed, "coloured", delay, BRISK)
+    return spoil(arm, motion(arm, seed, BRISK), recording.time - delay, recording)
+
+
 ARMS = {"NS 16": ns16, "Panda": panda}
 DELAYS = [0.0, 0.0013, 0.004, 0.01]  # s
 NEAR = 0.3e-3  # s
@@ -208,6 +245,50 @@ class TestDelayOfABriskMotion:
         unsure = 2.0 * np.std(shares, ddof=1) / np.sqrt(SEEDS)
         assert near >= 0.95 * SEEDS
         assert 0.93 - unsure < share < 0.98 + unsure
+
+
+class TestDelayBesideFaults:
+    """Of a model that does not know them."""
+
+    @pytest.mark.parametrize("name", ARMS)
+    @pytest.mark.parametrize("spoil", [with_stribeck_friction, with_drift, with_encoder_zero])
+    @pytest.mark.parametrize("seed", [0, 1])
+    def test_it_survives_them(self, name, spoil, seed):
+        arm = ARMS[name]()
+        estimate = estimate_delay(spoilt(arm, seed, 0.0013, spoil), model_of(arm))
+        assert estimate.significant
+        assert estimate.delay == pytest.approx(0.0013, abs=NEAR)
+
+    @pytest.mark.parametrize("name", ARMS)
+    @pytest.mark.parametrize("spoil", [with_stribeck_friction, with_jump, with_encoder_zero])
+    @pytest.mark.parametrize("seed", [0, 1])
+    def test_they_apply_none(self, name, spoil, seed):
+        arm = ARMS[name]()
+        estimate = estimate_delay(spoilt(arm, seed, 0.0, spoil), model_of(arm))
+        assert estimate.applied == 0.0
+        assert not estimate.significant
+
+    @pytest.mark.parametrize("name", ARMS)
+    @pytest.mark.parametrize("delay", [0.0, 1e-4, 2e-4, 3e-4, 4e-4])
+    def test_none_is_applied_whose_interval_contains_that_assumed(self, name, delay):
+        """Near the smallest delay that the motion shows."""
+        arm = ARMS[name]()
+        estimate = estimate_delay(recorded(arm, 2, "coloured", delay, BRISK), model_of(arm))
+        contained = abs(estimate.delay - estimate.assumed) <= estimate.half_interval
+        assert not (contained and estimate.applied != estimate.assumed)
+        assert estimate.delay == pytest.approx(delay, abs=1.5 * estimate.half_interval)
+
+    def test_single_joints_that_differ_widen_its_interval(self):
+        """The torque of one joint is 5 ms late, which is no delay of all."""
+        arm = ns16()
+        recording = recorded(arm, 0, "white", 0.0, BRISK)
+        alike = estimate_delay(recording, model_of(arm))
+        torque = recording.torque.copy()
+        time = recording.time
+        torque[:, 0] = np.interp(time - 0.005, time, torque[:, 0])
+        differ = estimate_delay(replace(recording, torque=torque), model_of(arm))
+        assert differ.half_interval > 3.0 * alike.half_interval
+        assert differ.applied == 0.0
 
 
 class TestDelayBesideOtherSettings:

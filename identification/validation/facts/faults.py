@@ -120,8 +120,7 @@ class FaultFacts:
 
     causes: tuple[Cause, ...]
     certain_below: float  # ratio of the errors
-    # of the scale of one joint's torque over those of the others, as it is assumed (n,)
-    scale_std: Array
+    scale_std: Array  # of each joint's torque, as it is assumed, relative (n,)
     matters: Mask  # joints with an error that has to be explained (n,)
 
     @classmethod
@@ -152,9 +151,8 @@ class FaultFacts:
         )
         std = evidence.context.scale_std
         std = np.zeros(len(evidence.held_out.rows)) if std is None else std
-        others = np.sqrt(np.maximum((std**2).sum() - std**2, 0.0) / max(len(std) - 1, 1))
         matters = np.nan_to_num(evidence.held_out.relative) > limits.unexplained
-        return cls(causes, limits.cause, np.hypot(std, others), matters)
+        return cls(causes, limits.cause, std, matters)
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
         """Yield each fault."""
@@ -192,11 +190,14 @@ class FaultFacts:
         """Return whether a torque is off by no more than the scale of torques may be."""
         if cause.fault.kind != "gain" or cause.fault.part is not None:
             return False
-        std = float(np.hypot(self._scale_std_of(cause), cause.std))
-        return abs(cause.size or 0.0) <= _SIGMAS * std
+        return abs(cause.size or 0.0) <= _SIGMAS * self._scale_std_of(cause)
 
     def _scale_std_of(self, cause: Cause) -> float:
-        return float(self.scale_std[[*cause.fault.joints]].max())
+        """Return the standard deviation of a torque's scale over those of the others.
+
+        Their scales are in that of the cause.
+        """
+        return float(np.hypot(self.scale_std[[*cause.fault.joints]].max(), cause.std))
 
 
 class _Text(NamedTuple):
@@ -243,7 +244,7 @@ def _text(cause: Cause, joints: str, naming: Naming) -> _Text:
 def _size(cause: Cause, scale: float = 1.0, offset: float = 0.0) -> str:
     """Return offset + scale * size of a cause, with its 95 % interval."""
     size = offset + scale * (cause.size or 0.0)
-    return f"{abs(size):.3g} ± {scale * 2.0 * cause.std:.2g}"
+    return f"{abs(size):.3g} ± {scale * cause.half_interval:.2g}"
 
 
 def _more(cause: Cause) -> str:
