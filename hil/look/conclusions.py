@@ -19,6 +19,7 @@ from hil.look.result import Choice, Look, Row, fit_alike
 from hil.look.run import SETTINGS, look_at_joints, mountings
 from hil.terminal_text import typed
 from identification.errors import IdentificationError
+from identification.estimators.torque_channel import possible_low_passes
 from identification.signals.samples import Samples, prepare
 from identification.text import percentage
 from identification.validation.reading_scores import Score, compare, score_of
@@ -30,6 +31,7 @@ logs of four real arms have 0.04 to 0.11, with URDFs of other arms 0.09 to 1.1."
 _MUCH_BETTER: Final = 0.85  # error ratio of another mounting that chance alone does not make
 _OTHER_ARM: Final = 0.5
 """The same, above which no masses of this arm explain the torque."""
+_EXPLAINS: Final = 0.5  # of the error, that a low-pass or heavy rotors leave where they are there
 _DRIVES: Final = -4.0  # standard errors of a friction that drives a joint
 _ROWS: Final = 700
 _WARNED: Final = 2  # contradictions: a wrong limit of a right URDF explains one, more are refused
@@ -66,6 +68,8 @@ def concluded(
     if is_bag or not (suspect or _hangs_otherwise(cell, samples, score)):
         contradictions = Contradictions.of(cell, cell.model, samples, score, score.overall)
         return _of_this_arm(imported, source, contradictions)
+    if score.overall > _SUSPECT and (channel := _explaining_channel(imported.archive, score)):
+        return replace(imported, lines=(*imported.lines, channel))
     look = look_at_joints(source, imported)
     error = score.overall if look.error is None else look.error
     if error > _OTHER_ARM:
@@ -98,6 +102,31 @@ def _few_rows(archive: Path) -> tuple[Cell, Samples, Score] | None:
         return cell, few, score_of(cell.model, few)
     except (IdentificationError, ValueError):
         return None  # the identification says what is wrong
+
+
+def _explaining_channel(archive: Path, score: Score) -> str | None:
+    """Return the low-pass and heavy rotors that explain the torque as it is read, or None.
+
+    They explain it if they halve the error of its `score`. Other units, signs and orders are
+    searched without them, and may then seem to fit.
+    """
+    opened = open_archive(archive)
+    cell = cell_of(opened)
+    recording = source_of(opened, cell).recording
+    low_passes = possible_low_passes(recording, cell.model, options=SETTINGS)
+    for how in (*low_passes, SETTINGS):
+        samples = prepare(recording, cell.model, options=how)
+        for wide_rotors in (False, True):
+            explained = score_of(cell.model, samples, wide_rotors=wide_rotors).overall
+            if explained < _EXPLAINS * score.overall:
+                width = how.torque_bandwidth
+                parts = [
+                    f"low-passed at {width:.2g} Hz" if width else "",
+                    "with rotors heavier than the links" if wide_rotors else "",
+                ]
+                described = ", ".join(filter(None, parts))
+                return f"torque: follows the arm of the URDF, {described}"
+    return None
 
 
 def _hangs_otherwise(cell: Cell, samples: Samples, score: Score) -> bool:

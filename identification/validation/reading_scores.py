@@ -82,14 +82,21 @@ def _factor(model: RobotModel, samples: Samples) -> Factor:
     return Factor.of(model, samples, index=index)
 
 
-def score_of(model: RobotModel, samples: Samples, columns: NDArray[np.intp] | None = None) -> Score:
+def score_of(
+    model: RobotModel,
+    samples: Samples,
+    columns: NDArray[np.intp] | None = None,
+    *,
+    wide_rotors: bool = False,
+) -> Score:
     """Predict every fifth of `_BLOCKS` blocks of samples from the others.
 
-    `columns` are those of the recorded torque that the joints are read from, by default in order.
+    `columns` are those of the recorded torque that the joints are read from, by default in order;
+    `wide_rotors` as for :func:`~identification.estimators.prior.body_prior`.
     """
     columns = np.arange(model.n_joints) if columns is None else columns
     factor = _factor(model, samples)
-    prior = body_prior(model, factor).gaussian
+    prior = body_prior(model, factor, wide_rotors=wide_rotors).gaussian
     squares = np.zeros((len(factor), factor.n_joints))
     weights: Array | None = None
     estimates: list[Array] = []
