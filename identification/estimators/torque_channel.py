@@ -270,9 +270,9 @@ class _Spectra:
 
         0: none of it, 1: all of it. In the two octaves above the bandwidth, where the two differ
         most, the gain g of the recorded torque over that of a model fitted without low-pass, with
-        the delay `undelayed` [s], is ``log g / log |H|``. The gain is that of all joints, each
-        weighted by the inverse variance of what the model leaves unexplained there. Without torque
-        there the standard deviation is infinite.
+        the delay `undelayed` [s], is ``log g / log |H|``. Joints count by how well the two torques
+        agree there: one whose torque the model does not describe says nothing. Without torque there
+        the standard deviation is infinite.
         """
         values = self._fitted([_Filter(undelayed)])[2][0]
         late = np.exp(2j * np.pi * self.frequency * (undelayed - self.delay))
@@ -280,28 +280,31 @@ class _Spectra:
         size = np.maximum(np.abs(response), np.finfo(np.float64).tiny)
         # The phase is not judged: that of a delay fitted by mistake would hide the torque.
         phases = (np.ones_like(response), response / size)
+        modelled = [joint.modelled(values) for joint in self.joints]
         shares = []
         for octave in _OCTAVES:
             low, high = (factor * channel.bandwidth for factor in octave)
             inside = (self.frequency >= low) & (self.frequency < high)
-            sums = np.zeros(3)  # information, and that times the gain of filter and torque
-            for joint in self.joints:
-                model, cross = joint.modelled(values)
+            certain = np.zeros(len(self.joints))  # information on the logarithm of the gain
+            gains = np.zeros(len(self.joints))  # its logarithm
+            expected = np.zeros(len(self.joints))
+            for k, (joint, (model, cross)) in enumerate(zip(self.joints, modelled, strict=True)):
                 power = float(model[inside].sum())
-                if power <= 0.0:
-                    continue
+                torque = float(joint.powers[inside].sum())
                 both = (cross * late)[inside]
-                gained = max(abs(np.vdot(phase[inside], both)) for phase in phases)
+                product = max((abs(np.vdot(phase[inside], both)) for phase in phases), default=0.0)
+                if not product > 0.0:
+                    continue
+                # At most one, up to the rounding of sums of squares.
+                coherence = min(product**2 / (power * torque), 1.0 - _SMALLEST_NOISE)
                 count = max(1.0, joint.duration * (high - low))
-                left = float(joint.powers[inside].sum()) - gained**2 / power
-                weight = 2.0 * count * power / max(left, _SMALLEST_NOISE * gained)
-                filtered = float((size * model)[inside].sum())
-                sums += weight * np.array([1.0, filtered / power, gained / power])
-            if sums[0] > 0.0:
-                expected = math.log(sums[1] / sums[0])
-                gain = max(float(sums[2] / sums[0]), _SMALLEST_NOISE)
-                std = 1.0 / (gain * math.sqrt(sums[0]))
-                shares.append((math.log(gain) / expected, std / abs(expected)))
+                certain[k] = 2.0 * count * coherence / (1.0 - coherence)
+                gains[k] = math.log(product / power)
+                expected[k] = math.log(float((size * model)[inside].sum()) / power)
+            if certain.any():
+                fall = float(certain @ expected) / certain.sum()
+                gain = float(certain @ gains) / certain.sum()
+                shares.append((gain / fall, 1.0 / (abs(fall) * math.sqrt(certain.sum()))))
         if not shares:
             return 0.0, math.inf
         share, std = np.array(shares).T
