@@ -122,7 +122,7 @@ def possible_low_passes(
     for kind_delays, shapes in ((delays, WITHOUT_PHASE), ((still,), FORWARDS)):
         kinds = [_Filter(delay, shape) for delay, shape in product(kind_delays, shapes)]
         misfit, best = spectra.best(kinds)
-        share, std = spectra.attenuation(best, still)
+        share, std = spectra.attenuation(best)
         if misfit < enough and share - std > _THERE:
             assert best.shape is not None
             possible.append(
@@ -265,21 +265,23 @@ class _Spectra:
             variance = np.column_stack(squares) / rows
         return variance, smallest, values
 
-    def attenuation(self, channel: _Filter, undelayed: float) -> tuple[float, float]:
+    def attenuation(self, channel: _Filter) -> tuple[float, float]:
         """Return how much of a low-pass is in the torque, and the standard deviation of that.
 
         0: none of it, 1: all of it. In the two octaves above the bandwidth, where the two differ
-        most, the gain g of the recorded torque over that of a model fitted without low-pass, with
-        the delay `undelayed` [s], is ``log g / log |H|``. Joints count by how well the two torques
+        most, the gain g of the recorded torque over that of a model fitted without the low-pass,
+        with a delay by its lag, is ``log g / log |H|``. Joints count by how well the two torques
         agree there: one whose torque the model does not describe says nothing. Without torque there
         the standard deviation is infinite.
         """
-        values = self._fitted([_Filter(undelayed)])[2][0]
-        late = np.exp(2j * np.pi * self.frequency * (undelayed - self.delay))
+        assert channel.shape is not None
+        lag = channel.shape.lag(channel.bandwidth) if channel.shape.causal else 0.0
+        delayed = _Filter(channel.delay + lag)
+        values = self._fitted([delayed])[2][0]
         response = self.response(channel)[0]
         size = np.maximum(np.abs(response), np.finfo(np.float64).tiny)
         # The phase is not judged: that of a delay fitted by mistake would hide the torque.
-        phases = (np.ones_like(response), response / size)
+        phases = (np.ones_like(response), response / size, self.response(delayed)[0])
         modelled = [joint.modelled(values) for joint in self.joints]
         shares = []
         for octave in _OCTAVES:
@@ -291,7 +293,7 @@ class _Spectra:
             for k, (joint, (model, cross)) in enumerate(zip(self.joints, modelled, strict=True)):
                 power = float(model[inside].sum())
                 torque = float(joint.powers[inside].sum())
-                both = (cross * late)[inside]
+                both = cross[inside]
                 product = max((abs(np.vdot(phase[inside], both)) for phase in phases), default=0.0)
                 if not product > 0.0:
                     continue
