@@ -1,16 +1,22 @@
 """Whether 95 % intervals of `hil identify` hold the truth of arms that were simulated without hil.
 
 Run with ``python -m benchmarks.coverage [--seeds N] [--arms NAME ...] [--delays MS ...]
-[--quadratic] [--load SHARE] [--white] [--rate HZ] [--speed SHARE] [--scale SHARE] [--json]``. Each
-run is a log of its own seed, imported and identified with default settings; another motion is held
-out. Motion, dynamics (pinocchio's RNEA), friction and noise share no code with what is tested, only
-the URDF; what the parameters are called and how they are grouped is the project's.
+[--quadratic] [--load SHARE] [--stribeck SHARE] [--stribeck-speed SPEED] [--drift SHARE] [--white]
+[--rate HZ] [--speed SHARE] [--scale SHARE] [--json]``. Each run is a log of its own seed, imported
+and identified with default settings; another motion is held out. Motion, dynamics (pinocchio's
+RNEA), friction and noise share no code with what is tested, only the URDF; what the parameters are
+called and how they are grouped is the project's.
 
 - The arm is not its URDF: masses differ by 10 to 20 %, centres and inertias alike, by a congruence
   of the pseudo-inertia, which keeps a body physically consistent. Its rotors are in no URDF.
 - Friction is Coulomb, viscous and an offset, the law that an import assumes. ``--quadratic`` adds a
   term with the speed squared, and states all four in the archive. ``--load`` lets dry friction grow
   by a share of the rigid body's torque, which no archive states.
+- ``--stribeck`` raises dry friction at rest by a share, which decays with ``exp(-(v / v_s)²)``; v_s
+  is 0.1 rad/s or that of ``--stribeck-speed``. ``--drift`` lets dry and viscous friction fall by a
+  share over the fitted log, linearly; the held-out motion follows. No archive states either.
+  Coefficients count as those of the true law: Coulomb and viscous friction without the Stribeck
+  part; of friction that drifts its values at the start, in the middle and at the end of the log.
 - The motion is a random Fourier series within the URDF's limits that starts and ends at rest.
   ``--speed`` is the share of the largest speeds that it may use.
 - The scale of each joint's torque is off by 3 % (standard deviation), as an import assumes of one
@@ -29,6 +35,9 @@ Figures per arm and delay, and of all; a seed is the same arm, motion and noise 
   ``delay_bias_ms``: mean of applied less true; ``delay_half_ms``: median half width of its interval
   where a run states one, ``delay_intervals`` their number, ``delay_held`` that of those which hold
   the true delay.
+- ``doubted``: runs whose verdict puts the friction law of some joint in doubt; ``friction_width``:
+  median half width of an interval of Coulomb or viscous friction over the true value. ``plain``:
+  runs whose verdict is good without naming anything doubtful about friction.
 - ``false_causes``: runs whose verdict blames something, other than a delay that is there, by the
   name of the finding. ``good``: runs whose verdict is good.
 - ``inside``: share of held-out means of torque inside their intervals (`calibration` in
@@ -72,6 +81,9 @@ DELAYS: Final = (0.0, 1.3, 4.0, 10.0)  # ms
 NEAR: Final = 0.3e-3  # s
 QUADRATIC_LAW: Final = FrictionLaw(third="quadratic", offset=True)
 
+# Name of the finding that puts a friction law in doubt, and of all that name friction.
+IN_DOUBT: Final = "form of friction"
+_OF_FRICTION: Final = frozenset({IN_DOUBT, "friction", "friction over time"})
 _BASE_FREQUENCY: Final = 0.1  # Hz
 _HARMONICS: Final = 10
 _ROOM_SHARE: Final = 0.6  # of the way from the middle of a range to its end
@@ -98,6 +110,9 @@ class Conditions(NamedTuple):
         speed: share of the URDF's largest speeds that motions may use.
         scale: standard deviation of the scale of each joint's logged torque, as a share.
         load: share of the rigid body's torque by which dry friction grows.
+        stribeck: share by which dry friction at rest exceeds that in motion.
+        stribeck_speed: over which it decays [rad/s].
+        drift: share by which friction falls over the fitted log.
     """
 
     quadratic: bool = False
@@ -106,25 +121,35 @@ class Conditions(NamedTuple):
     speed: float = 0.7
     scale: float = 0.03
     load: float = 0.0
+    stribeck: float = 0.0
+    stribeck_speed: float = 0.1
+    drift: float = 0.0
 
 
 DEFAULTS: Final = Conditions()
 
 
 class Friction(NamedTuple):
-    """Coefficients (n,) of Coulomb [N·m], viscous, quadratic friction, an offset and the load."""
+    """Coefficients (n,) of Coulomb [N·m], viscous, quadratic friction, an offset and the load.
+
+    Dry friction at rest exceeds that in motion by a share `stribeck`, over a speed [rad/s].
+    """
 
     coulomb: Array
     viscous: Array
     quadratic: Array
     offset: Array
     load: Array
+    stribeck: float = 0.0
+    stribeck_speed: float = 1.0
 
-    def torque(self, velocity: Array, rigid: Array) -> Array:
-        """Torque (m, n) at speeds and torques of the rigid body (m, n)."""
-        dry = (self.coulomb + self.load * np.abs(rigid)) * np.tanh(velocity / _DRY_SPEED)
+    def torque(self, velocity: Array, rigid: Array, level: Array | float) -> Array:
+        """Torque (m, n) at speeds and torques of the rigid body (m, n), times a level (m,)."""
+        at_rest = 1.0 + self.stribeck * np.exp(-((velocity / self.stribeck_speed) ** 2))
+        dry = self.coulomb * at_rest + self.load * np.abs(rigid)
+        dry = dry * np.tanh(velocity / _DRY_SPEED)
         fluid = self.viscous * velocity + self.quadratic * np.abs(velocity) * velocity
-        return np.asarray(dry + fluid + self.offset)
+        return np.asarray(np.reshape(level, (-1, 1)) * (dry + fluid) + self.offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,12 +199,12 @@ class Arm:
     robot: Any
     friction: Friction
 
-    def torque(self, position: Array, velocity: Array, acceleration: Array) -> Array:
-        """Torque (m, n) of the joints, friction included."""
+    def torque(self, position: Array, velocity: Array, acceleration: Array, level: Array) -> Array:
+        """Torque (m, n) of the joints, with friction at a level (m,) of the drawn one."""
         data = self.robot.createData()
         states = zip(position, velocity, acceleration, strict=True)
         rigid = np.array([pin.rnea(self.robot, data, *state) for state in states])
-        return rigid + self.friction.torque(velocity, rigid)
+        return rigid + self.friction.torque(velocity, rigid, level)
 
 
 def drawn_arm(kind: ArmType, seed: int, conditions: Conditions = DEFAULTS) -> Arm:
@@ -201,7 +226,8 @@ def drawn_arm(kind: ArmType, seed: int, conditions: Conditions = DEFAULTS) -> Ar
     share = near([1.0 / 3.0] * len(coulomb)) if conditions.quadratic else np.zeros(len(coulomb))
     quadratic = share * viscous / robot.velocityLimit
     load = np.full(len(coulomb), conditions.load)
-    return Arm(robot, Friction(coulomb, viscous, quadratic, offset, load))
+    rise = conditions.stribeck, conditions.stribeck_speed
+    return Arm(robot, Friction(coulomb, viscous, quadratic, offset, load, *rise))
 
 
 def drawn_body(body: Any, random: np.random.Generator) -> Any:
@@ -286,7 +312,9 @@ def logged(
     random = np.random.default_rng([seed, 2, part])
     motion = drawn_motion(arm.robot, random, duration, conditions.speed)
     time = np.arange(round(duration * conditions.rate)) / conditions.rate
-    torque = arm.torque(*motion.at(time - delay))
+    # The held-out motion follows the fitted one.
+    worn = np.minimum(time / duration, 1.0) if part == 0 else np.ones_like(time)
+    torque = arm.torque(*motion.at(time - delay), 1.0 - conditions.drift * worn)
     noise = random.standard_normal(torque.shape)
     if not conditions.white:
         keep = np.exp(-1.0 / (_MEMORY * conditions.rate))
@@ -309,7 +337,18 @@ def true_values(arm: Arm, model: RobotModel) -> dict[str, float]:
     values = dict(
         zip(model.parameter_names, (model.base.grouping @ standard).tolist(), strict=False)
     )
-    symbols = dict(zip(("f0", "f1", "f2", "fo", "fl"), arm.friction, strict=True))
+    friction = arm.friction
+    symbols = {
+        "f0": friction.coulomb,
+        "f1": friction.viscous,
+        "f2": friction.quadratic,
+        "fo": friction.offset,
+        "fl": friction.load,
+    }
+    if friction.stribeck:
+        # Of a term with another speed there is no true coefficient.
+        same = friction.stribeck_speed == DEFAULTS.stribeck_speed
+        symbols["fs"] = friction.coulomb * (friction.stribeck if same else np.nan)
     for symbol, coefficients in symbols.items():
         if symbol in ("f0", "f1", "fo") or coefficients.any():
             values |= {f"{symbol}_{j}": value for j, value in enumerate(coefficients.tolist(), 1)}
@@ -332,6 +371,9 @@ class Run(NamedTuple):
         inside: share of held-out means inside their intervals.
         error: of held-out torque.
         seconds: of the processor.
+        friction_width: half widths of intervals of Coulomb and viscous friction, likewise.
+        doubted: whether the friction law of a joint is in doubt.
+        plain: whether the verdict is good and names nothing doubtful about friction.
     """
 
     inertial: list[bool]
@@ -346,6 +388,9 @@ class Run(NamedTuple):
     inside: float | None
     error: float
     seconds: float
+    friction_width: Sequence[float] = ()
+    doubted: bool = False
+    plain: bool = True
 
 
 def run(name: str, delay: float, seed: int, conditions: Conditions = DEFAULTS) -> Run:
@@ -366,14 +411,22 @@ def run(name: str, delay: float, seed: int, conditions: Conditions = DEFAULTS) -
         results = identify_archives(archives[:1], Silent(), predict=archives[1:]).results
         seconds = time.process_time() - start
     model = RobotModel.from_urdf(robot.urdf, locked=kind.locked, friction=law)
-    return compared(results, true_values(arm, model), delay, seconds)
+    truth = true_values(arm, model)
+    return compared(results, truth, delay, seconds, conditions.drift)
 
 
-def compared(results: Results, truth: Mapping[str, float], delay: float, seconds: float) -> Run:
+def compared(
+    results: Results,
+    truth: Mapping[str, float],
+    delay: float,
+    seconds: float,
+    drift: float = 0.0,
+) -> Run:
     """Compare results with the truth: parameters by name, and the delay [s].
 
-    A coefficient that the truth does not have is zero. The interval is zero wide where a parameter
-    was fixed at zero, and does not hold another value.
+    Coefficients f0, f1 and f2 fall by a share `drift`: those at the start, in the middle and at the
+    end are compared. A coefficient that the truth does not have is zero. The interval is zero wide
+    where a parameter was fixed at zero, and does not hold another value.
 
     Raises:
         KeyError: the results have another base parameter.
@@ -381,6 +434,8 @@ def compared(results: Results, truth: Mapping[str, float], delay: float, seconds
     inertial: list[bool] = []
     friction: list[bool] = []
     width: list[float] = []
+    friction_width: list[float] = []
+    levels = (1.0, 1.0 - 0.5 * drift, 1.0 - drift) if drift else (1.0,)
     undetermined = 0
     for index, parameter in enumerate(results.parameters):
         if parameter.undetermined or not np.isfinite(parameter.std):
@@ -388,27 +443,39 @@ def compared(results: Results, truth: Mapping[str, float], delay: float, seconds
             continue
         is_inertial = index < results.n_base
         value = truth[parameter.name] if is_inertial else truth.get(parameter.name, 0.0)
+        if np.isnan(value):
+            continue
         half = results.uncertainty.interval_factor * parameter.std
-        held = bool(abs(parameter.estimate - value) <= half)
-        (inertial if is_inertial else friction).append(held)
+        drifts = parameter.name.startswith(("f0_", "f1_", "f2_"))
+        held = [
+            bool(abs(parameter.estimate - level * value) <= half)
+            for level in (levels if drifts else (1.0,))
+        ]
+        (inertial if is_inertial else friction).extend(held)
         if is_inertial:
             width.append(half / abs(value))
+        elif parameter.name.startswith(("f0_", "f1_")):
+            friction_width.append(half / abs(value))
     delays = results.delays
     applied = np.zeros(len(results.joint_names)) if delays is None else np.array(delays.applied)
     half_widths = [] if delays is None else [half for half in delays.interval if half is not None]
     justified = {"delay"} if delay > 0.0 else set()
     checks = [finding.check for finding in suspicious(results)]
     blamed = [check for check in checks if check in CAUSES - justified]
+    named = sum(check in _OF_FRICTION for check in checks)
     return Run(
         inertial=inertial,
         friction=friction,
         undetermined=undetermined,
         dropped=len(truth.keys() - {parameter.name for parameter in results.parameters}),
         width=width,
+        friction_width=friction_width,
+        doubted=IN_DOUBT in checks,
         delay_error=(applied - delay).tolist(),
         delay_half=half_widths,
         blamed=list(dict.fromkeys(blamed)),
         good=results.verdict.good,
+        plain=results.verdict.good and not named,
         inside=None if results.calibration is None else results.calibration.inside,
         error=results.validation[0].all_rows_relative_error,
         seconds=seconds,
@@ -431,6 +498,10 @@ def figures(draws: Sequence[Sequence[Run]]) -> dict[str, Any]:
         "undetermined": sum(run.undetermined for run in runs),
         "dropped": sum(run.dropped for run in runs),
         "width": _rounded(np.median([share for run in runs for share in run.width])),
+        "friction_width": _rounded(
+            np.median([share for run in runs for share in run.friction_width] or [0.0])
+        ),
+        "doubted": sum(run.doubted for run in runs),
         "delay_near": sum(near),
         "delay_bias_ms": _rounded(1e3 * bias),
         "delay_half_ms": _rounded(1e3 * np.median(halves)) if halves else None,
@@ -438,6 +509,7 @@ def figures(draws: Sequence[Sequence[Run]]) -> dict[str, Any]:
         "delay_held": sum(held),
         "false_causes": dict(Counter(name for run in runs for name in run.blamed)),
         "good": sum(run.good for run in runs),
+        "plain": sum(run.plain for run in runs),
         "inside": _rounded(np.mean(inside)) if inside else None,
         "error": _rounded(np.mean([run.error for run in runs])),
         "seconds": _rounded(np.mean([run.seconds for run in runs])),
@@ -470,6 +542,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--delays", nargs="+", type=float, default=DELAYS, metavar="MS")
     parser.add_argument("--quadratic", action="store_true", help="true, and stated in the archive")
     parser.add_argument("--load", type=float, default=DEFAULTS.load, metavar="SHARE")
+    parser.add_argument("--stribeck", type=float, default=DEFAULTS.stribeck, metavar="SHARE")
+    parser.add_argument(
+        "--stribeck-speed", type=float, default=DEFAULTS.stribeck_speed, metavar="SPEED"
+    )
+    parser.add_argument("--drift", type=float, default=DEFAULTS.drift, metavar="SHARE")
     parser.add_argument("--white", action="store_true", help="no coloured noise of the torque")
     parser.add_argument("--rate", type=float, default=DEFAULTS.rate, metavar="HZ")
     parser.add_argument("--speed", type=float, default=DEFAULTS.speed, metavar="SHARE")
@@ -482,6 +559,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options.speed,
         options.scale,
         options.load,
+        options.stribeck,
+        options.stribeck_speed,
+        options.drift,
     )
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     cells: dict[str, dict[str, Any]] = {}
@@ -518,7 +598,9 @@ def _line(cell: str, row: Mapping[str, Any]) -> str:
     shown.append(f"in {row['delay_held']} of {row['delay_intervals']} intervals")
     shown.append(f"false causes {row['false_causes'] or 'none'}")
     shown.append(f"good {row['good']}")
-    shown += [f"{name} {row[name]}" for name in ("width", "inside", "error", "seconds")]
+    shown.append(f"plain {row['plain']}  doubted {row['doubted']}")
+    last = ("width", "friction_width", "inside", "error", "seconds")
+    shown += [f"{name} {row[name]}" for name in last]
     return "  ".join(shown)
 
 
