@@ -199,7 +199,9 @@ class Arm:
     robot: Any
     friction: Friction
 
-    def torque(self, position: Array, velocity: Array, acceleration: Array, level: Array) -> Array:
+    def torque(
+        self, position: Array, velocity: Array, acceleration: Array, level: Array | float = 1.0
+    ) -> Array:
         """Torque (m, n) of the joints, with friction at a level (m,) of the drawn one."""
         data = self.robot.createData()
         states = zip(position, velocity, acceleration, strict=True)
@@ -463,11 +465,12 @@ def compared(
     checks = [finding.check for finding in suspicious(results)]
     blamed = [check for check in checks if check in CAUSES - justified]
     named = sum(check in _OF_FRICTION for check in checks)
+    known = {name for name, value in truth.items() if not np.isnan(value)}
     return Run(
         inertial=inertial,
         friction=friction,
         undetermined=undetermined,
-        dropped=len(truth.keys() - {parameter.name for parameter in results.parameters}),
+        dropped=len(known - {parameter.name for parameter in results.parameters}),
         width=width,
         friction_width=friction_width,
         doubted=IN_DOUBT in checks,

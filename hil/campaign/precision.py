@@ -130,9 +130,14 @@ class PrecisionMeter:
         products = np.sum(rates, axis=0) if rates else None
         known = takewhile(lambda each: each.source.path in self._elastic, recordings)
         elastic = [self._elastic[each.source.path] for each in known]
-        estimation = estimate_with(prepared, self._options, Silent(), factors, products, elastic)
-        for recording, torque in zip(recordings, estimation.elastic, strict=False):
+        forms = [self._forms[each.source.path] for each in recordings[: len(elastic)]]
+        estimation = estimate_with(
+            prepared, self._options, Silent(), factors, products, elastic, forms
+        )
+        read = zip(recordings, estimation.elastic, estimation.forms, strict=False)
+        for recording, torque, form in read:
             self._elastic[recording.source.path] = torque
+            self._forms[recording.source.path] = form
         pooled = estimation.result.pooled
         posterior = estimation.posterior
         stated = estimation.stated
@@ -218,6 +223,7 @@ class PrecisionMeter:
         self._earlier = [self._reduced(source) for source in self._given]
         self._repetitions: dict[Path, _Reduced] = {}
         self._elastic: dict[Path, ElasticTorque] = {}
+        self._forms: dict[Path, Factor] = {}
         self._delays: dict[tuple[Path, ...], CombinedDelay] = {}
         self._first = path
 

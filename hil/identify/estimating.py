@@ -24,6 +24,13 @@ from identification.estimators.elasticity import (
     expected_compliance,
     with_elastic_gears,
 )
+from identification.estimators.friction_form import (
+    FormDoubt,
+    doubt_form,
+    form_factor,
+    with_doubted_form,
+    with_drift,
+)
 from identification.estimators.instrumental import (
     estimate_instrumental,
     planned_motion,
@@ -56,6 +63,7 @@ from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.calibration import Refit
 from identification.validation.finding import joined
+from identification.validation.residuals import drift_of_factors
 
 from .cell_context import TorqueScale, torque_scale_of
 from .estimators import OF_PRIOR, Estimator, fit_of, values_of
@@ -98,6 +106,8 @@ class Estimation:
     stated: Estimate
     notes: tuple[str, ...]  #: what the intervals assume
     elastic: tuple[ElasticTorque, ...]  #: of the first recordings, at most `_ALIKE` of one motion
+    forms: tuple[Factor, ...]  #: with more friction terms, of the same recordings
+    form: FormDoubt  #: whether the friction law lacks one of them
 
 
 def fit_with_transmitted_load(
@@ -154,11 +164,13 @@ def estimate_with(
     factors: Sequence[Factor] = (),
     products: Array | None = None,
     elastic: Sequence[ElasticTorque] = (),
+    forms: Sequence[Factor] = (),
 ) -> Estimation:
     """Estimate the parameters by `options.estimator`, with all applicable tests.
 
-    `factors` by time of the fitted samples, the sum of their `rate_products`, and the torques of
-    elastic gears in the first of them are computed unless they are known (not for "iv").
+    `factors` by time of the fitted samples, the sum of their `rate_products`, the torques of
+    elastic gears in the first of them and `forms`, factors with more friction terms of those, are
+    computed unless they are known (not for "iv").
 
     Raises:
         InputError: the archives lack data that the estimator needs.
@@ -195,6 +207,9 @@ def estimate_with(
         held_out = tuple(Factor.by_time(model, samples) for samples in prepared.held_out)
         task.advance(1)
     stated, notes, elastic = _stated(prepared, result, fitted, posterior, precision, elastic)
+    form, forms = _form_of_friction(prepared, result, fitted, precision, forms)
+    stated = with_doubted_form(stated, form)
+    stated = with_drift(model, stated, _drift_of(model, result.pooled.values, factors))
     return Estimation(
         estimator=name,
         result=result,
@@ -206,6 +221,8 @@ def estimate_with(
         stated=stated,
         notes=notes,
         elastic=elastic,
+        forms=forms,
+        form=form,
     )
 
 
@@ -266,7 +283,7 @@ def _stated(
         return estimate, (note,), ()
     model = posterior.model
     values = estimate.values
-    some = fitted[:_ALIKE] if sources.same_motion else fitted
+    some = _enough(prepared, fitted)
     compliance = expected_compliance(model, some[0], values)
     elastic = (
         *elastic[: len(some)],
@@ -276,6 +293,37 @@ def _stated(
     effect = posterior.design_effect
     estimate = with_elastic_gears(estimate, result.factor, torque, effect, precision)
     return estimate, (note, "they allow for elastic gears between motors and links"), elastic
+
+
+def _enough(prepared: Prepared, fitted: Sequence[Samples]) -> Sequence[Samples]:
+    """Return the recordings that show what is alike in all: few of one motion."""
+    return fitted[:_ALIKE] if prepared.sources.same_motion else fitted
+
+
+def _form_of_friction(
+    prepared: Prepared,
+    result: RepeatedEstimate,
+    fitted: Sequence[Samples],
+    precision: Array | None,
+    forms: Sequence[Factor],
+) -> tuple[FormDoubt, tuple[Factor, ...]]:
+    """Return the doubt about the friction law, and the factors of its terms; some are known."""
+    model = prepared.sources.cell.model
+    some = _enough(prepared, fitted)
+    every = (
+        *forms[: len(some)],
+        *(form_factor(model, samples) for samples in some[len(forms) :]),
+    )
+    total = sum(every[1:], every[0])
+    return doubt_form(model, result.pooled, result.factor, total, precision), every
+
+
+def _drift_of(model: RobotModel, values: Array, factors: Sequence[Factor]) -> Array:
+    """Return the significant relative change of each joint's friction over the recordings (n,)."""
+    drift = drift_of_factors(model, values, factors)
+    if drift is None:
+        return np.zeros(model.n_joints)
+    return np.where(drift.significant, np.nan_to_num(drift.change), 0.0)
 
 
 def _require_usable_rows(prepared: Prepared) -> None:

@@ -64,6 +64,7 @@ def validate(prepared: Prepared, estimation: Estimation, reporter: Reporter) -> 
             unseen=unseen,
             consistency=None if isinstance(consistency, str) else consistency,
             prior=ScorePrior(posterior.prior.belief.gaussian, posterior.design_effect),
+            form=estimation.form,
         )
         verdict = judge(model.joint_names, evidence, tested_on=sources.tested_on)
         task.advance(1)
