@@ -130,13 +130,14 @@ class PrecisionMeter:
         products = np.sum(rates, axis=0) if rates else None
         known = takewhile(lambda each: each.source.path in self._elastic, recordings)
         elastic = [self._elastic[each.source.path] for each in known]
-        forms = [self._forms[each.source.path] for each in recordings[: len(elastic)]]
+        read = takewhile(lambda each: each.source.path in self._forms, recordings)
+        forms = [self._forms[each.source.path] for each in read]
         estimation = estimate_with(
             prepared, self._options, Silent(), factors, products, elastic, forms
         )
-        read = zip(recordings, estimation.elastic, estimation.forms, strict=False)
-        for recording, torque, form in read:
+        for recording, torque in zip(recordings, estimation.elastic, strict=False):
             self._elastic[recording.source.path] = torque
+        for recording, form in zip(recordings, estimation.forms, strict=False):
             self._forms[recording.source.path] = form
         pooled = estimation.result.pooled
         posterior = estimation.posterior

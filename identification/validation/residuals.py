@@ -220,6 +220,7 @@ def drift_of_factors(
     model: RobotModel, values: Array, factors: Sequence[Factor]
 ) -> FrictionDrift | None:
     """Return the drift by the factors by time of recordings in order; None with too few blocks."""
+    factors = [factor.occupied() for factor in factors]
     pieces = -(-_PIECES // max(1, len(factors)))
     if min((len(factor) for factor in factors), default=0) < pieces:
         return None
