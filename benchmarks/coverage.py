@@ -37,7 +37,7 @@ Figures per arm and delay, and of all; a seed is the same arm, motion and noise 
   the true delay.
 - ``doubted``: runs whose verdict puts the friction law of some joint in doubt; ``friction_width``:
   median half width of an interval of Coulomb or viscous friction over the true value. ``plain``:
-  runs whose verdict is good without naming anything doubtful about friction.
+  runs whose verdict is good without a reservation in its line.
 - ``false_causes``: runs whose verdict blames something, other than a delay that is there, by the
   name of the finding. ``good``: runs whose verdict is good.
 - ``inside``: share of held-out means of torque inside their intervals (`calibration` in
@@ -72,6 +72,7 @@ from hil.progress import Silent
 from hil.results import Results
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
+from identification.validation.facts.form import FORM
 
 Array = NDArray[np.float64]
 
@@ -81,9 +82,6 @@ DELAYS: Final = (0.0, 1.3, 4.0, 10.0)  # ms
 NEAR: Final = 0.3e-3  # s
 QUADRATIC_LAW: Final = FrictionLaw(third="quadratic", offset=True)
 
-# Name of the finding that puts a friction law in doubt, and of all that name friction.
-IN_DOUBT: Final = "form of friction"
-_OF_FRICTION: Final = frozenset({IN_DOUBT, "friction", "friction over time"})
 _BASE_FREQUENCY: Final = 0.1  # Hz
 _HARMONICS: Final = 10
 _ROOM_SHARE: Final = 0.6  # of the way from the middle of a range to its end
@@ -375,7 +373,7 @@ class Run(NamedTuple):
         seconds: of the processor.
         friction_width: half widths of intervals of Coulomb and viscous friction, likewise.
         doubted: whether the friction law of a joint is in doubt.
-        plain: whether the verdict is good and names nothing doubtful about friction.
+        plain: whether the verdict is good without a reservation.
     """
 
     inertial: list[bool]
@@ -461,10 +459,10 @@ def compared(
     delays = results.delays
     applied = np.zeros(len(results.joint_names)) if delays is None else np.array(delays.applied)
     half_widths = [] if delays is None else [half for half in delays.interval if half is not None]
-    justified = {"delay"} if delay > 0.0 else set()
+    present = {"delay": delay > 0.0, "friction": drift > 0.0}
+    justified = {check for check, there in present.items() if there}
     checks = [finding.check for finding in suspicious(results)]
     blamed = [check for check in checks if check in CAUSES - justified]
-    named = sum(check in _OF_FRICTION for check in checks)
     known = {name for name, value in truth.items() if not np.isnan(value)}
     return Run(
         inertial=inertial,
@@ -473,12 +471,13 @@ def compared(
         dropped=len(known - {parameter.name for parameter in results.parameters}),
         width=width,
         friction_width=friction_width,
-        doubted=IN_DOUBT in checks,
+        doubted=FORM in checks,
         delay_error=(applied - delay).tolist(),
         delay_half=half_widths,
         blamed=list(dict.fromkeys(blamed)),
         good=results.verdict.good,
-        plain=results.verdict.good and not named,
+        plain=results.verdict.good
+        and not any(finding.reservation for finding in suspicious(results)),
         inside=None if results.calibration is None else results.calibration.inside,
         error=results.validation[0].all_rows_relative_error,
         seconds=seconds,

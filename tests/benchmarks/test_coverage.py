@@ -55,6 +55,23 @@ class TestArm:
         traces = [np.log(np.trace(d.inertia) / np.trace(body.inertia)) for d in drawn]
         assert 0.1 < np.std(traces) < 0.2
 
+    def test_stribeck_friction_is_a_share_of_dry_friction_at_low_speed(self) -> None:
+        usual, rising = (
+            drawn_arm(ARM_TYPES["panda"], 1, DEFAULTS._replace(stribeck=share)).friction
+            for share in (0.0, 0.3)
+        )
+        slow, fast = (np.full((1, 7), speed) for speed in (0.01, 1.0))
+        still = np.zeros((1, 7))
+        more = rising.torque(slow, still, 1.0) - usual.torque(slow, still, 1.0)
+        np.testing.assert_allclose(more[0], 0.3 * usual.coulomb, rtol=0.02)
+        np.testing.assert_allclose(rising.torque(fast, still, 1.0), usual.torque(fast, still, 1.0))
+
+    def test_friction_that_drifts_leaves_offsets(self) -> None:
+        friction = drawn_arm(ARM_TYPES["panda"], 1).friction
+        moving, still = np.ones((2, 7)), np.zeros((2, 7))
+        torque = friction.torque(moving, still, np.array([1.0, 0.9])) - friction.offset
+        np.testing.assert_allclose(torque[1], 0.9 * torque[0])
+
     def test_a_seed_is_one_arm(self) -> None:
         first, same, other = (drawn_arm(ARM_TYPES["panda"], seed) for seed in (1, 1, 2))
         masses = [[body.mass for body in arm.robot.inertias] for arm in (first, same, other)]

@@ -205,6 +205,11 @@ class TestVerdict:
         (warning,) = [text for text in verdict.warnings if "lacks a term" in text]
         assert "Stribeck (0.1 rad/s), 20 % of its friction" in warning
 
+    def test_nor_is_one_whose_friction_changed(self):
+        verdict = judged(friction_change=np.array([0.0, 0.1]))
+        assert verdict.good
+        assert "well, but friction of two changed: " in verdict.line
+
     @pytest.mark.parametrize(("probability", "share"), [(0.9, 0.2), (0.999, 0.01)])
     def test_neither_chance_nor_a_trifle_is_a_doubt(self, probability, share):
         """A term that is not certain, or changes friction by less than temperature does."""
