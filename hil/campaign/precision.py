@@ -128,17 +128,14 @@ class PrecisionMeter:
         factors = [recording.factor for recording in recordings]
         rates = [each.products for each in recordings if each.products is not None]
         products = np.sum(rates, axis=0) if rates else None
-        known = takewhile(lambda each: each.source.path in self._elastic, recordings)
-        elastic = [self._elastic[each.source.path] for each in known]
-        read = takewhile(lambda each: each.source.path in self._forms, recordings)
-        forms = [self._forms[each.source.path] for each in read]
+        read = [recording.source.path for recording in recordings]
+        elastic = [self._elastic[path] for path in takewhile(self._elastic.__contains__, read)]
+        forms = [self._forms[path] for path in takewhile(self._forms.__contains__, read)]
         estimation = estimate_with(
             prepared, self._options, Silent(), factors, products, elastic, forms
         )
-        for recording, torque in zip(recordings, estimation.elastic, strict=False):
-            self._elastic[recording.source.path] = torque
-        for recording, form in zip(recordings, estimation.forms, strict=False):
-            self._forms[recording.source.path] = form
+        self._elastic.update(zip(read, estimation.elastic, strict=False))
+        self._forms.update(zip(read, estimation.forms, strict=False))
         pooled = estimation.result.pooled
         posterior = estimation.posterior
         stated = estimation.stated

@@ -25,11 +25,11 @@ from identification.estimators.elasticity import (
     with_elastic_gears,
 )
 from identification.estimators.friction_form import (
-    FormDoubt,
-    doubt_form,
+    FormUncertainty,
     form_factor,
-    with_doubted_form,
+    form_uncertainty,
     with_drift,
+    with_uncertain_form,
 )
 from identification.estimators.instrumental import (
     estimate_instrumental,
@@ -107,7 +107,7 @@ class Estimation:
     notes: tuple[str, ...]  #: what the intervals assume
     elastic: tuple[ElasticTorque, ...]  #: of the first recordings, at most `_ALIKE` of one motion
     forms: tuple[Factor, ...]  #: with more friction terms, of the same recordings
-    form: FormDoubt  #: whether the friction law lacks one of them
+    form: FormUncertainty  #: whether the friction law lacks one of them
 
 
 def fit_with_transmitted_load(
@@ -168,9 +168,8 @@ def estimate_with(
 ) -> Estimation:
     """Estimate the parameters by `options.estimator`, with all applicable tests.
 
-    `factors` by time of the fitted samples, the sum of their `rate_products`, the torques of
-    elastic gears in the first of them and `forms`, factors with more friction terms of those, are
-    computed unless they are known (not for "iv").
+    `factors` by time of the fitted samples, the sum of their `rate_products`, and of the first of
+    them the torques of elastic gears and `form_factor` are computed unless known (not for "iv").
 
     Raises:
         InputError: the archives lack data that the estimator needs.
@@ -197,10 +196,8 @@ def estimate_with(
         if variance := prepared.settings.delay_variance:
             result = _with_uncertain_delay(model, result, fitted, products, variance, precision)
         task.advance(1, "prior")
-        if name in OF_PRIOR:
-            beside = replace(beside, estimate=result.pooled)
-        else:
-            beside = posterior.fit(result.factor)
+        of_prior = replace(beside, estimate=result.pooled)
+        beside = of_prior if name in OF_PRIOR else posterior.fit(result.factor)
         if name == "prior":
             warnings += _prior_contradictions(model, beside)
         task.advance(1, "held-out motion")
@@ -208,8 +205,7 @@ def estimate_with(
         task.advance(1)
     stated, notes, elastic = _stated(prepared, result, fitted, posterior, precision, elastic)
     form, forms = _form_of_friction(prepared, result, fitted, precision, forms)
-    stated = with_doubted_form(stated, form)
-    stated = with_drift(model, stated, _drift_of(model, result.pooled.values, factors))
+    stated = _with_uncertain_friction(model, stated, form, factors)
     return Estimation(
         estimator=name,
         result=result,
@@ -306,8 +302,8 @@ def _form_of_friction(
     fitted: Sequence[Samples],
     precision: Array | None,
     forms: Sequence[Factor],
-) -> tuple[FormDoubt, tuple[Factor, ...]]:
-    """Return the doubt about the friction law, and the factors of its terms; some are known."""
+) -> tuple[FormUncertainty, tuple[Factor, ...]]:
+    """Return the uncertainty of the friction law, and the factors of its terms; some are known."""
     model = prepared.sources.cell.model
     some = _enough(prepared, fitted)
     every = (
@@ -315,15 +311,19 @@ def _form_of_friction(
         *(form_factor(model, samples) for samples in some[len(forms) :]),
     )
     total = sum(every[1:], every[0])
-    return doubt_form(model, result.pooled, result.factor, total, precision), every
+    return form_uncertainty(model, result.pooled, result.factor, total, precision), every
 
 
-def _drift_of(model: RobotModel, values: Array, factors: Sequence[Factor]) -> Array:
-    """Return the significant relative change of each joint's friction over the recordings (n,)."""
-    drift = drift_of_factors(model, values, factors)
+def _with_uncertain_friction(
+    model: RobotModel, estimate: Estimate, form: FormUncertainty, factors: Sequence[Factor]
+) -> Estimate:
+    """Return the estimate with form and significant drift of friction in its covariance."""
+    estimate = with_uncertain_form(estimate, form)
+    drift = drift_of_factors(model, estimate.values, factors)
     if drift is None:
-        return np.zeros(model.n_joints)
-    return np.where(drift.significant, np.nan_to_num(drift.change), 0.0)
+        return estimate
+    change = np.where(drift.significant, np.nan_to_num(drift.change), 0.0)
+    return with_drift(model, estimate, change)
 
 
 def _require_usable_rows(prepared: Prepared) -> None:

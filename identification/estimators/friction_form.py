@@ -1,4 +1,4 @@
-r"""Doubt about the form of friction, and what it makes of the covariance of an estimate.
+r"""Uncertainty of the form of friction, and what it makes of the covariance of an estimate.
 
 A law that lacks a term is fitted wrongly, alike in every block of time, so that the scatter of
 blocks does not show the error of its coefficients. Each joint may have one more term than its law
@@ -60,12 +60,12 @@ _SHARE: Final = 0.3
 _MOSTLY_SLOW: Final = 0.5
 _INDEPENDENT: Final = 1e-3  # share of a column that is none of the others
 _HIGHEST: Final = 0.9  # leverage of a block whose residual still counts
-DOUBTED: Final = 0.99
-"""Probability of a further term from which on a law is in doubt."""
+UNCERTAIN: Final = 0.99
+"""Probability of a further term from which on a law is uncertain."""
 
 
 @dataclass(frozen=True, eq=False)
-class FormDoubt:
+class FormUncertainty:
     """Probability of a term that the friction law of each joint lacks, and what it would change."""
 
     probability: Array  #: (n,)
@@ -98,13 +98,13 @@ def form_factor(model: RobotModel, samples: Samples) -> Factor:
     return friction_factor(model, samples, FORMS)
 
 
-def doubt_form(
+def form_uncertainty(
     model: RobotModel,
     estimate: Estimate,
     factor: Factor,
     forms: Factor,
     precision: Array | None = None,
-) -> FormDoubt:
+) -> FormUncertainty:
     """Ask whether a friction law lacks a term.
 
     Args:
@@ -128,7 +128,7 @@ def doubt_form(
     probability = odds / (odds.sum(axis=1, keepdims=True) + np.exp(-largest))
     square = probability * ((known * trials.value) ** 2 + known * trials.std**2)
     shifts = trials.moved * np.sqrt(square)
-    return FormDoubt(
+    return FormUncertainty(
         probability=probability.sum(axis=1),
         forms=tuple(FORMS[k] for k in probability.argmax(axis=1).tolist()),
         shifts=shifts,
@@ -212,12 +212,12 @@ def _friction_rms(model: RobotModel, estimate: Estimate, factor: Factor) -> Arra
     return np.asarray(np.sqrt(np.maximum(squares, 0.0) / np.maximum(factor.samples, 1)))
 
 
-def with_doubted_form(estimate: Estimate, doubt: FormDoubt) -> Estimate:
-    """Return the estimate with the mean square of the doubt in its covariance."""
+def with_uncertain_form(estimate: Estimate, uncertainty: FormUncertainty) -> Estimate:
+    """Return the estimate with the mean square of these shifts in its covariance."""
     return replace(
         estimate,
-        covariance=estimate.covariance + doubt.covariance,
-        method=f"{estimate.method}, with doubt about the form of friction",
+        covariance=estimate.covariance + uncertainty.covariance,
+        method=f"{estimate.method}, with an uncertain form of friction",
     )
 
 

@@ -1,7 +1,7 @@
 """Factors of other columns than those of the regressor W.
 
 Instrumental variables use [Z | W | y], gains [W | t | 1 | i], a search for the direction of gravity
-[W0 | Wx | Wy | Wz | y], doubts about a friction law [W | F | y].
+[W0 | Wx | Wy | Wz | y], uncertain friction laws [W | F | y].
 """
 
 from __future__ import annotations

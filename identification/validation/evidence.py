@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.estimators.delay import DelayEstimate
-from identification.estimators.friction_form import FormDoubt
+from identification.estimators.friction_form import FormUncertainty
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.factor.columns import standard_factor
 from identification.factor.estimate import Estimate
@@ -133,7 +133,7 @@ class Evidence:
     consistency: ConsistencyCheck | None = None  #: with the nearest consistent parameters
     dissipation: Dissipation | None = None  #: friction of each joint at its top speed
     residuals: ResidualChecks | None = None  #: patterns of the residual
-    form: FormDoubt | None = None  #: whether the friction law of a joint lacks a term
+    form: FormUncertainty | None = None  #: whether the friction law of a joint lacks a term
     context: CellContext = CellContext()  #: data on the cell
     prismatic: tuple[int, ...] = ()  #: indices of the joints that slide
     moved: Array | None = None  #: time in which each joint moved in unseen motion (n,) [s]
@@ -190,14 +190,12 @@ def gather(
     unseen: Factor | None = None,
     consistency: ConsistencyCheck | None = None,
     prior: ScorePrior | None = None,
-    form: FormDoubt | None = None,
 ) -> Evidence:
     """Collect the evidence for a verdict; every recording is read a few times.
 
     With `same_motion` the training recordings, in the order of the result, repeat one motion, and
     noise is measured. `nominal` are parameters (p,); with `in_sample` the held-out motions are the
-    training. `unseen` is the sum of the held-out factors, if known; `prior` is that of the arm,
-    `form` the doubt about its friction law.
+    training. `unseen` is the sum of the held-out factors, if known; `prior` is that of the arm.
     """
     pooled = result.pooled
     values = pooled.values
@@ -233,7 +231,6 @@ def gather(
         residuals=check_residuals(
             model, values, training, others, same_motion=same_motion, motor_from_joint=motors
         ),
-        form=form,
         context=context,
         in_sample=in_sample,
         prismatic=tuple(np.flatnonzero(~model.chain.revolute).tolist()),

@@ -55,7 +55,7 @@ class TestArm:
         traces = [np.log(np.trace(d.inertia) / np.trace(body.inertia)) for d in drawn]
         assert 0.1 < np.std(traces) < 0.2
 
-    def test_stribeck_friction_is_a_share_of_dry_friction_at_low_speed(self) -> None:
+    def test_stribeck_friction_is_a_share_at_low_speed(self) -> None:
         usual, rising = (
             drawn_arm(ARM_TYPES["panda"], 1, DEFAULTS._replace(stribeck=share)).friction
             for share in (0.0, 0.3)

@@ -8,11 +8,11 @@ import pytest
 
 from identification.estimators.friction_form import (
     FORMS,
-    FormDoubt,
-    doubt_form,
+    FormUncertainty,
     form_factor,
-    with_doubted_form,
+    form_uncertainty,
     with_drift,
+    with_uncertain_form,
 )
 from identification.estimators.least_squares import fit_least_squares
 from identification.factor.columns import friction_factor
@@ -45,12 +45,12 @@ def recorded(added=0.0, seed=0, motion=MOTION, noise=NOISE):
     return as_samples(MODEL, motion, torque + noise * random.standard_normal(torque.shape))
 
 
-def doubted(samples, model=MODEL):
-    """The estimate of the law, the doubt about it, and the estimate that allows for it."""
+def examined(samples, model=MODEL):
+    """The estimate of the law, the uncertainty of that, and the estimate that allows for it."""
     estimate = fit_least_squares(model, [samples])
     factor = Factor.by_time(model, samples)
-    doubt = doubt_form(model, estimate, factor, form_factor(model, samples))
-    return estimate, doubt, with_doubted_form(estimate, doubt)
+    uncertainty = form_uncertainty(model, estimate, factor, form_factor(model, samples))
+    return estimate, uncertainty, with_uncertain_form(estimate, uncertainty)
 
 
 def holds(estimate, which):
@@ -62,7 +62,7 @@ def holds(estimate, which):
 @pytest.fixture(scope="module")
 def runs():
     """Forty recordings of an arm whose friction is that of the law."""
-    return [doubted(recorded(seed=seed)) for seed in range(40)]
+    return [examined(recorded(seed=seed)) for seed in range(40)]
 
 
 class TestRightLaw:
@@ -70,9 +70,9 @@ class TestRightLaw:
         ratios = [wider.std / estimate.std for estimate, _, wider in runs]
         assert np.mean(ratios) < 1.05
 
-    def test_it_is_not_in_doubt(self, runs):
+    def test_it_is_not_uncertain(self, runs):
         """At most one of twenty recordings raises a false alarm."""
-        alarms = sum(bool(np.any(doubt.probability > 0.99)) for _, doubt, _ in runs)
+        alarms = sum(bool(np.any(uncertainty.probability > 0.99)) for _, uncertainty, _ in runs)
         assert alarms <= len(runs) / 20
 
     def test_the_estimate_stays(self, runs):
@@ -82,30 +82,30 @@ class TestRightLaw:
 
 class TestWrongLaw:
     @pytest.mark.parametrize("speed", [0.07, 0.15, 0.3])
-    def test_its_intervals_hold_the_coefficients_of_the_true_law(self, speed):
+    def test_its_intervals_hold_the_true_coefficients(self, speed):
         """At any speed over which the friction that it lacks decays, listed or not."""
-        runs = [doubted(recorded(stribeck(0.8, speed), seed)) for seed in range(12)]
+        runs = [examined(recorded(stribeck(0.8, speed), seed)) for seed in range(12)]
         which = [COULOMB[ELBOW], VISCOUS[ELBOW]]
         before = np.mean([holds(estimate, which) for estimate, _, _ in runs])
         after = np.mean([holds(wider, which) for _, _, wider in runs])
         assert before < 0.75
         assert after >= 0.9
 
-    def test_the_joint_is_in_doubt_and_no_other(self):
+    def test_the_joint_is_uncertain_and_no_other(self):
         for seed in range(5):
-            _, doubt, _ = doubted(recorded(stribeck(0.8, WIDE), seed))
-            assert doubt.probability[ELBOW] > 0.99
-            assert doubt.probability[0] < 0.99
-            assert doubt.forms[ELBOW].symbol == "fs"
+            _, uncertainty, _ = examined(recorded(stribeck(0.8, WIDE), seed))
+            assert uncertainty.probability[ELBOW] > 0.99
+            assert uncertainty.probability[0] < 0.99
+            assert uncertainty.forms[ELBOW].symbol == "fs"
 
-    def test_the_shift_is_that_of_a_fit_with_the_missing_term(self):
+    def test_the_shift_is_that_of_the_right_law(self):
         samples = recorded(stribeck(0.8, WIDE), noise=0.1 * NOISE)
         law = FrictionLaw(third=None, stribeck=WIDE)
         right = fit_least_squares(RobotModel.from_urdf(URDF, friction=law), [samples])
-        estimate, doubt, _ = doubted(samples)
+        estimate, uncertainty, _ = examined(samples)
         k = COULOMB[ELBOW]
         moved = right.value(MODEL.parameter_names[k]) - estimate.values[k]
-        assert np.sqrt(doubt.covariance[k, k]) == pytest.approx(abs(moved), rel=0.1)
+        assert np.sqrt(uncertainty.covariance[k, k]) == pytest.approx(abs(moved), rel=0.1)
 
     @pytest.mark.parametrize(
         ("term", "size"), [(QUADRATIC, 0.4), (ASYMMETRIC, 0.4), (replace(STRIBECK, speed=0.1), 2.0)]
@@ -113,18 +113,18 @@ class TestWrongLaw:
     def test_the_missing_term_is_named(self, term, size):
         velocity = MOTION.velocity
         added = size * term.column(velocity, np.sign(velocity)) * [0.0, 1.0]
-        _, doubt, _ = doubted(recorded(added))
-        assert doubt.forms[ELBOW].label == term.label
-        assert doubt.probability[ELBOW] > 0.99
+        _, uncertainty, _ = examined(recorded(added))
+        assert uncertainty.forms[ELBOW].label == term.label
+        assert uncertainty.probability[ELBOW] > 0.99
 
-    def test_a_law_that_has_the_term_is_not_in_doubt(self):
+    def test_a_law_that_has_the_term_is_not_uncertain(self):
         model = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None, stribeck=0.2))
-        _, doubt, _ = doubted(recorded(stribeck(0.8, 0.2)), model)
-        assert np.all(doubt.probability < 0.99)
+        _, uncertainty, _ = examined(recorded(stribeck(0.8, 0.2)), model)
+        assert np.all(uncertainty.probability < 0.99)
 
-    def test_noise_that_hides_the_term_leaves_the_law_as_it_is(self):
-        _, doubt, _ = doubted(recorded(stribeck(0.8, WIDE), noise=100.0 * NOISE))
-        assert np.all(doubt.probability < 0.5)
+    def test_noise_may_hide_the_term(self):
+        _, uncertainty, _ = examined(recorded(stribeck(0.8, WIDE), noise=100.0 * NOISE))
+        assert np.all(uncertainty.probability < 0.5)
 
 
 class TestRecordings:
@@ -134,8 +134,8 @@ class TestRecordings:
         factor = Factor.by_time(MODEL, samples)
         estimate = fit_least_squares(MODEL, [samples] * 3)
         total = factor + factor + factor
-        one = doubt_form(MODEL, estimate, total, forms)
-        every = doubt_form(MODEL, estimate, total, forms + forms + forms)
+        one = form_uncertainty(MODEL, estimate, total, forms)
+        every = form_uncertainty(MODEL, estimate, total, forms + forms + forms)
         np.testing.assert_allclose(one.covariance, every.covariance, rtol=1e-6, atol=1e-12)
 
     @pytest.mark.parametrize("bandwidth", [None, np.array([8.0, 12.0])])
@@ -193,15 +193,15 @@ class TestDrift:
 
 class TestVerdict:
     @staticmethod
-    def doubt(probability, share):
+    def uncertainty(probability, share):
         terms = (QUADRATIC, replace(STRIBECK, speed=0.1))
         shifts = np.zeros((4, 2, len(FORMS)))
-        return FormDoubt(np.array([0.0, probability]), terms, shifts, np.array([0.0, share]))
+        return FormUncertainty(np.array([0.0, probability]), terms, shifts, np.array([0.0, share]))
 
-    def test_a_model_with_a_doubtful_law_is_not_plainly_well(self):
-        verdict = judged(form=self.doubt(0.999, 0.2))
+    def test_an_uncertain_law_is_a_reservation(self):
+        verdict = judged(form=self.uncertainty(0.999, 0.2))
         assert verdict.good
-        assert "well, but the friction law of two is in doubt: " in verdict.line
+        assert "well, but the friction law of two is uncertain: " in verdict.line
         (warning,) = [text for text in verdict.warnings if "lacks a term" in text]
         assert "Stribeck (0.1 rad/s), 20 % of its friction" in warning
 
@@ -211,11 +211,11 @@ class TestVerdict:
         assert "well, but friction of two changed: " in verdict.line
 
     @pytest.mark.parametrize(("probability", "share"), [(0.9, 0.2), (0.999, 0.01)])
-    def test_neither_chance_nor_a_trifle_is_a_doubt(self, probability, share):
+    def test_neither_chance_nor_a_trifle_counts(self, probability, share):
         """A term that is not certain, or changes friction by less than temperature does."""
-        finding = finding_of(FORM, form=self.doubt(probability, share))
+        finding = finding_of(FORM, form=self.uncertainty(probability, share))
         assert finding.level == "good"
-        assert "well: " in judged(form=self.doubt(probability, share)).line
+        assert "well: " in judged(form=self.uncertainty(probability, share)).line
 
     def test_without_a_test_nothing_is_said(self):
         assert all(finding.check != FORM for finding in judged().findings)

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.estimators.friction_form import DOUBTED
+from identification.estimators.friction_form import UNCERTAIN
 from identification.text import percentage
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Mask, Naming, Thresholds
@@ -27,28 +27,28 @@ class FormFacts:
     probability: Array  # of such a term (n,)
     share: Array  # change of a coefficient, as torque over the friction (n,)
     lacking: tuple[str, ...]  # the most probable term of each joint (n,)
-    joints: Mask  # whose law is in doubt (n,)
+    joints: Mask  # whose law is uncertain (n,)
     limit: float  # of the change
 
     @classmethod
     def of(cls, evidence: Evidence, limits: Thresholds) -> FormFacts | None:
-        """Compare the probabilities with that of a doubt; None if not tested."""
-        doubt = evidence.form
-        if doubt is None:
+        """Compare the probabilities with the least of an uncertain law; None if not tested."""
+        uncertainty = evidence.form
+        if uncertainty is None:
             return None
-        joints = (doubt.probability > DOUBTED) & (doubt.share > limits.friction)
+        joints = (uncertainty.probability > UNCERTAIN) & (uncertainty.share > limits.friction)
         lacking = tuple(
             f"{form.label} ({form.speed:g} {speed})" if form.speed_symbol else form.label
             for form, speed in zip(
-                doubt.forms,
-                ("rad/s" if evidence.revolute(j) else "m/s" for j in range(len(doubt.forms))),
+                uncertainty.forms,
+                ("rad/s" if evidence.revolute(j) else "m/s" for j in range(len(uncertainty.forms))),
                 strict=True,
             )
         )
-        return cls(doubt.probability, doubt.share, lacking, joints, limits.friction)
+        return cls(uncertainty.probability, uncertainty.share, lacking, joints, limits.friction)
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
-        """Yield the joints whose law is in doubt, or that there are none."""
+        """Yield the joints whose law is uncertain, or that there are none."""
         if not self.joints.any():
             yield Finding(FORM, "good", "no joint's friction law lacks a term that matters")
             return
@@ -65,5 +65,5 @@ class FormFacts:
             f"describe the friction of {joints} by further terms (`--friction` or"
             " [robot.friction]), or use its curve in the report",
             "symptom",
-            reservation=f"the friction law of {joints} is in doubt",
+            reservation=f"the friction law of {joints} is uncertain",
         )
