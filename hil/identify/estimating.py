@@ -193,19 +193,16 @@ def estimate_with(
         if prepared.sources.same_motion:
             result = result.with_scatter()
         precision = posterior.precision if name in OF_PRIOR else None
-        if variance := prepared.settings.delay_variance:
-            result = _with_uncertain_delay(model, result, fitted, products, variance, precision)
+        result = _with_uncertain_delay(prepared, result, fitted, products, precision)
         task.advance(1, "prior")
         of_prior = replace(beside, estimate=result.pooled)
         beside = of_prior if name in OF_PRIOR else posterior.fit(result.factor)
-        if name == "prior":
-            warnings += _prior_contradictions(model, beside)
+        warnings += _prior_contradictions(model, beside) if name == "prior" else []
         task.advance(1, "held-out motion")
         held_out = tuple(Factor.by_time(model, samples) for samples in prepared.held_out)
         task.advance(1)
     stated, notes, elastic = _stated(prepared, result, fitted, posterior, precision, elastic)
     form, forms = _form_of_friction(prepared, result, fitted, precision, forms)
-    stated = _with_uncertain_friction(model, stated, form, factors)
     return Estimation(
         estimator=name,
         result=result,
@@ -214,7 +211,7 @@ def estimate_with(
         with_prior=beside,
         refit=refit_of(model, name, posterior),
         warnings=tuple(warnings),
-        stated=stated,
+        stated=_with_uncertain_friction(model, stated, form, factors),
         notes=notes,
         elastic=elastic,
         forms=forms,
@@ -237,13 +234,16 @@ def _without_prior(
 
 
 def _with_uncertain_delay(
-    model: RobotModel,
+    prepared: Prepared,
     result: RepeatedEstimate,
     fitted: Sequence[Samples],
     products: Array | None,
-    variance: float,
     precision: Array | None,
 ) -> RepeatedEstimate:
+    variance = prepared.settings.delay_variance
+    if not variance:
+        return result
+    model = prepared.sources.cell.model
     if products is None:
         products = np.asarray(sum(rate_products(model, samples) for samples in fitted))
     pooled = with_uncertain_delay(result.pooled, result.factor, products, variance, precision)
