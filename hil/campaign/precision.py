@@ -129,11 +129,14 @@ class PrecisionMeter:
         factors = [recording.factor for recording in recordings]
         rates = [each.products for each in recordings if each.products is not None]
         products = np.sum(rates, axis=0) if rates else None
-        known = takewhile(lambda each: each.source.path in self._elastic, recordings)
-        elastic = [self._elastic[each.source.path] for each in known]
-        estimation = estimate_with(prepared, self._options, Silent(), factors, products, elastic)
-        for recording, torque in zip(recordings, estimation.elastic, strict=False):
-            self._elastic[recording.source.path] = torque
+        read = [recording.source.path for recording in recordings]
+        elastic = [self._elastic[path] for path in takewhile(self._elastic.__contains__, read)]
+        forms = [self._forms[path] for path in takewhile(self._forms.__contains__, read)]
+        estimation = estimate_with(
+            prepared, self._options, Silent(), factors, products, elastic, forms
+        )
+        self._elastic.update(zip(read, estimation.elastic, strict=False))
+        self._forms.update(zip(read, estimation.forms, strict=False))
         pooled = estimation.result.pooled
         posterior = estimation.posterior
         stated = estimation.stated
@@ -220,6 +223,7 @@ class PrecisionMeter:
         self._earlier = [self._reduced(source) for source in self._given]
         self._repetitions: dict[Path, _Reduced] = {}
         self._elastic: dict[Path, ElasticTorque] = {}
+        self._forms: dict[Path, Factor] = {}
         self._delays: dict[tuple[Path, ...], CombinedDelay] = {}
         self._first = path
 

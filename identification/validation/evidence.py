@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.estimators.delay import DelayEstimate
+from identification.estimators.friction_form import FormUncertainty
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.factor.columns import standard_factor
 from identification.factor.estimate import Estimate
@@ -132,6 +133,7 @@ class Evidence:
     consistency: ConsistencyCheck | None = None  #: with the nearest consistent parameters
     dissipation: Dissipation | None = None  #: friction of each joint at its top speed
     residuals: ResidualChecks | None = None  #: patterns of the residual
+    form: FormUncertainty | None = None  #: whether the friction law of a joint lacks a term
     context: CellContext = CellContext()  #: data on the cell
     prismatic: tuple[int, ...] = ()  #: indices of the joints that slide
     moved: Array | None = None  #: time in which each joint moved in unseen motion (n,) [s]

@@ -1340,9 +1340,9 @@ class TestDelay:
         without, beside = (
             estimate_delay(loaded, MODEL.with_friction(load=load)) for load in (False, True)
         )
-        for estimate in (without, beside):
-            assert estimate.delay == pytest.approx(1.6e-3, abs=estimate.half_interval)
-            assert estimate.half_interval < 2e-4
+        for found in (without, beside):
+            assert found.delay == pytest.approx(1.6e-3, abs=found.half_interval)
+            assert found.half_interval < 2e-4
 
     def test_recordings_in_succession_determine_it_better(self):
         recordings = [delayed(1.6e-3, seed=seed) for seed in range(4)]
