@@ -113,6 +113,31 @@ def elastic_torque(model: RobotModel, samples: Samples, values: Array, complianc
     return torque
 
 
+def open_compliance(
+    inverse: Array, products: Array, squares: Array, design_effect: float = 1.0
+) -> tuple[Array, Array]:
+    """Return how compliances move the parameters (p, n), and their covariance beside them (n, n).
+
+    In units of the expected ones. `inverse` is that of the information (p, p) of `products` (p, n)
+    and `squares` (n, n), of whose rows `design_effect` count as one.
+    """
+    moved = inverse @ products
+    beside = (squares - products.T @ moved) / design_effect + np.eye(len(squares))
+    return moved, np.linalg.inv(beside)
+
+
+def expected_square(covariance: Array) -> Array:
+    """Return the expected products (n, n) of the fitted compliances of an arm not recorded yet.
+
+    Their means are Gaussian about zero, with what a covariance (n, n) leaves of their prior, and
+    none is negative; those of different gears are taken for independent.
+    """
+    size = np.sqrt(np.maximum(1.0 - np.diag(covariance), 0.0))
+    products = np.outer(size, size) / (2.0 * np.pi)
+    np.fill_diagonal(products, 0.5 * size**2)
+    return products
+
+
 def with_elastic_gears(
     estimate: Estimate,
     factor: Factor,
@@ -132,9 +157,8 @@ def with_elastic_gears(
     if precision is not None:
         equations = equations._replace(A=equations.A + precision)
     determined = np.isfinite(np.diag(estimate.covariance))
-    moved = np.where(determined[:, None], solve(equations).inverse @ products, 0.0)
-    beside = (squares - products.T @ moved) / design_effect + np.eye(len(errors))
-    covariance = np.linalg.inv(beside)
+    inverse = np.where(determined[:, None], solve(equations).inverse, 0.0)
+    moved, covariance = open_compliance(inverse, products, squares, design_effect)
     mean = np.maximum(covariance @ errors / design_effect, 0.0)
     added = moved @ (np.outer(mean, mean) + covariance) @ moved.T
     return replace(
