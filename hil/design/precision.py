@@ -49,7 +49,7 @@ ERROR_TIME: Final = 0.015
 """Its correlation [s]: the simulated NS 16 with unmodelled effects has 14 ms."""
 NOISE_SHARE: Final = 0.01
 """White noise of the torque in one cycle, which repetitions average, as a share of the torque."""
-SIMULATED_SHARE: Final = 0.003
+SIMULATED_SHARE: Final = 0.002
 """Torque error of the fitted model of a simulated arm, likewise, in addition to the noise of its
 currents: its servo, encoders and smoothing."""
 _CYCLE: Final = 0.001  # s, of a cell without controller
@@ -244,10 +244,7 @@ class PrecisionDesign:
     def forecasts(self, excitation: Excitation, repetitions: int) -> list[Forecast]:
         """Return what a motion promises for each requirement after so many repetitions."""
         shown = self._shown(midpoints(excitation.trajectory))
-        limits = np.zeros(len(self.wanted.labels))
-        if self.scale.std.any() and self.wanted.absolute.any():
-            endless = self._ratios(shown, repetitions, _ENDLESS)
-            limits = np.where(self.wanted.absolute, endless, 0.0)
+        limits = self._of_scale(shown, repetitions, _ENDLESS)
         forecasts = []
         worst = self.wanted.worst(self._ratios(shown, repetitions, 1.0))
         for k, (requirement, label, ratio) in enumerate(worst):
@@ -288,24 +285,30 @@ class PrecisionDesign:
         `motions` is the number of different motions of its kind.
         """
         precision = self.precision(repetitions)
-        by_joint = motions * shown.grams / precision.density[:, None, None]
-        information = by_joint.sum(axis=0)
-        ratios = precision.ratios(information)
         quantities = self.wanted.quantities
-        if shown.rows is not None and isinstance(quantities, Quantities):
+        if shown.rows is None or not isinstance(quantities, Quantities):
+            by_joint = motions * shown.grams / precision.density[:, None, None]
+            ratios = precision.ratios(by_joint.sum(axis=0))
+        else:
             variances = shown.rows.variances(
                 quantities.directions, self.prior, precision.density, motions
             )
-            ratios = (
-                shown.rows.interval_factor(motions) * np.sqrt(variances.total) / quantities.allowed
-            )
+            half = shown.rows.interval_factor(motions) * np.sqrt(variances.total)
+            ratios = half / quantities.allowed
+        return np.asarray(np.hypot(ratios, self._of_scale(shown, repetitions, motions)))
+
+    def _of_scale(self, shown: _Shown, repetitions: float, motions: float) -> Array:
+        """Return the part of the ratios (k,) by the torque's scale; zero if it is no error."""
         is_absolute = self.wanted.absolute
         if not self.scale.std.any() or not is_absolute.any():
-            return ratios
+            return np.zeros(len(is_absolute))
+        precision = self.precision(repetitions)
+        by_joint = motions * shown.grams / precision.density[:, None, None]
         pulls = (by_joint @ self.subject).T
-        moved = precision.spread(information).slope @ pulls * self.scale.std
+        slope = precision.spread(by_joint.sum(axis=0)).slope
+        moved = slope @ pulls * self.scale.std
         by_scale = _NORMAL * np.linalg.norm(moved, axis=1) / self.wanted.quantities.allowed
-        return np.where(is_absolute, np.hypot(ratios, by_scale), ratios)
+        return np.where(is_absolute, by_scale, 0.0)
 
     def _require_possible(self) -> None:
         """Raise InputError for a requirement beyond what a year of different motions gives."""

@@ -106,16 +106,15 @@ class PredictedRows:
         moved = inverse @ total[:p, p]
         left = float(total[p, p] - total[:p, p] @ moved)
         delay = self._delay_variance(1.0 / np.sqrt(left) if left > 0.0 else np.inf)
-        moved_by_gears, open_ = open_compliance(
+        moved_by_gears, covariance = open_compliance(
             inverse, total[:p, p + 1 :], total[p + 1 :, p + 1 :]
         )
-        if not self.rigid:
-            open_ = open_ + expected_square(open_)
         gears = directions @ moved_by_gears
+        square = expected_square(covariance, rigid=self.rigid)
         return Variances(
             rows,
             delay * (directions @ moved) ** 2,
-            np.einsum("kn,nm,km->k", gears, open_, gears),
+            np.einsum("kn,nm,km->k", gears, square, gears),
         )
 
     def interval_factor(self, motions: float = 1.0) -> float:

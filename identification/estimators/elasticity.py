@@ -123,19 +123,22 @@ def open_compliance(
     """
     moved = inverse @ products
     beside = (squares - products.T @ moved) / design_effect + np.eye(len(squares))
-    return moved, np.linalg.inv(beside)
+    return moved, np.asarray(np.linalg.inv(beside))
 
 
-def expected_square(covariance: Array) -> Array:
-    """Return the expected products (n, n) of the fitted compliances of an arm not recorded yet.
+def expected_square(covariance: Array, *, rigid: bool) -> Array:
+    """Return the expected mean square (n, n) of the fitted compliances of an arm not recorded yet.
 
-    Their means are Gaussian about zero, with what a covariance (n, n) leaves of their prior, and
-    none is negative; those of different gears are taken for independent.
+    `covariance` (n, n) is what its recordings will leave open. Their means scatter about zero: of
+    rigid gears by the noise, else with what the recordings show of the expected ones. None is
+    negative; those of different gears are taken for independent.
     """
-    size = np.sqrt(np.maximum(1.0 - np.diag(covariance), 0.0))
-    products = np.outer(size, size) / (2.0 * np.pi)
-    np.fill_diagonal(products, 0.5 * size**2)
-    return products
+    shown = np.eye(len(covariance)) - covariance
+    variance = np.diag(covariance @ shown if rigid else shown)
+    size = np.sqrt(np.maximum(variance, 0.0))
+    squares = np.outer(size, size) / (2.0 * np.pi)
+    np.fill_diagonal(squares, 0.5 * size**2)
+    return np.asarray(covariance + squares)
 
 
 def with_elastic_gears(
@@ -144,15 +147,18 @@ def with_elastic_gears(
     torque: ElasticTorque,
     design_effect: float,
     precision: Array | None = None,
+    believed: Array | None = None,
 ) -> Estimate:
     """Return the estimate with the mean square of the compliances in its covariance.
 
     `torque` are the sums of the factor's rows, of which `design_effect` count as one; `precision`
-    (p, p) is that of a prior beside them. No gear has a negative compliance.
+    (p, p) is that of a prior beside them, by which `believed` (p,) are the parameters of rigid
+    gears, by default those of the estimate: what a stronger prior leaves unexplained is no torque
+    of gears. No gear has a negative compliance.
     """
     weights = inverse_variance(estimate.noise_std**2)
     products, squares, measured = (np.tensordot(weights, part, axes=1) for part in torque)
-    errors = measured - products.T @ estimate.values
+    errors = measured - products.T @ (estimate.values if believed is None else believed)
     equations = factor.weighted(weights)
     if precision is not None:
         equations = equations._replace(A=equations.A + precision)
