@@ -165,7 +165,9 @@ def with_elastic_gears(
     determined = np.isfinite(np.diag(estimate.covariance))
     inverse = np.where(determined[:, None], solve(equations).inverse, 0.0)
     moved, covariance = open_compliance(inverse, products, squares, design_effect)
-    mean = np.maximum(covariance @ errors / design_effect, 0.0)
+    # Correlated compliances cannot be cut off at zero one by one.
+    root = np.linalg.cholesky(np.linalg.inv(covariance))
+    mean, _ = scipy.optimize.nnls(root.T, root.T @ (covariance @ errors) / design_effect)
     added = moved @ (np.outer(mean, mean) + covariance) @ moved.T
     return replace(
         estimate,
