@@ -33,6 +33,7 @@ from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.selection.settings import Strength
 from planner import JointLimits, Trajectory
+from sim_fixtures.servo import loops_per_cycle
 
 from .given import given_sources
 from .predicted import PredictedRows
@@ -420,11 +421,15 @@ def _posterior(cell: Cell, paths: Sequence[Path]) -> tuple[Array, Array, Array]:
 
 
 def _current_noise(cell: Cell) -> Array:
-    """Return the density (n,) of the torque noise of a simulated arm's currents [(N m)² s]."""
+    """Return the density (n,) of the torque noise of a simulated arm's currents [(N m)² s].
+
+    It is another one in each period of the servo loops.
+    """
     simulation = cell.simulation
     variance = simulation.current_noise**2 + simulation.current_resolution**2 / 12.0
     torques = cell.drive_train.joint_torque(np.eye(len(cell.joint_names)))
-    return np.asarray(variance * (torques**2).sum(axis=0) * cell.period)
+    step = cell.period / loops_per_cycle(cell.period)
+    return np.asarray(variance * (torques**2).sum(axis=0) * step)
 
 
 def _cycle(cell: Cell) -> float:

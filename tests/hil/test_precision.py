@@ -149,10 +149,10 @@ class TestPromise:
     def test_the_torque_error_of_a_simulated_arm_is_that_of_its_currents(
         self, cell, motions
     ) -> None:
-        """A current noise of 0.01 A rms and a resolution of 2 mA, in cycles of 2 ms."""
+        """A current noise of 0.01 A rms and a resolution of 2 mA, in servo loops of 1 ms."""
         made = promise(cell, motions, "torque 1")
         current = 0.01**2 + 0.002**2 / 12.0
-        expected = current * (np.array([0.5, 0.4]) * [100.0, 80.0]) ** 2 * 0.002
+        expected = current * (np.array([0.5, 0.4]) * [100.0, 80.0]) ** 2 * 0.001
         np.testing.assert_allclose(made.noise, expected)
         real = promise(cell.with_values({"controller.transport": "udp"}), motions, "torque 1")
         assert "assumed, 3 %" in real.source
