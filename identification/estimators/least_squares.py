@@ -118,7 +118,7 @@ def no_narrower(covariance: Array, values: Array) -> Array:
     determined = np.isfinite(std) & (std > 0.0)
     scatter = values.std(axis=0, ddof=1) / np.sqrt(len(values))
     ratio = np.where(determined, scatter / np.where(determined, std, 1.0), 1.0)
-    certain = _CERTAIN ** (1.0 / max(1, np.count_nonzero(determined)))
+    certain = _CERTAIN ** (1.0 / max(1, int(determined.sum())))
     chance = np.sqrt(scipy.stats.chi2.ppf(certain, freedom) / freedom)
     wider = np.where(ratio > chance, ratio, 1.0)
     return np.where(
