@@ -62,7 +62,7 @@ _CHANCE: Final = 0.005  # one-sided probability of a false delay
 CLOSED_LOOP_BIAS: Final = 1e-4
 """Standard deviation [s] of an estimate's error in addition to its interval: encoder noise in the
 closed loop, elastic gears, ripple. Simulated NS 16, UR5, Panda and arm of two joints with effects,
-cycles of 1 and 2 ms: 0.01 to 0.17 ms, RMS 0.1 ms (`benchmarks.precision --delays`)."""
+cycles of 1 and 2 ms: nine runs, 0.01 to 0.17 ms, RMS 0.1 ms."""
 
 
 def read_at(time: Array, values: Array, at: Array) -> Array:
