@@ -291,7 +291,8 @@ def _stated(
     )
     torque = ElasticTorque.total(elastic, len(fitted) / len(some))
     effect = posterior.design_effect
-    estimate = with_elastic_gears(estimate, result.factor, torque, effect, precision)
+    believed = None if precision is None else posterior.believed(result.factor)
+    estimate = with_elastic_gears(estimate, result.factor, torque, effect, precision, believed)
     return estimate, (note, "they allow for elastic gears between motors and links"), elastic
 
 
@@ -405,6 +406,10 @@ class Posterior:
     def precision(self) -> Array:
         """Information of what is believed, as it counts beside that of all rows (p, p)."""
         return self.design_effect * self.prior.belief.gaussian.information
+
+    def believed(self, factor: Factor) -> Array:
+        """Return the parameters (p,) by what is believed, without a stronger prior."""
+        return posterior_values(factor, self.prior.belief.gaussian, self.design_effect)[0]
 
     def free(self, factor: Factor, share: float = 1.0) -> PosteriorEstimate:
         """Fit a factor that is this share of the rows, whatever bodies the parameters need."""

@@ -193,16 +193,15 @@ def renewed_delay(sources: Sources, settings: Settings, options: Options) -> Com
     estimate = _delays(sources, stated, options, Silent())
     if estimate is None:
         return unchanged
-    combined = _with_stated(estimate, settings.stated_delay)
+    combined = with_stated_delay(estimate, settings.stated_delay)
     if used == settings.stated_delay:
         return CombinedDelay(used, combined.mean_square_error(used))
     return combined
 
 
-def _with_stated(estimate: DelayEstimate, stated: float) -> CombinedDelay:
+def with_stated_delay(estimate: DelayEstimate, stated: float) -> CombinedDelay:
     """Return the delay by an estimate and by what is stated of a controller [s]."""
-    bound, bias = (share * estimate.cycle for share in (Thresholds().delay, CLOSED_LOOP_BIAS))
-    return estimate.combined(stated, bound, bias)
+    return estimate.combined(stated, Thresholds().delay * estimate.cycle, CLOSED_LOOP_BIAS)
 
 
 def _as_stated(sources: Sources, options: Options) -> tuple[Sources, Settings]:
@@ -270,7 +269,7 @@ class _DelayChoice:
         filter.
         """
         stated = self.assumed
-        combined = _with_stated(estimate, stated)
+        combined = with_stated_delay(estimate, stated)
         errors = {stated: combined.mean_square_error(stated), combined.mean: combined.variance}
         choice = replace(self, notes=described, errors=errors)
         far = abs(estimate.delay - stated) > Thresholds().delay * estimate.cycle
