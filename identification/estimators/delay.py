@@ -196,6 +196,10 @@ class DelayEstimate:
         """
         return float(np.fmin(self.std**2, LONGEST_DELAY**2 / 3.0))
 
+    def excludes(self, delay: float) -> bool:
+        """Return whether the 95 % interval does not hold another delay [s]."""
+        return abs(self.delay - delay) > self.half_interval
+
     def combined(self, stated: float, bound: float, bias: float = 0.0) -> CombinedDelay:
         """Return the delay by this estimate and by a stated value together [s].
 
