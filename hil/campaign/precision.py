@@ -148,8 +148,7 @@ class PrecisionMeter:
                 replace(estimate, values=estimate.values + moved) for estimate in (pooled, stated)
             )
         values = pooled.values
-        noise_std = pooled.noise_std
-        weights = inverse_variance(noise_std**2)
+        weights = inverse_variance(pooled.noise_std**2)
         information = estimation.result.factor.weighted(weights).A + posterior.precision
         wanted = self._reference.wanted(
             self._requirements, values, information / posterior.design_effect

@@ -182,26 +182,18 @@ class PrecisionDesign:
         reference = ReferenceMotions(cell.model, sampled)
         nominal = cell.nominal_values()
         scatter = reference.scatter(nominal)
-        exact = cell.file.controller is not None and cell.only_simulated and not effects
-        share = SIMULATED_SHARE if exact else ERROR_SHARE
-        error = (share * scatter) ** 2 * ERROR_TIME
-        noise = _current_noise(cell) if exact else (NOISE_SHARE * scatter) ** 2 * _cycle(cell)
+        simulated = cell.file.controller is not None and cell.only_simulated
+        exact = simulated and not effects
+        error, noise, source = _assumed_error(cell, scatter, exact=exact)
         whole = Motion(
             *(np.concatenate(parts) for parts in zip(*(m[:4] for m in sampled), strict=True))
         )
         factor = Factor.from_samples(cell.model, whole, reference.torque(nominal))
         prior = Posterior.of(cell, factor, "auto", Strength()).prior.gaussian.information
         values = nominal
-        simulated = cell.file.controller is not None and cell.only_simulated
         scale = torque_scale(cell, (), simulated=simulated)
         if cell.file.drive_train is not None:
             scale = replace(scale, of="torque constants")
-        source = (
-            f"assumed, {100 * ERROR_SHARE:g} % of each joint's torque; recordings measure it "
-            "(--given)"
-        )
-        if exact:
-            source = f"of the simulated arm: its current noise, and {100 * share:g} % of the torque"
         if given:
             values, prior, error = _posterior(cell, given)
             source = "of the given recordings"
@@ -419,6 +411,20 @@ def _posterior(cell: Cell, paths: Sequence[Path]) -> tuple[Array, Array, Array]:
     data = total.weighted(weights).A / posterior.design_effect
     information = data + posterior.prior.belief.gaussian.information
     return estimate.values, information, np.median(errors, axis=0)
+
+
+def _assumed_error(cell: Cell, scatter: Array, *, exact: bool) -> tuple[Array, Array, str]:
+    """Return densities (n,) of the torque's error and noise [(N m)² s], and what they are of.
+
+    `scatter` is that of the torques (n,) [N m]; the model of an `exact` arm leaves out nothing.
+    """
+    share = SIMULATED_SHARE if exact else ERROR_SHARE
+    error = (share * scatter) ** 2 * ERROR_TIME
+    if exact:
+        source = f"of the simulated arm: its current noise, and {100 * share:g} % of the torque"
+        return error, _current_noise(cell), source
+    source = f"assumed, {100 * share:g} % of each joint's torque; recordings measure it (--given)"
+    return error, (NOISE_SHARE * scatter) ** 2 * _cycle(cell), source
 
 
 def _current_noise(cell: Cell) -> Array:

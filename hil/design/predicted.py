@@ -2,7 +2,8 @@
 
 They are those of `hil identify` (`hil.identify.estimating`): the error of the torque, an uncertain
 delay, and elastic gears, each by the function that counts it of recordings. The scale of the
-torques, which only absolute intervals have, is added by :mod:`hil.design.precision`.
+torques, which only absolute intervals have, is added by :mod:`hil.design.precision`. Only
+recordings show that a friction law lacks a term, or that friction drifts.
 """
 
 from __future__ import annotations

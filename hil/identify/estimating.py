@@ -175,7 +175,7 @@ def estimate_with(
         InputError: the archives lack data that the estimator needs.
         ArchiveError: a recording has no usable row.
     """
-    cell, name = prepared.sources.cell, options.estimator
+    cell, name, settings = prepared.sources.cell, options.estimator, prepared.settings
     model = cell.model
     _require_usable_rows(prepared)
     with reporter.task("estimating", 4) as task:
@@ -183,7 +183,6 @@ def estimate_with(
         task.advance(1, name)
         factors = factors or [Factor.by_time(model, samples) for samples in fitted]
         total = sum(factors, Factor.zero(model))
-        settings = prepared.settings
         posterior = Posterior.of(cell, total, name, settings.strength, settings.average)
         posterior, beside, unsolved = posterior.solved(total)
         if name in OF_PRIOR:

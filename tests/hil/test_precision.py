@@ -146,9 +146,7 @@ class TestPromise:
         assert np.all(elastic.gears > rigid.gears)
         np.testing.assert_array_equal(elastic.rows, rigid.rows)
 
-    def test_the_torque_error_of_a_simulated_arm_is_that_of_its_currents(
-        self, cell, motions
-    ) -> None:
+    def test_a_simulated_arm_has_the_noise_of_its_currents(self, cell, motions) -> None:
         """A current noise of 0.01 A rms and a resolution of 2 mA, in servo loops of 1 ms."""
         made = promise(cell, motions, "torque 1")
         current = 0.01**2 + 0.002**2 / 12.0

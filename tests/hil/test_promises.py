@@ -29,7 +29,7 @@ def kept(cell: Cell, required: str, seeds: range, within: float = 1.25) -> dict:
     return figures
 
 
-def test_an_arm_that_is_as_precise_as_required_is_not_sent_to_another_motion() -> None:
+def test_a_promise_that_is_kept_asks_for_no_other_motion() -> None:
     """Two joints in cycles of 2 ms: intervals of the delay were ten times its error."""
     cell = Cell.load(TWO_JOINTS)
     figures = kept(cell, "parameters 5 %, torque 0.5, friction 2 %", range(1, 4))
