@@ -1,17 +1,22 @@
 """Whether 95 % intervals of `hil identify` hold the truth of arms that were simulated without hil.
 
 Run with ``python -m benchmarks.coverage [--seeds N] [--arms NAME ...] [--delays MS ...]
-[--quadratic] [--load SHARE] [--white] [--rate HZ] [--speed SHARE] [--scale SHARE] [--ensemble N]
-[--json]``. Each run is a log of its own seed, imported and identified with default settings;
-another motion is held out. Motion, dynamics (pinocchio's RNEA), friction and noise share no code
-with what is tested, only the URDF; what the parameters are called and how they are grouped is the
-project's.
+[--quadratic] [--load SHARE] [--stribeck SHARE] [--stribeck-speed SPEED] [--drift SHARE] [--white]
+[--rate HZ] [--speed SHARE] [--scale SHARE] [--ensemble N] [--json]``. Each run is a log of its own
+seed, imported and identified with default settings; another motion is held out. Motion, dynamics
+(pinocchio's RNEA), friction and noise share no code with what is tested, only the URDF; what the
+parameters are called and how they are grouped is the project's.
 
 - The arm is not its URDF: masses differ by 10 to 20 %, centres and inertias alike, by a congruence
   of the pseudo-inertia, which keeps a body physically consistent. Its rotors are in no URDF.
 - Friction is Coulomb, viscous and an offset, the law that an import assumes. ``--quadratic`` adds a
   term with the speed squared, and states all four in the archive. ``--load`` lets dry friction grow
   by a share of the rigid body's torque, which no archive states.
+- ``--stribeck`` raises dry friction at rest by a share, which decays with ``exp(-(v / v_s)²)``; v_s
+  is 0.1 rad/s or that of ``--stribeck-speed``. ``--drift`` lets dry and viscous friction fall by a
+  share over the fitted log, linearly; the held-out motion follows. No archive states either.
+  Coefficients count as those of the true law: Coulomb and viscous friction without the Stribeck
+  part; of friction that drifts its values at the start, in the middle and at the end of the log.
 - The motion is a random Fourier series within the URDF's limits that starts and ends at rest.
   ``--speed`` is the share of the largest speeds that it may use.
 - The scale of each joint's torque is off by 3 % (standard deviation), as an import assumes of one
@@ -40,6 +45,9 @@ Figures per arm and delay, and of all; a seed is the same arm, motion and noise 
   ``delay_bias_ms``: mean of applied less true; ``delay_half_ms``: median half width of its interval
   where a run states one, ``delay_intervals`` their number, ``delay_held`` that of those which hold
   the true delay.
+- ``doubted``: runs whose verdict puts the friction law of some joint in doubt; ``friction_width``:
+  median half width of an interval of Coulomb or viscous friction over the true value. ``plain``:
+  runs whose verdict is good without a reservation in its line.
 - ``false_causes``: runs whose verdict blames something, other than a delay that is there, by the
   name of the finding. ``good``: runs whose verdict is good.
 - ``inside``: share of held-out means of torque inside their intervals (`calibration` in
@@ -76,6 +84,7 @@ from hil.progress import Silent
 from hil.results import Results
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
+from identification.validation.facts.form import FORM
 
 Array = NDArray[np.float64]
 
@@ -100,7 +109,8 @@ _SHAPE_SCATTER: Final = 0.05  # of the pseudo-inertia's congruence, each entry
 _MASS_SCATTER: Final = 0.12  # of the logarithm of a body's density
 _FRICTION_SCATTER: Final = 0.2  # of each coefficient
 _FEW_ROWS: Final = 5  # of which one is predicted by drawn arms
-_FRICTION_SYMBOLS: Final = ("f0", "f1", "f2", "fo", "fl")  # in the order of `Friction`
+_FRICTION_SYMBOLS: Final = ("f0", "f1", "f2", "fo", "fl", "fs")  # in the order of `Friction`
+_DRIFTING: Final = ("f0_", "f1_", "f2_")  # names of coefficients that are compared as they fall
 
 
 class Conditions(NamedTuple):
@@ -113,6 +123,9 @@ class Conditions(NamedTuple):
         speed: share of the URDF's largest speeds that motions may use.
         scale: standard deviation of the scale of each joint's logged torque, as a share.
         load: share of the rigid body's torque by which dry friction grows.
+        stribeck: share by which dry friction at rest exceeds that in motion.
+        stribeck_speed: over which it decays [rad/s].
+        drift: share by which friction falls over the fitted log.
         ensemble: number of arms that are drawn from each posterior.
     """
 
@@ -122,6 +135,9 @@ class Conditions(NamedTuple):
     speed: float = 0.7
     scale: float = 0.03
     load: float = 0.0
+    stribeck: float = 0.0
+    stribeck_speed: float = 0.1
+    drift: float = 0.0
     ensemble: int = 0
 
 
@@ -129,19 +145,26 @@ DEFAULTS: Final = Conditions()
 
 
 class Friction(NamedTuple):
-    """Coefficients (n,) of Coulomb [N·m], viscous, quadratic friction, an offset and the load."""
+    """Coefficients (n,) of Coulomb [N·m], viscous, quadratic friction, an offset and the load.
+
+    Dry friction at rest exceeds that in motion by a share `stribeck`, over a speed [rad/s].
+    """
 
     coulomb: Array
     viscous: Array
     quadratic: Array
     offset: Array
     load: Array
+    stribeck: float = 0.0
+    stribeck_speed: float = 1.0
 
-    def torque(self, velocity: Array, rigid: Array) -> Array:
-        """Torque (m, n) at speeds and torques of the rigid body (m, n)."""
-        dry = (self.coulomb + self.load * np.abs(rigid)) * np.tanh(velocity / _DRY_SPEED)
+    def torque(self, velocity: Array, rigid: Array, level: Array | float = 1.0) -> Array:
+        """Torque (m, n) at speeds and torques of the rigid body (m, n), times a level (m,)."""
+        at_rest = 1.0 + self.stribeck * np.exp(-((velocity / self.stribeck_speed) ** 2))
+        dry = self.coulomb * at_rest + self.load * np.abs(rigid)
+        dry = dry * np.tanh(velocity / _DRY_SPEED)
         fluid = self.viscous * velocity + self.quadratic * np.abs(velocity) * velocity
-        return np.asarray(dry + fluid + self.offset)
+        return np.asarray(np.reshape(level, (-1, 1)) * (dry + fluid) + self.offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,10 +214,12 @@ class Arm:
     robot: Any
     friction: Friction
 
-    def torque(self, position: Array, velocity: Array, acceleration: Array) -> Array:
-        """Torque (m, n) of the joints, friction included."""
+    def torque(
+        self, position: Array, velocity: Array, acceleration: Array, level: Array | float = 1.0
+    ) -> Array:
+        """Torque (m, n) of the joints, with friction at a level (m,) of the drawn one."""
         rigid = self.rigid_torque(position, velocity, acceleration)
-        return rigid + self.friction.torque(velocity, rigid)
+        return rigid + self.friction.torque(velocity, rigid, level)
 
     def rigid_torque(self, position: Array, velocity: Array, acceleration: Array) -> Array:
         """Torque (m, n) of bodies and rotors."""
@@ -222,7 +247,8 @@ def drawn_arm(kind: ArmType, seed: int, conditions: Conditions = DEFAULTS) -> Ar
     share = near([1.0 / 3.0] * len(coulomb)) if conditions.quadratic else np.zeros(len(coulomb))
     quadratic = share * viscous / robot.velocityLimit
     load = np.full(len(coulomb), conditions.load)
-    return Arm(robot, Friction(coulomb, viscous, quadratic, offset, load))
+    rise = conditions.stribeck, conditions.stribeck_speed
+    return Arm(robot, Friction(coulomb, viscous, quadratic, offset, load, *rise))
 
 
 def drawn_body(body: Any, random: np.random.Generator) -> Any:
@@ -305,7 +331,7 @@ def logged(
 ) -> Logged:
     """Log a motion with noise, the torque a delay [s] late."""
     random, motion, time = _part(arm, seed, part, duration, conditions)
-    torque = arm.torque(*motion.at(time - delay))
+    torque = arm.torque(*motion.at(time - delay), _level(part, time, duration, conditions))
     noise = random.standard_normal(torque.shape)
     if not conditions.white:
         keep = _kept(conditions)
@@ -335,6 +361,12 @@ def _part(
     return random, motion, np.arange(round(duration * conditions.rate)) / conditions.rate
 
 
+def _level(part: int, time: Array, duration: float, conditions: Conditions) -> Array:
+    """Friction over the drawn one (m,): it falls in the fitted log, which the others follow."""
+    worn = np.minimum(time / duration, 1.0) if part == 0 else np.ones_like(time)
+    return np.asarray(1.0 - conditions.drift * worn)
+
+
 def _kept(conditions: Conditions) -> float:
     """Correlation of the coloured half of the noise from one row to the next, 0 if it is white."""
     return 0.0 if conditions.white else float(np.exp(-1.0 / (_MEMORY * conditions.rate)))
@@ -344,8 +376,8 @@ class Truth(NamedTuple):
     """What the log of a fitted motion can show, by the names of the parameters.
 
     Attributes:
-        values: of the arm.
-        rows: its regressor without noise (n, m, p), parameters in the order of `values`.
+        values: of the arm; NaN of a term of which the arm has none with that speed.
+        rows: its regressor without noise (n, m, p), parameters in the order of `known`.
         noise: standard deviations of the torque's noise (n,).
         keep: correlation of its coloured half from one row to the next.
         scale: logged over true torque (n,).
@@ -358,6 +390,11 @@ class Truth(NamedTuple):
     scale: Array
 
     @property
+    def known(self) -> dict[str, float]:
+        """Values of parameters that the arm has."""
+        return {name: value for name, value in self.values.items() if not np.isnan(value)}
+
+    @property
     def bound(self) -> dict[str, float]:
         """Least standard deviations."""
         return self._by_name(bound(self.rows, self.noise, self.keep))
@@ -367,9 +404,17 @@ class Truth(NamedTuple):
         """Standard deviations of weighted least squares."""
         return self._by_name(least_squares_deviations(self.rows, self.noise, self.keep))
 
-    def in_scale(self, std: Array) -> dict[str, float]:
-        """Parameters that fit the torques in the scale of the log best, for residuals std (n,)."""
-        values = np.array([*self.values.values()])
+    def in_scale(self, std: Array, level: float = 1.0) -> dict[str, float]:
+        """Parameters that fit the torques in the scale of the log best, for residuals std (n,).
+
+        Coefficients that drift are at a level of the drawn ones.
+        """
+        values = np.array(
+            [
+                value * (level if name.startswith(_DRIFTING) else 1.0)
+                for name, value in self.known.items()
+            ]
+        )
         weighted = self.rows / std[:, None, None]
         information = np.einsum("jmp,jmq->pq", weighted, weighted)
         # Solved for the change, which is exactly zero in the true scale.
@@ -379,28 +424,37 @@ class Truth(NamedTuple):
         return self._by_name(values + np.linalg.solve(information, pull))
 
     def _by_name(self, figures: Array) -> dict[str, float]:
-        return dict(zip(self.values, figures.tolist(), strict=True))
+        return dict(zip(self.known, figures.tolist(), strict=True))
 
 
 def truth_of(arm: Arm, model: RobotModel, seed: int, delay: float, conditions: Conditions) -> Truth:
     """What the log of the fitted motion can show, by pinocchio and the law of friction."""
     _, motion, time = _part(arm, seed, 0, FITTED_TIME, conditions)
     states = motion.at(time - delay)
-    values = true_values(arm, model)
+    scale = torque_scale(seed, arm.robot.nv, conditions)
     rigid = arm.rigid_torque(*states)
-    noise = _TORQUE_NOISE * (rigid + arm.friction.torque(states[1], rigid)).std(axis=0)
+    level = _level(0, time, FITTED_TIME, conditions)
+    noise = _TORQUE_NOISE * (rigid + arm.friction.torque(states[1], rigid, level)).std(axis=0)
     base = base_regressor(arm.robot, model, *states)
-    rows = np.zeros((*base.shape[:2], len(values)))
+    none = np.zeros((*base.shape[:2], 0))
+    truth = Truth(true_values(arm, model), none, noise * scale, _kept(conditions), scale)
+    rows = np.zeros((*base.shape[:2], len(truth.known)))
     rows[:, :, : base.shape[2]] = base
-    unit = np.eye(len(Friction._fields))
-    for place, name in enumerate(values):
+    for place, name in enumerate(truth.known):
         symbol, _, joint = name.partition("_")
         if symbol in _FRICTION_SYMBOLS:
-            only = Friction(*unit[_FRICTION_SYMBOLS.index(symbol)])
             axis = int(joint) - 1
-            rows[axis, :, place] = only.torque(states[1], rigid)[:, axis]
-    scale = torque_scale(seed, arm.robot.nv, conditions)
-    return Truth(values, rows, noise * scale, _kept(conditions), scale)
+            rows[axis, :, place] = _unit_torque(symbol, states[1], rigid)[:, axis]
+    return truth._replace(rows=rows)
+
+
+def _unit_torque(symbol: str, velocity: Array, rigid: Array) -> Array:
+    """Torque (m, n) of friction with a coefficient of one, at speeds and rigid torques (m, n)."""
+    if symbol == "fs":
+        dry = Friction(*np.eye(5)[0])
+        rising = dry._replace(stribeck=1.0, stribeck_speed=DEFAULTS.stribeck_speed)
+        return rising.torque(velocity, rigid) - dry.torque(velocity, rigid)
+    return Friction(*np.eye(5)[_FRICTION_SYMBOLS.index(symbol)]).torque(velocity, rigid)
 
 
 def true_values(arm: Arm, model: RobotModel) -> dict[str, float]:
@@ -412,7 +466,12 @@ def true_values(arm: Arm, model: RobotModel) -> dict[str, float]:
     values = dict(
         zip(model.parameter_names, (model.base.grouping @ standard).tolist(), strict=False)
     )
-    symbols = dict(zip(_FRICTION_SYMBOLS, arm.friction, strict=True))
+    friction = arm.friction
+    symbols = dict(zip(_FRICTION_SYMBOLS, friction[:5], strict=False))
+    if friction.stribeck:
+        # Of a term with another speed there is no true coefficient.
+        same = friction.stribeck_speed == DEFAULTS.stribeck_speed
+        symbols["fs"] = friction.coulomb * (friction.stribeck if same else np.nan)
     for symbol, coefficients in symbols.items():
         if symbol in ("f0", "f1", "fo") or coefficients.any():
             values |= {f"{symbol}_{j}": value for j, value in enumerate(coefficients.tolist(), 1)}
@@ -443,6 +502,9 @@ class Run(NamedTuple):
         inside: share of held-out means inside their intervals.
         error: of held-out torque.
         seconds: of the processor.
+        friction_width: half widths of intervals of Coulomb and viscous friction, likewise.
+        doubted: whether the friction law of a joint is in doubt.
+        plain: whether the verdict is good without a reservation.
     """
 
     inertial: list[bool]
@@ -464,6 +526,9 @@ class Run(NamedTuple):
     inside: float | None
     error: float
     seconds: float
+    friction_width: Sequence[float] = ()
+    doubted: bool = False
+    plain: bool = True
 
 
 def run(name: str, delay: float, seed: int, conditions: Conditions = DEFAULTS) -> Run:
@@ -486,7 +551,7 @@ def run(name: str, delay: float, seed: int, conditions: Conditions = DEFAULTS) -
         identified = model_of(found) if conditions.ensemble else None
     model = RobotModel.from_urdf(robot.urdf, locked=kind.locked, friction=law)
     truth = truth_of(arm, model, seed, delay, conditions)
-    outcome = compared(found.results, truth, delay, seconds)
+    outcome = compared(found.results, truth, delay, seconds, conditions.drift)
     if identified is None:
         return outcome
     spread, error = ensemble_spread(identified, arm, seed, conditions)
@@ -499,8 +564,10 @@ def ensemble_spread(
     """Spread of the held-out torque of drawn arms (n,), and the error of the estimate there."""
     model = identified.cell.model
     _, motion, time = _part(arm, seed, 1, HELD_OUT_TIME, conditions)
-    states = motion.at(time[::_FEW_ROWS])
-    torque = arm.torque(*states) * torque_scale(seed, arm.robot.nv, conditions)
+    time = time[::_FEW_ROWS]
+    states = motion.at(time)
+    torque = arm.torque(*states, _level(1, time, HELD_OUT_TIME, conditions))
+    torque *= torque_scale(seed, arm.robot.nv, conditions)
     moving = model.moving(states[1])
 
     def rms(values: Array) -> Array:
@@ -512,11 +579,14 @@ def ensemble_spread(
     return rms(drawn.std(axis=0, ddof=1)), rms(estimated - torque)
 
 
-def compared(results: Results, truth: Truth, delay: float, seconds: float) -> Run:
+def compared(
+    results: Results, truth: Truth, delay: float, seconds: float, drift: float = 0.0
+) -> Run:
     """Compare results with the truth: parameters by name, and the delay [s].
 
-    A coefficient that the truth does not have is zero. The interval is zero wide where a parameter
-    was fixed at zero, and does not hold another value.
+    Coefficients f0, f1 and f2 fall by a share `drift`: those at the start, in the middle and at the
+    end are compared. A coefficient that the truth does not have is zero. The interval is zero wide
+    where a parameter was fixed at zero, and does not hold another value.
 
     Raises:
         KeyError: the results have another base parameter.
@@ -528,32 +598,40 @@ def compared(results: Results, truth: Truth, delay: float, seconds: float) -> Ru
         for index, parameter in enumerate(results.parameters)
         if not parameter.undetermined and np.isfinite(parameter.std)
     ]
-    in_scale = truth.in_scale(np.array(results.noise_std))
     least = truth.bound
     least_squares = truth.least_squares
     own: tuple[list[bool], list[bool]] = [], []
     absolute: tuple[list[bool], list[bool]] = [], []
     over: tuple[list[float], list[float]] = [], []
     width: list[float] = []
+    friction_width: list[float] = []
+    levels = (1.0, 1.0 - 0.5 * drift, 1.0 - drift) if drift else (1.0,)
+    in_scale = [truth.in_scale(np.array(results.noise_std), level) for level in levels]
     for is_friction, parameter in known:
         name = parameter.name
+        value = truth.values.get(name, 0.0) if is_friction else truth.values[name]
+        if np.isnan(value):
+            continue
         half = factor * parameter.std
         absolute_half = factor * (parameter.absolute_std or parameter.std)
-        values = [
-            values.get(name, 0.0) if is_friction else values[name]
-            for values in (in_scale, truth.values)
-        ]
-        errors = [abs(parameter.estimate - value) for value in values]
-        own[is_friction].append(bool(errors[0] <= half))
-        absolute[is_friction].append(bool(errors[1] <= absolute_half))
+        drifts = name.startswith(_DRIFTING)
+        for level, scaled in zip(levels, in_scale, strict=True):
+            if drifts or level == levels[len(levels) // 2]:
+                error = abs(parameter.estimate - scaled.get(name, 0.0))
+                own[is_friction].append(bool(error <= half))
+                error = abs(parameter.estimate - (level * value if drifts else value))
+                absolute[is_friction].append(bool(error <= absolute_half))
         if name in least:
             over[is_friction].append(half / (_NORMAL * least[name]))
         if not is_friction:
-            width.append(half / abs(values[1]))
+            width.append(half / abs(value))
+        elif name.startswith(("f0_", "f1_")):
+            friction_width.append(half / abs(value))
     delays = results.delays
     applied = np.zeros(len(results.joint_names)) if delays is None else np.array(delays.applied)
     half_widths = [] if delays is None else [half for half in delays.interval if half is not None]
-    justified = {"delay"} if delay > 0.0 else set()
+    present = {"delay": delay > 0.0, "friction": drift > 0.0}
+    justified = {check for check, there in present.items() if there}
     checks = [finding.check for finding in suspicious(results)]
     blamed = [check for check in checks if check in CAUSES - justified]
     return Run(
@@ -569,14 +647,18 @@ def compared(results: Results, truth: Truth, delay: float, seconds: float) -> Ru
             if name.partition("_")[0] in _FRICTION_SYMBOLS
         ],
         undetermined=len(results.parameters) - len(known),
-        dropped=len(truth.values.keys() - {parameter.name for parameter in results.parameters}),
+        dropped=len(truth.known.keys() - {parameter.name for parameter in results.parameters}),
         width=width,
+        friction_width=friction_width,
+        doubted=FORM in checks,
         delay_error=(applied - delay).tolist(),
         delay_half=half_widths,
         spread=[],
         spread_error=[],
         blamed=list(dict.fromkeys(blamed)),
         good=results.verdict.good,
+        plain=results.verdict.good
+        and not any(finding.reservation for finding in suspicious(results)),
         inside=None if results.calibration is None else results.calibration.inside,
         error=results.validation[0].all_rows_relative_error,
         seconds=seconds,
@@ -608,6 +690,10 @@ def figures(draws: Sequence[Sequence[Run]]) -> dict[str, Any]:
         "undetermined": sum(run.undetermined for run in runs),
         "dropped": sum(run.dropped for run in runs),
         "width": _rounded(np.median([share for run in runs for share in run.width])),
+        "friction_width": _rounded(
+            np.median([share for run in runs for share in run.friction_width] or [0.0])
+        ),
+        "doubted": sum(run.doubted for run in runs),
         "ensemble": _ratio_of_squares(
             [share for run in runs for share in run.spread],
             [share for run in runs for share in run.spread_error],
@@ -619,6 +705,7 @@ def figures(draws: Sequence[Sequence[Run]]) -> dict[str, Any]:
         "delay_held": sum(held),
         "false_causes": dict(Counter(name for run in runs for name in run.blamed)),
         "good": sum(run.good for run in runs),
+        "plain": sum(run.plain for run in runs),
         "inside": _rounded(np.mean(inside)) if inside else None,
         "error": _rounded(np.mean([run.error for run in runs])),
         "seconds": _rounded(np.mean([run.seconds for run in runs])),
@@ -660,6 +747,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--delays", nargs="+", type=float, default=DELAYS, metavar="MS")
     parser.add_argument("--quadratic", action="store_true", help="true, and stated in the archive")
     parser.add_argument("--load", type=float, default=DEFAULTS.load, metavar="SHARE")
+    parser.add_argument("--stribeck", type=float, default=DEFAULTS.stribeck, metavar="SHARE")
+    parser.add_argument(
+        "--stribeck-speed", type=float, default=DEFAULTS.stribeck_speed, metavar="SPEED"
+    )
+    parser.add_argument("--drift", type=float, default=DEFAULTS.drift, metavar="SHARE")
     parser.add_argument("--white", action="store_true", help="no coloured noise of the torque")
     parser.add_argument("--rate", type=float, default=DEFAULTS.rate, metavar="HZ")
     parser.add_argument("--speed", type=float, default=DEFAULTS.speed, metavar="SHARE")
@@ -673,6 +765,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options.speed,
         options.scale,
         options.load,
+        options.stribeck,
+        options.stribeck_speed,
+        options.drift,
         options.ensemble,
     )
     seeds = range(options.first_seed, options.first_seed + options.seeds)
@@ -711,7 +806,9 @@ def _line(cell: str, row: Mapping[str, Any]) -> str:
     shown.append(f"in {row['delay_held']} of {row['delay_intervals']} intervals")
     shown.append(f"false causes {row['false_causes'] or 'none'}")
     shown.append(f"good {row['good']}")
-    shown += [f"{name} {row[name]}" for name in ("width", "inside", "error", "seconds")]
+    shown.append(f"plain {row['plain']}  doubted {row['doubted']}")
+    last = ("width", "friction_width", "inside", "error", "seconds")
+    shown += [f"{name} {row[name]}" for name in last]
     return "  ".join(shown)
 
 

@@ -129,11 +129,14 @@ class PrecisionMeter:
         factors = [recording.factor for recording in recordings]
         rates = [each.products for each in recordings if each.products is not None]
         products = np.sum(rates, axis=0) if rates else None
-        known = takewhile(lambda each: each.source.path in self._elastic, recordings)
-        elastic = [self._elastic[each.source.path] for each in known]
-        estimation = estimate_with(prepared, self._options, Silent(), factors, products, elastic)
-        for recording, torque in zip(recordings, estimation.elastic, strict=False):
-            self._elastic[recording.source.path] = torque
+        read = [recording.source.path for recording in recordings]
+        elastic = [self._elastic[path] for path in takewhile(self._elastic.__contains__, read)]
+        forms = [self._forms[path] for path in takewhile(self._forms.__contains__, read)]
+        estimation = estimate_with(
+            prepared, self._options, Silent(), factors, products, elastic, forms
+        )
+        self._elastic.update(zip(read, estimation.elastic, strict=False))
+        self._forms.update(zip(read, estimation.forms, strict=False))
         pooled = estimation.result.pooled
         posterior = estimation.posterior
         stated = estimation.stated
@@ -145,8 +148,7 @@ class PrecisionMeter:
                 replace(estimate, values=estimate.values + moved) for estimate in (pooled, stated)
             )
         values = pooled.values
-        noise_std = pooled.noise_std
-        weights = inverse_variance(noise_std**2)
+        weights = inverse_variance(pooled.noise_std**2)
         information = estimation.result.factor.weighted(weights).A + posterior.precision
         wanted = self._reference.wanted(
             self._requirements, values, information / posterior.design_effect
@@ -220,6 +222,7 @@ class PrecisionMeter:
         self._earlier = [self._reduced(source) for source in self._given]
         self._repetitions: dict[Path, _Reduced] = {}
         self._elastic: dict[Path, ElasticTorque] = {}
+        self._forms: dict[Path, Factor] = {}
         self._delays: dict[tuple[Path, ...], CombinedDelay] = {}
         self._first = path
 

@@ -24,6 +24,13 @@ from identification.estimators.elasticity import (
     expected_compliance,
     with_elastic_gears,
 )
+from identification.estimators.friction_form import (
+    FormUncertainty,
+    form_factor,
+    form_uncertainty,
+    with_drift,
+    with_uncertain_form,
+)
 from identification.estimators.instrumental import (
     estimate_instrumental,
     planned_motion,
@@ -56,6 +63,7 @@ from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.calibration import Refit
 from identification.validation.finding import joined
+from identification.validation.residuals import drift_of_factors
 
 from .cell_context import TorqueScale, torque_scale_of
 from .estimators import OF_PRIOR, Estimator, fit_of, values_of
@@ -98,6 +106,8 @@ class Estimation:
     stated: Estimate
     notes: tuple[str, ...]  #: what the intervals assume
     elastic: tuple[ElasticTorque, ...]  #: of the first recordings, at most `_ALIKE` of one motion
+    forms: tuple[Factor, ...]  #: with more friction terms, of the same recordings
+    form: FormUncertainty  #: whether the friction law lacks one of them
 
 
 def fit_with_transmitted_load(
@@ -154,17 +164,18 @@ def estimate_with(
     factors: Sequence[Factor] = (),
     products: Array | None = None,
     elastic: Sequence[ElasticTorque] = (),
+    forms: Sequence[Factor] = (),
 ) -> Estimation:
     """Estimate the parameters by `options.estimator`, with all applicable tests.
 
-    `factors` by time of the fitted samples, the sum of their `rate_products`, and the torques of
-    elastic gears in the first of them are computed unless they are known (not for "iv").
+    `factors` by time of the fitted samples, the sum of their `rate_products`, and of the first of
+    them the torques of elastic gears and `form_factor` are computed unless known (not for "iv").
 
     Raises:
         InputError: the archives lack data that the estimator needs.
         ArchiveError: a recording has no usable row.
     """
-    cell, name = prepared.sources.cell, options.estimator
+    cell, name, settings = prepared.sources.cell, options.estimator, prepared.settings
     model = cell.model
     _require_usable_rows(prepared)
     with reporter.task("estimating", 4) as task:
@@ -172,7 +183,6 @@ def estimate_with(
         task.advance(1, name)
         factors = factors or [Factor.by_time(model, samples) for samples in fitted]
         total = sum(factors, Factor.zero(model))
-        settings = prepared.settings
         posterior = Posterior.of(cell, total, name, settings.strength, settings.average)
         posterior, beside, unsolved = posterior.solved(total)
         if name in OF_PRIOR:
@@ -183,19 +193,16 @@ def estimate_with(
         if prepared.sources.same_motion:
             result = result.with_scatter()
         precision = posterior.precision if name in OF_PRIOR else None
-        if variance := prepared.settings.delay_variance:
-            result = _with_uncertain_delay(model, result, fitted, products, variance, precision)
+        result = _with_uncertain_delay(prepared, result, fitted, products, precision)
         task.advance(1, "prior")
-        if name in OF_PRIOR:
-            beside = replace(beside, estimate=result.pooled)
-        else:
-            beside = posterior.fit(result.factor)
-        if name == "prior":
-            warnings += _prior_contradictions(model, beside)
+        of_prior = replace(beside, estimate=result.pooled)
+        beside = of_prior if name in OF_PRIOR else posterior.fit(result.factor)
+        warnings += _prior_contradictions(model, beside) if name == "prior" else []
         task.advance(1, "held-out motion")
         held_out = tuple(Factor.by_time(model, samples) for samples in prepared.held_out)
         task.advance(1)
     stated, notes, elastic = _stated(prepared, result, fitted, posterior, precision, elastic)
+    form, forms = _form_of_friction(prepared, result, fitted, precision, forms)
     return Estimation(
         estimator=name,
         result=result,
@@ -204,9 +211,11 @@ def estimate_with(
         with_prior=beside,
         refit=refit_of(model, name, posterior),
         warnings=tuple(warnings),
-        stated=stated,
+        stated=_with_uncertain_friction(model, stated, form, factors),
         notes=notes,
         elastic=elastic,
+        forms=forms,
+        form=form,
     )
 
 
@@ -225,13 +234,16 @@ def _without_prior(
 
 
 def _with_uncertain_delay(
-    model: RobotModel,
+    prepared: Prepared,
     result: RepeatedEstimate,
     fitted: Sequence[Samples],
     products: Array | None,
-    variance: float,
     precision: Array | None,
 ) -> RepeatedEstimate:
+    variance = prepared.settings.delay_variance
+    if not variance:
+        return result
+    model = prepared.sources.cell.model
     if products is None:
         products = np.asarray(sum(rate_products(model, samples) for samples in fitted))
     pooled = with_uncertain_delay(result.pooled, result.factor, products, variance, precision)
@@ -270,7 +282,7 @@ def _stated(
         return estimate, (note,), ()
     model = posterior.model
     values = estimate.values
-    some = fitted[:_ALIKE] if sources.same_motion else fitted
+    some = _enough(prepared, fitted)
     compliance = expected_compliance(model, some[0], values)
     elastic = (
         *elastic[: len(some)],
@@ -278,8 +290,44 @@ def _stated(
     )
     torque = ElasticTorque.total(elastic, len(fitted) / len(some))
     effect = posterior.design_effect
-    estimate = with_elastic_gears(estimate, result.factor, torque, effect, precision)
+    believed = None if precision is None else posterior.believed(result.factor)
+    estimate = with_elastic_gears(estimate, result.factor, torque, effect, precision, believed)
     return estimate, (note, "they allow for elastic gears between motors and links"), elastic
+
+
+def _enough(prepared: Prepared, fitted: Sequence[Samples]) -> Sequence[Samples]:
+    """Return the recordings that show what is alike in all: few of one motion."""
+    return fitted[:_ALIKE] if prepared.sources.same_motion else fitted
+
+
+def _form_of_friction(
+    prepared: Prepared,
+    result: RepeatedEstimate,
+    fitted: Sequence[Samples],
+    precision: Array | None,
+    forms: Sequence[Factor],
+) -> tuple[FormUncertainty, tuple[Factor, ...]]:
+    """Return the uncertainty of the friction law, and the factors of its terms; some are known."""
+    model = prepared.sources.cell.model
+    some = _enough(prepared, fitted)
+    every = (
+        *forms[: len(some)],
+        *(form_factor(model, samples) for samples in some[len(forms) :]),
+    )
+    total = sum(every[1:], every[0])
+    return form_uncertainty(model, result.pooled, result.factor, total, precision), every
+
+
+def _with_uncertain_friction(
+    model: RobotModel, estimate: Estimate, form: FormUncertainty, factors: Sequence[Factor]
+) -> Estimate:
+    """Return the estimate with form and significant drift of friction in its covariance."""
+    estimate = with_uncertain_form(estimate, form)
+    drift = drift_of_factors(model, estimate.values, factors)
+    if drift is None:
+        return estimate
+    change = np.where(drift.significant, np.nan_to_num(drift.change), 0.0)
+    return with_drift(model, estimate, change)
 
 
 def _require_usable_rows(prepared: Prepared) -> None:
@@ -357,6 +405,10 @@ class Posterior:
     def precision(self) -> Array:
         """Information of what is believed, as it counts beside that of all rows (p, p)."""
         return self.design_effect * self.prior.belief.gaussian.information
+
+    def believed(self, factor: Factor) -> Array:
+        """Return the parameters (p,) by what is believed, without a stronger prior."""
+        return posterior_values(factor, self.prior.belief.gaussian, self.design_effect)[0]
 
     def free(self, factor: Factor, share: float = 1.0) -> PosteriorEstimate:
         """Fit a factor that is this share of the rows, whatever bodies the parameters need."""

@@ -181,7 +181,8 @@ def renewed_delay(sources: Sources, settings: Settings, options: Options) -> Com
     """Return the delay in chosen settings of a controller's torque by other sources [s].
 
     That of the settings if it is known, or if it cannot be estimated from these. A stated delay in
-    the settings stays in use, with its error by the other sources.
+    the settings stays in use, with its error by the other sources, and so does one that they do not
+    exclude.
     """
     used = settings.preprocessing.torque_delay
     unchanged = CombinedDelay(used, settings.delay_variance)
@@ -193,16 +194,16 @@ def renewed_delay(sources: Sources, settings: Settings, options: Options) -> Com
     estimate = _delays(sources, stated, options, Silent())
     if estimate is None:
         return unchanged
-    combined = _with_stated(estimate, settings.stated_delay)
-    if used == settings.stated_delay:
-        return CombinedDelay(used, combined.mean_square_error(used))
+    stated_value = settings.stated_delay
+    combined = with_stated_delay(estimate, stated_value)
+    if used == stated_value or not estimate.excludes(stated_value):
+        return CombinedDelay(stated_value, combined.mean_square_error(stated_value))
     return combined
 
 
-def _with_stated(estimate: DelayEstimate, stated: float) -> CombinedDelay:
+def with_stated_delay(estimate: DelayEstimate, stated: float) -> CombinedDelay:
     """Return the delay by an estimate and by what is stated of a controller [s]."""
-    bound, bias = (share * estimate.cycle for share in (Thresholds().delay, CLOSED_LOOP_BIAS))
-    return estimate.combined(stated, bound, bias)
+    return estimate.combined(stated, Thresholds().delay * estimate.cycle, CLOSED_LOOP_BIAS)
 
 
 def _as_stated(sources: Sources, options: Options) -> tuple[Sources, Settings]:
@@ -263,20 +264,20 @@ class _DelayChoice:
     def _beside_stated(
         self, estimate: DelayEstimate, described: tuple[str, ...], *, filtered: bool
     ) -> _DelayChoice:
-        """Use an estimate beside the stated delay of a controller: both together.
+        """Use the stated delay of a controller, or both together if the estimate excludes it.
 
         Inner prediction decides on a significant, determined one that is far from it. Beside a
         low-pass of the torque the stated one is used, as the estimate may include the delay of the
         filter.
         """
         stated = self.assumed
-        combined = _with_stated(estimate, stated)
+        combined = with_stated_delay(estimate, stated)
         errors = {stated: combined.mean_square_error(stated), combined.mean: combined.variance}
         choice = replace(self, notes=described, errors=errors)
         far = abs(estimate.delay - stated) > Thresholds().delay * estimate.cycle
         if far and estimate.determined and estimate.significant:
             return replace(choice, suggested=(SuggestedDelay(combined.mean, determined=True),))
-        if filtered:
+        if filtered or not estimate.excludes(stated):
             return choice
         if abs(combined.mean - stated) >= _SAME_DELAY * estimate.cycle:
             beside = f"by this and the stated {stated * 1e3:.3g} ms"

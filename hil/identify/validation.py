@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from hil.progress import Reporter
 from identification import Factor, IdentificationError
@@ -65,6 +65,7 @@ def validate(prepared: Prepared, estimation: Estimation, reporter: Reporter) -> 
             consistency=None if isinstance(consistency, str) else consistency,
             prior=ScorePrior(posterior.prior.belief.gaussian, posterior.design_effect),
         )
+        evidence = replace(evidence, form=estimation.form)
         verdict = judge(model.joint_names, evidence, tested_on=sources.tested_on)
         task.advance(1)
     calibration = _calibration(prepared, estimation)

@@ -158,7 +158,7 @@ def _sandwich(
     """
     scores = scores @ solution.root
     corrected = leverage_corrected(shares, scores)
-    corrected *= np.sqrt(1.0 + 2.0 * max(0.0, _lag_correlation(scores)))
+    corrected *= np.sqrt(1.0 + 2.0 * max(0.0, lag_correlation(scores)))
     moved = corrected @ solution.root.T
     covariance = np.asarray(moved.T @ moved)
     effect = float((corrected**2).sum() / max(1, corrected.shape[1]))
@@ -197,12 +197,12 @@ def block_length(scores: Array) -> int:
     longest = max(1, len(scores) // _FEWEST_BLOCKS)
     shortest = min(SHORTEST_BLOCK, longest)
     for length in range(shortest, longest):
-        if _lag_correlation(merged(scores, length)) < _CORRELATED:
+        if lag_correlation(merged(scores, length)) < _CORRELATED:
             return length
     return longest
 
 
-def _lag_correlation(scores: Array) -> float:
+def lag_correlation(scores: Array) -> float:
     """Return the mean correlation of scores (B, k) with those of the next block."""
     power = (scores**2).sum(axis=0)
     both = (scores[1:] * scores[:-1]).sum(axis=0)

@@ -113,29 +113,61 @@ def elastic_torque(model: RobotModel, samples: Samples, values: Array, complianc
     return torque
 
 
+def open_compliance(
+    inverse: Array, products: Array, squares: Array, design_effect: float = 1.0
+) -> tuple[Array, Array]:
+    """Return how compliances move the parameters (p, n), and their covariance beside them (n, n).
+
+    In units of the expected ones. `inverse` is that of the information (p, p) of `products` (p, n)
+    and `squares` (n, n), of whose rows `design_effect` count as one.
+    """
+    moved = inverse @ products
+    beside = (squares - products.T @ moved) / design_effect + np.eye(len(squares))
+    return moved, np.asarray(np.linalg.inv(beside))
+
+
+def expected_square(covariance: Array, *, rigid: bool) -> Array:
+    """Return the expected mean square (n, n) of the fitted compliances of an arm not recorded yet.
+
+    `covariance` (n, n) is what its recordings will leave open. Their means scatter about zero: of
+    rigid gears by the noise, else with what the recordings show of the expected ones. None is
+    negative; those of different gears are taken for independent.
+    """
+    shown = np.eye(len(covariance)) - covariance
+    variance = np.diag(covariance @ shown if rigid else shown)
+    size = np.sqrt(np.maximum(variance, 0.0))
+    squares = np.outer(size, size) / (2.0 * np.pi)
+    np.fill_diagonal(squares, 0.5 * size**2)
+    return np.asarray(covariance + squares)
+
+
 def with_elastic_gears(
     estimate: Estimate,
     factor: Factor,
     torque: ElasticTorque,
     design_effect: float,
     precision: Array | None = None,
+    believed: Array | None = None,
 ) -> Estimate:
     """Return the estimate with the mean square of the compliances in its covariance.
 
     `torque` are the sums of the factor's rows, of which `design_effect` count as one; `precision`
-    (p, p) is that of a prior beside them. No gear has a negative compliance.
+    (p, p) is that of a prior beside them, by which `believed` (p,) are the parameters of rigid
+    gears, by default those of the estimate: what a stronger prior leaves unexplained is no torque
+    of gears. No gear has a negative compliance.
     """
     weights = inverse_variance(estimate.noise_std**2)
     products, squares, measured = (np.tensordot(weights, part, axes=1) for part in torque)
-    errors = measured - products.T @ estimate.values
+    errors = measured - products.T @ (estimate.values if believed is None else believed)
     equations = factor.weighted(weights)
     if precision is not None:
         equations = equations._replace(A=equations.A + precision)
     determined = np.isfinite(np.diag(estimate.covariance))
-    moved = np.where(determined[:, None], solve(equations).inverse @ products, 0.0)
-    beside = (squares - products.T @ moved) / design_effect + np.eye(len(errors))
-    covariance = np.linalg.inv(beside)
-    mean = np.maximum(covariance @ errors / design_effect, 0.0)
+    inverse = np.where(determined[:, None], solve(equations).inverse, 0.0)
+    moved, covariance = open_compliance(inverse, products, squares, design_effect)
+    # Correlated compliances cannot be cut off at zero one by one.
+    root = np.linalg.cholesky(np.linalg.inv(covariance))
+    mean, _ = scipy.optimize.nnls(root.T, root.T @ (covariance @ errors) / design_effect)
     added = moved @ (np.outer(mean, mean) + covariance) @ moved.T
     return replace(
         estimate,

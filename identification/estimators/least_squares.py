@@ -68,7 +68,8 @@ def clustered_fit(
     return solution, block_covariance(by_time, weights, solution.values)
 
 
-_CERTAIN: Final = 0.99  # probability that the scatter of equal repetitions is not significant
+# Probability that the scatter of equal repetitions is significant for none of the parameters.
+_CERTAIN: Final = 0.99
 
 Fit = Callable[[Sequence[Samples], Factor], Estimate]
 """Estimator: recordings and their factor by time to an estimate."""
@@ -117,7 +118,8 @@ def no_narrower(covariance: Array, values: Array) -> Array:
     determined = np.isfinite(std) & (std > 0.0)
     scatter = values.std(axis=0, ddof=1) / np.sqrt(len(values))
     ratio = np.where(determined, scatter / np.where(determined, std, 1.0), 1.0)
-    chance = np.sqrt(scipy.stats.chi2.ppf(_CERTAIN, freedom) / freedom)
+    certain = _CERTAIN ** (1.0 / max(1, int(determined.sum())))
+    chance = np.sqrt(scipy.stats.chi2.ppf(certain, freedom) / freedom)
     wider = np.where(ratio > chance, ratio, 1.0)
     return np.where(
         np.outer(determined, determined), covariance * np.outer(wider, wider), covariance

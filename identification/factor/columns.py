@@ -1,7 +1,7 @@
 """Factors of other columns than those of the regressor W.
 
 Instrumental variables use [Z | W | y], gains [W | t | 1 | i], a search for the direction of gravity
-[W0 | Wx | Wy | Wz | y].
+[W0 | Wx | Wy | Wz | y], uncertain friction laws [W | F | y].
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.factor.blocks import FINE_BLOCK, count_by_block, fine_blocks
-from identification.factor.factor import Factor
+from identification.factor.factor import Factor, time_blocks
 from identification.factor.rows import augmented_rows
+from identification.model.friction import FrictionTerm
 from identification.model.motion import Motion
 from identification.model.payload import Load, Payload
 from identification.model.regressor import RegressorPlan
@@ -101,6 +102,62 @@ def gain_factor(
     names = (*model.parameter_names, "torque of the payload", "offset")
     every = (np.arange(p + 2),) * n
     return Factor.of_rows([(index, tables)], count_by_block(index, usable), every, names)
+
+
+def friction_factor(model: RobotModel, samples: Samples, terms: Sequence[FrictionTerm]) -> Factor:
+    """Reduce a recording to blocks of [W | F | y], F with q more friction terms of each joint.
+
+    Those of joint j are the parameters p + q j to p + q (j + 1); none depends on the load.
+    """
+    n = model.n_joints
+    p = model.n_parameters
+    q = len(terms)
+    index, block = time_blocks(samples)
+    added = _friction_columns(model, samples, terms)
+    columns = tuple(
+        np.append(joint_columns, p + q * joint + np.arange(q))
+        for joint, joint_columns in enumerate(model.plan.columns)
+    )
+    chunks = (
+        (
+            index[part],
+            [
+                np.concatenate(
+                    [
+                        table[:-1],
+                        np.where(samples.usable[part, joint], added[joint][:, part], 0.0),
+                        table[-1:],
+                    ]
+                )
+                for joint, table in enumerate(tables)
+            ],
+        )
+        for part, tables in augmented_rows(model, samples)
+    )
+    names = (
+        *model.parameter_names,
+        *(f"{term.label} {k} {joint + 1}" for joint in range(n) for k, term in enumerate(terms)),
+    )
+    counts = count_by_block(index, samples.usable)
+    return replace(Factor.of_rows(chunks, counts, columns, names), block=block)
+
+
+def _friction_columns(
+    model: RobotModel, samples: Samples, terms: Sequence[FrictionTerm]
+) -> list[Array]:
+    """Return the columns of friction terms in the torque of each joint, n times (q, m)."""
+    if samples.parent is not None:
+        parent, rows = samples.parent
+        return [columns[:, rows] for columns in _friction_columns(model, parent, terms)]
+    motion = samples.motion
+    direction = motion.direction
+    if direction is None:
+        direction = model.friction.direction(*motion[:3])
+    columns = [
+        np.array([term.column(motion.velocity[:, j], direction[:, j]) for term in terms])
+        for j in range(model.n_joints)
+    ]
+    return [samples.as_measured(j, column.T).T for j, column in enumerate(columns)]
 
 
 def every_torque_factor(model: RobotModel, samples: Samples) -> Factor:

@@ -93,12 +93,8 @@ class Factor:
     @classmethod
     def by_time(cls, model: RobotModel, samples: Samples) -> Self:
         """Reduce the usable rows of a recording by :func:`fine_blocks`, longer ones if many."""
-        index = fine_blocks(samples)
-        length = 1
-        while length < _COARSEST and index.max(initial=0) >= length * _MANY_BLOCKS:
-            length *= 2
-        factor = cls.of(model, samples, index=index // length)
-        return replace(factor, block=length * FINE_BLOCK)
+        index, block = time_blocks(samples)
+        return replace(cls.of(model, samples, index=index), block=block)
 
     @classmethod
     def from_samples(
@@ -394,6 +390,15 @@ class Factor:
         wide = np.zeros((len(stacked), self.n_parameters + 1))
         wide[:, self._places(joint)] = stacked
         return wide
+
+
+def time_blocks(samples: Samples) -> tuple[Indices, float]:
+    """Return the block of each sample (m,), and its duration [s]: longer ones if many."""
+    index = fine_blocks(samples)
+    length = 1
+    while length < _COARSEST and index.max(initial=0) >= length * _MANY_BLOCKS:
+        length *= 2
+    return index // length, length * FINE_BLOCK
 
 
 def joined(parts: Sequence[Factor]) -> Factor:

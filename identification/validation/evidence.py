@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.estimators.delay import DelayEstimate
+from identification.estimators.friction_form import FormUncertainty
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.factor.columns import standard_factor
 from identification.factor.estimate import Estimate
@@ -132,6 +133,7 @@ class Evidence:
     consistency: ConsistencyCheck | None = None  #: with the nearest consistent parameters
     dissipation: Dissipation | None = None  #: friction of each joint at its top speed
     residuals: ResidualChecks | None = None  #: patterns of the residual
+    form: FormUncertainty | None = None  #: whether the friction law of a joint lacks a term
     context: CellContext = CellContext()  #: data on the cell
     prismatic: tuple[int, ...] = ()  #: indices of the joints that slide
     moved: Array | None = None  #: time in which each joint moved in unseen motion (n,) [s]
@@ -195,18 +197,18 @@ def gather(
     noise is measured. `nominal` are parameters (p,); with `in_sample` the held-out motions are the
     training. `unseen` is the sum of the held-out factors, if known; `prior` is that of the arm.
     """
-    pooled = result.pooled
-    values = pooled.values
+    pooled, values = result.pooled, result.pooled.values
     unseen = total_factor(model, held_out) if unseen is None else unseen
     gravity, load = _gravity_and_load(model, training, held_out)
-    repeated = same_motion and len(result.values) > 1
-    noise = repetition_noise(model, values, training, SLOW) if repeated else None
+    noise = _noise(model, result, training) if same_motion else None
     floor = noise_floor(model, values, training[:_MOST_RECORDINGS], noise)
     error = _error(model, values, held_out)
     slow = None if noise is None else _slow_errors(model, result, held_out, error, unseen, noise)
     speed = np.abs(np.concatenate([run.motion.velocity for run in held_out])).max(axis=0)
-    others = () if in_sample else held_out
-    motors = context.motor_from_joint
+    others, motors = (() if in_sample else held_out), context.motor_from_joint
+    causes = find_causes(
+        model, training, values, names, noise=floor, prior=prior, scale_std=context.scale_std
+    )
     return Evidence(
         estimate=pooled,
         held_out=error,
@@ -217,15 +219,7 @@ def gather(
         noise_floor=floor,
         open_share=None if in_sample else _open_share(pooled, unseen),
         disagreement=None if noise is None else _disagreement(result),
-        causes=find_causes(
-            model,
-            training,
-            values,
-            names,
-            noise=floor,
-            prior=prior,
-            scale_std=context.scale_std,
-        ),
+        causes=causes,
         changes=find_changes(model, pooled, training, others, unseen) if others else (),
         one_way=_one_way(training),
         gravity=gravity,
@@ -242,6 +236,15 @@ def gather(
         prismatic=tuple(np.flatnonzero(~model.chain.revolute).tolist()),
         moved=np.sum([_time_moved(run) for run in held_out], axis=0),
     )
+
+
+def _noise(
+    model: RobotModel, result: RepeatedEstimate, training: Sequence[Samples]
+) -> Array | None:
+    """Return the noise (n,) between repetitions of one motion; None of a single one."""
+    if len(result.values) < 2:
+        return None
+    return repetition_noise(model, result.pooled.values, training, SLOW)
 
 
 def _time_moved(run: Samples) -> Array:

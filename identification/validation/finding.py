@@ -26,6 +26,8 @@ class Finding:
     next_step: str = ""  # remedy; empty if none is needed
     # a "cause" explains errors; the step of a "symptom" is given only if no cause was found
     role: Role = "condition"
+    # what a model that predicts well must not be used for without care, for the verdict's sentence
+    reservation: str = ""
 
 
 def joined(names: Sequence[str], most: int = 6) -> str:

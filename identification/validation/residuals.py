@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.distributions import student_limit
+from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.signals.spectrum import power_density
@@ -213,6 +214,29 @@ def _drift_sums(
         for joint_sums, factor in zip(sums, (residual[:, joint], friction), strict=True):
             joint_sums[:, joint] = np.add.reduceat(friction * factor, edges)
     return sums
+
+
+def drift_of_factors(
+    model: RobotModel, values: Array, factors: Sequence[Factor]
+) -> FrictionDrift | None:
+    """Return the drift by the factors by time of recordings in order; None with too few blocks."""
+    factors = [factor.occupied() for factor in factors]
+    pieces = -(-_PIECES // max(1, len(factors)))
+    if min((len(factor) for factor in factors), default=0) < pieces:
+        return None
+    augmented = np.append(-values, 1.0)
+    friction = np.append(np.where(model.friction_columns, values, 0.0), 0.0)
+    sums = []
+    for factor in factors:
+        edges = np.linspace(0, len(factor), pieces + 1).astype(np.intp)[:-1]
+        products = np.zeros((2, len(factor), model.n_joints))
+        for joint, (matrix, used) in enumerate(zip(factor.matrices, factor.columns, strict=True)):
+            places = np.append(used, factor.n_parameters)
+            by_friction = friction[places] @ matrix
+            products[0, :, joint] = by_friction @ augmented[places]
+            products[1, :, joint] = by_friction @ friction[places]
+        sums.append(np.add.reduceat(products, edges, axis=1))
+    return _friction_drift(sums)
 
 
 def _friction_drift(sums: Sequence[Array]) -> FrictionDrift | None:

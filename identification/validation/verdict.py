@@ -21,6 +21,7 @@ from identification.validation.facts.errors import (
 )
 from identification.validation.facts.excitation import ExcitationFacts
 from identification.validation.facts.faults import FaultFacts, GravityFacts, OutlierFacts
+from identification.validation.facts.form import FormFacts
 from identification.validation.facts.patterns import (
     DriftFacts,
     ProfileFacts,
@@ -72,7 +73,10 @@ def judge(
     wrong = [finding for finding in findings if finding.level == "wrong"]
     doubtful = [finding for finding in findings if finding.level == "doubtful"]
     measure = _measure(naming.joints, evidence)
-    line = f"The model predicts {tested_on} well: {measure}."
+    # Nothing is well without reserve where a parameter that was asked for is in doubt.
+    reserve = "; ".join(finding.reservation for finding in findings if finding.reservation)
+    but = f", but {reserve}" if reserve else ""
+    line = f"The model predicts {tested_on} well{but}: {measure}."
     if wrong:
         line = f"The model must not be relied on: {wrong[0].words}; {measure}."
     causes = [finding for finding in (*wrong, *doubtful) if finding.role == "cause"]
@@ -125,6 +129,7 @@ def facts_in_order(evidence: Evidence, limits: Thresholds) -> tuple[Facts, ...]:
         CorrectionFacts.of(evidence),
         SaturationFacts.of(evidence, limits),
         WhitenessFacts.of(evidence, limits),
+        FormFacts.of(evidence, limits),
         ProfileFacts.of_speed(evidence, limits),
         ProfileFacts.of_position(evidence, limits),
         RippleFacts.of(evidence, limits),

@@ -56,6 +56,23 @@ class TestArm:
         traces = [np.log(np.trace(d.inertia) / np.trace(body.inertia)) for d in drawn]
         assert 0.1 < np.std(traces) < 0.2
 
+    def test_stribeck_friction_is_a_share_at_low_speed(self) -> None:
+        usual, rising = (
+            drawn_arm(ARM_TYPES["panda"], 1, DEFAULTS._replace(stribeck=share)).friction
+            for share in (0.0, 0.3)
+        )
+        slow, fast = (np.full((1, 7), speed) for speed in (0.01, 1.0))
+        still = np.zeros((1, 7))
+        more = rising.torque(slow, still, 1.0) - usual.torque(slow, still, 1.0)
+        np.testing.assert_allclose(more[0], 0.3 * usual.coulomb, rtol=0.02)
+        np.testing.assert_allclose(rising.torque(fast, still, 1.0), usual.torque(fast, still, 1.0))
+
+    def test_friction_that_drifts_leaves_offsets(self) -> None:
+        friction = drawn_arm(ARM_TYPES["panda"], 1).friction
+        moving, still = np.ones((2, 7)), np.zeros((2, 7))
+        torque = friction.torque(moving, still, np.array([1.0, 0.9])) - friction.offset
+        np.testing.assert_allclose(torque[1], 0.9 * torque[0])
+
     def test_a_seed_is_one_arm(self) -> None:
         first, same, other = (drawn_arm(ARM_TYPES["panda"], seed) for seed in (1, 1, 2))
         masses = [[body.mass for body in arm.robot.inertias] for arm in (first, same, other)]
@@ -100,6 +117,44 @@ class TestBound:
         assert exact.in_scale(truth.noise) == truth.values
         twice = truth._replace(scale=np.full(model.n_joints, 2.0)).in_scale(truth.noise)
         np.testing.assert_allclose([*twice.values()], 2.0 * np.array([*truth.values.values()]))
+
+    @pytest.mark.parametrize(
+        "conditions",
+        [
+            pytest.param(DEFAULTS._replace(stribeck=0.3), id="stribeck"),
+            pytest.param(DEFAULTS._replace(drift=0.1), id="drift"),
+        ],
+    )
+    def test_its_rows_are_of_the_law_of_the_arm(self, conditions: Conditions) -> None:
+        """With a Stribeck term; and at the level of friction that drifts, half way 95 %."""
+        kind = ARM_TYPES["panda"]
+        arm = drawn_arm(kind, 1, conditions)
+        text = urdf(kind.urdf).read_text(encoding="utf-8")
+        model = RobotModel.from_urdf(text, locked=kind.locked, friction=IMPORTED_LAW)
+        slow = conditions._replace(rate=20.0)
+        truth = coverage.truth_of(arm, model, 1, 0.0, slow)
+        exact = truth._replace(scale=np.ones(model.n_joints))
+        level = 1.0 - 0.5 * conditions.drift
+        motion = drawn_motion(
+            arm.robot, np.random.default_rng([1, 2, 0]), coverage.FITTED_TIME, SPEED
+        )
+        torque = arm.torque(*motion.at(np.arange(truth.rows.shape[1]) / 20.0), level)
+        values = np.array([*exact.in_scale(truth.noise, level).values()])
+        modelled = np.einsum("jmp,p->mj", truth.rows, values)
+        np.testing.assert_allclose(modelled, torque, atol=1e-9 * np.abs(torque).max())
+
+    def test_a_term_without_a_true_coefficient_has_no_column(self) -> None:
+        """Of Stribeck friction over another speed than the law's."""
+        kind = ARM_TYPES["panda"]
+        conditions = DEFAULTS._replace(stribeck=0.3, stribeck_speed=0.03, rate=20.0)
+        arm = drawn_arm(kind, 1, conditions)
+        text = urdf(kind.urdf).read_text(encoding="utf-8")
+        model = RobotModel.from_urdf(text, locked=kind.locked, friction=IMPORTED_LAW)
+        truth = coverage.truth_of(arm, model, 1, 0.0, conditions)
+        assert np.isnan(truth.values["fs_1"])
+        assert list(truth.bound) == list(model.parameter_names)
+        assert list(truth.in_scale(truth.noise)) == list(model.parameter_names)
+        assert truth.rows.shape[2] == model.n_parameters
 
 
 class TestMotion:

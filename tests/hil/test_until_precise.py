@@ -16,6 +16,7 @@ from hil.campaign.precision_record import Look, PrecisionRecord, Reached
 from hil.cli import app
 from hil.errors import ExecutionError, InputError
 from hil.identified_campaign import identify_campaign
+from hil.identify import estimating
 from hil.progress import Silent
 from identification.estimators.elasticity import ElasticTorque
 from identification.factor.factor import Factor
@@ -95,7 +96,9 @@ class TestEnd:
         paths = campaign.folder.completed("excitation")
         meter.measure(paths[:1])
         reduced: list[str] = []
-        for owner, name in ((Factor, "by_time"), (ElasticTorque, "of")):
+        for owner, name in (
+            (Factor, "by_time"), (ElasticTorque, "of"), (estimating, "form_factor"),
+        ):  # fmt: skip
             original = getattr(owner, name)
 
             def noting(*arguments, name=name, original=original):
@@ -104,7 +107,7 @@ class TestEnd:
 
             monkeypatch.setattr(owner, name, noting)
         meter.measure(paths)
-        assert reduced == ["by_time", "of"]
+        assert reduced == ["by_time", "of", "form_factor"]
         reduced.clear()
         meter.measure(paths)
         assert reduced == []

@@ -9,10 +9,13 @@ from identification.estimators.elasticity import (
     ElasticTorque,
     elastic_torque,
     expected_compliance,
+    open_compliance,
     with_elastic_gears,
 )
 from identification.estimators.least_squares import fit_least_squares
+from identification.factor.estimate import inverse_variance
 from identification.factor.factor import Factor
+from identification.factor.normal_equations import solve
 from tests.identification.two_link import MODEL, NOISE, as_samples, four_sines, truth
 
 STEP = 0.002
@@ -81,6 +84,47 @@ def test_data_of_rigid_gears_widen_intervals_little():
     alone = fit_least_squares(MODEL, [elastic(samples, expected)]).values - estimate.values
     assert np.max(np.abs(alone) / estimate.std) > 3.0
     assert np.max(wider.std / estimate.std) < 1.5
+
+
+def test_the_noise_of_rigid_gears_makes_none_elastic():
+    """Where two gears add nearly the same torque, one of which cannot have a negative share."""
+    samples = recorded(np.zeros(2), NOISE)
+    estimate = fit_least_squares(MODEL, [samples])
+    factor = Factor.by_time(MODEL, samples)
+    weights = inverse_variance(estimate.noise_std**2)
+    each = elastic_torque(
+        MODEL, samples, estimate.values, expected_compliance(MODEL, samples, estimate.values)
+    )
+    each[:, :, 1] = each[:, :, 0] + 0.01 * each[:, :, 1]
+    opposed = replace(samples, torque=samples.torque + 3.0 * (each[:, :, 0] - each[:, :, 1]))
+    sums = _sums(opposed, each)
+    products, squares, measured = (np.tensordot(weights, part, axes=1) for part in sums)
+    inverse = solve(factor.weighted(weights)).inverse
+    moved, covariance = open_compliance(inverse, products, squares)
+    errors = measured - products.T @ estimate.values
+    wider = with_elastic_gears(estimate, factor, sums, 1.0)
+    added = wider.covariance - estimate.covariance - moved @ covariance @ moved.T
+    # The most likely ones without negative shares, among all on a grid.
+    shares = np.linspace(0.0, 1.0, 201)
+    grid = np.stack(np.meshgrid(shares, shares), axis=-1).reshape(-1, 2)
+    curvature = np.linalg.inv(covariance)
+    costs = 0.5 * np.einsum("gi,ij,gj->g", grid, curvature, grid) - grid @ errors
+    best = moved @ grid[np.argmin(costs)]
+    step = np.abs(moved).sum(axis=1) * (shares[1] - shares[0])
+    assert np.all(np.abs(np.sqrt(np.maximum(np.diag(added), 0.0)) - np.abs(best)) <= step)
+
+
+def _sums(samples, each):
+    products = np.zeros((2, MODEL.n_parameters, 2))
+    squares = np.zeros((2, 2, 2))
+    measured = np.zeros((2, 2))
+    for joint, (block, used) in enumerate(zip(*samples.regressor(MODEL), strict=True)):
+        some = samples.usable[:, joint]
+        effect = each[some, joint]
+        products[joint][used] = block[some].T @ effect
+        squares[joint] = effect.T @ effect
+        measured[joint] = effect.T @ samples.torque[some, joint]
+    return ElasticTorque(products, squares, measured)
 
 
 def test_repetitions_count_like_more_rows():

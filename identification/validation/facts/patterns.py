@@ -238,4 +238,5 @@ class DriftFacts:
                 f" than {percentage(self.limit)} of the torque",
                 WARMER,
                 "cause",
+                reservation=f"friction of {naming.of(self.large)} changed during the recordings",
             )

@@ -214,4 +214,5 @@ class FrictionFacts:
                 f" {changes}; gear temperature may have changed{other}",
                 WARMER + step,
                 "cause",
+                reservation=f"friction of {naming.of(self.joints)} changed",
             )
