@@ -269,19 +269,26 @@ class _Spectra:
         """Return how much of a low-pass is in the torque, and the standard deviation of that.
 
         0: none of it, 1: all of it. In the two octaves above the bandwidth, where the two differ
-        most, the gain g of the recorded torque over that of a model fitted without the low-pass,
-        with a delay by its lag, is ``log g / log |H|``. Joints count by how well the two torques
-        agree there: one whose torque the model does not describe says nothing. Without torque there
-        the standard deviation is infinite.
+        most, the gain g of the recorded torque over that of a model fitted without the low-pass is
+        ``log g / log |H|``. Joints count by how well the two torques agree there: one whose torque
+        the model does not describe says nothing. Without torque there the standard deviation is
+        infinite.
+
+        A causal low-pass is late as well, which spoils a fit without a delay, while one with a
+        delay by its lag may describe all of a weak one: the larger share is returned.
         """
         assert channel.shape is not None
-        lag = channel.shape.lag(channel.bandwidth) if channel.shape.causal else 0.0
-        delayed = _Filter(channel.delay + lag)
-        values = self._fitted([delayed])[2][0]
+        delays = [channel.delay]
+        if channel.shape.causal:
+            delays.append(channel.delay + channel.shape.lag(channel.bandwidth))
+        return max(self._attenuation(channel, _Filter(delay)) for delay in delays)
+
+    def _attenuation(self, channel: _Filter, without: _Filter) -> tuple[float, float]:
+        values = self._fitted([without])[2][0]
         response = self.response(channel)[0]
         size = np.maximum(np.abs(response), np.finfo(np.float64).tiny)
         # The phase is not judged: that of a delay fitted by mistake would hide the torque.
-        phases = (np.ones_like(response), response / size, self.response(delayed)[0])
+        phases = (np.ones_like(response), response / size, self.response(without)[0])
         modelled = [joint.modelled(values) for joint in self.joints]
         shares = []
         for octave in _OCTAVES:

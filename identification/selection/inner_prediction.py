@@ -49,12 +49,6 @@ Question = Literal[
 
 RATE: Final = 125.0
 """Rate [Hz] to which recordings are averaged for choices: three times the widest bandwidth."""
-SHORT: Final = 15.0
-"""Time of motion [s] below which fewer questions are asked: ten segments of less than a second and
-a half show no period of an exciting motion."""
-IF_LONG: Final[frozenset[str]] = frozenset({"springs"})
-"""Questions that are asked of long recordings only: their answers correct small errors, and a wrong
-one costs much on another motion."""
 CERTAIN: Final = 3.0
 LOW_PASS: Final = "low-pass of the torque"
 REVERSAL: Final = "reversal of dry friction"
@@ -136,8 +130,6 @@ def choose_settings(
     asked: set[str] = {*questions}
     if "estimator" in asked:
         asked |= {"strength", "consistency"}
-    if trial.duration(now) < SHORT:
-        asked -= IF_LONG
     first = now
     trial.weigh(first)
     if "estimator" in asked and trial.has_grouped_rotors(first):
@@ -236,9 +228,7 @@ def _friction_terms(trial: Trial, now: Settings) -> Decision:
     """Choose the terms beside Coulomb and viscous friction, the stated ones first.
 
     A term must also predict fast motion from slower one no worse, and leave friction in a faster
-    motion, too: the law is the choice that carries over to another motion least. Segments of a
-    short motion have the same speeds and do not test it: there a term must predict the fast motion
-    clearly better.
+    motion, too: the law is the choice that carries over to another motion least.
     """
     law = trial.model(now).friction.laws[0].table()
     stated = {"third": law["third"], "stribeck": law["stribeck"]}
@@ -246,8 +236,6 @@ def _friction_terms(trial: Trial, now: Settings) -> Decision:
     candidates = [now.with_friction(**term) for term in terms]
 
     limit = trial.fast_error(now)
-    if trial.duration(now) < SHORT:
-        limit *= 1.0 - TERM_WORTHWHILE
 
     def possible(term: Settings) -> bool:
         return (
@@ -322,12 +310,11 @@ def _compare_delays(
     for delay in delays:
         sliding = now.preprocessed(left_out="slow")
         late = sliding.preprocessed(torque_delay=delay.value)
-        # A short recording has to show that the delay predicts better, and so has a wide interval.
-        doubtful = trial.duration(now) < SHORT or not delay.determined
-        pair = [sliding, late] if doubtful else [late, sliding]
+        # A delay with a wide interval has to show that it predicts better.
+        pair = [late, sliding] if delay.determined else [sliding, late]
         # The unknown scale of one torque resembles a delay, but of that joint only. One that was
         # estimated beside friction which the law does not have is not refuted by that law at once.
-        certainty = 1.0 if doubtful else CERTAIN
+        certainty = CERTAIN if delay.determined else 1.0
         decision = trial.decide(DELAY, pair, 0.0, by_joint=True, rows="fitted", certainty=certainty)
         compared.append(decision.choice)
         if decision.settings.preprocessing.torque_delay == delay.value:

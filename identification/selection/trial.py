@@ -151,16 +151,6 @@ class Trial:
         self._effect = design_effect_of(total, prior) if total.samples.any() else 1.0
         self._errors.clear()
 
-    def duration(self, settings: Settings) -> float:
-        """Return the time of motion of the recordings [s], in which at least one joint moves."""
-        model = self.model(settings)
-        samples = self.samples(settings)
-        return sum(
-            float(np.count_nonzero(model.moving(each.motion.velocity).any(axis=1)))
-            * float(np.median(np.diff(each.motion.time)))
-            for each in samples
-        )
-
     def decide(
         self,
         name: str,

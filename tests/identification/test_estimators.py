@@ -795,6 +795,19 @@ class TestBodyPrior:
         alone = 0.5 * np.sqrt(np.mean(torque**2) / np.mean(turning**2))
         assert prior.std[rotors[1]] == pytest.approx(max(prior.std[rotors[1]], alone))
 
+    def test_wide_rotors_alone_make_half_of_the_torque(self):
+        """That of the first joint, too, whose column is that of the inertia of its link."""
+        samples = noisy()
+        wide = body_prior(MODEL, Factor.of(MODEL, samples), wide_rotors=True)
+        assert MODEL.layout.rotors[0] not in MODEL.base.pivots
+        for joint, rotor in enumerate(MODEL.layout.rotors):
+            rows = samples.usable[:, joint]
+            acceleration = samples.motion.acceleration[rows, joint]
+            torque = samples.torque[rows, joint]
+            alone = 0.5 * np.sqrt(np.mean(torque**2) / np.mean(acceleration**2))
+            outboard = body_prior(MODEL, Factor.of(MODEL, samples)).std[rotor]
+            assert wide.std[rotor] == pytest.approx(max(outboard, alone))
+
     def test_a_friction_term_alone_makes_half_of_the_torque(self):
         factor = Factor.of(MODEL, noisy())
         prior = body_prior(MODEL, factor)

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
@@ -27,7 +28,6 @@ from identification.selection.inner_prediction import (
     DELAY,
     LOAD,
     LOW_PASS,
-    SHORT,
     STRENGTH,
     STRENGTHS,
     TERM_WORTHWHILE,
@@ -35,7 +35,7 @@ from identification.selection.inner_prediction import (
     choose_settings,
 )
 from identification.selection.settings import Settings, Strength
-from identification.selection.trial import IMPOSSIBLE_WORTHWHILE, WORTHWHILE, Trial
+from identification.selection.trial import IMPOSSIBLE_WORTHWHILE, TRANSFER, WORTHWHILE, Trial
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
 from identification.signals.smoothing import FORWARDS, WITHOUT_PHASE, LowPassShape, low_passed
@@ -440,21 +440,24 @@ class TestChosenSettings:
         assert decision.errors[1] < (1.0 - IMPOSSIBLE_WORTHWHILE) * decision.errors[0]
         assert settings.strength.consistent == possible
 
-    def test_a_short_recording_asks_fewer_questions(self):
-        """It is not asked for a narrower bandwidth."""
-        asked = {"bandwidth", "rows", "estimator"}
-        candidates = {
-            duration: {
-                choice.name: choice.candidates
-                for choice in chosen(a_recording(duration=duration), asked)[1]
-            }
-            for duration in (0.9 * SHORT, LONG)
-        }
-        short = candidates[0.9 * SHORT]
-        long = candidates[LONG]
-        assert short.keys() == long.keys()
-        width = "bandwidth of the motion"
-        assert set(long[width]) - set(short[width]) == {"10 Hz"}
+    def test_a_short_recording_is_asked_the_same_questions(self):
+        """Evidence decides, not how long a recording is."""
+        asked = {"bandwidth", "presliding", "rows", "friction", "estimator"}
+        short, long = (
+            [choice.name for choice in chosen(a_recording(duration=duration), asked)[1]]
+            for duration in (8.0, LONG)
+        )
+        assert short == long
+
+    @pytest.mark.parametrize(("inertia", "wide"), [(0.4, False), (400.0, True)])
+    def test_rotors_heavier_than_the_links_are_found(self, inertia, wide):
+        """That of the first joint acts like the inertia of its link, which limits it otherwise."""
+        values = truth()
+        column = int(np.flatnonzero(MODEL.base.grouping[:, MODEL.layout.rotors[0]])[0])
+        values[column] += inertia
+        recording = a_recording(values=values, duration=LONG, noise=1.0)
+        settings, _ = chosen(recording, {"estimator"})
+        assert settings.strength.wide_rotors == wide
 
     @pytest.mark.parametrize(("noise", "least", "most"), [(1.0, WORTHWHILE, 1.0), (2.4, 0.0, 0.01)])
     def test_rests_that_no_law_predicts_are_not_fitted(self, noise, least, most):
@@ -497,6 +500,44 @@ def decided(*errors):
         np.square(scores[trial.key(settings)])[:, None], np.ones((len(errors[0]), 1))
     )
     return trial.decide("", candidates).choice
+
+
+class TestAverage:
+    """Settings that predict alike are averaged, by the probability that each is the better one."""
+
+    CHOSEN = Settings(Preprocessing(rigid_bandwidth=14.0))
+    FIRST = np.linspace(0.1, 0.4, 10)
+
+    def average(self, *errors):
+        """Average over settings of these errors in segments (k,); the values are their widths."""
+        trial = Trial(MODEL, lambda *_: [])
+        others = [self.CHOSEN.preprocessed(rigid_bandwidth=20.0 + k) for k in range(len(errors))]
+        scores = dict(
+            zip(map(trial.key, [self.CHOSEN, *others]), [self.FIRST, *errors], strict=True)
+        )
+        trial.errors = lambda settings: Errors(
+            np.square(scores[trial.key(settings)])[:, None], np.ones((len(self.FIRST), 1))
+        )
+        trial._values = lambda settings: np.array([settings.preprocessing.rigid_bandwidth])
+        return trial.average(self.CHOSEN, others)
+
+    def test_what_predicts_as_well_counts_as_much(self):
+        average, choice = self.average(self.FIRST, self.FIRST)
+        assert choice.weights == pytest.approx([1 / 3] * 3)
+        assert average.shift == pytest.approx([np.mean([14.0, 20.0, 21.0]) - 14.0])
+
+    def test_its_covariance_is_that_of_the_mixture(self):
+        average, _ = self.average(self.FIRST, self.FIRST)
+        assert average.covariance == pytest.approx(np.var([14.0, 20.0, 21.0]))
+
+    def test_what_predicts_clearly_worse_does_not_count(self):
+        assert self.average(1.3 * self.FIRST) is None
+
+    def test_what_predicts_hardly_worse_counts_less(self):
+        """Another motion differs from parts of this one by `TRANSFER`."""
+        _, choice = self.average(np.exp(TRANSFER) * self.FIRST)
+        weight = 2.0 * scipy.stats.norm.cdf(-1.0)
+        assert choice.weights == pytest.approx([1.0 / (1.0 + weight), weight / (1.0 + weight)])
 
 
 class TestClearlyBetter:
@@ -633,6 +674,15 @@ class TestLowPass:
         assert settings.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
         assert settings.preprocessing.torque_shape.causal == causal
         assert held_out_error(recording, settings) < 1.3 * unfiltered_error()
+
+    @pytest.mark.parametrize("shape", [LowPassShape(2), LowPassShape(2, causal=True)], ids=str)
+    def test_a_filter_of_the_model_alone_is_none(self, shape, monkeypatch):
+        """One that fits better for other reasons has no less torque above its bandwidth."""
+        monkeypatch.setattr("identification.estimators.torque_channel._WORTHWHILE", -np.inf)
+        recording = a_recording(noise=0.5 * NOISE, duration=20.0)
+        assert not possible_low_passes(recording, MODEL)
+        filtered = a_recording(noise=0.5 * NOISE, duration=20.0, shape=shape)
+        assert possible_low_passes(filtered, MODEL)
 
     @pytest.mark.parametrize("seed", range(3))
     def test_none_is_found_in_unfiltered_torque(self, seed):
