@@ -1,7 +1,7 @@
 """Identification with default settings and an ordinary fit, on real and on degraded recordings.
 
 Run with ``python -m benchmarks.board [--data FOLDER] [--only NAME] [--short] [--degraded]
-[--json] [--page FILE]``, where FOLDER holds the folders of recordings that `benchmarks/recordings`
+[--choices] [--json] [--page FILE]``, where FOLDER holds the folders of recordings that `benchmarks/recordings`
 describes. ``--fetch [FROM ...]`` collects these in FOLDER instead (`benchmarks.fetch`); ``--page
 docs/board.md`` writes the page (`benchmarks.board_page`), with ``--rows FILE`` from a saved line of
 JSON instead of measuring.
@@ -11,11 +11,15 @@ Errors are ||tau - tau_hat|| / ||tau|| over all joints and every row of what is 
 torque as it was recorded. *hil* imports a recording and identifies from the archive as `hil
 identify` does with default settings; `plain` is `benchmarks.plain_fit` on the same rows, *plain +
 prior* the same with a Gaussian prior about the URDF's bodies, *nominal* the URDF's model as it is
-and *nominal + friction* that with rotor inertia, friction and offset fitted; the last two are
-missing where the URDF has no masses. A ratio below 1 is better than `plain`. *Inside* is the share
+*nominal + friction* that with rotor inertia, friction and offset fitted, and *nominal + scale* that
+with the scale of each joint's torque as well; these three are missing where the URDF has no masses. A ratio below 1 is better than `plain`. *Inside* is the share
 of hil's held-out means of torque inside their 95 % intervals. A summary follows the rows: the
 geometric mean of the ratios, the worst, and which rows are above 1.03 of `plain` or above *nominal
 + friction*.
+
+With ``--choices``, each row is repeated without each automatic choice in turn
+(`benchmarks.choices`): the error over that with all of them, and in the summary whether the other
+robots would keep the choice.
 
 With ``--degraded``, the first held-out split of each robot and of the simulated cell is repeated
 with copies of the logs, each with one fault (`benchmarks.degradations`): the error, that of the
@@ -38,6 +42,7 @@ import numpy as np
 
 from benchmarks import parser_of, plain_fit, show
 from benchmarks.board_page import commit, write_page
+from benchmarks.choices import CHOICES, judged_by_others, without
 from benchmarks.degradations import CAUSES, DEGRADATIONS, EXPECTED, FITTED_ONLY, HARMLESS
 from benchmarks.fetch import FETCHED, fetch, show_fetched
 from benchmarks.identification_study import recorded, study
@@ -60,9 +65,11 @@ RIVALS: Final[Mapping[str, Callable[[Any, plain_fit.Measured], plain_fit.PlainFi
     "plain + prior": plain_fit.fit_with_prior,
     "nominal": lambda robot, _: plain_fit.nominal(robot),
     "nominal + friction": plain_fit.fit_friction,
+    "nominal + scale": plain_fit.fit_friction_and_scale,
 }
 """Columns of the board beside hil's."""
-NEED_MASSES: Final = ("nominal", "nominal + friction")
+NEED_MASSES: Final = ("nominal", "nominal + friction", "nominal + scale")
+_SHOWN: Final = 5e-4  # change of an error by a choice that is printed
 _RATED_PAYLOAD: Final = 16.0  # kg, of the NS 16
 _VALIDATION_SEED: Final = 1_000_000  # noise of its own
 
@@ -151,8 +158,17 @@ def fit_errors(parts: Parts) -> tuple[float, list[float]]:
     return errors
 
 
-def row(name: str, split: Split, archives: Mapping[str, Path], logs: Mapping[str, JointLog]) -> Row:
+def row(
+    name: str,
+    split: Split,
+    archives: Mapping[str, Path],
+    logs: Mapping[str, JointLog],
+    *,
+    choices: bool = False,
+) -> Row:
     """All errors on one split of logs, which the archives hold, and the seconds that two took.
+
+    With `choices`, `without` has the error without each choice over that with all.
 
     `inside` is None in sample; `white_inside`: of the intervals that white residuals would have.
     Seconds are of the processor.
@@ -165,6 +181,10 @@ def row(name: str, split: Split, archives: Mapping[str, Path], logs: Mapping[str
     seconds = {"hil": middle - start, "plain": time.process_time() - middle}
     others = {rival: rival_errors(rival, parts) for rival in RIVALS if rival != "plain"}
     calibration = ours.results.calibration
+    left_out = {}
+    for choice in CHOICES if choices else ():
+        with without(choice):
+            left_out[choice] = identified_split(split, archives, parts).error / ours.error
     return {
         "data": name,
         "split": str(split),
@@ -177,17 +197,18 @@ def row(name: str, split: Split, archives: Mapping[str, Path], logs: Mapping[str
         "seconds": seconds,
         "inside": None if calibration is None else calibration.inside,
         "white_inside": None if calibration is None else calibration.white_inside,
+        **({"without": left_out} if choices else {}),
     }
 
 
-def rows_of(name: str, data: Path, *, short: bool = False) -> Iterator[Row]:
+def rows_of(name: str, data: Path, *, short: bool = False, choices: bool = False) -> Iterator[Row]:
     """Every split of a configuration, or every short one, in the folder of all recordings."""
     published = Published.named(name)
     with tempfile.TemporaryDirectory() as scratch:
         archives = import_all(published, data / (published.folder or name), Path(scratch))
         logs = {log: JointLog.read(path, published.rated_payload) for log, path in archives.items()}
         for split in published.short_splits if short else published.splits:
-            yield row(name, split, archives, logs)
+            yield row(name, split, archives, logs, choices=choices)
 
 
 def import_all(published: Published, data: Path, folder: Path) -> dict[str, Path]:
@@ -319,11 +340,12 @@ def summary(rows: Sequence[Row], degraded: Sequence[Row]) -> dict[str, Any]:
         figures |= {"worst_ratio": float(ratios.max()), "mean_ratio": mean}
         figures["worst_row"] = row_name(rows[int(ratios.argmax())])
         figures["above_plain"] = [row_name(row) for row in rows if row["ratio"] > ABOVE_PLAIN]
-        figures["above_nominal_friction"] = [
-            row_name(row)
-            for row in rows
-            if row["nominal + friction"] is not None and row["hil"] > row["nominal + friction"]
-        ]
+        for rival in ("nominal + friction", "nominal + scale"):
+            figures[f"above_{rival.replace(' + ', '_')}"] = [
+                row_name(row) for row in rows if row[rival] is not None and row["hil"] > row[rival]
+            ]
+        if "without" in rows[0]:
+            figures["choices"] = judged_by_others(rows)
     if degraded:
         figures |= {"degraded": list(degraded), "right": sum(row["right"] for row in degraded)}
     return figures
@@ -344,11 +366,18 @@ def summary_lines(figures: Mapping[str, Any]) -> Iterator[str]:
         for title, key in (
             (f"above {ABOVE_PLAIN:g} of plain", "above_plain"),
             ("above nominal + friction", "above_nominal_friction"),
+            ("above nominal + scale", "above_nominal_scale"),
         ):
             names = figures[key]
             yield f"{title}: {len(names)} of {len(figures['rows'])} rows" + "".join(
                 f"; {name}" for name in names
             )
+    for choice, judged in figures.get("choices", {}).items():
+        yield (
+            f"without {choice}: {judged['mean']:.3f} ({judged['best']:.2f} to"
+            f" {judged['worst']:.2f}); left out by the others of"
+            f" {', '.join(judged['dropped_by']) or 'none'}"
+        )
     if "right" in figures:
         yield f"right verdicts: {figures['right']} of {len(figures['degraded'])}"
 
@@ -361,6 +390,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--only", action="append", choices=[*known(), SIMULATED], help="may be repeated"
     )
     parser.add_argument("--short", action="store_true", help="fit 40 %% of a log, predict the rest")
+    parser.add_argument("--choices", action="store_true", help="without each choice as well")
     parser.add_argument("--degraded", action="store_true", help="spoilt copies as well")
     parser.add_argument(
         "--fetch", nargs="*", type=Path, metavar="FROM",
@@ -383,7 +413,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows: list[Row] = []
     degraded: list[Row] = []
     for name in wanted:
-        for row in () if name == SIMULATED else rows_of(name, options.data, short=options.short):
+        measured = rows_of(name, options.data, short=options.short, choices=options.choices)
+        for row in () if name == SIMULATED else measured:
             rows.append(row)
             if not options.json:
                 print(_line(row), flush=True)
@@ -406,6 +437,11 @@ def _line(row: Row) -> str:
     errors = [key for key in ("hil", *RIVALS, "undegraded") if row.get(key) is not None]
     shown += [f"{key} {row[key]:.2%}" for key in errors]
     shown += [f"{key} {row[key]:.2f}" for key in ("ratio", "inside") if row.get(key) is not None]
+    shown += [
+        f"without {choice} {ratio:.3f}"
+        for choice, ratio in row.get("without", {}).items()
+        if abs(ratio - 1.0) > _SHOWN
+    ]
     if "right" in row:
         shown += ["right" if row["right"] else "not right", *row["words"]]
     return "  ".join(shown)

@@ -8,6 +8,7 @@ Coulomb and viscous friction and an offset for each joint. Every row is fitted.
   residual, iterated.
 - `fit_friction`: the URDF's masses as they are; rotor inertia, friction and offset by least squares
   for each joint alone.
+- `fit_friction_and_scale`: likewise, and the scale of each joint's torque.
 - `fit_with_prior`: the most probable parameters of a Gaussian prior about the URDF's, at one
   cut-off. Where the motion determines a parameter, this is `fit`.
 
@@ -67,7 +68,10 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlainFit:
-    """Cut-off [Hz] and parameters (14 n,): ten per link, then rotors, Coulomb, viscous, offset."""
+    """Cut-off [Hz] and parameters: ten per link, then rotors, Coulomb, viscous, offset (14 n,).
+
+    Perhaps followed by the scales of the torques of the bodies (n,).
+    """
 
     robot: Any
     cutoff: float
@@ -75,7 +79,7 @@ class PlainFit:
 
     def predicted_torque(self, measured: Measured) -> Array:
         """Torque (m, n) [N·m or N] of a motion, of which the torque is not looked at."""
-        return np.asarray(regressor(self.robot, measured, self.cutoff) @ self.parameters)
+        return torque_of(regressor(self.robot, measured, self.cutoff), self.parameters)
 
 
 def robot_from_urdf(
@@ -113,6 +117,30 @@ def fit_friction(robot: Any, measured: Measured) -> PlainFit:
     return _best_cutoff(robot, measured, friction)
 
 
+def fit_friction_and_scale(robot: Any, measured: Measured) -> PlainFit:
+    """Keep the URDF's bodies; fit the scale of each joint's torque, rotor, friction and offset.
+
+    Raises:
+        ValueError: the URDF has no masses.
+    """
+    if not has_masses(robot):
+        raise ValueError("the masses of this URDF are placeholders: all bodies have the same")
+    bodies = body_parameters(robot)
+
+    def scaled(table: Array, torque: Array) -> Array:
+        n = torque.shape[1]
+        parameters = np.concatenate([bodies, np.ones(n)])
+        rigid = table @ bodies
+        for joint in range(n):
+            own = 10 * n + joint + n * np.arange(4)
+            columns = np.column_stack([table[:, joint, own], rigid[:, joint]])
+            places = np.append(own, 14 * n + joint)
+            parameters[places] = np.linalg.lstsq(columns, torque[:, joint], rcond=_RANK)[0]
+        return parameters
+
+    return _best_cutoff(robot, measured, scaled)
+
+
 def fit_with_prior(
     robot: Any,
     measured: Measured,
@@ -135,10 +163,19 @@ def _best_cutoff(
 
     def inner_error(cutoff: float) -> float:
         parameters = solved(tables[cutoff][:cut], measured.torque[:cut])
-        return relative_error(measured.torque[cut:], tables[cutoff][cut:] @ parameters)
+        return relative_error(measured.torque[cut:], torque_of(tables[cutoff][cut:], parameters))
 
     best = min(tables, key=inner_error)
     return PlainFit(robot, best, solved(tables[best], measured.torque))
+
+
+def torque_of(table: Array, parameters: Array) -> Array:
+    """Torque (m, n) of a regressor (m, n, 14 n) and parameters as in `PlainFit`."""
+    n = table.shape[1]
+    bodies = table[..., : 10 * n] @ parameters[: 10 * n]
+    drives = table[..., 10 * n :] @ parameters[10 * n : 14 * n]
+    scale = parameters[14 * n :] if len(parameters) > 14 * n else 1.0
+    return np.asarray(scale * bodies + drives)
 
 
 def has_masses(robot: Any) -> bool:

@@ -50,6 +50,12 @@ Question = Literal[
 RATE: Final = 125.0
 """Rate [Hz] to which recordings are averaged for choices: three times the widest bandwidth."""
 CERTAIN: Final = 3.0
+ROTORS: Final = "largest inertia of rotors"
+PRESLIDING_DISPLACEMENT: Final = "presliding displacement"
+ROWS: Final = "rows that are left out"
+VELOCITY: Final = "velocity"
+BANDWIDTH: Final = "bandwidth of the motion"
+FRICTION_AT_SPEED: Final = "friction at speed"
 LOW_PASS: Final = "low-pass of the torque"
 REVERSAL: Final = "reversal of dry friction"
 DELAY: Final = "delay of the torque"
@@ -244,7 +250,7 @@ def _friction_terms(trial: Trial, now: Settings) -> Decision:
             and trial.has_friction(term)
         )
 
-    return trial.decide("friction at speed", candidates, TERM_WORTHWHILE, possible=possible)
+    return trial.decide(FRICTION_AT_SPEED, candidates, TERM_WORTHWHILE, possible=possible)
 
 
 def _load_friction(trial: Trial, now: Settings) -> Decision:
@@ -453,7 +459,7 @@ class _Swept(NamedTuple):
 _SWEPT: Final = (
     _Swept(
         "rotors",
-        "largest inertia of rotors",
+        ROTORS,
         lambda now: [
             replace(now, strength=replace(now.strength, wide_rotors=wide)) for wide in (False, True)
         ],
@@ -462,24 +468,24 @@ _SWEPT: Final = (
     ),
     _Swept(
         "presliding",
-        "presliding displacement",
+        PRESLIDING_DISPLACEMENT,
         lambda now: [now.with_friction(presliding=distance) for distance in PRESLIDING],
         lambda now: float(now.friction["presliding"]),
         transfer=TRANSFER,
     ),
     _Swept(
         "rows",
-        "rows that are left out",
+        ROWS,
         lambda now: [now.preprocessed(left_out=rows) for rows in LEFT_OUT],
     ),
     _Swept(
         "velocity",
-        "velocity",
+        VELOCITY,
         lambda now: [now.preprocessed(velocity=source) for source in VELOCITIES],
     ),
     _Swept(
         "bandwidth",
-        "bandwidth of the motion",
+        BANDWIDTH,
         lambda now: [now.preprocessed(rigid_bandwidth=width) for width in BANDWIDTHS],
         lambda now: now.preprocessing.rigid_bandwidth,
         transfer=TRANSFER,

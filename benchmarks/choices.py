@@ -1,0 +1,96 @@
+"""What each choice of the automatic settings is worth: identifications that leave it out.
+
+Used by ``python -m benchmarks.board --choices``. A choice that is left out has its first candidate,
+whatever the data say: the default where nothing is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, Final
+from unittest.mock import patch
+
+import numpy as np
+
+from identification.selection import inner_prediction as names
+from identification.selection.settings import Choice, Settings
+from identification.selection.trial import AVERAGE, Decision, Trial
+
+CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
+    "rotors": (names.ROTORS,),
+    "presliding": (names.PRESLIDING_DISPLACEMENT,),
+    "rows": (names.ROWS, names.ROWS_IN_MOTION),
+    "velocity": (names.VELOCITY,),
+    "bandwidth": (names.BANDWIDTH,),
+    "average": (AVERAGE,),
+    "delay": (names.DELAY,),
+    "low-pass": (names.LOW_PASS,),
+    "reversal": (names.REVERSAL,),
+    "friction": (names.FRICTION_AT_SPEED,),
+    "load": (names.LOAD,),
+    "strength": (names.STRENGTH,),
+    "consistency": (names.CONSISTENT,),
+    "springs": (names.SPRINGS,),
+}
+"""Names of the decisions of each choice."""
+
+
+@contextmanager
+def without(choice: str) -> Iterator[None]:
+    """Leave out a choice: its decisions return the first candidate, a delay the stated one."""
+    left_out = CHOICES[choice]
+
+    def deciding(decide: Callable[..., Decision]) -> Callable[..., Decision]:
+        def decided(
+            trial: Trial, name: str, candidates: Sequence[Settings], *others: Any, **more: Any
+        ) -> Decision:
+            if name not in left_out:
+                return decide(trial, name, candidates, *others, **more)
+            kept = candidates[0]
+            if name == names.DELAY:
+                kept = min(candidates, key=_added_delay)
+            return Decision(kept, Choice(name, ("left out",), (), 0))
+
+        return decided
+
+    average = (lambda *_: None) if AVERAGE in left_out else Trial.average
+    with (
+        patch.object(Trial, "decide", deciding(Trial.decide)),
+        patch.object(Trial, "decide_last", deciding(Trial.decide_last)),
+        patch.object(Trial, "average", average),
+    ):
+        yield
+
+
+def _added_delay(settings: Settings) -> float:
+    return abs(settings.preprocessing.torque_delay - settings.stated_delay)
+
+
+def judged_by_others(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Whether the other robots would keep each choice, and the mean ratio if they decide.
+
+    `mean`: geometric mean over robots of the error without it over that with it; `dropped_by`: the
+    robots whose others would leave it out; `left_to_others`: geometric mean over robots of the
+    error that their others choose over that with the choice.
+    """
+    table = {}
+    for choice in CHOICES:
+        robots: dict[str, list[float]] = {}
+        for row in rows:
+            robots.setdefault(row["data"], []).append(float(np.log(row["without"][choice])))
+        means = {name: float(np.mean(logs)) for name, logs in robots.items()}
+        dropped = [
+            name
+            for name in means
+            if np.mean([mean for other, mean in means.items() if other != name] or [0.0]) < 0.0
+        ]
+        chosen = [mean if name in dropped else 0.0 for name, mean in means.items()]
+        table[choice] = {
+            "mean": round(float(np.exp(np.mean([*means.values()]))), 4),
+            "worst": round(float(np.exp(max(max(logs) for logs in robots.values()))), 3),
+            "best": round(float(np.exp(min(min(logs) for logs in robots.values()))), 3),
+            "dropped_by": dropped,
+            "left_to_others": round(float(np.exp(np.mean(chosen))), 4),
+        }
+    return table
