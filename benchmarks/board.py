@@ -1,21 +1,21 @@
 """Identification with default settings and an ordinary fit, on real and on degraded recordings.
 
 Run with ``python -m benchmarks.board [--data FOLDER] [--only NAME] [--short] [--degraded]
-[--choices] [--json] [--page FILE]``, where FOLDER holds the folders of recordings that `benchmarks/recordings`
-describes. ``--fetch [FROM ...]`` collects these in FOLDER instead (`benchmarks.fetch`); ``--page
-docs/board.md`` writes the page (`benchmarks.board_page`), with ``--rows FILE`` from a saved line of
-JSON instead of measuring.
-With ``--short`` the first and the last 40 % of each log are fitted and its rest is predicted.
+[--choices] [--json] [--page FILE]``, where FOLDER holds the folders of recordings that
+`benchmarks/recordings` describes. ``--fetch [FROM ...]`` collects these in FOLDER instead
+(`benchmarks.fetch`); ``--page docs/board.md`` writes the page (`benchmarks.board_page`), with
+``--rows FILE`` from a saved line of JSON instead of measuring. With ``--short`` the first and the
+last 40 % of each log are fitted and its rest is predicted.
 
 Errors are ||tau - tau_hat|| / ||tau|| over all joints and every row of what is predicted, of the
 torque as it was recorded. *hil* imports a recording and identifies from the archive as `hil
 identify` does with default settings; `plain` is `benchmarks.plain_fit` on the same rows, *plain +
-prior* the same with a Gaussian prior about the URDF's bodies, *nominal* the URDF's model as it is
+prior* the same with a Gaussian prior about the URDF's bodies, *nominal* the URDF's model as it is,
 *nominal + friction* that with rotor inertia, friction and offset fitted, and *nominal + scale* that
-with the scale of each joint's torque as well; these three are missing where the URDF has no masses. A ratio below 1 is better than `plain`. *Inside* is the share
-of hil's held-out means of torque inside their 95 % intervals. A summary follows the rows: the
-geometric mean of the ratios, the worst, and which rows are above 1.03 of `plain` or above *nominal
-+ friction*.
+with the scale of each joint's torque as well; these three are missing where the URDF has no masses.
+A ratio below 1 is better than `plain`. *Inside* is the share of hil's held-out means of torque
+inside their 95 % intervals. A summary follows the rows: the geometric mean of the ratios, the
+worst, and which rows are above 1.03 of `plain` or above a nominal model.
 
 With ``--choices``, each row is repeated without each automatic choice in turn
 (`benchmarks.choices`): the error over that with all of them, and in the summary whether the other

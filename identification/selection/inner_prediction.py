@@ -69,9 +69,9 @@ ROWS_IN_MOTION: Final = "rows that are left out, by the error in motion"
 VELOCITIES: Final[tuple[VelocitySource, ...]] = ("measured", "position")
 # Unmodelled dynamics start at about 10 Hz on most arms. The smoother of 14 Hz, the default, leaves
 # nine tenths of an amplitude there, and half of it at 14 Hz.
-BANDWIDTHS: Final = (14.0, 7.0, 10.0, 20.0, 40.0)  # Hz
+BANDWIDTHS: Final = (14.0, 10.0, 20.0, 7.0, 40.0)  # Hz, by distance from the first
 # The middle of what gears show first. Zero is no candidate: its sign at rest is noise.
-PRESLIDING: Final = (3e-5, 1e-6, 1e-5, 1e-4, 3e-4, 1e-3)  # rad or m
+PRESLIDING: Final = (3e-5, 1e-5, 1e-4, 3e-4, 1e-6, 1e-3)  # rad or m
 # Rows of a joint that stands while another moves hold its load; but those near a reversal, or at
 # rest by brake or static friction, can mislead.
 LEFT_OUT: Final[tuple[LeftOut, ...]] = ("rests", "halts", "slow")

@@ -168,7 +168,9 @@ class Trial:
 
         Better by a share (`WORTHWHILE`), and by more than the standard error of the difference over
         the segments times the certainty: over all joints, by their geometric mean `by_joint`, or of
-        one `joint`. `transfer` is a relative standard deviation in addition (`TRANSFER`).
+        one `joint`. With `transfer`, a relative standard deviation in addition (`TRANSFER`), it is
+        the first one that is not clearly worse than the best: candidates are then in the order of
+        their distance from the first.
         """
         share = WORTHWHILE if share is None else share
         scores = [self.errors(each, rows) for each in candidates]
@@ -185,6 +187,14 @@ class Trial:
             better = clearly_better(segments[k], segments[0], share, certainty, transfer)
             if better and (possible is None or possible(candidates[k])):
                 chosen = k
+        if transfer and chosen:
+            best = segments[chosen]
+            for k in range(1, chosen):
+                if clearly_better(segments[k], segments[0], share, certainty, transfer) and not (
+                    clearly_better(best, segments[k], 0.0, certainty, transfer)
+                ):
+                    chosen = k
+                    break
         self._retain_samples(candidates[chosen])
         return self._decision(name, candidates, means, chosen)
 

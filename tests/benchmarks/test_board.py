@@ -12,11 +12,17 @@ import pinocchio as pin
 import pytest
 
 from benchmarks import board, degradations, plain_fit
+from benchmarks.choices import CHOICES, judged_by_others, without
 from benchmarks.degradations import DEGRADATIONS, EXPECTED, FITTED_ONLY
 from benchmarks.joint_log import JointLog
 from benchmarks.plain_fit import Measured
 from benchmarks.published import Published, Split, known
 from hil.importers import Robot
+from identification.selection.inner_prediction import BANDWIDTH
+from identification.selection.settings import Settings
+from identification.selection.trial import Trial
+from identification.signals.samples import Preprocessing
+from tests.identification.two_link import MODEL
 
 pytestmark = pytest.mark.long
 
@@ -117,11 +123,12 @@ class TestRow:
         summary = json.loads(json.dumps(board.summary(rows, [])))
         assert summary.keys() == {
             "rows", "worst_ratio", "mean_ratio", "worst_row", "above_plain",
-            "above_nominal_friction",
+            "above_nominal_friction", "above_nominal_scale",
         }  # fmt: skip
         assert summary["rows"][0].keys() == {
             "data", "split", "hil", "plain", "ratio", "plain + prior", "nominal",
-            "nominal + friction", "hil_joints", "plain_joints", "seconds", "inside", "white_inside",
+            "nominal + friction", "nominal + scale", "hil_joints", "plain_joints", "seconds",
+            "inside", "white_inside",
         }  # fmt: skip
         assert summary["worst_ratio"] == pytest.approx(summary["mean_ratio"])
 
@@ -130,7 +137,8 @@ class TestRow:
 
         def row(split: str, hil: float, nominal_friction: float | None) -> board.Row:
             ratios = {"plain": 0.1, "ratio": hil / 0.1, "nominal + friction": nominal_friction}
-            return {"data": "arm", "split": split, "hil": hil, **ratios}
+            scaled = None if nominal_friction is None else 0.9 * nominal_friction
+            return {"data": "arm", "split": split, "hil": hil, "nominal + scale": scaled, **ratios}
 
         rows = [row("near", 0.103, 0.2), row("far", 0.104, 0.1), row("bare", 0.05, None)]
         figures = board.summary(rows, [])
@@ -141,7 +149,29 @@ class TestRow:
             "hil / plain: geometric mean 0.812, worst 1.040 (arm, far)",
             "above 1.03 of plain: 1 of 3 rows; arm, far",
             "above nominal + friction: 1 of 3 rows; arm, far",
+            "above nominal + scale: 1 of 3 rows; arm, far",
         ]
+
+    def test_a_choice_is_judged_by_the_other_robots(self) -> None:
+        """Each robot counts once; a choice that makes others worse would be left out."""
+        none = dict.fromkeys(CHOICES, 1.0)
+        rows = [
+            {"data": name, "without": {**none, "rows": ratio}}
+            for name, ratio in (("a", 1.2), ("a", 1.2), ("b", 0.9), ("c", 0.95))
+        ]
+        judged = judged_by_others(rows)
+        assert judged["rows"]["mean"] == pytest.approx((1.2 * 0.9 * 0.95) ** (1 / 3), abs=1e-4)
+        assert judged["rows"]["dropped_by"] == ["a"]
+        assert judged["rows"]["left_to_others"] == pytest.approx(1.2 ** (1 / 3), abs=1e-4)
+        assert judged["bandwidth"]["dropped_by"] == []
+
+    def test_a_choice_that_is_left_out_keeps_its_first_candidate(self) -> None:
+        trial = Trial(MODEL, lambda *_: [])
+        candidates = [Settings(Preprocessing(rigid_bandwidth=width)) for width in (14.0, 7.0)]
+        with without("bandwidth"):
+            decision = trial.decide(BANDWIDTH, candidates)
+        assert decision.settings is candidates[0]
+        assert decision.choice.chosen == 0
 
     def test_the_fields_of_a_degraded_one(
         self, logs: Logs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -248,6 +278,19 @@ class TestPlainFit:
     def test_friction_of_a_nominal_model_is_found_exactly(self) -> None:
         fitted = plain_fit.fit_friction(ROBOT, of_the_regressor(5.0, 1))
         assert fitted.parameters == pytest.approx(planted(), abs=1e-8)
+
+    def test_scales_of_a_nominal_model_are_found_exactly(self) -> None:
+        """The torque of the bodies times the scale of each joint; drives are not scaled."""
+        measured = of_the_regressor(5.0, 1)
+        table = plain_fit.regressor(ROBOT, measured, 5.0)
+        scale = np.array([1.2, 0.8])
+        bodies = table[..., :20] @ planted()[:20]
+        drives = table[..., 20:] @ planted()[20:]
+        fitted = plain_fit.fit_friction_and_scale(
+            ROBOT, measured._replace(torque=scale * bodies + drives)
+        )
+        assert fitted.parameters[-2:] == pytest.approx(scale, abs=1e-8)
+        assert fitted.parameters[20:-2] == pytest.approx(planted()[20:], abs=1e-8)
 
     def test_a_prior_hardly_moves_what_a_motion_determines(self) -> None:
         """Prediction moves by less than the noise of the fitted torque, and less if rows count."""
