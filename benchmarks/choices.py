@@ -15,7 +15,7 @@ import numpy as np
 
 from identification.selection import inner_prediction as names
 from identification.selection.settings import Choice, Settings
-from identification.selection.trial import AVERAGE, Decision, Trial
+from identification.selection.trial import Decision, Trial
 
 CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "rotors": (names.ROTORS,),
@@ -23,7 +23,6 @@ CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "rows": (names.ROWS, names.ROWS_IN_MOTION),
     "velocity": (names.VELOCITY,),
     "bandwidth": (names.BANDWIDTH,),
-    "average": (AVERAGE,),
     "delay": (names.DELAY,),
     "low-pass": (names.LOW_PASS,),
     "reversal": (names.REVERSAL,),
@@ -54,11 +53,9 @@ def without(choice: str) -> Iterator[None]:
 
         return decided
 
-    average = (lambda *_: None) if AVERAGE in left_out else Trial.average
     with (
         patch.object(Trial, "decide", deciding(Trial.decide)),
         patch.object(Trial, "decide_last", deciding(Trial.decide_last)),
-        patch.object(Trial, "average", average),
     ):
         yield
 

@@ -92,10 +92,8 @@ class IdentifiedModel:
                 field="--estimator",
                 remedy="use auto or prior",
             )
-        settings = self.prepared.settings
-        return Posterior.of(
-            self.cell, self.factor, self.estimator, settings.strength, settings.average
-        )
+        strength = self.prepared.settings.strength
+        return Posterior.of(self.cell, self.factor, self.estimator, strength)
 
     def predicted_residuals(self, shortest: float) -> list[Array]:
         """Return what moves joints otherwise than predicted (m, n), for each fitted recording.

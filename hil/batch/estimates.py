@@ -237,7 +237,6 @@ class Estimator:
         self.model = self.cell.model
         self._delay_variance = settings.delay_variance
         self._strength = settings.strength
-        self._average = settings.average
 
     def posterior(self, total: Factor) -> tuple[Posterior | None, list[str]]:
         """Return the posterior of a sum and its archives, and notes; None: there is no prior.
@@ -248,7 +247,7 @@ class Estimator:
         require_rows(self.model, total)
         if self.name != "auto":
             return None, []
-        prior = Posterior.of(self.cell, total, self.name, self._strength, self._average)
+        prior = Posterior.of(self.cell, total, self.name, self._strength)
         posterior, _, notes = prior.solved(total)
         return posterior, notes
 

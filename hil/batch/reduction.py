@@ -62,7 +62,7 @@ class Reduction:
 def settings_digest(settings: Settings) -> str:
     """Return the digest of the settings that determine the factor of an archive."""
     entries = asdict(settings)
-    for later in ("strength", "average", "choices"):  # of the estimate only
+    for later in ("strength", "choices"):  # of the estimate only
         del entries[later]
     return json_digest([entries, code_digest()])
 

@@ -1,6 +1,6 @@
 """What a motion that was not run yet will leave uncertain, by the contributions of an interval.
 
-They are those of `hil identify` (`hil.identify.estimating`): the error of the torque, an uncertain
+`hil identify` counts the same (`hil.identify.estimating`): the error of the torque, an uncertain
 delay, and elastic gears, each by the function that counts it of recordings. The scale of the
 torques, which only absolute intervals have, is added by :mod:`hil.design.precision`. Only
 recordings show that a friction law lacks a term, or that friction drifts.

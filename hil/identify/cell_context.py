@@ -19,7 +19,7 @@ from identification.estimators.torque_channel import torque_noiseless_above
 from identification.estimators.torque_scale import DATA_SHEET, described
 from identification.factor.estimate import Estimate
 from identification.model.friction import TERMS, FrictionLaw
-from identification.selection.inner_prediction import LOAD, LOW_PASS, REVERSAL
+from identification.selection.inner_prediction import FRICTION_AT_SPEED, LOAD, LOW_PASS, REVERSAL
 from identification.signals.masks import SATURATED
 from identification.signals.recording import UNWRAPPED, Recording
 from identification.signals.samples import Samples
@@ -38,7 +38,6 @@ from .sources import Source, Sources
 Array = NDArray[np.float64]
 
 _POSTURES = 500
-_FRICTION_AT_SPEED: Final = "friction at speed"  # name of the choice of friction terms
 _TIME_TOLERANCE = 1e-6  # s
 
 
@@ -186,7 +185,7 @@ def _wrapped(sources: Sequence[Source]) -> Iterator[Finding]:
 def _added_friction(prepared: Prepared) -> tuple[str, ...]:
     """Return the symbols of friction terms that inner prediction chose and nobody stated."""
     chosen = prepared.settings.friction
-    if not any(choice.name == _FRICTION_AT_SPEED for choice in prepared.settings.choices):
+    if not any(choice.name == FRICTION_AT_SPEED for choice in prepared.settings.choices):
         return ()
     stated = prepared.sources.cell.stated.robot.friction
     added = [
@@ -201,7 +200,7 @@ def _added_friction(prepared: Prepared) -> tuple[str, ...]:
 
 def _friction_law(prepared: Prepared) -> Iterator[Finding]:
     """Yield a finding if inner prediction chose another friction law than the archives state."""
-    names = (_FRICTION_AT_SPEED, LOAD, REVERSAL)
+    names = (FRICTION_AT_SPEED, LOAD, REVERSAL)
     if not any(choice.chosen for choice in prepared.settings.choices if choice.name in names):
         return
     cell = prepared.sources.cell

@@ -58,7 +58,7 @@ from identification.factor.columns import instrument_factor
 from identification.factor.estimate import Estimate, inverse_variance
 from identification.factor.factor import QR_CONDITION, Factor, no_rows_message, total_factor
 from identification.factor.normal_equations import solve
-from identification.selection.settings import Average, Settings, Strength
+from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.calibration import Refit
@@ -183,7 +183,7 @@ def estimate_with(
         task.advance(1, name)
         factors = factors or [Factor.by_time(model, samples) for samples in fitted]
         total = sum(factors, Factor.zero(model))
-        posterior = Posterior.of(cell, total, name, settings.strength, settings.average)
+        posterior = Posterior.of(cell, total, name, settings.strength)
         posterior, beside, unsolved = posterior.solved(total)
         if name in OF_PRIOR:
             result = _posterior(model, fitted, posterior, beside.estimate, factors)
@@ -202,7 +202,7 @@ def estimate_with(
         held_out = tuple(Factor.by_time(model, samples) for samples in prepared.held_out)
         task.advance(1)
     stated, notes, elastic = _stated(prepared, result, fitted, posterior, precision, elastic)
-    form, forms = _form_of_friction(prepared, result, fitted, precision, forms)
+    form, forms = _form_of_friction(prepared, result, fitted, posterior, precision, forms)
     return Estimation(
         estimator=name,
         result=result,
@@ -304,6 +304,7 @@ def _form_of_friction(
     prepared: Prepared,
     result: RepeatedEstimate,
     fitted: Sequence[Samples],
+    posterior: Posterior,
     precision: Array | None,
     forms: Sequence[Factor],
 ) -> tuple[FormUncertainty, tuple[Factor, ...]]:
@@ -315,7 +316,10 @@ def _form_of_friction(
         *(form_factor(model, samples) for samples in some[len(forms) :]),
     )
     total = sum(every[1:], every[0])
-    return form_uncertainty(model, result.pooled, result.factor, total, precision), every
+    estimate = result.pooled
+    if precision is not None:  # the scores of a stronger prior, or of possible bodies, are not zero
+        estimate = replace(estimate, values=posterior.believed(result.factor))
+    return form_uncertainty(model, estimate, result.factor, total, precision), every
 
 
 def _with_uncertain_friction(
@@ -365,20 +369,10 @@ class Posterior:
     prior: BodyPrior
     design_effect: float  #: rows that count as one
     consistent: bool  #: whether parameters that no bodies have are excluded
-    average: Average | None = None  #: over settings; None: over none
 
     @classmethod
-    def of(
-        cls,
-        cell: Cell,
-        factor: Factor,
-        name: str,
-        strength: Strength,
-        average: Average | None = None,
-    ) -> Posterior:
+    def of(cls, cell: Cell, factor: Factor, name: str, strength: Strength) -> Posterior:
         """Return the posterior of an estimator; all but "auto" have the strength of the residuals.
-
-        They are not averaged over settings, either.
 
         The bodies are as uncertain as `[nominal]` states; the estimator "prior" trusts them to
         `NOMINAL_SHARE` if it states nothing.
@@ -389,7 +383,6 @@ class Posterior:
             share = table.uncertainty or share
         if name != "auto":
             strength = Strength()
-            average = None
         prior = body_prior(
             cell.model,
             factor,
@@ -399,7 +392,7 @@ class Posterior:
         )
         effect = design_effect_of(factor, prior.gaussian)
         prior = prior.with_weight(strength.weight)
-        return cls(cell.model, prior, effect, strength.consistent, average)
+        return cls(cell.model, prior, effect, strength.consistent)
 
     @property
     def precision(self) -> Array:
@@ -422,23 +415,19 @@ class Posterior:
     def fit(self, factor: Factor, share: float = 1.0) -> PosteriorEstimate:
         """Fit a factor that is this share of the rows, with the prior counting as for all."""
         result = self.free(factor, share)
-        if not self.consistent and self.average is None:
+        if not self.consistent:
             return result
         values = self.values(factor, share)
-        changed = replace(result.estimate, values=values, noise_std=factor.residual_rms(values))
-        if self.average is not None:
-            covariance = changed.covariance + self.average.covariance
-            changed = replace(changed, covariance=covariance)
-        return replace(result, estimate=changed)
+        noise = factor.residual_rms(values)
+        return replace(result, estimate=replace(result.estimate, values=values, noise_std=noise))
 
     def values(self, factor: Factor, share: float = 1.0) -> Array:
         """Return the parameters (p,) from a factor that is this share of the rows."""
         effect = share * self.design_effect
         values, weights = posterior_values(factor, self.prior.gaussian, effect)
-        shift = None if self.average is None else np.array(self.average.shift)
-        if self.consistent:
-            return consistent_values(self.model, factor, weights, values, self.prior, effect, shift)
-        return values if shift is None else values + shift
+        if not self.consistent:
+            return values
+        return consistent_values(self.model, factor, weights, values, self.prior, effect)
 
     def solved(self, factor: Factor) -> tuple[Posterior, PosteriorEstimate, list[str]]:
         """Fit a factor, without restriction to possible bodies if that fails, and say why."""

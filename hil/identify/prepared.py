@@ -180,9 +180,9 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
 def renewed_delay(sources: Sources, settings: Settings, options: Options) -> CombinedDelay:
     """Return the delay in chosen settings of a controller's torque by other sources [s].
 
-    That of the settings if it is known, or if it cannot be estimated from these. A stated delay in
-    the settings stays in use, with its error by the other sources, and so does one that they do not
-    exclude.
+    The settings' delay if it is known, or if these sources cannot estimate one. A stated delay in
+    the settings stays in use, with its error by the other sources; an estimated one returns to the
+    stated delay if these sources do not exclude that.
     """
     used = settings.preprocessing.torque_delay
     unchanged = CombinedDelay(used, settings.delay_variance)

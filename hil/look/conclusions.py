@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from hil.look.run import SETTINGS, look_at_joints, mountings
 from hil.terminal_text import typed
 from identification.errors import IdentificationError
 from identification.estimators.torque_channel import possible_low_passes
-from identification.signals.samples import Samples, prepare
+from identification.signals.samples import Preprocessing, Samples, prepare
 from identification.text import percentage
 from identification.validation.reading_scores import Score, compare, score_of
 from identification.validation.readings import SURE
@@ -68,8 +68,11 @@ def concluded(
     if is_bag or not (suspect or _hangs_otherwise(cell, samples, score)):
         contradictions = Contradictions.of(cell, cell.model, samples, score, score.overall)
         return _of_this_arm(imported, source, contradictions)
-    if score.overall > _SUSPECT and (channel := _explaining_channel(imported.archive, score)):
-        return replace(imported, lines=(*imported.lines, channel))
+    if score.overall > _SUSPECT and (explained := _explained(imported.archive)):
+        imported = replace(imported, lines=(*imported.lines, explained.line))
+        error = explained.score.overall
+        contradictions = Contradictions.of(cell, cell.model, samples, explained.score, error)
+        return _of_this_arm(imported, source, contradictions)
     look = look_at_joints(source, imported)
     error = score.overall if look.error is None else look.error
     if error > _OTHER_ARM:
@@ -104,29 +107,45 @@ def _few_rows(archive: Path) -> tuple[Cell, Samples, Score] | None:
         return None  # the identification says what is wrong
 
 
-def _explaining_channel(archive: Path, score: Score) -> str | None:
-    """Return the low-pass and heavy rotors that explain the torque as it is read, or None.
+class _Explained(NamedTuple):
+    """Score of a torque through a low-pass or with heavy rotors, and both in words."""
 
-    They explain it if they halve the error of its `score`. Other units, signs and orders are
-    searched without them, and may then seem to fit.
+    score: Score
+    line: str
+
+
+def _explained(archive: Path) -> _Explained | None:
+    """Return how a low-pass or heavy rotors explain the torque as it is read; None: they do not.
+
+    They explain it if they halve the error of the same rows, and no friction drives a joint. Other
+    units, signs and orders are searched without them, and may then seem to fit.
     """
     opened = open_archive(archive)
     cell = cell_of(opened)
-    recording = source_of(opened, cell).recording
-    low_passes = possible_low_passes(recording, cell.model, options=SETTINGS)
-    for how in (*low_passes, SETTINGS):
-        samples = prepare(recording, cell.model, options=how)
-        for wide_rotors in (False, True):
-            explained = score_of(cell.model, samples, wide_rotors=wide_rotors).overall
-            if explained < _EXPLAINS * score.overall:
-                width = how.torque_bandwidth
-                parts = [
-                    f"low-passed at {width:.2g} Hz" if width else "",
-                    "with rotors heavier than the links" if wide_rotors else "",
-                ]
-                described = ", ".join(filter(None, parts))
-                return f"torque: follows the arm of the URDF, {described}"
+    model = cell.model
+    try:
+        recording = source_of(opened, cell).recording
+        plain = prepare(recording, model, options=SETTINGS)
+        least = min(_OTHER_ARM, _EXPLAINS * score_of(model, plain).overall)
+        low_passes = possible_low_passes(recording, model, options=SETTINGS)
+        for how in (*low_passes, SETTINGS):
+            samples = plain if how is SETTINGS else prepare(recording, model, options=how)
+            for wide_rotors in (False, True) if how is not SETTINGS else (True,):
+                score = score_of(model, samples, wide_rotors=wide_rotors)
+                if 0.0 < score.overall < least and not score.driven.any():
+                    return _Explained(score, _described(how, wide_rotors=wide_rotors))
+    except (IdentificationError, ValueError):
+        pass  # the identification says what is wrong
     return None
+
+
+def _described(how: Preprocessing, *, wide_rotors: bool) -> str:
+    width = how.torque_bandwidth
+    parts = (
+        f"low-passed at {width:.2g} Hz" if width else "",
+        "with rotors heavier than the links" if wide_rotors else "",
+    )
+    return f"torque: follows the arm of the URDF, {', '.join(filter(None, parts))}"
 
 
 def _hangs_otherwise(cell: Cell, samples: Samples, score: Score) -> bool:

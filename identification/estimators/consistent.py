@@ -233,23 +233,17 @@ def consistent_values(
     values: Array,
     prior: BodyPrior,
     design_effect: float = 1.0,
-    shift: Array | None = None,
 ) -> Array:
     """Return a posterior's parameters (p,), or the most probable possible ones instead of them.
 
-    `values` (p,) are the free posterior's, with weights (n,) of the joints; `shift` (p,) is added
-    to them, and to what the data say.
+    `values` (p,) are the free posterior's, with weights (n,) of the joints.
 
     Raises:
         SolverError: the conic solver found none.
     """
-    equations = factor.weighted(weights)
-    if shift is not None:
-        values = values + shift
-        equations = equations._replace(b=equations.b + equations.A @ shift)
     if is_consistent(model, prior.most_probable(values)):
         return values
-    parts = consistent_parameters(model, equations, prior, design_effect)
+    parts = consistent_parameters(model, factor.weighted(weights), prior, design_effect)
     return np.asarray(prior.combinations @ np.concatenate(parts))
 
 

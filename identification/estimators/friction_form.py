@@ -225,7 +225,7 @@ def with_drift(model: RobotModel, estimate: Estimate, change: Array) -> Estimate
     """Return the estimate with the spread of friction that changes in its covariance.
 
     Of relative changes (n,) of each joint's friction over the recordings, in a straight line about
-    the mean: a standard deviation of the twelfth root.
+    the mean: a standard deviation of the change over the root of twelve.
     """
     friction = np.where(model.friction_columns, estimate.values, 0.0)
     spread = np.zeros((model.n_parameters, model.n_joints))

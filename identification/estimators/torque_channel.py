@@ -166,7 +166,7 @@ class _Joint(NamedTuple):
         own = np.append(values[self.columns], 1.0)
         size = len(own)
         bands = len(self.powers)
-        power = self.gram.reshape(bands, size, size) @ own @ own
+        power = np.maximum(self.gram.reshape(bands, size, size) @ own @ own, 0.0)
         return power, self.cross[:bands] @ own + 1j * (self.cross[bands : 2 * bands] @ own)
 
     @classmethod
@@ -301,8 +301,8 @@ class _Spectra:
                 power = float(model[inside].sum())
                 torque = float(joint.powers[inside].sum())
                 both = cross[inside]
-                product = max((abs(np.vdot(phase[inside], both)) for phase in phases), default=0.0)
-                if not product > 0.0:
+                product = max(float(abs(np.vdot(phase[inside], both))) for phase in phases)
+                if not (product > 0.0 and power > 0.0):
                     continue
                 # At most one, up to the rounding of sums of squares.
                 coherence = min(product**2 / (power * torque), 1.0 - _SMALLEST_NOISE)

@@ -107,7 +107,7 @@ def gain_factor(
 def friction_factor(model: RobotModel, samples: Samples, terms: Sequence[FrictionTerm]) -> Factor:
     """Reduce a recording to blocks of [W | F | y], F with q more friction terms of each joint.
 
-    Those of joint j are the parameters p + q j to p + q (j + 1); none depends on the load.
+    The parameters p + q j to p + q (j + 1) are of joint j; none depends on the load.
     """
     n = model.n_joints
     p = model.n_parameters

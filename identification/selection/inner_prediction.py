@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
-from identification.selection.settings import Average, Choice, Settings
+from identification.selection.settings import Choice, Settings
 from identification.selection.trial import (
     IMPOSSIBLE_WORTHWHILE,
     MEANINGLESS,
@@ -165,25 +165,7 @@ def choose_settings(
         for decision in _torsion_springs(trial, now, springs):
             now = decision.settings
             choices = [*choices, decision.choice]
-    if "estimator" in asked and (averaged := _average(trial, now, asked)):
-        average, choice = averaged
-        now = replace(now, average=average)
-        choices = [*choices, choice]
     return replace(now, choices=tuple(choice for choice in choices if len(choice.candidates) > 1))
-
-
-def _average(trial: Trial, now: Settings, asked: Collection[str]) -> tuple[Average, Choice] | None:
-    """Average over the answers to questions that leave the columns of the regressor as they are."""
-    others: list[Settings] = []
-    for swept in _SWEPT:
-        if not (swept.averaged and swept.question in asked):
-            continue
-        candidates = [now, *(each for each in swept.vary(now) if trial.key(each) != trial.key(now))]
-        tried = [*range(len(candidates))]
-        if swept.size is not None:
-            tried = trial.walk(candidates, swept.size)
-        others += [candidates[k] for k in tried if k > 0]
-    return trial.average(now, others)
 
 
 def _first_candidates(start: Settings, questions: Collection[Question]) -> Settings:
@@ -453,7 +435,6 @@ class _Swept(NamedTuple):
     share: float | None = None  # by which another candidate must be better, if not as usual
     certainty: float = 1.0  # in standard errors
     transfer: float = 0.0  # relative standard deviation in addition
-    averaged: bool = False  # whether parameters are averaged over the candidates
 
 
 _SWEPT: Final = (
@@ -489,7 +470,6 @@ _SWEPT: Final = (
         lambda now: [now.preprocessed(rigid_bandwidth=width) for width in BANDWIDTHS],
         lambda now: now.preprocessing.rigid_bandwidth,
         transfer=TRANSFER,
-        averaged=True,
     ),
 )
 

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from identification.signals.samples import Preprocessing
 
@@ -41,24 +37,6 @@ class Choice:
     # mean over the segments
     errors: tuple[float, ...]
     chosen: int  # index of the candidate
-    weights: tuple[float, ...] = ()  # of candidates that are averaged; empty: one was chosen
-
-
-@dataclass(frozen=True)
-class Average:
-    """Mean over settings that the data cannot tell apart, by what it adds to the chosen ones.
-
-    The mean of parameters, and the covariance of a mixture (Buckland, Burnham and Augustin 1997).
-    """
-
-    shift: tuple[float, ...]  #: of the parameters (p,)
-    rows: tuple[tuple[float, ...], ...]  #: (k, p), whose outer products add to the covariance
-
-    @cached_property
-    def covariance(self) -> NDArray[np.float64]:
-        """What choosing among these settings adds to the covariance (p, p)."""
-        rows = np.array(self.rows)
-        return np.asarray(rows.T @ rows)
 
 
 @dataclass(frozen=True)
@@ -78,7 +56,6 @@ class Settings:
     stated_delay: float = 0.0  #: of the torque, by cell or options [s]
     delay_variance: float = 0.0  #: mean square error of the delay [s²]; zero if it is known
     strength: Strength = Strength()
-    average: Average | None = None  #: over settings that predict alike; None: over none
     choices: tuple[Choice, ...] = ()  #: made by inner prediction
     #: parameters (p,) of bodies and drives that load the gears, for friction that grows with it;
     #: None: it does not, or they are estimated with it

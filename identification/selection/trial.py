@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
@@ -30,7 +29,7 @@ from identification.model.elements import Element, TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.selection.folds import FOLDS, Errors, Folds, PredictedRows, mean_error
-from identification.selection.settings import Average, Choice, Settings, Strength
+from identification.selection.settings import Choice, Settings, Strength
 from identification.signals.samples import Preprocessing, Samples
 
 Array = NDArray[np.float64]
@@ -41,7 +40,6 @@ TRANSFER: Final = 0.05
 
 Relative standard deviation: 2 to 14 % (root mean square) on the splits of eight real arms, for
 bandwidths, presliding displacements and excluded rows (``benchmarks.leave_one_out``)."""
-_LEAST_WEIGHT: Final = 0.02  # of settings in an average, relative to the chosen ones
 
 # Improvement required to replace the first, simpler candidate, beside its standard error; more for
 # a low-pass, which correlates with other settings.
@@ -50,7 +48,6 @@ WORTHWHILE: Final = 0.01
 IMPOSSIBLE_WORTHWHILE: Final = 0.05
 # An error above the torque itself chooses nothing, nor does one that no sensor resolves.
 MEANINGLESS: Final = 1.0
-AVERAGE: Final = "mean over settings that predict alike"
 _EXACT: Final = 1e-5
 _SAME: Final = 1e-4  # relative difference of errors that is none
 # Speeds above this share of the largest are predicted from slower ones to try friction terms.
@@ -214,40 +211,6 @@ class Trial:
         if not means[chosen] <= (1.0 + _SAME) * means[0]:
             chosen -= 1
         return self._decision(name, candidates[: len(means)], means, chosen)
-
-    def average(
-        self, chosen: Settings, others: Sequence[Settings]
-    ) -> tuple[Average, Choice] | None:
-        """Return the mean of the parameters over chosen settings and others of the same columns.
-
-        Each other counts by the probability that it predicts another motion better, relative to a
-        half. None where none of them counts, or where they cannot be compared.
-        """
-        first = self.errors(chosen).segments
-        if not first.size or not np.all(np.isfinite(first)):
-            return None
-        weights = [1.0]
-        members = [chosen]
-        for each in others:
-            segments = self.errors(each).segments
-            if segments.shape != first.shape or not np.all(np.isfinite(segments)):
-                continue
-            change, std = _change(segments, first, TRANSFER)
-            weight = 2.0 * float(scipy.special.ndtr(-change / std))
-            if weight > _LEAST_WEIGHT:
-                weights.append(weight)
-                members.append(each)
-        if len(members) == 1:
-            return None
-        share = np.array(weights) / np.sum(weights)
-        values = np.array([self._values(each) for each in members])
-        changes = values - values[0]
-        shift = share @ changes
-        rows = np.sqrt(share)[:, None] * (changes - shift)
-        described = _differences([_description(self.model(each), each) for each in members])
-        errors = tuple(self.errors(each).overall for each in members)
-        choice = Choice(AVERAGE, described, errors, 0, tuple(share.tolist()))
-        return Average(tuple(shift.tolist()), tuple(map(tuple, rows.tolist()))), choice
 
     def _decision(
         self, name: str, candidates: Sequence[Settings], means: Sequence[float], chosen: int

@@ -6,7 +6,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
@@ -35,7 +34,7 @@ from identification.selection.inner_prediction import (
     choose_settings,
 )
 from identification.selection.settings import Settings, Strength
-from identification.selection.trial import IMPOSSIBLE_WORTHWHILE, TRANSFER, WORTHWHILE, Trial
+from identification.selection.trial import IMPOSSIBLE_WORTHWHILE, WORTHWHILE, Trial
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
 from identification.signals.smoothing import FORWARDS, WITHOUT_PHASE, LowPassShape, low_passed
@@ -500,44 +499,6 @@ def decided(*errors):
         np.square(scores[trial.key(settings)])[:, None], np.ones((len(errors[0]), 1))
     )
     return trial.decide("", candidates).choice
-
-
-class TestAverage:
-    """Settings that predict alike are averaged, by the probability that each is the better one."""
-
-    CHOSEN = Settings(Preprocessing(rigid_bandwidth=14.0))
-    FIRST = np.linspace(0.1, 0.4, 10)
-
-    def average(self, *errors):
-        """Average over settings of these errors in segments (k,); the values are their widths."""
-        trial = Trial(MODEL, lambda *_: [])
-        others = [self.CHOSEN.preprocessed(rigid_bandwidth=20.0 + k) for k in range(len(errors))]
-        scores = dict(
-            zip(map(trial.key, [self.CHOSEN, *others]), [self.FIRST, *errors], strict=True)
-        )
-        trial.errors = lambda settings: Errors(
-            np.square(scores[trial.key(settings)])[:, None], np.ones((len(self.FIRST), 1))
-        )
-        trial._values = lambda settings: np.array([settings.preprocessing.rigid_bandwidth])
-        return trial.average(self.CHOSEN, others)
-
-    def test_what_predicts_as_well_counts_as_much(self):
-        average, choice = self.average(self.FIRST, self.FIRST)
-        assert choice.weights == pytest.approx([1 / 3] * 3)
-        assert average.shift == pytest.approx([np.mean([14.0, 20.0, 21.0]) - 14.0])
-
-    def test_its_covariance_is_that_of_the_mixture(self):
-        average, _ = self.average(self.FIRST, self.FIRST)
-        assert average.covariance == pytest.approx(np.var([14.0, 20.0, 21.0]))
-
-    def test_what_predicts_clearly_worse_does_not_count(self):
-        assert self.average(1.3 * self.FIRST) is None
-
-    def test_what_predicts_hardly_worse_counts_less(self):
-        """Another motion differs from parts of this one by `TRANSFER`."""
-        _, choice = self.average(np.exp(TRANSFER) * self.FIRST)
-        weight = 2.0 * scipy.stats.norm.cdf(-1.0)
-        assert choice.weights == pytest.approx([1.0 / (1.0 + weight), weight / (1.0 + weight)])
 
 
 class TestClearlyBetter:
