@@ -54,6 +54,9 @@ _BIN: Final = 0.005  # s
 # Minima of the profile are wider.
 _PROFILE_STEP: Final = 0.01  # s
 _ITERATIONS: Final = 12
+_SETTLING: Final = 3  # iterations
+# Half a 95 % interval that less noise of the positions may make that of a determined delay.
+_WITHIN_REACH: Final = 3e-3  # s
 _CONVERGED = 1e-6  # s
 _OF_STD = 0.02  # share of the standard deviation
 _MODEL_ERROR: Final = 0.05  # difference of log variance up to which two minima are equally good
@@ -258,7 +261,8 @@ def estimate_delay(
     # Reversals are left out below, less widely than beside a smoother of this bandwidth.
     options = replace(_narrow(options), left_out="halts")
     estimate = _estimated(recording, model, noise_variance, options)
-    if estimate.determined or options.rigid_bandwidth <= _SMOOTH_MOTION:
+    is_far = not estimate.half_interval < _WITHIN_REACH
+    if estimate.determined or is_far or options.rigid_bandwidth <= _SMOOTH_MOTION:
         return estimate
     # Noise of positions turns friction at slow motion: a smoother motion may show the delay.
     smooth = replace(options, rigid_bandwidth=_SMOOTH_MOTION)
@@ -278,7 +282,7 @@ def _estimated(
     grid = np.linspace(*ends, 1 + 2 * int(np.ceil(LONGEST_DELAY / _PROFILE_STEP)))
     reader, (heights, values) = _profiled(model, samples, grid)
     shift = float(grid[np.argmin(heights)])
-    for _ in range(_ITERATIONS):
+    for iteration in range(_ITERATIONS):
         blocks = reader.linearised(shift, values)
         solution = blocks.solution()
         values = np.delete(solution.values, p)
@@ -286,6 +290,9 @@ def _estimated(
         before = shift
         shift = float(np.clip(shift + step, *ends))
         if abs(shift - before) <= max(_CONVERGED, _OF_STD * float(np.sqrt(solution.inverse[p, p]))):
+            break
+        # What is far from determined need not settle, and often does not.
+        if iteration >= _SETTLING and blocks.delay_std(solution)[0] > WIDEST_INTERVAL:
             break
     height = reader.profile(np.array([shift])).heights[0]
     other = _other_minimum(grid, heights, shift, height)
