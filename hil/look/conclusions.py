@@ -125,11 +125,11 @@ def _explained(archive: Path) -> _Explained | None:
     model = cell.model
     try:
         recording = source_of(opened, cell).recording
-        as_read = prepare(recording, model, options=SETTINGS)
-        least = min(_OTHER_ARM, _EXPLAINS * score_of(model, as_read).overall)
+        unfiltered = prepare(recording, model, options=SETTINGS)
+        least = min(_OTHER_ARM, _EXPLAINS * score_of(model, unfiltered).overall)
         low_passes = possible_low_passes(recording, model, options=SETTINGS)
         for how in (*low_passes, SETTINGS):
-            samples = as_read if how is SETTINGS else prepare(recording, model, options=how)
+            samples = unfiltered if how is SETTINGS else prepare(recording, model, options=how)
             for wide_rotors in (False, True) if how is not SETTINGS else (True,):
                 score = score_of(model, samples, wide_rotors=wide_rotors)
                 if 0.0 < score.overall < least and not score.driven.any():

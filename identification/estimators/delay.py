@@ -54,7 +54,7 @@ _BIN: Final = 0.005  # s
 # Minima of the profile are wider.
 _PROFILE_STEP: Final = 0.01  # s
 _ITERATIONS: Final = 12
-_SETTLING: Final = 3  # iterations
+_FIRST_ITERATIONS: Final = 3  # iterations
 # Half a 95 % interval that less noise of the positions may make that of a determined delay.
 _WITHIN_REACH: Final = 3e-3  # s
 _CONVERGED = 1e-6  # s
@@ -292,7 +292,7 @@ def _estimated(
         if abs(shift - before) <= max(_CONVERGED, _OF_STD * float(np.sqrt(solution.inverse[p, p]))):
             break
         # What is far from determined need not settle, and often does not.
-        if iteration >= _SETTLING and blocks.delay_std(solution)[0] > WIDEST_INTERVAL:
+        if iteration >= _FIRST_ITERATIONS and blocks.delay_std(solution)[0] > WIDEST_INTERVAL:
             break
     height = reader.profile(np.array([shift])).heights[0]
     other = _other_minimum(grid, heights, shift, height)
