@@ -137,7 +137,7 @@ offers only URDFs (`example-robot-data`): recordings come from a folder.
 Rows *measured elsewhere* are of arms whose recordings are reserved for acceptance and are not
 here. Their figures are those reported for the commit in the row (`benchmarks/elsewhere.toml`),
 which is older than heavy rotors and the test of low-passes, and were not repeated since;
-ranges are those of a group of rows. Sources that the report does not name are *not named*.
+a range covers a group of rows. Sources that the report does not name are *not named*.
 """
 _COMMANDS: Final = """\
 ```text

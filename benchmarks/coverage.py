@@ -15,7 +15,7 @@ parameters are called and how they are grouped is the project's.
 - ``--stribeck`` raises dry friction at rest by a share, which decays with ``exp(-(v / v_s)²)``; v_s
   is 0.1 rad/s or that of ``--stribeck-speed``. ``--drift`` lets dry and viscous friction fall by a
   share over the fitted log, linearly; the held-out motion follows. No archive states either.
-  Coefficients count as those of the true law: Coulomb and viscous friction without the Stribeck
+  The true coefficients are the law's own: Coulomb and viscous friction without the Stribeck
   part; of friction that drifts its values at the start, in the middle and at the end of the log.
 - The motion is a random Fourier series within the URDF's limits that starts and ends at rest.
   ``--speed`` is the share of the largest speeds that it may use.
@@ -487,7 +487,7 @@ class Run(NamedTuple):
         friction: likewise of the friction coefficients.
         inertial_absolute: likewise in absolute intervals.
         friction_absolute: likewise.
-        inertial_over_bound: half widths of intervals over those of the Cramer-Rao bound.
+        inertial_over_bound: half widths of intervals divided by the Cramer-Rao bound's.
         friction_over_bound: likewise of true coefficients of friction.
         friction_least_squares: the latter of weighted least squares.
         undetermined: number of parameters without an interval.

@@ -107,9 +107,7 @@ def fit_friction(robot: Any, measured: Measured) -> PlainFit:
     Raises:
         ValueError: the URDF has no masses.
     """
-    if not has_masses(robot):
-        raise ValueError("the masses of this URDF are placeholders: all bodies have the same")
-    bodies = body_parameters(robot)
+    bodies = known_bodies(robot)
 
     def friction(table: Array, torque: Array) -> Array:
         return solve_friction(bodies, table, torque)
@@ -123,9 +121,7 @@ def fit_friction_and_scale(robot: Any, measured: Measured) -> PlainFit:
     Raises:
         ValueError: the URDF has no masses.
     """
-    if not has_masses(robot):
-        raise ValueError("the masses of this URDF are placeholders: all bodies have the same")
-    bodies = body_parameters(robot)
+    bodies = known_bodies(robot)
 
     def scaled(table: Array, torque: Array) -> Array:
         n = torque.shape[1]
@@ -193,6 +189,17 @@ def body_parameters(robot: Any) -> Array:
     """The URDF's bodies (14 n,), without rotors, friction and offsets."""
     bodies = [inertia.toDynamicParameters() for inertia in robot.inertias[1:]]
     return np.concatenate([*bodies, np.zeros(4 * robot.nv)])
+
+
+def known_bodies(robot: Any) -> Array:
+    """Return the URDF's bodies as `body_parameters`.
+
+    Raises:
+        ValueError: the URDF has no masses.
+    """
+    if not has_masses(robot):
+        raise ValueError("the masses of this URDF are placeholders: all bodies have the same")
+    return body_parameters(robot)
 
 
 def nominal(robot: Any) -> PlainFit:

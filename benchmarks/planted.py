@@ -1,7 +1,7 @@
 """What `hil identify` says of one planted fault: the delay it applies, the cause and its size.
 
 Run with ``python -m benchmarks.planted [--cases NAME ...] [--arms NAME ...] [--seeds N] [--json]``.
-Arms, motions and noise are those of `benchmarks.coverage`, which share no code with what is tested;
+Arms, motions and noise come from `benchmarks.coverage` and share no code with what is tested;
 each run fits a log of 30 s and predicts another motion, with default settings. The scale of each
 torque is off by 3 % (standard deviation).
 
@@ -68,7 +68,7 @@ PLANTED_ARMS: Final[Mapping[str, ArmType]] = {
         rated_payload=10.0,
     ),
 }
-"""Beside those of the study of coverage one of medium friction."""
+"""The arms of `benchmarks.coverage`, and one of medium friction."""
 
 _STATED: Final = 0.0  # s, delay of an imported log
 _STRIBECK_SPEED: Final = 0.1  # rad/s
@@ -216,7 +216,7 @@ def outcome_of(found: Identification, true_factor: float, seconds: float) -> Out
 
 
 def figures(outcomes: Sequence[tuple[Plant, Outcome]]) -> dict[str, int]:
-    """Count what is said of some runs; see the module."""
+    """Summarise some runs; see the module for the figures."""
     wrong = [out.applied - plant.delay for plant, out in outcomes]
     used = [abs(out.applied - _STATED) > 0.0 for _, out in outcomes]
     there = [plant.delay != _STATED for plant, _ in outcomes]
