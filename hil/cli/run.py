@@ -75,7 +75,7 @@ def run(
         no_identify: Only run; no parameters and no report.
         until_precise: End the repetitions when the required precision is reached, or when more of
             them do not help. Their number in [campaign] is the limit.
-        precision: Required, such as "parameters 5 %, torque 10". Default: that of the design.
+        precision: Such as "parameters 5 %" or "parameters 5 % absolute". Default: as in the design.
         live: Stream the run to Foxglove; on 127.0.0.1 unless HOST is given.
     """
     choices = _choices(dry_run, accept_dry_run, accept_torque or ())
