@@ -21,7 +21,7 @@ from hil.errors import HilError, InputError
 from hil.files import file_digest
 from hil.identify import Identification, Options, identify_paths
 from hil.identify.cell_context import torque_limits
-from hil.identify.estimating import Posterior
+from hil.identify.estimating import posterior_of
 from hil.identify.estimators import OF_PRIOR
 from hil.identify.prepared import Prepared, prepared_with
 from hil.identify.sources import gather_sources
@@ -38,10 +38,10 @@ from identification.export.arm import Arm, Ranges
 from identification.export.friction import median_load
 from identification.export.parameters import estimate_in
 from identification.factor.blocks import FINE_BLOCK, fine_blocks
-from identification.factor.factor import total_factor
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.pseudo_inertia import margin
 from identification.model.robot import RobotModel
+from identification.reduction.posterior import Posterior
 from identification.rollout.comparison import driving_residual
 from identification.selection.folds import FOLDS
 
@@ -76,7 +76,7 @@ class IdentifiedModel:
     @cached_property
     def factor(self) -> Factor:
         """Sums over the fitted rows."""
-        return total_factor(self.cell.model, self.prepared.fitted)
+        return self.prepared.total.factor
 
     @cached_property
     def posterior(self) -> Posterior:
@@ -93,7 +93,7 @@ class IdentifiedModel:
                 remedy="use auto or prior",
             )
         strength = self.prepared.settings.strength
-        return Posterior.of(self.cell, self.factor, self.estimator, strength)
+        return posterior_of(self.cell, self.factor, self.estimator, strength)
 
     def predicted_residuals(self, shortest: float) -> list[Array]:
         """Return what moves joints otherwise than predicted (m, n), for each fitted recording.

@@ -48,7 +48,14 @@ from .estimates import (
     group_of,
     result_of,
 )
-from .reduction import ensure_reduced, load_source, reduce_archives, reduction_key
+from .reduction import (
+    ToReduce,
+    ensure_reduced,
+    load_source,
+    reduce_archives,
+    reduction_key,
+    to_reduce,
+)
 
 PARTITION: Final = 16
 """Archives of one task, and campaigns of one sum: Dask takes 2.5 ms for a task, and sums of factors
@@ -197,10 +204,10 @@ class _Campaign:
         return self.settings
 
     @property
-    def partitions(self) -> list[list[ArchiveRef]]:
+    def partitions(self) -> list[list[ToReduce]]:
         """Its archives by task, in the order of sums."""
         refs = sorted(self.refs, key=lambda ref: ref.order)
-        return list(_chunks([ref for ref in refs if ref.use != "standstill"]))
+        return list(_chunks(to_reduce([ref for ref in refs if ref.use != "standstill"])))
 
 
 @dataclass(eq=False)
@@ -387,15 +394,15 @@ class _Batch:
             place = campaign.key.campaign
             partitions = campaign.partitions
             estimated = (arm.model, campaign.ready, place)
-            if all(self._has(refs, campaign) for refs in partitions):
+            if all(self._has(wanted, campaign) for wanted in partitions):
                 pair = submit(place, estimate_cached, partitions, self.cache, *estimated)
                 receivers[pair.key] = _advance(advance, sum(map(len, partitions)), place)
                 yield pair
             else:
                 parts = []
-                for refs in partitions:
-                    part = submit(place, reduce_archives, refs, campaign.ready, self.cache)
-                    receivers[part.key] = _advance(advance, len(refs), place)
+                for wanted in partitions:
+                    part = submit(place, reduce_archives, wanted, campaign.ready, self.cache)
+                    receivers[part.key] = _advance(advance, len(wanted), place)
                     parts.append(part)
                 pair = submit(place, estimate_campaign, parts, *estimated)
                 yield from parts
@@ -430,20 +437,20 @@ class _Batch:
     def _uncached(self, campaign: _Campaign) -> int:
         """Return how many archives of a campaign have to be read."""
         count = 0
-        for refs in campaign.partitions:
-            if not self._has(refs, campaign):
-                count += sum(not self._has([ref], campaign) for ref in refs)
+        for wanted in campaign.partitions:
+            if not self._has(wanted, campaign):
+                count += sum(not self._has([one], campaign) for one in wanted)
         return count
 
-    def _has(self, refs: Sequence[ArchiveRef], campaign: _Campaign) -> bool:
-        return self.cache.has(refs[0].location, reduction_key(refs, campaign.ready))
+    def _has(self, wanted: Sequence[ToReduce], campaign: _Campaign) -> bool:
+        return self.cache.has(wanted[0].ref.location, reduction_key(wanted, campaign.ready))
 
     def _remove_deadly(self, campaign: _Campaign) -> None:
         """Remove the archives of a campaign that end the process that reduces them."""
         tasks = [
-            Task(ref.location, ensure_reduced, (ref, campaign.ready, self.cache))
-            for refs in campaign.partitions
-            for ref in refs
+            Task(one.ref.location, ensure_reduced, (one, campaign.ready, self.cache))
+            for wanted in campaign.partitions
+            for one in wanted
         ]
         results = self._results(tasks, "reducing archives one by one", len(tasks))
         deadly = [result for result in results if result is not None]

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -31,19 +30,20 @@ from hil.identify.prepared import (
     Prepared,
     decide,
     prepared_with,
+    reduction_of,
     renewed_delay,
-    samples_of,
+    versions_of,
 )
 from hil.identify.sources import Source, gather_sources
 from hil.progress import Reporter, Silent
 from hil.reading import path_exists
 from hil.terminal_text import plural
-from identification.estimators.delay import CombinedDelay, delay_sensitivity, rate_products
-from identification.estimators.elasticity import ElasticTorque
+from identification.estimators.delay import CombinedDelay, delay_sensitivity
 from identification.estimators.torque_scale import absolute
 from identification.excitation import midpoints
 from identification.factor.estimate import Estimate, inverse_variance
 from identification.factor.factor import Factor
+from identification.reduction.reduction import ALIKE, Reduction
 from identification.signals.samples import Samples
 
 from .precision_record import IN_A_ROW, Look, PrecisionRecord, Reached
@@ -70,8 +70,7 @@ class _Reduced(NamedTuple):
 
     source: Source
     samples: Samples
-    factor: Factor
-    products: Array | None  #: `rate_products`, if the delay is uncertain
+    reduction: Reduction
 
 
 class PrecisionMeter:
@@ -122,27 +121,20 @@ class PrecisionMeter:
         for path in paths:
             if path not in self._repetitions:
                 (source,) = gather_sources([path], self._options.split, in_sample=True).training
-                self._repetitions[path] = self._reduced(source)
+                few = bool(self._earlier) or len(self._repetitions) < ALIKE
+                self._repetitions[path] = self._reduced(source, unmodelled=few)
         repetitions = [self._repetitions[path] for path in paths]
         recordings = (*self._earlier, *repetitions)
         prepared, later = self._prepared_of(recordings)
-        factors = [recording.factor for recording in recordings]
-        rates = [each.products for each in recordings if each.products is not None]
-        products = np.sum(rates, axis=0) if rates else None
-        read = [recording.source.path for recording in recordings]
-        elastic = [self._elastic[path] for path in takewhile(self._elastic.__contains__, read)]
-        forms = [self._forms[path] for path in takewhile(self._forms.__contains__, read)]
-        estimation = estimate_with(
-            prepared, self._options, Silent(), factors, products, elastic, forms
-        )
-        self._elastic.update(zip(read, estimation.elastic, strict=False))
-        self._forms.update(zip(read, estimation.forms, strict=False))
+        reductions = [recording.reduction for recording in recordings]
+        rates = Reduction.total(prepared.sources.cell.model, reductions).rates
+        estimation = estimate_with(prepared, self._options, Silent(), reductions)
         pooled = estimation.result.pooled
         posterior = estimation.posterior
         stated = estimation.stated
-        if products is not None and later:
+        if rates is not None and later:
             moved = later * delay_sensitivity(
-                pooled, estimation.result.factor, products, posterior.precision
+                pooled, estimation.result.factor, rates, posterior.precision
             )
             pooled, stated = (
                 replace(estimate, values=estimate.values + moved) for estimate in (pooled, stated)
@@ -159,8 +151,8 @@ class PrecisionMeter:
         # The errors of delay, gears and torque scale, which are in it as well, do not fall.
         of_rows = _variances(directions, posterior.free(estimation.result.factor).estimate)
         moved = np.asarray(np.linalg.solve(information, directions.T))
-        of_repetitions = [repetition.factor for repetition in repetitions]
-        earlier = [recording.factor for recording in self._earlier]
+        of_repetitions = [repetition.reduction.factor for repetition in repetitions]
+        earlier = [recording.reduction.factor for recording in self._earlier]
         return Measured(
             wanted=wanted,
             values=directions @ values,
@@ -219,21 +211,17 @@ class PrecisionMeter:
         ]
         model = self._prepared.sources.cell.model
         self._reference = ReferenceMotions(model, motions, campaign.cell.model.parameter_names)
-        self._earlier = [self._reduced(source) for source in self._given]
+        self._earlier = [self._reduced(source, unmodelled=True) for source in self._given]
         self._repetitions: dict[Path, _Reduced] = {}
-        self._elastic: dict[Path, ElasticTorque] = {}
-        self._forms: dict[Path, Factor] = {}
         self._delays: dict[tuple[Path, ...], CombinedDelay] = {}
         self._first = path
 
-    def _reduced(self, source: Source) -> _Reduced:
+    def _reduced(self, source: Source, *, unmodelled: bool) -> _Reduced:
         cell = self._prepared.sources.cell
         settings = self._prepared.settings
-        samples = samples_of(source, cell, settings)
-        if settings.loading is not None:
-            samples = samples.with_load(cell.model, np.array(settings.loading))
-        products = rate_products(cell.model, samples) if settings.delay_variance else None
-        return _Reduced(source, samples, Factor.by_time(cell.model, samples), products)
+        versions = versions_of(source, cell, settings)
+        reduction = reduction_of(cell, settings, versions, unmodelled=unmodelled)
+        return _Reduced(source, versions[0], reduction)
 
 
 def _variances(directions: Array, estimate: Estimate) -> Array:

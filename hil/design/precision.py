@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.identify.cell_context import TorqueScale, torque_scale
-from hil.identify.estimating import Posterior
+from hil.identify.estimating import posterior_of
 from hil.identify.options import FIXED
-from hil.identify.prepared import samples_of, stated_settings
+from hil.identify.prepared import reduction_of, stated_settings, versions_of
 from hil.terminal_text import plural
 from identification.estimators.payload import parameter_change
 from identification.estimators.payload_problem import DRIFT
@@ -189,7 +189,7 @@ class PrecisionDesign:
             *(np.concatenate(parts) for parts in zip(*(m[:4] for m in sampled), strict=True))
         )
         factor = Factor.from_samples(cell.model, whole, reference.torque(nominal))
-        prior = Posterior.of(cell, factor, "auto", Strength()).prior.gaussian.information
+        prior = posterior_of(cell, factor, "auto", Strength()).prior.gaussian.information
         values = nominal
         scale = torque_scale(cell, (), simulated=simulated)
         if cell.file.drive_train is not None:
@@ -397,15 +397,15 @@ def _posterior(cell: Cell, paths: Sequence[Path]) -> tuple[Array, Array, Array]:
     factors = list[Factor]()
     errors = list[Array]()
     for source in given_sources(cell, paths):
-        samples = samples_of(source, cell, settings)
-        factors.append(Factor.by_time(cell.model, samples))
+        versions = versions_of(source, cell, settings)
+        factors.append(reduction_of(cell, settings, versions, unmodelled=False).factor)
         if len(errors) < _MEASURED:
-            step = float(np.median(np.diff(samples.motion.time)))
-            alone = Posterior.of(cell, factors[-1], "auto", Strength())
+            step = float(np.median(np.diff(versions[0].motion.time)))
+            alone = posterior_of(cell, factors[-1], "auto", Strength())
             noise = alone.free(factors[-1]).estimate.noise_std
             errors.append(noise**2 * step * alone.design_effect)
     total = sum(factors[1:], factors[0])
-    posterior = Posterior.of(cell, total, "auto", Strength())
+    posterior = posterior_of(cell, total, "auto", Strength())
     estimate = posterior.free(total).estimate
     weights = inverse_variance(estimate.noise_std**2)
     data = total.weighted(weights).A / posterior.design_effect

@@ -14,56 +14,28 @@ from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification import IdentificationError, RobotModel
-from identification.estimators.consistent import (
-    SolverError,
-    consistent_values,
-)
-from identification.estimators.delay import rate_products, with_uncertain_delay
-from identification.estimators.elasticity import (
-    ElasticTorque,
-    expected_compliance,
-    with_elastic_gears,
-)
-from identification.estimators.friction_form import (
-    FormUncertainty,
-    form_factor,
-    form_uncertainty,
-    with_drift,
-    with_uncertain_form,
-)
+from identification.estimators.friction_form import FormUncertainty
 from identification.estimators.instrumental import (
     estimate_instrumental,
     planned_motion,
     same_plan,
 )
-from identification.estimators.least_squares import (
-    RepeatedEstimate,
-    estimate_repetitions,
-)
+from identification.estimators.least_squares import RepeatedEstimate, estimate_repetitions
 from identification.estimators.load_friction import LoadFit, fit_with_load
 from identification.estimators.losses import Huber, Loss, Tukey
-from identification.estimators.prior import (
-    BODY_SHARE,
-    NOMINAL_SHARE,
-    BodyPrior,
-    PosteriorEstimate,
-    body_prior,
-    design_effect_of,
-    fit_posterior,
-    posterior_values,
-)
+from identification.estimators.prior import BODY_SHARE, NOMINAL_SHARE, PosteriorEstimate
 from identification.estimators.robust import RobustEstimate, robust_estimate
-from identification.estimators.torque_scale import with_torque_scale
 from identification.factor.columns import instrument_factor
-from identification.factor.estimate import Estimate, inverse_variance
+from identification.factor.estimate import Estimate
 from identification.factor.factor import QR_CONDITION, Factor, no_rows_message, total_factor
-from identification.factor.normal_equations import solve
+from identification.reduction.intervals import delayed, widened
+from identification.reduction.posterior import Posterior
+from identification.reduction.reduction import Reduction
 from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.calibration import Refit
 from identification.validation.finding import joined
-from identification.validation.residuals import drift_of_factors
 
 from .cell_context import TorqueScale, torque_scale_of
 from .estimators import OF_PRIOR, Estimator, fit_of, values_of
@@ -78,9 +50,6 @@ from .sources import Sources
 MIN_IV_BANDWIDTH: Final = 20.0
 # Difference between data and prior, in standard deviations, that is reported.
 _MAX_PRIOR_DEVIATION: Final = 4.0
-
-# Repetitions of a motion in which elastic gears add the same torque: no more are read for it.
-_ALIKE: Final = 3
 
 Array = NDArray[np.float64]
 
@@ -105,9 +74,7 @@ class Estimation:
     #: the scale of the torques: no residual shows what they do to parameters
     stated: Estimate
     notes: tuple[str, ...]  #: what the intervals assume
-    elastic: tuple[ElasticTorque, ...]  #: of the first recordings, at most `_ALIKE` of one motion
-    forms: tuple[Factor, ...]  #: with more friction terms, of the same recordings
-    form: FormUncertainty  #: whether the friction law lacks one of them
+    form: FormUncertainty | None  #: whether the friction law lacks a term
 
 
 def fit_with_transmitted_load(
@@ -118,7 +85,7 @@ def fit_with_transmitted_load(
 
     def fit(samples: Sequence[Samples]) -> Estimate:
         total = total_factor(model, samples)
-        return Posterior.of(cell, total, "auto", strength).fit(total).estimate
+        return posterior_of(cell, total, "auto", strength).fit(total).estimate
 
     return fit_with_load(model, fitted, fit)
 
@@ -161,15 +128,11 @@ def estimate_with(
     prepared: Prepared,
     options: Options,
     reporter: Reporter,
-    factors: Sequence[Factor] = (),
-    products: Array | None = None,
-    elastic: Sequence[ElasticTorque] = (),
-    forms: Sequence[Factor] = (),
+    reductions: Sequence[Reduction] = (),
 ) -> Estimation:
     """Estimate the parameters by `options.estimator`, with all applicable tests.
 
-    `factors` by time of the fitted samples, the sum of their `rate_products`, and of the first of
-    them the torques of elastic gears and `form_factor` are computed unless known (not for "iv").
+    `reductions` are those of the fitted recordings; they are computed unless known.
 
     Raises:
         InputError: the archives lack data that the estimator needs.
@@ -179,30 +142,33 @@ def estimate_with(
     model = cell.model
     _require_usable_rows(prepared)
     with reporter.task("estimating", 4) as task:
-        fitted = smoothed_for_instruments(model, prepared) if name == "iv" else prepared.fitted
+        if name == "iv":
+            prepared = smoothed_for_instruments(prepared)
         task.advance(1, name)
-        factors = factors or [Factor.by_time(model, samples) for samples in fitted]
-        total = sum(factors, Factor.zero(model))
-        posterior = Posterior.of(cell, total, name, settings.strength)
-        posterior, beside, unsolved = posterior.solved(total)
+        reductions = reductions or prepared.reductions
+        factors = [reduction.factor for reduction in reductions]
+        total = Reduction.total(model, reductions)
+        posterior = posterior_of(cell, total.factor, name, settings.strength)
+        posterior, beside, unsolved = posterior.solved(total.factor)
+        precision = posterior.precision if name in OF_PRIOR else None
         if name in OF_PRIOR:
-            result = _posterior(model, fitted, posterior, beside.estimate, factors)
+            result = _posterior(model, posterior, beside.estimate, factors)
             warnings = unsolved
         else:
-            result, warnings = _without_prior(prepared, fitted, name)
+            result, warnings = _without_prior(prepared, name)
         if prepared.sources.same_motion:
             result = result.with_scatter()
-        precision = posterior.precision if name in OF_PRIOR else None
-        result = _with_uncertain_delay(prepared, result, fitted, products, precision)
+        pooled = delayed(result.pooled, total, settings.delay_variance, precision)
+        result = replace(result, pooled=pooled)
         task.advance(1, "prior")
-        of_prior = replace(beside, estimate=result.pooled)
+        of_prior = replace(beside, estimate=pooled)
         beside = of_prior if name in OF_PRIOR else posterior.fit(result.factor)
         warnings += _prior_contradictions(model, beside) if name == "prior" else []
         task.advance(1, "held-out motion")
         held_out = tuple(Factor.by_time(model, samples) for samples in prepared.held_out)
         task.advance(1)
-    stated, notes, elastic = _stated(prepared, result, fitted, posterior, precision, elastic)
-    form, forms = _form_of_friction(prepared, result, fitted, posterior, precision, forms)
+    scale = torque_scale_of(prepared.sources)
+    stated, form = widened(pooled, total, posterior, precision, scale.std, factors)
     return Estimation(
         estimator=name,
         result=result,
@@ -211,43 +177,49 @@ def estimate_with(
         with_prior=beside,
         refit=refit_of(model, name, posterior),
         warnings=tuple(warnings),
-        stated=_with_uncertain_friction(model, stated, form, factors),
-        notes=notes,
-        elastic=elastic,
-        forms=forms,
+        stated=stated,
+        notes=_interval_notes(cell, scale),
         form=form,
     )
 
 
-def _without_prior(
-    prepared: Prepared, fitted: Sequence[Samples], name: Estimator
-) -> tuple[RepeatedEstimate, list[str]]:
+def _interval_notes(cell: Cell, scale: TorqueScale) -> tuple[str, ...]:
+    """Return what the intervals assume."""
+    units = (
+        "the intervals of the parameters are in units of the torque of this arm; absolute ones are"
+        f" computed {scale.message}"
+    )
+    if cell.file.drive_train is None:  # positions may be measured behind the gears
+        return (units,)
+    return units, "they allow for elastic gears between motors and links"
+
+
+def posterior_of(cell: Cell, factor: Factor, name: str, strength: Strength) -> Posterior:
+    """Return the posterior of an estimator; all but "auto" have the strength of the residuals.
+
+    The bodies are as uncertain as `[nominal]` states; the estimator "prior" trusts them to
+    `NOMINAL_SHARE` if it states nothing.
+    """
+    table = cell.file.nominal
+    share = NOMINAL_SHARE if name == "prior" else BODY_SHARE
+    if table is not None and "uncertainty" in table.model_fields_set:
+        share = table.uncertainty or share
+    if name != "auto":
+        strength = Strength()
+    return Posterior.of(cell.model, factor, share, known_parameters(cell), strength)
+
+
+def _without_prior(prepared: Prepared, name: Estimator) -> tuple[RepeatedEstimate, list[str]]:
     """Fit by an estimator that has no prior; return its warnings as well."""
     model = prepared.sources.cell.model
+    fitted = prepared.fitted
     if name == "iv":
-        result, warnings = _instrumental(model, prepared, fitted)
+        result, warnings = _instrumental(model, prepared)
     elif name in _LOSSES:
         result, warnings = _robust(model, fitted, name)
     else:
         result, warnings = _by_factor(model, fitted, name)
     return result, warnings + _poorly_separated(result.pooled)
-
-
-def _with_uncertain_delay(
-    prepared: Prepared,
-    result: RepeatedEstimate,
-    fitted: Sequence[Samples],
-    products: Array | None,
-    precision: Array | None,
-) -> RepeatedEstimate:
-    variance = prepared.settings.delay_variance
-    if not variance:
-        return result
-    model = prepared.sources.cell.model
-    if products is None:
-        products = np.asarray(sum(rate_products(model, samples) for samples in fitted))
-    pooled = with_uncertain_delay(result.pooled, result.factor, products, variance, precision)
-    return replace(result, pooled=pooled)
 
 
 def _poorly_separated(estimate: Estimate) -> list[str]:
@@ -257,81 +229,6 @@ def _poorly_separated(estimate: Estimate) -> list[str]:
         f"the scaled condition number is {estimate.condition:.2g}: the motion separates some"
         " parameters poorly (solved by QR)"
     ]
-
-
-def _stated(
-    prepared: Prepared,
-    result: RepeatedEstimate,
-    fitted: Sequence[Samples],
-    posterior: Posterior,
-    precision: Array | None,
-    elastic: Sequence[ElasticTorque],
-) -> tuple[Estimate, tuple[str, ...], tuple[ElasticTorque, ...]]:
-    """Return the pooled estimate with what no residual shows in its covariance, and notes on it.
-
-    Also the torques of elastic gears, of which `elastic` are known.
-    """
-    sources = prepared.sources
-    scale = torque_scale_of(sources)
-    estimate = with_uncertain_scale(result.pooled, result.factor, precision, scale)
-    note = (
-        "the intervals of the parameters are in units of the torque of this arm; absolute ones are"
-        f" computed {scale.message}"
-    )
-    if sources.cell.file.drive_train is None:  # positions may be those of links, behind the gears
-        return estimate, (note,), ()
-    model = posterior.model
-    values = estimate.values
-    some = _enough(prepared, fitted)
-    compliance = expected_compliance(model, some[0], values)
-    elastic = (
-        *elastic[: len(some)],
-        *(ElasticTorque.of(model, more, values, compliance) for more in some[len(elastic) :]),
-    )
-    torque = ElasticTorque.total(elastic, len(fitted) / len(some))
-    effect = posterior.design_effect
-    believed = None if precision is None else posterior.believed(result.factor)
-    estimate = with_elastic_gears(estimate, result.factor, torque, effect, precision, believed)
-    return estimate, (note, "they allow for elastic gears between motors and links"), elastic
-
-
-def _enough(prepared: Prepared, fitted: Sequence[Samples]) -> Sequence[Samples]:
-    """Return the recordings that show what is alike in all: few of one motion."""
-    return fitted[:_ALIKE] if prepared.sources.same_motion else fitted
-
-
-def _form_of_friction(
-    prepared: Prepared,
-    result: RepeatedEstimate,
-    fitted: Sequence[Samples],
-    posterior: Posterior,
-    precision: Array | None,
-    forms: Sequence[Factor],
-) -> tuple[FormUncertainty, tuple[Factor, ...]]:
-    """Return the uncertainty of the friction law, and the factors of its terms; some are known."""
-    model = prepared.sources.cell.model
-    some = _enough(prepared, fitted)
-    every = (
-        *forms[: len(some)],
-        *(form_factor(model, samples) for samples in some[len(forms) :]),
-    )
-    total = sum(every[1:], every[0])
-    estimate = result.pooled
-    if precision is not None:  # the scores of a stronger prior, or of possible bodies, are not zero
-        estimate = replace(estimate, values=posterior.believed(result.factor))
-    return form_uncertainty(model, estimate, result.factor, total, precision), every
-
-
-def _with_uncertain_friction(
-    model: RobotModel, estimate: Estimate, form: FormUncertainty, factors: Sequence[Factor]
-) -> Estimate:
-    """Return the estimate with form and significant drift of friction in its covariance."""
-    estimate = with_uncertain_form(estimate, form)
-    drift = drift_of_factors(model, estimate.values, factors)
-    if drift is None:
-        return estimate
-    change = np.where(drift.significant, np.nan_to_num(drift.change), 0.0)
-    return with_drift(model, estimate, change)
 
 
 def _require_usable_rows(prepared: Prepared) -> None:
@@ -345,99 +242,6 @@ def _require_usable_rows(prepared: Prepared) -> None:
             )
 
 
-def with_uncertain_scale(
-    estimate: Estimate, factor: Factor, precision: Array | None, scale: TorqueScale
-) -> Estimate:
-    """Return the estimate with its change by the uncertain scale of the torques.
-
-    `precision` (p, p) is that of a prior beside the factor.
-    """
-    if not scale.std.any():
-        return estimate
-    weights = inverse_variance(estimate.noise_std**2)
-    equations = factor.weighted(weights)
-    if precision is not None:
-        equations = equations._replace(A=equations.A + precision)
-    return with_torque_scale(estimate, factor, weights, solve(equations).inverse, scale.std)
-
-
-@dataclass(frozen=True, eq=False)
-class Posterior:
-    """Prior of an arm, and how strongly it counts."""
-
-    model: RobotModel
-    prior: BodyPrior
-    design_effect: float  #: rows that count as one
-    consistent: bool  #: whether parameters that no bodies have are excluded
-
-    @classmethod
-    def of(cls, cell: Cell, factor: Factor, name: str, strength: Strength) -> Posterior:
-        """Return the posterior of an estimator; all but "auto" have the strength of the residuals.
-
-        The bodies are as uncertain as `[nominal]` states; the estimator "prior" trusts them to
-        `NOMINAL_SHARE` if it states nothing.
-        """
-        table = cell.file.nominal
-        share = NOMINAL_SHARE if name == "prior" else BODY_SHARE
-        if table is not None and "uncertainty" in table.model_fields_set:
-            share = table.uncertainty or share
-        if name != "auto":
-            strength = Strength()
-        prior = body_prior(
-            cell.model,
-            factor,
-            share,
-            known_parameters(cell),
-            wide_rotors=strength.wide_rotors,
-        )
-        effect = design_effect_of(factor, prior.gaussian)
-        prior = prior.with_weight(strength.weight)
-        return cls(cell.model, prior, effect, strength.consistent)
-
-    @property
-    def precision(self) -> Array:
-        """Information of what is believed, as it counts beside that of all rows (p, p)."""
-        return self.design_effect * self.prior.belief.gaussian.information
-
-    def believed(self, factor: Factor) -> Array:
-        """Return the parameters (p,) by what is believed, without a stronger prior."""
-        return posterior_values(factor, self.prior.belief.gaussian, self.design_effect)[0]
-
-    def free(self, factor: Factor, share: float = 1.0) -> PosteriorEstimate:
-        """Fit a factor that is this share of the rows, whatever bodies the parameters need."""
-        effect = share * self.design_effect
-        return fit_posterior(self.model, factor, self.prior.gaussian, effect)
-
-    def weights(self, factor: Factor, share: float = 1.0) -> Array:
-        """Return the weights of the joints (n,): inverse variances of their residuals."""
-        return posterior_values(factor, self.prior.gaussian, share * self.design_effect)[1]
-
-    def fit(self, factor: Factor, share: float = 1.0) -> PosteriorEstimate:
-        """Fit a factor that is this share of the rows, with the prior counting as for all."""
-        result = self.free(factor, share)
-        if not self.consistent:
-            return result
-        values = self.values(factor, share)
-        noise = factor.residual_rms(values)
-        return replace(result, estimate=replace(result.estimate, values=values, noise_std=noise))
-
-    def values(self, factor: Factor, share: float = 1.0) -> Array:
-        """Return the parameters (p,) from a factor that is this share of the rows."""
-        effect = share * self.design_effect
-        values, weights = posterior_values(factor, self.prior.gaussian, effect)
-        if not self.consistent:
-            return values
-        return consistent_values(self.model, factor, weights, values, self.prior, effect)
-
-    def solved(self, factor: Factor) -> tuple[Posterior, PosteriorEstimate, list[str]]:
-        """Fit a factor, without restriction to possible bodies if that fails, and say why."""
-        try:
-            return self, self.fit(factor), []
-        except SolverError as error:
-            free = replace(self, consistent=False)
-            return free, free.fit(factor), [f"all bodies were allowed because {error}"]
-
-
 # Estimators
 
 
@@ -447,21 +251,14 @@ def refit_of(model: RobotModel, name: Estimator, posterior: Posterior) -> Refit:
 
 
 def _posterior(
-    model: RobotModel,
-    fitted: Sequence[Samples],
-    posterior: Posterior,
-    pooled: Estimate,
-    factors: Sequence[Factor],
+    model: RobotModel, posterior: Posterior, pooled: Estimate, factors: Sequence[Factor]
 ) -> RepeatedEstimate:
-    share = 1.0 / len(fitted)
-    return estimate_repetitions(
-        model,
-        fitted,
-        lambda *_: pooled,
+    share = 1.0 / len(factors)
+    values = [pooled.values]
+    if len(factors) > 1:
         # The prior counts for a part as for the whole, so that the scatter is that of the noise.
-        each=lambda _, factor: posterior.values(factor, share),
-        factors=factors,
-    )
+        values = [posterior.values(factor, share) for factor in factors]
+    return RepeatedEstimate.of(model, pooled, values, sum(factors, Factor.zero(model)))
 
 
 def _by_factor(
@@ -523,22 +320,23 @@ def _prior_contradictions(model: RobotModel, posterior: PosteriorEstimate) -> li
 # Instruments
 
 
-def smoothed_for_instruments(model: RobotModel, prepared: Prepared) -> tuple[Samples, ...]:
-    """Return the fitted samples, smoothed with a bandwidth of at least `MIN_IV_BANDWIDTH`."""
+def smoothed_for_instruments(prepared: Prepared) -> Prepared:
+    """Return fitted samples that are smoothed with a bandwidth of at least `MIN_IV_BANDWIDTH`."""
+    model = prepared.sources.cell.model
     wide = prepared.settings.preprocessed(rigid_bandwidth=MIN_IV_BANDWIDTH)
     noiseless = replace(wide, noise_variance=(0.0,) * model.n_joints)
-    return tuple(
+    fitted = tuple(
         samples
         if float(samples.position_bandwidth.min()) >= MIN_IV_BANDWIDTH
         else samples_of(source, prepared.sources.cell, noiseless)
         for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True)
     )
+    return replace(prepared, fitted=fitted, hedged=())
 
 
-def _instrumental(
-    model: RobotModel, prepared: Prepared, fitted: Sequence[Samples]
-) -> tuple[RepeatedEstimate, list[str]]:
+def _instrumental(model: RobotModel, prepared: Prepared) -> tuple[RepeatedEstimate, list[str]]:
     """Fit with the commanded motion as instruments."""
+    fitted = prepared.fitted
     factors = []
     plans: list[_Plan] = []
     try:

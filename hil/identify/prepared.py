@@ -7,6 +7,7 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from identification.estimators.delay import (
 from identification.estimators.torque_channel import possible_low_passes
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
+from identification.reduction.reduction import ALIKE, Reduction, reduce
 from identification.selection.inner_prediction import (
     DELAY,
     RATE,
@@ -110,6 +112,46 @@ def samples_of(
     if source.context is None:
         return samples
     return samples.between(start, start + source.recording.n_samples)
+
+
+def versions_of(
+    source: Source,
+    cell: Cell,
+    settings: Settings,
+    motions: dict[Preprocessing, Smoothed] | None = None,
+    *,
+    for_fit: bool = True,
+) -> tuple[Samples, ...]:
+    """Return the samples of a source, and those of the bandwidth it is averaged with, if any.
+
+    With the load of the gears that the settings state; not `for_fit` :func:`validation_samples`.
+
+    Raises:
+        RecordingError: the recording cannot be prepared.
+    """
+    if for_fit:
+        every = tuple(samples_of(source, cell, each, motions=motions) for each in settings.versions)
+    else:
+        every = (validation_samples(source, cell, settings, motions),)
+    if settings.loading is None:
+        return every
+    loading = np.array(settings.loading)
+    return tuple(samples.with_load(cell.model, loading) for samples in every)
+
+
+def reduction_of(
+    cell: Cell, settings: Settings, versions: Sequence[Samples], *, unmodelled: bool
+) -> Reduction:
+    """Reduce a recording by :func:`versions_of`; `unmodelled` as of the reduction."""
+    return reduce(
+        cell.model,
+        versions,
+        settings.shares if len(versions) > 1 else (1.0,),
+        uncertain_delay=settings.delay_variance > 0.0,
+        known=known_parameters(cell),
+        unmodelled=unmodelled,
+        elastic=cell.file.drive_train is not None,
+    )
 
 
 def validation_samples(
@@ -550,6 +592,8 @@ class Prepared:
 
     sources: Sources  #: with the chosen friction law, and warnings of the preparation
     fitted: tuple[Samples, ...]  #: for the fit
+    #: the same recordings with the bandwidth that the chosen one is averaged with; empty: with none
+    hedged: tuple[Samples, ...]
     training: tuple[Samples, ...]  #: the same recordings for the verdict: torques as recorded
     held_out: tuple[Samples, ...]  #: for the verdict; `training` if nothing was held out
     settings: Settings  #: of `fitted`
@@ -564,6 +608,23 @@ class Prepared:
         """Delay of the torque that the fit used [s]."""
         return self.settings.preprocessing.torque_delay
 
+    @cached_property
+    def reductions(self) -> tuple[Reduction, ...]:
+        """Sums of each fitted recording."""
+        same = self.sources.same_motion
+        sides = (self.fitted, self.hedged) if self.hedged else (self.fitted,)
+        return tuple(
+            reduction_of(
+                self.sources.cell, self.settings, versions, unmodelled=not same or k < ALIKE
+            )
+            for k, versions in enumerate(zip(*sides, strict=True))
+        )
+
+    @property
+    def total(self) -> Reduction:
+        """Their sum."""
+        return Reduction.total(self.sources.cell.model, self.reductions)
+
     def warned(self, *warnings: str) -> Prepared:
         """Return the same with warnings of later steps."""
         sources = replace(self.sources, warnings=(*self.sources.warnings, *warnings))
@@ -577,12 +638,18 @@ class Prepared:
         model = self.sources.cell.model
         if not model.friction.has_load:
             return self
-        groups = (self.fitted, self.training, () if self.sources.in_sample else self.held_out)
-        fitted, training, held_out = (
-            tuple(samples.with_load(model, values) for samples in group) for group in groups
+        unseen = () if self.sources.in_sample else self.held_out
+        fitted, hedged, training, held_out = (
+            tuple(samples.with_load(model, values) for samples in group)
+            for group in (self.fitted, self.hedged, self.training, unseen)
         )
-        held_out = held_out or training
-        return replace(self, fitted=fitted, training=training, held_out=held_out)
+        return replace(
+            self,
+            fitted=fitted,
+            hedged=hedged,
+            training=training,
+            held_out=held_out or training,
+        )
 
 
 def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> Prepared:
@@ -626,14 +693,15 @@ def prepared_with(sources: Sources, settings: Settings, reporter: Reporter) -> P
     # Parts of one recording share its arrays, and have its motion.
     motions: defaultdict[int, dict[Preprocessing, Smoothed]] = defaultdict(dict)
     with reporter.task("smoothing recordings", len(sources.training) + len(unseen)) as task:
-        fitted = []
+        versions = []
         held_out = []
         for source in sources.training:
-            fitted.append(samples_of(source, cell, settings, motions=motions[source.motion_key]))
+            versions.append(versions_of(source, cell, settings, motions[source.motion_key]))
             task.advance(1, source.name)
         for source in unseen:
             held_out.append(validation_samples(source, cell, settings, motions[source.motion_key]))
             task.advance(1, source.name)
+    fitted, *others = zip(*versions, strict=True)
     if settings.preprocessing.smooth_torque:
         training = [validation_samples(source, cell, settings) for source in sources.training]
     else:
@@ -645,7 +713,8 @@ def prepared_with(sources: Sources, settings: Settings, reporter: Reporter) -> P
     rows = sum(len(samples.torque) for samples in fitted)
     return Prepared(
         sources=sources,
-        fitted=tuple(fitted),
+        fitted=fitted,
+        hedged=others[0] if others else (),
         training=tuple(training),
         held_out=tuple(training if sources.in_sample else held_out),
         settings=settings,

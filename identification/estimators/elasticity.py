@@ -13,9 +13,8 @@ to the covariance of the parameters, which stay those of rigid gears.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Final, NamedTuple, Self
+from dataclasses import dataclass, replace
+from typing import Final, Self
 
 import numpy as np
 import scipy
@@ -40,33 +39,57 @@ _RATE: Final = 125.0  # Hz, at which the torque of elastic gears is computed: it
 _LINEAR: Final = 1e-3  # share of the expected compliances by which it is linearised
 
 
-class ElasticTorque(NamedTuple):
-    """Sums over the rows of each joint with the torque E (m, n) of expected compliances."""
+@dataclass(frozen=True, eq=False)
+class ElasticTorque:
+    """Sums over the rows of each joint with the torque E (m, n) of compliances of one."""
 
-    products: Array  # W' E (n, p, n)
-    squares: Array  # E' E (n, n, n)
-    measured: Array  # E' t (n, n)
+    products: Array  #: W' E (n, p, n)
+    squares: Array  #: E' E (n, n, n)
+    measured: Array  #: E' t (n, n)
+    #: expected compliances (n,) [rad/(N·m) or m/N], summed over the recordings
+    compliance: Array
+    recordings: int = 1
 
     @classmethod
-    def of(cls, model: RobotModel, samples: Samples, values: Array, compliance: Array) -> Self:
-        """Return the sums over a recording, with parameters (p,) and compliances (n,)."""
+    def of(cls, model: RobotModel, samples: Samples, values: Array) -> Self:
+        """Return the sums over a recording, with parameters (p,)."""
         n = model.n_joints
-        p = model.n_parameters
-        sums = cls(np.zeros((n, p, n)), np.zeros((n, n, n)), np.zeros((n, n)))
+        compliance = expected_compliance(model, samples, values)
+        products = np.zeros((n, model.n_parameters, n))
+        squares = np.zeros((n, n, n))
+        measured = np.zeros((n, n))
         torque = elastic_torque(model, samples, values, compliance)
+        torque /= np.where(compliance > 0.0, compliance, 1.0)
         for part, tables in augmented_rows(model, samples):
             for joint, (table, used) in enumerate(zip(tables, model.plan.columns, strict=True)):
                 usable = samples.usable[part, joint]
                 effect = torque[part][usable, joint]
-                sums.products[joint][used] += table[:-1, usable] @ effect
-                sums.squares[joint] += effect.T @ effect
-                sums.measured[joint] += effect.T @ table[-1, usable]
-        return sums
+                products[joint][used] += table[:-1, usable] @ effect
+                squares[joint] += effect.T @ effect
+                measured[joint] += effect.T @ table[-1, usable]
+        return cls(products, squares, measured, compliance)
 
-    @classmethod
-    def total(cls, recordings: Sequence[ElasticTorque], times: float = 1.0) -> ElasticTorque:
-        """Return the sums over recordings, each of which counts so many times."""
-        return cls(*(times * np.sum(parts, axis=0) for parts in zip(*recordings, strict=True)))
+    def plus(self, other: ElasticTorque) -> ElasticTorque:
+        """Return the sums over both."""
+        return ElasticTorque(
+            self.products + other.products,
+            self.squares + other.squares,
+            self.measured + other.measured,
+            self.compliance + other.compliance,
+            self.recordings + other.recordings,
+        )
+
+    def weighted(self, weights: Array, times: float) -> tuple[Array, Array, Array]:
+        """Return W' E (p, n), E' E (n, n) and E' t (n,) of the expected compliances.
+
+        With joint weights (n,), of rows that count so many times.
+        """
+        size = self.compliance / self.recordings
+        products, squares, measured = (
+            times * np.tensordot(weights, part, axes=1)
+            for part in (self.products, self.squares, self.measured)
+        )
+        return products * size, squares * np.outer(size, size), measured * size
 
 
 def expected_compliance(model: RobotModel, samples: Samples, values: Array) -> Array:
@@ -148,16 +171,25 @@ def with_elastic_gears(
     design_effect: float,
     precision: Array | None = None,
     believed: Array | None = None,
+    times: float = 1.0,
 ) -> Estimate:
     """Return the estimate with the mean square of the compliances in its covariance.
 
-    `torque` are the sums of the factor's rows, of which `design_effect` count as one; `precision`
-    (p, p) is that of a prior beside them, by which `believed` (p,) are the parameters of rigid
-    gears, by default those of the estimate: what a stronger prior leaves unexplained is no torque
-    of gears. No gear has a negative compliance.
+    No gear has a negative compliance.
+
+    Args:
+        estimate: of p parameters and n joints, with rigid gears.
+        factor: of the fitted rows.
+        torque: sums of the factor's rows, or of such a share of them that each stands for `times`
+            rows.
+        design_effect: rows that count as one.
+        precision: information (p, p) of a prior in addition to the rows.
+        believed: parameters (p,) of rigid gears by that prior, by default those of the estimate;
+            what a stronger prior leaves unexplained is no torque of gears.
+        times: see `torque`.
     """
     weights = inverse_variance(estimate.noise_std**2)
-    products, squares, measured = (np.tensordot(weights, part, axes=1) for part in torque)
+    products, squares, measured = torque.weighted(weights, times)
     errors = measured - products.T @ (estimate.values if believed is None else believed)
     equations = factor.weighted(weights)
     if precision is not None:

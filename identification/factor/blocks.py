@@ -82,6 +82,11 @@ def merged(blocks: Blocks, length: int) -> Blocks:
     return total
 
 
+def part_edges(blocks: int, count: int) -> Indices:
+    """Return the first of the blocks of each of `count` equal parts (count,)."""
+    return np.arange(count) * blocks // count
+
+
 def added(first: Blocks, second: Blocks) -> Blocks:
     """Add blocks (B, ...) of possibly different number."""
     longer, shorter = (first, second) if len(first) >= len(second) else (second, first)

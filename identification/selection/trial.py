@@ -196,6 +196,16 @@ class Trial:
         self._retain_samples(candidates[chosen])
         return self._decision(name, candidates, means, chosen)
 
+    def odds(self, other: Settings, chosen: Settings, transfer: float) -> float:
+        """Return the odds of other settings against chosen ones on another motion, at most one.
+
+        By the likelihood of their difference in the logarithm of the error, whose standard
+        deviation is that over the segments and `transfer`.
+        """
+        theirs, ours = (self.errors(each).segments for each in (other, chosen))
+        change, std = _change(theirs, ours, transfer)
+        return math.exp(-0.5 * (max(0.0, change) / std) ** 2)
+
     def decide_last(self, name: str, candidates: Sequence[Settings]) -> Decision:
         """Return the last candidate up to which none predicts worse than the first.
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.files import write_files
-from hil.identify.estimating import Posterior
+from hil.identify.estimating import posterior_of
 from hil.outcome import Exports, exports_of
 from identification import Estimate
 from identification.estimators.covariance import with_block_covariance
@@ -91,7 +91,7 @@ def identified_arm(
     weights = joint_weights(training)
     free = with_block_covariance(estimate(model, training, weights), training, weights)
     unseen = sum(held_out, Factor.zero(model))
-    posterior = Posterior.of(cell, training, "auto", Strength())
+    posterior = posterior_of(cell, training, "auto", Strength())
     consistency = check_consistency(
         model,
         training,

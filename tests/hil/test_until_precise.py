@@ -16,10 +16,10 @@ from hil.campaign.precision_record import Look, PrecisionRecord, Reached
 from hil.cli import app
 from hil.errors import ExecutionError, InputError
 from hil.identified_campaign import identify_campaign
-from hil.identify import estimating
 from hil.progress import Silent
 from identification.estimators.elasticity import ElasticTorque
 from identification.factor.factor import Factor
+from identification.reduction import reduction
 from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell, pass_rehearsal
 from tests.messages import ALL_REQUIREMENTS_MET
 
@@ -97,7 +97,7 @@ class TestEnd:
         meter.measure(paths[:1])
         reduced: list[str] = []
         for owner, name in (
-            (Factor, "by_time"), (ElasticTorque, "of"), (estimating, "form_factor"),
+            (Factor, "by_time"), (ElasticTorque, "of"), (reduction, "form_factor"),
         ):  # fmt: skip
             original = getattr(owner, name)
 
@@ -107,7 +107,7 @@ class TestEnd:
 
             monkeypatch.setattr(owner, name, noting)
         meter.measure(paths)
-        assert reduced == ["by_time", "of", "form_factor"]
+        assert reduced == ["by_time", "form_factor", "of"]
         reduced.clear()
         meter.measure(paths)
         assert reduced == []

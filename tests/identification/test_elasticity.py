@@ -50,8 +50,7 @@ def fitted(samples):
     """The estimate of rigid gears, and the same with elastic ones allowed for."""
     estimate = fit_least_squares(MODEL, [samples])
     factor = Factor.by_time(MODEL, samples)
-    expected = expected_compliance(MODEL, samples, estimate.values)
-    torque = ElasticTorque.of(MODEL, samples, estimate.values, expected)
+    torque = ElasticTorque.of(MODEL, samples, estimate.values)
     return estimate, with_elastic_gears(estimate, factor, torque, 1.0)
 
 
@@ -98,7 +97,7 @@ def test_the_noise_of_rigid_gears_makes_none_elastic():
     each[:, :, 1] = each[:, :, 0] + 0.01 * each[:, :, 1]
     opposed = replace(samples, torque=samples.torque + 3.0 * (each[:, :, 0] - each[:, :, 1]))
     sums = _sums(opposed, each)
-    products, squares, measured = (np.tensordot(weights, part, axes=1) for part in sums)
+    products, squares, measured = sums.weighted(weights, 1.0)
     inverse = solve(factor.weighted(weights)).inverse
     moved, covariance = open_compliance(inverse, products, squares)
     errors = measured - products.T @ estimate.values
@@ -124,16 +123,18 @@ def _sums(samples, each):
         products[joint][used] = block[some].T @ effect
         squares[joint] = effect.T @ effect
         measured[joint] = effect.T @ samples.torque[some, joint]
-    return ElasticTorque(products, squares, measured)
+    return ElasticTorque(products, squares, measured, compliance=np.ones(2))
 
 
 def test_repetitions_count_like_more_rows():
     samples = recorded(COMPLIANCE, NOISE)
     estimate, _ = fitted(samples)
-    expected = expected_compliance(MODEL, samples, estimate.values)
-    single = ElasticTorque.of(MODEL, samples, estimate.values, expected)
-    double = ElasticTorque.total([single, single])
-    for once, twice in zip(ElasticTorque.total([single], 2.0), double, strict=True):
+    weights = np.array([1.0, 2.0])
+    single = ElasticTorque.of(MODEL, samples, estimate.values)
+    double = single.plus(single)
+    for once, twice in zip(
+        single.weighted(weights, 2.0), double.weighted(weights, 1.0), strict=True
+    ):
         np.testing.assert_allclose(once, twice)
 
 
@@ -161,8 +162,7 @@ def test_an_undetermined_parameter_stays_so():
     covariance[0, :] = covariance[:, 0] = 0.0
     covariance[0, 0] = np.inf
     unknown = replace(estimate, covariance=covariance)
-    expected = expected_compliance(MODEL, samples, estimate.values)
-    torque = ElasticTorque.of(MODEL, samples, estimate.values, expected)
+    torque = ElasticTorque.of(MODEL, samples, estimate.values)
     wider = with_elastic_gears(unknown, Factor.by_time(MODEL, samples), torque, 1.0)
     assert np.isinf(wider.covariance[0, 0])
     np.testing.assert_array_equal(wider.covariance[0, 1:], 0.0)

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from identification.estimators.friction_drift import drift_of_factors
 from identification.estimators.friction_form import (
     FORMS,
     FormUncertainty,
@@ -20,7 +21,6 @@ from identification.factor.factor import Factor
 from identification.model.friction import ASYMMETRIC, QUADRATIC, STRIBECK, FrictionLaw
 from identification.model.robot import RobotModel
 from identification.validation.facts.form import FORM
-from identification.validation.residuals import drift_of_factors
 from tests.identification.test_verdict import finding_of, judged
 from tests.identification.two_link import MODEL, NOISE, URDF, P, a_motion, as_samples, truth
 
