@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
@@ -75,11 +76,17 @@ class ToReduce(NamedTuple):
 
 
 def to_reduce(refs: Sequence[ArchiveRef]) -> list[ToReduce]:
-    """Return the archives of a campaign with what it needs of each, as `hil identify` does."""
+    """Return the archives of a campaign with what it needs of each.
+
+    The first of each motion show what the model lacks; of unknown motions the first of all.
+    """
     fitted = [ref for ref in refs if ref.use == "excitation"]
-    motions = {ref.motion for ref in fitted}
-    same_motion = len(motions) == 1 and "" not in motions
-    shown = set(fitted[:ALIKE] if same_motion else fitted)
+    seen: Counter[str] = Counter()
+    shown = set()
+    for ref in fitted:
+        seen[ref.motion] += 1
+        if seen[ref.motion] <= ALIKE:
+            shown.add(ref)
     parts = PIECES if len(fitted) < PIECES else 1
     return [ToReduce(ref, ref in shown, parts if ref.use == "excitation" else 1) for ref in refs]
 

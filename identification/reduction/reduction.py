@@ -105,16 +105,18 @@ def reduce(
         unmodelled: whether the recording is one of those that show what the model lacks.
         elastic: whether positions are those of motors, in front of elastic gears.
     """
-    factor = mean_factor([Factor.by_time(model, samples) for samples in versions], shares)
+    reduce_rows = form_factor if unmodelled else Factor.by_time
+    rows = mean_factor([reduce_rows(model, samples) for samples in versions], shares)
+    # The rows without further terms of friction are part of those with them.
+    factor = rows.restricted(np.arange(model.n_parameters)) if unmodelled else rows
     rates = None
     if uncertain_delay:
         every = [rate_products(model, samples) for samples in versions]
         rates = np.tensordot(shares, every, axes=1)
     if not unmodelled or not factor.samples.any():
         return Reduction(factor, rates)
-    forms = mean_factor([form_factor(model, samples) for samples in versions], shares)
     torque = None
     if elastic:
         values, _ = posterior_values(factor, body_prior(model, factor, stated=known).gaussian)
         torque = ElasticTorque.of(model, versions[0], values)
-    return Reduction(factor, rates, Unmodelled(forms, torque))
+    return Reduction(factor, rates, Unmodelled(rows, torque))
