@@ -522,7 +522,7 @@ class _Reader:
         """Return the bins with the motion of an earlier time, by a shift."""
         time = self.binned.motion.time
         usable = self.binned.usable.copy()
-        fields = {k: v for k, v in self.samples.motion._asdict().items() if v is not None}
+        fields = self.samples.motion.columns()
         del fields["time"]
         moved = {name: np.zeros((len(time), field.shape[1])) for name, field in fields.items()}
         for raw, b in self.parts:

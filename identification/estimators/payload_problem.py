@@ -64,7 +64,7 @@ class Run:
         p = model.n_parameters
         plan = RegressorPlan.of_bodies(model.chain, model.gravity, joint)
         blocks, columns = samples.regressor(model)
-        loads = plan.evaluate(*samples.motion[1:4])
+        loads = plan.evaluate(samples.motion.kinematics())
         index = fine_blocks(samples)
         tables = []
         places = []

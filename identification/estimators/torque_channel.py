@@ -216,7 +216,7 @@ class _Spectra:
         rows = np.zeros(model.n_joints)
         for segment in segments:
             part = segment.rows
-            blocks = model.regressor(*samples.motion.rows(part)[1:]).blocks
+            blocks = model.regressor(samples.motion.rows(part)).blocks
             for joint, (gram, block) in enumerate(zip(grams, blocks, strict=True)):
                 table = np.vstack([block.T, load[part, joint], torque[part, joint]])
                 rows[joint] += segment.add(gram, table, usable[part, joint])

@@ -144,8 +144,7 @@ class CurrentModel:
 
     def torque(self, motion: Motion) -> Array:
         """Return the largest expected joint torques (m, n) [N·m], payload included."""
-        q, qd, qdd = motion[1:4]
-        nominal = self.model.torque(self.values, q, qd, qdd) + self.model.load_torque(q, qd, qdd)
+        nominal = self.model.torque(self.values, motion) + self.model.load_torque(motion)
         return (1.0 + self.uncertainty) * nominal
 
     def current(self, torque: Array) -> Array:
@@ -220,7 +219,7 @@ class Constraints:
         bound = min(max(duration, self.min_duration), self.max_duration)
         if bound != duration:
             violations.append(Violation("duration", "the motion", duration, bound, None))
-        if beyond and not all(np.all(np.isfinite(column)) for column in motion[:4]):
+        if beyond and not motion.finite:
             return tuple(violations)
         if self.checker is not None:
             # With rates beyond the limits, the bounds between samples are too wide to be of use.

@@ -58,7 +58,7 @@ def median_load(model: RobotModel, values: Array, recordings: Sequence[Samples])
     """
     if not model.friction.has_load:
         return np.zeros(model.n_joints)
-    sizes = [np.abs(model.gear_torque(values, *recording.motion[1:4])) for recording in recordings]
+    sizes = [np.abs(model.gear_torque(values, recording.motion)) for recording in recordings]
     size = np.concatenate(sizes)
     usable = np.concatenate([recording.usable for recording in recordings])
     return np.array(

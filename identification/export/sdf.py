@@ -88,7 +88,7 @@ def drake_torque(text: str, arm: Arm, motion: Motion) -> Array:
     joints = [plant.GetJointByName(name) for name in arm.model.joint_names]
     order = [joint.velocity_start() for joint in joints]
     torque = np.empty(motion.position.shape)
-    for k, (q, qd, qdd) in enumerate(zip(*motion[1:4], strict=True)):
+    for k, (q, qd, qdd) in enumerate(motion.states()):
         position, velocity, acceleration = (np.zeros(len(order)) for _ in range(3))
         position[order] = q
         velocity[order] = qd
