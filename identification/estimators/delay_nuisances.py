@@ -16,12 +16,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.estimators.prior import LOAD_SHARE
 from identification.estimators.torque_scale import DATA_SHEET
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 ZERO: Final = 0.03
 """Standard deviation of the error of an encoder's zero [rad, m]: marks that are aligned by eye, or

@@ -19,8 +19,8 @@ from typing import Final, NamedTuple, Self
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.estimators.delay import DELAY_BANDWIDTH
 from identification.factor.estimate import Estimate, inverse_variance
 from identification.factor.factor import Factor
@@ -29,8 +29,6 @@ from identification.factor.rows import augmented_rows
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 RESONANCE: Final = 2.0 * np.pi * 15.0
 """Resonance of a joint's links on its gear [rad/s] that compliances are expected at: industrial

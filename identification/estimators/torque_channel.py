@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.factor.blocks import EqualRuns, add_grams, equal_runs
 from identification.model.robot import RobotModel
 from identification.signals.masks import LONGEST_END, edge_rows
@@ -28,7 +29,6 @@ from identification.signals.smoothing import (
     noiseless_above,
 )
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 LOWEST_BANDWIDTH: Final = 0.5  # Hz

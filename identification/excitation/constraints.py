@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.excitation.collision import CollisionChecker, Contact
 from identification.excitation.violation import Kind, Violation
 from identification.model.motion import Motion
@@ -43,9 +43,6 @@ def midpoints(trajectory: Trajectory, period: float = SAMPLE_PERIOD) -> Motion:
 
 def _steps(trajectory: Trajectory, period: float) -> int:
     return max(1, math.ceil(trajectory.duration / period - _ROUNDING))
-
-
-Array = NDArray[np.float64]
 
 
 _RATES = ("velocity", "acceleration", "jerk")

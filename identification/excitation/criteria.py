@@ -15,6 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.excitation.constraints import midpoints
 from identification.excitation.precision import Precision
 from identification.factor.factor import Factor
@@ -23,8 +24,6 @@ from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from planner import Trajectory
 from planner.arrays import Whole, strict
-
-Array = NDArray[np.float64]
 
 
 def information(factor: Factor) -> Array:

@@ -9,8 +9,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.export.arm import Arm
 from identification.export.friction import load_remarks
@@ -18,7 +18,6 @@ from identification.export.urdf import TENSOR, WriteBackError, as_text, comment_
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import body
 
-Array = NDArray[np.float64]
 Node = ElementTree.Element
 
 _BASE = "base"

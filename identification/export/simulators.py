@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.export.arm import Arm
 from identification.export.friction import load_remarks
@@ -32,7 +33,6 @@ from identification.model.kinematics import pinocchio_model
 from identification.model.motion import Motion
 from identification.model.regressor import RegressorPlan
 
-Array = NDArray[np.float64]
 Node = ElementTree.Element
 
 STATES: Final = 1000

@@ -15,8 +15,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.export.friction import equivalent_coulomb, load_remarks
 from identification.model.friction import TERMS
@@ -31,8 +31,6 @@ from identification.model.pseudo_inertia import Body, body, margin
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.model.urdf_text import urdf_tree
-
-Array = NDArray[np.float64]
 
 TENSOR: Final = {
     "ixx": (0, 0),

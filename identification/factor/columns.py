@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.factor.blocks import FINE_BLOCK, count_by_block, fine_blocks
 from identification.factor.factor import Factor, time_blocks
 from identification.factor.rows import augmented_rows
@@ -22,8 +23,6 @@ from identification.model.payload import Load, Payload
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 _MOST_ROWS: Final = 500  # of one recording, in standard parameters
 _PARTS: Final = ("W0", "Wx", "Wy", "Wz")

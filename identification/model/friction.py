@@ -34,11 +34,11 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import ModelError, ShapeError
 from identification.model.coupling import Coupling
 from identification.model.motion import Motion
 
-Array = NDArray[np.float64]
 ThirdTerm = Literal["quadratic", "cubic"]
 Zone = Literal["exclude", "linear"]
 Pair = tuple[str, tuple[tuple[float, float], tuple[float, float]]]

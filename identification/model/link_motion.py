@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.model.kinematics import Chain, skew
 from identification.model.motion import Motion
-
-Array = NDArray[np.float64]
 
 _ROUNDING = 1e-15  # of direction cosines
 

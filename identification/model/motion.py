@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import ShapeError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import ModelError
 from identification.model.kinematics import Chain
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import Body, inertial_parameters, tensors
 from identification.model.regressor import RegressorPlan
-
-Array = NDArray[np.float64]
 
 _ROUNDING = 1e-9  # relative to the largest principal moment
 _MOST = 1e9  # kg, m, kg·m²; products of larger numbers could overflow

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.model.elements import JointElements, PlacedElement
 from identification.model.friction import FrictionLaw, JointFriction, JointTerm
 from identification.model.kinematics import Chain
@@ -23,8 +24,6 @@ from identification.model.link_wrenches import (
     write_primitives,
 )
 from identification.model.motion import Motion
-
-Array = NDArray[np.float64]
 
 Rows = slice | NDArray[np.intp]
 

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array, Indices
 from identification.errors import ModelError, ShapeError
 from identification.model.base_parameters import TOLERANCE, BaseParameters, select_base, share_left
 from identification.model.coupling import Coupling
@@ -21,9 +22,6 @@ from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.motion import Motion, joint_arrays
 from identification.model.payload import Load, Payload
 from identification.model.regressor import Regressor, RegressorPlan
-
-Array = NDArray[np.float64]
-Places = NDArray[np.intp]
 
 _N_LINK = len(LINK_SYMBOLS)
 _N_SINGLE_DIGITS = 9
@@ -57,17 +55,17 @@ class StandardLayout:
         return self.n_joints * self.width + len(self.pairs)
 
     @cached_property
-    def links(self) -> Places:
+    def links(self) -> Indices:
         """Indices of the ten inertial parameters of each link (n, 10)."""
         return self._joint_blocks[:, :_N_LINK]
 
     @cached_property
-    def rotors(self) -> Places:
+    def rotors(self) -> Indices:
         """Indices of the rotor inertias (n,), or (0,)."""
         return self._joint_blocks[:, _N_LINK:].reshape(-1)
 
     @property
-    def couplings(self) -> Places:
+    def couplings(self) -> Indices:
         """Indices of the coupling inertias (c,), in the order of `pairs`."""
         return np.arange(self.n_joints * self.width, self.size)
 
@@ -115,7 +113,7 @@ class StandardLayout:
         return values
 
     @property
-    def _joint_blocks(self) -> Places:
+    def _joint_blocks(self) -> Indices:
         return np.arange(self.n_joints * self.width).reshape(self.n_joints, self.width)
 
     def _unit(self, standard: int) -> str:

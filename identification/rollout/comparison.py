@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.distributions import student_limit
 from identification.export.arm import Arm
 from identification.export.simulators import unsupported_torque
@@ -21,8 +22,6 @@ from identification.rollout.servo import Servo, command_of
 from identification.rollout.simulation import LARGEST_ERROR, Feedback, SimulatedArm
 from identification.rollout.windows import Stretch, Windows, stretches_of
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 HORIZONS: Final = (0.1, 0.2, 0.5, 1.0)
 """Times after the start of a window at which positions are compared [s]."""

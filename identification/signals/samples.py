@@ -8,6 +8,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.model.motion import Motion
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
@@ -21,8 +22,6 @@ from identification.signals.smoothing import (
     fit_smoothing_spline,
     low_passed,
 )
-
-Array = NDArray[np.float64]
 
 # Default (see :mod:`identification.selection.inner_prediction`). Planned motion is below 10 Hz, the
 # first resonance of large arms at 10 to 30 Hz; on the simulated NS 16 20 to 60 Hz are equal.

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
 from identification.estimators.prior import BodyPrior
 from identification.factor.estimate import Estimate
@@ -17,9 +18,6 @@ from identification.model.pseudo_inertia import pseudo_inertia, reference_bodies
 from identification.model.robot import RobotModel
 from identification.validation.finding import joined, little_torque
 from identification.validation.physical_signs import SIGMAS
-
-Array = NDArray[np.float64]
-
 
 # Smallest second moment of a link relative to the nominal body's at which a bound counts as active.
 _EDGE: Final = 0.01

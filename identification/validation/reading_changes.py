@@ -9,12 +9,12 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples
 from identification.validation.faults import COUPLED, Fault, corrected
 
-Array = NDArray[np.float64]
 Meaning = Literal[
     "torque sign",
     "position sign",

@@ -15,6 +15,7 @@ from typing import Final, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.excitation.collision import CollisionChecker
 from identification.excitation.constraints import Constraints, CurrentModel, midpoints, sampled
 from identification.excitation.criteria import Objective
@@ -22,8 +23,6 @@ from identification.excitation.genomes import Genome, ViaPointGenome
 from identification.excitation.searches.local_change import Change, PlannedMoves
 from identification.model.motion import Motion
 from planner import PlannerError
-
-Array = NDArray[np.float64]
 
 
 class Problem(Protocol):
