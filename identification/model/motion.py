@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,18 +28,18 @@ class Motion:
     load: Array | None = None
 
     @classmethod
-    def of_states(cls, position: Array, velocity: Array, acceleration: Array) -> Motion:
+    def of_states(cls, position: Array, velocity: Array, acceleration: Array) -> Self:
         """Return m states (m, n) that are no time series."""
         return cls(np.full(len(position), np.nan), position, velocity, acceleration)
 
     @classmethod
-    def at_rest(cls, position: Array) -> Motion:
+    def at_rest(cls, position: Array) -> Self:
         """Return m postures (m, n), at rest."""
         still = np.zeros_like(position)
         return cls.of_states(position, still, still)
 
     @classmethod
-    def joined(cls, motions: Sequence[Motion]) -> Motion:
+    def joined(cls, motions: Sequence[Self]) -> Self:
         """Return the instants of one motion after the other's; None where one of them has None."""
         known = [motion.columns() for motion in motions]
         common = [name for name in known[0] if all(name in columns for columns in known)]
@@ -50,19 +51,19 @@ class Motion:
         """Return the arrays that are known by name, instants along their first axis."""
         return {name: column for name, column in vars(self).items() if column is not None}
 
-    def rows(self, which: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Motion:
+    def rows(self, which: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Self:
         """Return the motion at some of the instants."""
-        return Motion(**{name: column[which] for name, column in self.columns().items()})
+        return type(self)(**{name: column[which] for name, column in self.columns().items()})
 
-    def kinematics(self) -> Motion:
+    def kinematics(self) -> Self:
         """Return the motion without direction of friction and load of the gears."""
         return replace(self, direction=None, load=None)
 
-    def without_load(self) -> Motion:
+    def without_load(self) -> Self:
         """Return the motion without load of the gears."""
         return replace(self, load=None)
 
-    def converted(self, convert: Callable[[Array], Array]) -> Motion:
+    def converted(self, convert: Callable[[Array], Array]) -> Self:
         """Return the motion with positions, velocities and accelerations (m, n) converted alike."""
         return replace(
             self,
@@ -75,7 +76,7 @@ class Motion:
         """Yield position, velocity and acceleration (n,) of each instant."""
         return zip(self.position, self.velocity, self.acceleration, strict=True)
 
-    def checked(self, n_joints: int) -> Motion:
+    def checked(self, n_joints: int) -> Self:
         """Return the motion with its states as float64 of one shape (m, n_joints).
 
         Raises:

@@ -164,8 +164,9 @@ class RegressorPlan:
         with self._borrowed(m) as work:
             for start in range(0, m, work.size):
                 part = slice(start, min(start + work.size, m))
-                work.set_motion(motion.rows(part), links=bool(bodies))
-                work.update_drives()
+                rows = motion.rows(part)
+                work.set_motion(rows, links=bool(bodies))
+                work.update_drives(rows)
                 torque[part] = work.torque(bodies, drives)[:, : part.stop - start].T
         return torque
 
@@ -238,9 +239,7 @@ class _Workspace:
         self._drive_rows = plan.drive_rows
         self._joint_friction = plan.friction
         self._first_drive_row = plan.first_drive_row
-        nothing = np.empty((0, n))
-        self._motion = Motion.of_states(nothing, nothing, nothing)  # that is set
-        self._link_motion = LinkMotion(plan.chain, plan.gravity, size)
+        self._motion = LinkMotion(plan.chain, plan.gravity, size)
         motors = 0 if plan.friction is None else len(plan.friction.motors)
         self._direction = np.zeros((n + motors, size))
         self._load = np.zeros((n, size))
@@ -263,7 +262,7 @@ class _Workspace:
     ) -> None:
         """Prepare the columns of one link; those of moments of inertia have no force."""
         size = self.rows.shape[2]
-        twists = self._link_motion.twists[link]
+        twists = self._motion.twists[link]
         part = twists[:, 0] if moments_only else twists.reshape(len(twists), 6, size)
         length = part.shape[1]
         used = ROTATIONAL if moments_only else slice(None)
@@ -285,7 +284,7 @@ class _Workspace:
 
     def _friction_parts(self) -> list[tuple[FrictionLaw, Array, Array, Array, Array]]:
         """Return laws with views of speeds, directions, transmitted torques and target rows."""
-        velocity = self._link_motion.velocity
+        velocity = self._motion.velocity
         direction = self._direction[: len(velocity)]
         if self._joint_friction is None:
             return []
@@ -305,7 +304,7 @@ class _Workspace:
 
     def _drive_parts(self) -> list[tuple[Array, Array]]:
         """Return views of accelerations and target rows of rotors and coupling inertias."""
-        acceleration = self._link_motion.acceleration
+        acceleration = self._motion.acceleration
         rotors = {drive.rotor for drive in self._drive_rows}
         parts = []
         if len(rotors) == 1 and None not in rotors:  # one step for all joints
@@ -335,18 +334,18 @@ class _Workspace:
         for motor, share, direction in zip(
             friction.motors, friction.motor_speeds(), directions, strict=True
         ):
-            speed = share @ self._link_motion.velocity
+            speed = share @ self._motion.velocity
             for joint in np.flatnonzero(share):
                 for (_, term, owner, _, _), row in self._drive_rows[joint].motors.items():
                     if owner == motor:
                         column = term.column(speed, direction)
                         np.multiply(share[joint], column, out=self.rows[joint, row])
 
-    def _write_direction(self, friction: JointFriction) -> None:
-        if self._motion.direction is not None:
-            self._direction[:, : self._motion.n_samples] = self._motion.direction.T
+    def _write_direction(self, friction: JointFriction, motion: Motion) -> None:
+        if motion.direction is not None:
+            self._direction[:, : motion.n_samples] = motion.direction.T
             return
-        velocity = self._link_motion.velocity
+        velocity = self._motion.velocity
         n = friction.n_joints
         if (common_law := friction.one_law) is not None:
             common_law.sign(velocity, out=self._direction[:n])
@@ -367,25 +366,23 @@ class _Workspace:
                 np.einsum("jrt,crt->jct", c.twists, c.wrenches, out=c.target)
             else:
                 c.target[c.joints] = np.einsum("jrt,crt->jct", c.twists, c.wrenches)
-        self.update_drives()
+        self.update_drives(motion)
 
     def set_motion(self, motion: Motion, *, links: bool = True) -> None:
         """Set the motion of k <= size samples, of joints alone or of the links as well."""
-        self._motion = motion
-        self._link_motion.set_joints(motion)
+        self._motion.set_joints(motion)
         if links:
-            self._link_motion.update()
-            write_primitives(self._link_motion.motion, self._primitives)
+            self._motion.update()
+            write_primitives(self._motion.motion, self._primitives)
 
-    def update_drives(self) -> None:
+    def update_drives(self, motion: Motion) -> None:
         """Compute the columns of drives, friction and elements for the motion that is set."""
-        q = self._motion.position
-        k = self._motion.n_samples
+        q = motion.position
+        k = motion.n_samples
         if self._joint_friction is not None:
-            self._write_direction(self._joint_friction)
+            self._write_direction(self._joint_friction, motion)
             if self._joint_friction.has_load:
-                load = self._motion.load
-                self._load[:, :k] = 0.0 if load is None else load.T
+                self._load[:, :k] = 0.0 if motion.load is None else motion.load.T
         for law, velocity, sign, transmitted, target in self._friction:
             target[...] = law.columns(velocity, sign, transmitted)
         for source, target in self._drives:
@@ -408,7 +405,7 @@ class _Workspace:
             ]
         )
         for link, joints, matrix in bodies:
-            twists = self._link_motion.twists[link]
+            twists = self._motion.twists[link]
             wrench = matrix @ self._primitives[link]
             torque[joints] += np.einsum("jrt,rt->jt", twists.reshape(len(twists), 6, -1), wrench)
         return torque
