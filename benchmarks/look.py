@@ -30,6 +30,7 @@ from hil.importers.recording import ImportOptions, RobotOf, import_recording
 from hil.look import Look, look_at
 from identification.estimators.prior import body_prior, fit_posterior
 from identification.factor.factor import Factor
+from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
@@ -111,9 +112,8 @@ def _weight(recording: Recording, model: RobotModel) -> Array:
     samples = prepare(recording, model, options=Preprocessing(14.0, left_out="rests"))
     factor = Factor.by_time(model, samples)
     values = fit_posterior(model, factor, body_prior(model, factor).gaussian).estimate.values
-    still = np.zeros_like(recording.position)
     rigid = np.where(model.friction_columns, 0.0, values)
-    return np.asarray(model.torque(rigid, recording.position, still, still))
+    return np.asarray(model.torque(rigid, Motion.at_rest(recording.position)))
 
 
 def plants(arm: Arm) -> Iterator[Planted]:

@@ -290,7 +290,7 @@ def stops(count: int) -> dict[str, Any]:
         recording = next(iter(recordings_of(seed, model.joint_names, (None,))))
         samples = samples_of(recording, model)
         truth = _posterior(model, Factor.by_time(model, samples))[0].values
-        clean = model.torque(truth, *samples.motion[1:4])
+        clean = model.torque(truth, samples.motion.kinematics())
         scatter = clean.std(axis=0)
         repeated = clean + _REPEATED * scatter * _coloured(random, clean.shape)
         factors = []

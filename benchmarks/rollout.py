@@ -82,7 +82,7 @@ def recorded(arm: Arm) -> RecordedMotion:
     motion = Motion(
         grid, 0.3 * np.sin(angle), 0.3 * rate * np.cos(angle), -0.3 * rate**2 * np.sin(angle)
     )
-    torque = model.torque(arm.values, *motion[1:4])
+    torque = model.torque(arm.values, motion)
     everything = np.ones(torque.shape, dtype=np.bool_)
     bandwidth = np.full(model.n_joints, np.inf)
     samples = Samples(motion, torque, everything, (slice(0, len(grid)),), 0.0, bandwidth)

@@ -245,9 +245,4 @@ def _motion(held_out: Sequence[Samples]) -> Motion:
     parts = [samples.motion for samples in held_out]
     step = -(-sum(motion.n_samples for motion in parts) // _MOST_ROWS)
     some = [motion.rows(slice(None, None, step)) for motion in parts]
-    columns = [
-        np.concatenate(column) for column in zip(*(motion[:4] for motion in some), strict=True)
-    ]
-    directions = [motion.direction for motion in some if motion.direction is not None]
-    direction = np.concatenate(directions) if len(directions) == len(some) else None
-    return Motion(*columns)._replace(direction=direction)
+    return Motion.joined(some).without_load()

@@ -33,6 +33,7 @@ from hil.progress import Reporter, Silent
 from hil.report.figures import MEASURED, NOMINAL, PREDICTED, RESIDUAL, joints_of, torque_charts
 from hil.results import Results
 from hil.threads import one_thread
+from identification.model.motion import Motion
 from identification.text import percentage
 from identification.validation.verdict import Verdict
 
@@ -118,11 +119,11 @@ class IdentifiedArm:
             ShapeError: an array has another shape.
         """
         model = self.identification.cell.model
-        motion = [np.asarray(values, dtype=np.float64) for values in (q, v, a)]
-        rows = [np.atleast_2d(values) for values in motion]
+        states = [np.asarray(values, dtype=np.float64) for values in (q, v, a)]
+        motion = Motion.of_states(*map(np.atleast_2d, states))
         values = self.identification.estimate.pooled.values
-        torque = model.torque(values, *rows) + model.load_torque(*rows)
-        return torque.reshape(motion[0].shape)
+        torque = model.torque(values, motion) + model.load_torque(motion)
+        return torque.reshape(states[0].shape)
 
     @property
     def model(self) -> pinocchio.Model:

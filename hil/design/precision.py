@@ -185,10 +185,7 @@ class PrecisionDesign:
         simulated = cell.file.controller is not None and cell.only_simulated
         exact = simulated and not effects
         error, noise, source = _assumed_error(cell, scatter, exact=exact)
-        whole = Motion(
-            *(np.concatenate(parts) for parts in zip(*(m[:4] for m in sampled), strict=True))
-        )
-        factor = Factor.from_samples(cell.model, whole, reference.torque(nominal))
+        factor = Factor.from_samples(cell.model, Motion.joined(sampled), reference.torque(nominal))
         prior = posterior_of(cell, factor, "auto", Strength()).prior.gaussian.information
         values = nominal
         scale = torque_scale(cell, (), simulated=simulated)

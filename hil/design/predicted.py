@@ -61,7 +61,7 @@ class PredictedRows:
         """Return the sums over a sampled motion."""
         model = cell.model
         n = model.n_joints
-        torque = model.torque(values, *motion[1:])
+        torque = model.torque(values, motion)
         samples = Samples(
             motion=motion,
             torque=torque,

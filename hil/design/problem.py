@@ -101,10 +101,9 @@ def _require_start(
         setting = "home_deg in [campaign]"
     else:
         return
-    zero = np.zeros_like(posture[None])
     frame = AngleFrame.of(cell)
     contact = None if checker is None else clearance(checker, posture[None])
-    exceeded = currents.check(Motion(np.zeros(1), posture[None], zero, zero)) if currents else []
+    exceeded = currents.check(Motion.at_rest(posture[None])) if currents else []
     if checker is not None and contact is not None:
         reason = violation_text(contact, frame)
         remedy = always_so(contact, checker) or f"correct [workspace] or {setting}"

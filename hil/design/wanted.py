@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -59,12 +59,11 @@ class ReferenceMotions:
     ) -> None:
         self.model = model
         self.names = frozenset(model.parameter_names if names is None else names)
-        states = [np.concatenate(parts) for parts in zip(*(m[1:4] for m in motions), strict=True)]
-        self.position, self.velocity, self.acceleration = states
-        count = len(self.position)
+        self.motion = Motion.joined(motions).kinematics()
+        count = self.motion.n_samples
         p = model.n_parameters
         self.rows = np.zeros((model.n_joints, count, p))
-        for part, blocks in model.chunks(*states):
+        for part, blocks in model.chunks(self.motion):
             for joint, (block, used) in enumerate(zip(blocks, model.plan.columns, strict=True)):
                 self.rows[joint, part, used] = block
 
@@ -85,7 +84,7 @@ class ReferenceMotions:
         if has_offsets:
             rows = rows - rows.mean(axis=1, keepdims=True)
         total = np.einsum("jmp,jmq->pq", rows / density[:, None, None], rows)
-        return np.asarray(total / len(self.position))
+        return np.asarray(total / self.motion.n_samples)
 
     def wanted(
         self, requirements: Sequence[Requirement], values: Array, information: Array
@@ -144,14 +143,14 @@ class ReferenceMotions:
 
     def _friction(self, joint: int, label: str, share: float, values: Array) -> Iterator[_Row]:
         model = self.model
-        speed = float(np.abs(self.velocity[:, joint]).max())
-        still = np.zeros((2 * len(_SPEEDS), model.n_joints))
+        speed = float(np.abs(self.motion.velocity[:, joint]).max())
+        still = Motion.at_rest(np.zeros((2 * len(_SPEEDS), model.n_joints)))
         some = model.friction_columns
-        turning = still.copy()
+        turning = np.zeros_like(still.position)
         turning[:, joint] = np.concatenate((_SPEEDS, np.negative(_SPEEDS))) * speed
         least = MOVED * float(self.scatter(values)[joint])
-        rows = np.zeros((len(still), len(values)))
-        ((_, blocks),) = model.chunks(still, turning, still)
+        rows = np.zeros((len(turning), len(values)))
+        ((_, blocks),) = model.chunks(replace(still, velocity=turning))
         rows[:, model.plan.columns[joint]] = blocks[joint].T
         for row in np.where(some, rows, 0.0):
             yield label, row, share * max(abs(float(row @ values)), least)

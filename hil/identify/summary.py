@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,8 +176,7 @@ def _excitation(prepared: Prepared) -> tuple[results.ExcitationResult, Array]:
         part = executed_rows(source, samples)
         lengths.append(part.stop - part.start)
         motion = samples.motion.rows(part)
-        direction = friction.direction(motion.time, motion.position, motion.velocity)
-        motion = motion._replace(direction=direction)
+        motion = replace(motion, direction=friction.direction(motion))
         factor = factor + Factor.from_samples(model, motion, samples.torque[part])
     gram = information(factor)
     most = coupling_index_max(len(gram))

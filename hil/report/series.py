@@ -194,7 +194,8 @@ def torque_parts(model: RobotModel, values: Array, samples: Samples) -> dict[str
 def _with_motion(samples: Samples, *, velocity: bool, acceleration: bool) -> Samples:
     """Return samples at the same positions, with velocity or acceleration or zero."""
     motion = samples.motion
-    moving = motion._replace(
+    moving = replace(
+        motion,
         velocity=motion.velocity if velocity else np.zeros_like(motion.velocity),
         acceleration=motion.acceleration if acceleration else np.zeros_like(motion.acceleration),
     )

@@ -18,17 +18,16 @@ from typing import Final, Self
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.estimators.delay import DELAY_BANDWIDTH
 from identification.factor.estimate import Estimate, inverse_variance
 from identification.factor.factor import Factor
 from identification.factor.normal_equations import solve
 from identification.factor.rows import augmented_rows
+from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 RESONANCE: Final = 2.0 * np.pi * 15.0
 """Resonance of a joint's links on its gear [rad/s] that compliances are expected at: industrial
@@ -101,8 +100,8 @@ def expected_compliance(model: RobotModel, samples: Samples, values: Array) -> A
     rows = np.linspace(0, len(samples.torque) - 1, _POSTURES).astype(int)
     postures = np.repeat(samples.motion.position[rows], n + 1, axis=0)
     pushes = np.tile(np.concatenate((np.eye(n), np.zeros((1, n)))), (_POSTURES, 1))
-    still = np.zeros_like(postures)
-    torque = model.gear_torque(values, postures, still, pushes).reshape(_POSTURES, n + 1, n)
+    pushed = replace(Motion.at_rest(postures), acceleration=pushes)
+    torque = model.gear_torque(values, pushed).reshape(_POSTURES, n + 1, n)
     inertia = np.einsum("bjj->bj", torque[:, :n] - torque[:, n:]).mean(axis=0)
     return np.where(inertia > 0.0, 1.0 / np.where(inertia > 0.0, inertia, 1.0), 0.0) / RESONANCE**2
 
@@ -117,20 +116,25 @@ def elastic_torque(model: RobotModel, samples: Samples, values: Array, complianc
         step = float(np.median(np.diff(time[segment])))
         rows = np.arange(segment.start, segment.stop, max(1, int(1.0 / (_RATE * step))))
         at = time[rows]
-        states = [np.asarray(part)[rows] for part in samples.motion[1:4]]
-        rigid = model.gear_torque(values, *states)
+        motion = samples.motion.rows(rows)
+        rigid = model.gear_torque(values, motion)
         order = 2
         rate = len(rows) / max(float(np.ptp(at)), step)
         if len(rows) <= 3 * (2 * order + 1) or rate <= 2.0 * DELAY_BANDWIDTH:
             continue
         low_pass = scipy.signal.butter(order, DELAY_BANDWIDTH, fs=rate, output="sos")
         sag = _LINEAR * compliance * scipy.signal.sosfiltfilt(low_pass, rigid, axis=0)
-        sags = [sag, np.gradient(sag, at, axis=0)]
-        sags.append(np.gradient(sags[1], at, axis=0))
+        sag_rate = np.gradient(sag, at, axis=0)
+        sag_acceleration = np.gradient(sag_rate, at, axis=0)
         for joint in np.flatnonzero(compliance):
             only = np.arange(model.n_joints) == joint
-            moved = [state - only * part for state, part in zip(states, sags, strict=True)]
-            change = (model.gear_torque(values, *moved) - rigid) / _LINEAR
+            moved = replace(
+                motion,
+                position=motion.position - only * sag,
+                velocity=motion.velocity - only * sag_rate,
+                acceleration=motion.acceleration - only * sag_acceleration,
+            )
+            change = (model.gear_torque(values, moved) - rigid) / _LINEAR
             for row in range(model.n_joints):
                 torque[segment, row, joint] = np.interp(time[segment], at, change[:, row])
     return torque

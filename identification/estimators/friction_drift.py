@@ -8,12 +8,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.distributions import student_limit
 from identification.factor.blocks import part_edges
 from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
-
-Array = NDArray[np.float64]
 
 PIECES: Final = 12
 """Parts of all recordings together."""

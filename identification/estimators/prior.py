@@ -21,6 +21,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_covariance
 from identification.factor.estimate import (
@@ -33,9 +34,6 @@ from identification.factor.estimate import (
 from identification.factor.factor import Factor, require_rows
 from identification.factor.normal_equations import Solution, solve_positive, solve_rows
 from identification.model.robot import RobotModel
-
-Array = NDArray[np.float64]
-
 
 # Posterior over prior standard deviation of a parameter that is determined by the data, which then
 # gave three quarters of its information (inverse variance).

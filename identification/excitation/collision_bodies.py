@@ -13,13 +13,12 @@ from typing import Final, NamedTuple
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.excitation.errors import CollisionModelError, MissingMeshError, WorkspaceError
 from identification.model.kinematics import FARTHEST
 from identification.model.urdf_text import urdf_tree
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 

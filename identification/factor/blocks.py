@@ -9,10 +9,9 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array, Indices
 from identification.signals.samples import Samples
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Blocks = TypeVar("Blocks", NDArray[np.float64], NDArray[np.intp])
 
 FINE_BLOCK: Final = 0.125  # s

@@ -15,6 +15,7 @@ from typing import Final, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array, Indices
 from identification.errors import IdentificationError
 from identification.factor.blocks import (
     FINE_BLOCK,
@@ -39,8 +40,6 @@ from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Storage = Literal["gram", "qr"]
 
 _COARSEST: Final = 4  # fine blocks in a block of a long recording

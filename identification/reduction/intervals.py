@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.estimators.delay import with_uncertain_delay
 from identification.estimators.elasticity import with_elastic_gears
 from identification.estimators.friction_drift import drift_of_factors
@@ -25,8 +25,6 @@ from identification.factor.normal_equations import solve
 from identification.model.robot import RobotModel
 from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction
-
-Array = NDArray[np.float64]
 
 
 class Widened(NamedTuple):

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from identification.arrays import Array
 from identification.estimators.consistent import SolverError, consistent_values
 from identification.estimators.prior import (
     BodyPrior,
@@ -20,8 +18,6 @@ from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from identification.selection.settings import Strength
 from identification.selection.trial import Known
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.estimators.delay import rate_products
 from identification.estimators.elasticity import ElasticTorque
 from identification.estimators.friction_form import form_factor
@@ -20,8 +20,6 @@ from identification.estimators.prior import body_prior, posterior_values
 from identification.factor.factor import Factor, mean_factor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 ALIKE: Final = 3
 """Repetitions of one motion that are reduced to `Unmodelled` sums, which all of them share."""

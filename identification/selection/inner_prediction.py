@@ -31,7 +31,6 @@ from identification.selection.trial import (
 from identification.signals.masks import LeftOut
 from identification.signals.samples import Preprocessing, VelocitySource
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 Question = Literal[
     "rotors",

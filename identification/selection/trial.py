@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.estimators.consistent import consistent_values
 from identification.estimators.prior import (
@@ -32,7 +33,6 @@ from identification.selection.folds import FOLDS, Errors, Folds, PredictedRows, 
 from identification.selection.settings import Choice, Settings, Strength
 from identification.signals.samples import Preprocessing, Samples
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 TRANSFER: Final = 0.07

@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array, Indices
 from identification.distributions import student_limit
 from identification.estimators.friction_drift import PIECES, FrictionDrift, friction_trend
 from identification.model.robot import RobotModel
@@ -20,8 +21,6 @@ from identification.signals.samples import Samples
 from identification.signals.spectrum import power_density
 from identification.validation.prediction import PredictionError
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Rows = NDArray[np.bool_]
 
 # Model errors are correlated over tenths of a second.

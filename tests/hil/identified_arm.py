@@ -108,7 +108,7 @@ def identified_arm(
 def _run(cell, truth, seed, still, noise):
     model = cell.model
     motion = a_motion(model.n_joints, seed, still)
-    size = np.sqrt(np.mean(model.torque(truth, *motion[1:]) ** 2, axis=0))
+    size = np.sqrt(np.mean(model.torque(truth, motion) ** 2, axis=0))
     return simulated(model, truth, motion, noise * size, seed)
 
 

@@ -407,7 +407,7 @@ class TestSeveralTopics:
 
 def test_a_look_shows_the_commands(tmp_path, urdf) -> None:
     messages = Messages("humble")
-    torque = MODEL.torque(np.ones(MODEL.n_parameters), *four_sines(MOVED.time, 0.5)[1:])
+    torque = MODEL.torque(np.ones(MODEL.n_parameters), four_sines(MOVED.time, 0.5))
     topics = {
         "/joint_states": measured(messages, MOVED, torque),
         "/arm_controller/controller_state": controller(messages, MOVED),

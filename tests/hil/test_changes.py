@@ -32,6 +32,7 @@ from hil.compare import (
 from hil.errors import InputError
 from hil.progress import Silent
 from hil.report.changes import comparison_page
+from identification.model.motion import Motion
 
 from . import arm_histories
 from .arm_histories import FRICTION, Condition
@@ -182,11 +183,14 @@ class TestInMemory:
         assert [axes[name] for name in ("mc2x", "I5xz")] == ["joint_2", "joint_5"]
         values = np.random.default_rng(1).uniform(0.1, 2.0, arm.n_parameters)
         values[: arm.base.rank] = 0.0
-        still = np.zeros((1, 6))
+        still = Motion.at_rest(np.zeros((1, 6)))
         for j, quantity in enumerate(q for q in compared if q.kind == "friction"):
-            speed = still.copy()
+            speed = np.zeros((1, 6))
             speed[0, j] = float(quantity.name.split()[-2])
-            both = [arm.torque(values, still, sign * speed, still)[0, j] for sign in (1.0, -1.0)]
+            both = [
+                arm.torque(values, replace(still, velocity=sign * speed))[0, j]
+                for sign in (1.0, -1.0)
+            ]
             assert quantity.weights @ values == pytest.approx(0.5 * (both[0] - both[1]), rel=0.05)
 
     def test_scatter_of_repetitions_hides_a_change(self):

@@ -361,7 +361,7 @@ class TestOtherArm:
         archive = open_archive(tmp_path / "a.mcap")
         cell = cell_of(archive)
         samples = prepare(source_of(archive, cell).recording, cell.model, options=SETTINGS)
-        motor = samples.motion._replace(position=100.0 * samples.motion.position)
+        motor = replace(samples.motion, position=100.0 * samples.motion.position)
         before_gears = replace(samples, motion=motor, torque=samples.torque / 100.0)
         score = score_of(cell.model, samples)
         assert not Contradictions.of(cell, cell.model, samples, score, 0.0).sentences

@@ -114,8 +114,8 @@ class TestPromise:
         motion = midpoints(motions[0])
         density = made.precision(1).density
         step = motion.time[1] - motion.time[0]
-        blocks, columns = cell.model.regressor(*motion[1:])
-        torque = cell.model.torque(made.values, *motion[1:])
+        blocks, columns = cell.model.regressor(motion)
+        torque = cell.model.torque(made.values, motion)
         rate = np.gradient(torque, motion.time, axis=0)
         usable = cell.model.moving(motion.velocity)
         information = made.prior.copy()

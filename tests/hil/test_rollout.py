@@ -325,7 +325,7 @@ def test_a_model_that_must_not_be_relied_on_says_so(tmp_path: Path) -> None:
     time = np.arange(0.0, 12.0, 0.004)
     motion = four_sines(time, 0.5)
     noise = np.random.default_rng(1).standard_normal((len(time), 4)) * [1e-5, 1e-5, 3.0, 0.2]
-    torque = -MODEL.torque(truth(), *motion[1:])
+    torque = -MODEL.torque(truth(), motion)
     columns = np.column_stack([time, np.column_stack([motion.position, torque]) + noise])
     log, urdf, archive = (tmp_path / name for name in ("log.csv", "robot.urdf", "log.mcap"))
     np.savetxt(log, columns, delimiter=",", header="t,q1,q2,tau1,tau2", comments="")

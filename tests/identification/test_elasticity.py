@@ -16,6 +16,7 @@ from identification.estimators.least_squares import fit_least_squares
 from identification.factor.estimate import inverse_variance
 from identification.factor.factor import Factor
 from identification.factor.normal_equations import solve
+from identification.model.motion import Motion
 from tests.identification.two_link import MODEL, NOISE, as_samples, four_sines, truth
 
 STEP = 0.002
@@ -30,11 +31,13 @@ def recorded(compliance, noise=0.0, seed=0):
     for _ in range(4):  # a fixed point: what the gears transmit is that of the links
         rate = np.gradient(sag, STEP, axis=0)
         bend = np.gradient(rate, STEP, axis=0)
-        states = motor.position - sag, motor.velocity - rate, motor.acceleration - bend
-        transmitted = MODEL.gear_torque(truth(), *states)
+        links = Motion(
+            motor.time, motor.position - sag, motor.velocity - rate, motor.acceleration - bend
+        )
+        transmitted = MODEL.gear_torque(truth(), links)
         sag = compliance * transmitted
-    at_motors = MODEL.torque(truth(), *motor[1:4])
-    torque = at_motors + transmitted - MODEL.gear_torque(truth(), *motor[1:4])
+    at_motors = MODEL.torque(truth(), motor)
+    torque = at_motors + transmitted - MODEL.gear_torque(truth(), motor)
     torque += noise * np.random.default_rng(seed).standard_normal(torque.shape)
     inside = slice(50, -50)  # differences are one-sided at the ends
     return as_samples(MODEL, motor.rows(inside), torque[inside])
@@ -142,10 +145,11 @@ def test_links_resonate_on_the_expected_gears():
     """One joint alone is an inertia on a spring."""
     samples = recorded(np.zeros(2))
     still = as_samples(
-        MODEL, samples.motion._replace(position=np.zeros_like(samples.torque)), samples.torque
+        MODEL, replace(samples.motion, position=np.zeros_like(samples.torque)), samples.torque
     )
-    inertia = MODEL.gear_torque(truth(), np.zeros((2, 2)), np.zeros((2, 2)), np.eye(2))
-    inertia -= MODEL.gear_torque(truth(), *np.zeros((3, 2, 2)))
+    rest = Motion.at_rest(np.zeros((2, 2)))
+    inertia = MODEL.gear_torque(truth(), replace(rest, acceleration=np.eye(2)))
+    inertia -= MODEL.gear_torque(truth(), rest)
     expected = expected_compliance(MODEL, still, truth())
     np.testing.assert_allclose(1.0 / np.sqrt(expected * np.diag(inertia)), RESONANCE)
 
