@@ -20,10 +20,10 @@ from rich.style import Style
 from rich.terminal_theme import MONOKAI, TerminalTheme
 
 from hil import Campaign, Cell
+from hil.base.progress import Silent, reporter
 from hil.campaign import Stop, design
 from hil.campaign.operator import RunStatus
-from hil.progress import Silent, reporter
-from hil.screen import Keyboard, Screen
+from hil.campaign.screen import Keyboard, Screen
 
 HERE: Final = Path(__file__).parent
 COLUMNS = 80

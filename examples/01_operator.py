@@ -9,11 +9,11 @@ import sys
 from pathlib import Path
 
 from hil import Campaign, Cell
+from hil.base.progress import reporter as progress
 from hil.campaign import design, stop_on_interrupt
+from hil.campaign.screen import Screen
 from hil.plots import save
 from hil.plots.archive_view import draw_archive, view_of
-from hil.progress import reporter as progress
-from hil.screen import Screen
 
 PICTURE = Path("runs/examples/01_operator.png")
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from hil import Cell
 from hil.campaign import stop_on_interrupt
-from hil.cell_link import cell_link
-from hil.move import plan_move, send
+from hil.control.cell_link import cell_link
+from hil.control.move import plan_move, send
 from hil.plots import save
 from hil.plots.archive_view import draw_archive, view_of
 

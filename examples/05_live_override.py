@@ -15,9 +15,9 @@ import numpy as np
 from hil import Cell
 from hil.archive import open_archive
 from hil.campaign import stop_on_interrupt
-from hil.campaign.operator import MotionProgress, OperatorRequest
-from hil.cell_link import cell_link
-from hil.move import plan_move, send
+from hil.control.cell_link import cell_link
+from hil.control.motion_watch import MotionProgress, OperatorRequest
+from hil.control.move import plan_move, send
 
 PICTURE = Path("runs/examples/05_live_override.png")
 

@@ -10,11 +10,11 @@ from tempfile import TemporaryDirectory
 import matplotlib.pyplot as plt
 
 from hil import Campaign, Cell
+from hil.base.progress import Silent
 from hil.batch.cluster import Cluster
-from hil.batch.run import reidentify
+from hil.batch.graph import reidentify
 from hil.campaign import design
-from hil.identify.options import Options
-from hil.progress import Silent
+from hil.pipeline.options import Options
 
 HERE = Path(__file__).parent
 PICTURE = Path("runs/examples/06_batch.png")

@@ -14,10 +14,10 @@ from tempfile import TemporaryDirectory
 from drivers import CycleRing, Guard, Session, TransportClosed
 from hil import Cell
 from hil.campaign import VirtualLink, stop_on_interrupt
-from hil.move import plan_move, send
+from hil.control.move import plan_move, send
+from hil.control.simulation import simulated_controller
 from hil.plots import save
 from hil.plots.archive_view import draw_archive, view_of
-from hil.simulation import simulated_controller
 
 CELL = "sim_fixtures/ns16/cell.toml"
 PICTURE = Path("runs/examples/07_own_transport.png")

@@ -18,15 +18,15 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.design.given import given_sources
-from hil.design.requirements import Requirement, require_known, requirements_from
+from hil.base.errors import InputError
+from hil.base.progress import Reporter, Silent
+from hil.base.safe_input import path_exists
+from hil.base.terminal_text import plural
 from hil.design.result import RESULT
 from hil.design.settings import load_settings
-from hil.design.wanted import ReferenceMotions, Wanted
-from hil.errors import InputError
-from hil.identify.estimating import estimate_with, with_loading
-from hil.identify.options import Options
-from hil.identify.prepared import (
+from hil.pipeline.estimating import estimate_with, with_loading
+from hil.pipeline.options import Options
+from hil.pipeline.prepared import (
     DELAY_TIME,
     Prepared,
     decide,
@@ -34,10 +34,10 @@ from hil.identify.prepared import (
     renewed_delay,
     samples_of,
 )
-from hil.identify.sources import Source, gather_sources
-from hil.progress import Reporter, Silent
-from hil.reading import path_exists
-from hil.terminal_text import plural
+from hil.pipeline.sources import Source, gather_sources
+from hil.precision.given_recordings import given_sources
+from hil.precision.required_quantities import ReferenceMotions, Wanted
+from hil.precision.requirements import Requirement, require_known, requirements_from
 from identification.estimators.delay import CombinedDelay, delay_sensitivity, rate_products
 from identification.estimators.elasticity import ElasticTorque
 from identification.estimators.torque_scale import absolute

@@ -20,19 +20,20 @@ from pydantic import StrictBool, model_validator
 from drivers.open_mode import MAX_TARGET_JUMP
 from drivers.transports.simulated import Delay, Duplicate, Fault, Lose, SimulatedTransport
 from hil.archive import open_archive
+from hil.archive.recorded_campaign import load_record
+from hil.base.errors import InputError
+from hil.base.files import write_output
+from hil.base.progress import Reporter
+from hil.base.terminal_text import typed
 from hil.cell import Cell
-from hil.errors import InputError
-from hil.files import write_output
-from hil.progress import Reporter
-from hil.recorded_campaign import load_record
-from hil.results import Frozen
-from hil.simulation import (
+from hil.control.simulation import (
     controller_settings,
     planted_values,
     simulated_controller,
     simulated_provenance,
 )
-from hil.terminal_text import typed
+from hil.control.virtual_link import VirtualLink
+from hil.results.results import Frozen
 from identification.distributions import normal_limit
 from identification.errors import IdentificationError
 from identification.signals.recording import RecordingError
@@ -42,7 +43,6 @@ from sim_fixtures import ServoSettings, UnmodelledEffects
 
 from .folder import CampaignFolder
 from .oscillation import growing_oscillation
-from .virtual_link import VirtualLink
 
 Array = NDArray[np.float64]
 
@@ -489,10 +489,10 @@ def _motion_remedy(cell: Cell, name: str, path: Path, joint: int | None, remedy:
 def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[Criterion]:
     """Judge an identification from the archives: determined, correct, predictive."""
     # Slow to import, and not needed by those who read a rehearsal.
-    from hil.identify.estimating import estimate_with
-    from hil.identify.options import FIXED
-    from hil.identify.prepared import prepare_sources
-    from hil.identify.sources import gather_sources
+    from hil.pipeline.estimating import estimate_with
+    from hil.pipeline.options import FIXED
+    from hil.pipeline.prepared import prepare_sources
+    from hil.pipeline.sources import gather_sources
 
     bounds = {"excitation": 0.0, "parameters": MOST_SIGMA, "unseen motion": MOST_ERROR}
     kinds = ("excitation", "validation", "standstill")

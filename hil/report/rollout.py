@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hil.report.chart import Caption, Chart, Legend, Plot, Trace, label
 from hil.report.figures import NOMINAL, PREDICTED
-from hil.rollout_result import WANTED, ArmErrors, RolloutResult
+from hil.results.rollout_result import WANTED, ArmErrors, RolloutResult
 from identification.text import percentage
 
 Array = NDArray[np.float64]

@@ -28,6 +28,7 @@ from hil.batch.cache import HEADER, JSON, NPZ, NUMBERS, CacheError, CacheLocatio
 from hil.batch.cluster import SkippedArchive
 from hil.batch.discovery import ArchiveRef, arm_digest
 from hil.batch.estimates import Arm
+from hil.batch.graph import PARTITION, BatchResult, _Campaign
 from hil.batch.reduction import (
     _matrices,
     _triangles,
@@ -35,7 +36,6 @@ from hil.batch.reduction import (
     reduction_key,
     settings_digest,
 )
-from hil.batch.run import PARTITION, BatchResult, _Campaign
 from hil.batch.table import COLUMNS, write_tables
 from hil.batch.thread import ThreadClient
 from hil.cell import Cell

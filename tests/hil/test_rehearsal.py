@@ -18,10 +18,13 @@ from typer.testing import CliRunner
 from drivers.drive_train import DriveTrain
 from drivers.transports.simulated import Lose
 from hil.archive import open_archive
+from hil.base.errors import OperatorStopError
+from hil.base.progress import Silent, Task
 from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop
 from hil.campaign import rehearsal as rehearsal_module
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
+from hil.campaign.identified import identify_campaign
 from hil.campaign.rehearsal import (
     CRITERIA,
     FASTEST,
@@ -36,9 +39,6 @@ from hil.campaign.rehearsal import (
 from hil.cell import Cell
 from hil.cell.text import with_values
 from hil.cli import app
-from hil.errors import OperatorStopError
-from hil.identify import identify_campaign
-from hil.progress import Silent, Task
 from planner import Move, plan_moves
 from sim_fixtures.plant import ElasticPlant, PlantTruth
 from tests import messages

@@ -19,10 +19,10 @@ from typing import Any
 import pytest
 from distributed import LocalCluster
 
+from hil.base.errors import InputError
 from hil.campaign.folder import SIDES, CampaignFolder
+from hil.control.simulation import simulated_link
 from hil.design import DesignResult
-from hil.errors import InputError
-from hil.simulation import simulated_link
 from tests.docs.test_messages import COMMAND, FIELD, OPTION, messages
 from tests.hil.fast_cell import (
     QUICK_GRADIENT,

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from hil.base.errors import ExecutionError, InputError
+from hil.base.progress import Silent
 from hil.campaign import Campaign
-from hil.campaign.operator import Stop
+from hil.campaign.identified import identify_campaign
 from hil.campaign.plan import design
 from hil.campaign.precision import PrecisionMeter, further, noise_shares, requirements_of
 from hil.campaign.precision_record import Look, PrecisionRecord, Reached
 from hil.cli import app
-from hil.errors import ExecutionError, InputError
-from hil.identified_campaign import identify_campaign
-from hil.identify import estimating
-from hil.progress import Silent
+from hil.control.motion_watch import Stop
+from hil.pipeline import estimating
 from identification.estimators.elasticity import ElasticTorque
 from identification.factor.factor import Factor
 from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell, pass_rehearsal
