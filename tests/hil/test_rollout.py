@@ -156,7 +156,7 @@ def test_no_predicted_part_is_shorter_than_a_window() -> None:
 
 
 def test_to_identify_imports_nothing_of_mujoco() -> None:
-    script = "import hil.cli.identify, hil.report, hil.report.output_files, sys; print('mujoco' in sys.modules)"
+    script = "import hil.cli.identify, hil.report.output_files, sys; print('mujoco' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.stdout == "False\n", done.stderr
 
