@@ -19,9 +19,8 @@ from rich.segment import Segment
 from rich.style import Style
 from rich.terminal_theme import MONOKAI, TerminalTheme
 
-from hil import Campaign, Cell
-from hil.base.progress import Silent, reporter
-from hil.campaign import Stop, design
+from hil import Campaign, Cell, Silent, Stop, reporter
+from hil.campaign import design
 from hil.campaign.operator import RunStatus
 from hil.campaign.screen import Keyboard, Screen
 

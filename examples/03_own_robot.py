@@ -11,8 +11,7 @@ from tempfile import TemporaryDirectory
 
 import matplotlib.pyplot as plt
 
-from hil import Campaign, Cell
-from hil.base.progress import Silent
+from hil import Campaign, Cell, Silent
 from hil.campaign import design
 
 HERE = Path(__file__).parent

@@ -14,8 +14,7 @@ from tempfile import TemporaryDirectory
 import matplotlib.pyplot as plt
 import numpy as np
 
-from hil import Campaign, Cell
-from hil.base.progress import Silent
+from hil import Campaign, Cell, Silent
 from hil.campaign import design
 from identification.excitation import Excitation, Objective, correlation, midpoints
 from identification.excitation.excitation import moves_through

@@ -9,12 +9,9 @@ from tempfile import TemporaryDirectory
 
 import matplotlib.pyplot as plt
 
-from hil import Campaign, Cell
-from hil.base.progress import Silent
+from hil import Campaign, Cell, Options, Silent, reidentify
 from hil.batch.cluster import Cluster
-from hil.batch.graph import reidentify
 from hil.campaign import design
-from hil.pipeline.options import Options
 
 HERE = Path(__file__).parent
 PICTURE = Path("runs/examples/06_batch.png")

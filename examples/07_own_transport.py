@@ -12,10 +12,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from drivers import CycleRing, Guard, Session, TransportClosed
-from hil import Cell
-from hil.campaign import VirtualLink, stop_on_interrupt
-from hil.control.move import plan_move, send
-from hil.control.simulation import simulated_controller
+from hil import Cell, plan_move, send, simulated_controller, stop_on_interrupt
+from hil.campaign import VirtualLink
 from hil.plots import save
 from hil.plots.archive_view import draw_archive, view_of
 
