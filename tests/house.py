@@ -20,7 +20,7 @@ PACKAGES: Final = ("drivers", "planner", "identification", "sim_fixtures", "hil"
 CEILINGS: Final[Mapping[str, int]] = {
     "import circles": 0,
     "folder circles": 0,
-    "imports inside functions": 21,
+    "imports inside functions": 17,
     "banned names": 0,
     "functions over 60 lines": 9,
     "long names of tests": 0,

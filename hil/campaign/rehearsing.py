@@ -11,6 +11,8 @@ from hil.base.files import make_folder
 from hil.base.progress import Reporter
 from hil.base.version import software
 from hil.campaign.planned_motions import planned_motions, require_runnable
+from hil.campaign.rehearsal_criteria import SATURATED, of_currents, of_estimate, of_motions
+from hil.campaign.twin import Twin
 from hil.cell import Cell
 from hil.control.errors import MotionFailedError
 from hil.control.motion_checks import PLANNED_CURRENT
@@ -20,18 +22,7 @@ from sim_fixtures import SimulationError
 
 from .errors import RepetitionsRejectedError
 from .operator import RunWatch
-from .rehearsal import (
-    AS_MODELLED,
-    CRITERIA,
-    EFFECTS,
-    SATURATED,
-    Criterion,
-    Rehearsal,
-    Twin,
-    of_currents,
-    of_estimate,
-    of_motions,
-)
+from .rehearsal import AS_MODELLED, CRITERIA, EFFECTS, Criterion, Rehearsal
 from .run import run_motions
 from .runner import RunOptions
 from .state import CampaignState

@@ -118,7 +118,7 @@ def import_recording(
 
     Joints of a gripper that were not recorded are fixed, and of a robot with several arms all
     joints but those of the recorded one. `held_joints` and the following are those of
-    :func:`hil.importers.import_log`.
+    :func:`hil.import_log`.
 
     Raises:
         SourceError: it cannot be read, or its channels leave a quantity open.

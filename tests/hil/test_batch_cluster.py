@@ -183,7 +183,7 @@ class TestSchedulersByHand:
         """Their numbers would differ."""
         source = Path(hil.__file__).parent
         shutil.copytree(source, tmp_path / "hil", ignore=shutil.ignore_patterns("__pycache__"))
-        with (tmp_path / "hil" / "version.py").open("a") as file:
+        with (tmp_path / "hil" / "base" / "version.py").open("a") as file:
             file.write("\n# another version\n")
         path = os.pathsep.join([str(tmp_path), str(source.parent)])
         with HandMade(workers=1) as processes:

@@ -305,7 +305,7 @@ class TestCache:
 
 class TestDigests:
     @pytest.mark.parametrize(
-        "name", ["batch/discovery.py", "batch/run.py", "signals/samples.py", "record.py"]
+        "name", ["batch/discovery.py", "batch/graph.py", "signals/samples.py", "record.py"]
     )
     def test_that_of_the_programs_depends_on_each(self, name, monkeypatch):
         here = code_digest()
