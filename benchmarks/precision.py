@@ -43,8 +43,8 @@ from hil.base.progress import Silent, Task
 from hil.campaign import Campaign, Stop
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.plan import CampaignPlan, plan_around, validation_motions
-from hil.campaign.precision import PrecisionMeter
 from hil.campaign.precision_record import IN_A_ROW
+from hil.campaign.reached_precision import PrecisionMeter
 from hil.cell import Cell
 from hil.control.link import MotionLink
 from hil.control.motion_checks import MotionChecks

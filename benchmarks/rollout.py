@@ -41,7 +41,7 @@ from hil.cell import Cell
 from hil.pipeline.identified_model import IdentifiedModel, model_of
 from hil.pipeline.identify_folder import identify_paths
 from hil.results.rollout_result import JUDGED, RolloutResult
-from hil.rollout.rollout import RolloutOptions, nominal_arm, roll_out
+from hil.rollout.torque_rollout import RolloutOptions, nominal_arm, roll_out
 from identification import Samples
 from identification.export.arm import Arm, Ranges
 from identification.model.motion import Motion

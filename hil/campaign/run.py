@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from hil.base.progress import Reporter
+from hil.campaign.reached_precision import PrecisionStage
 from hil.control.cell_link import cell_link
 from hil.control.connection import active_checks, narrower_limits
 from hil.control.link import MotionLink
@@ -20,7 +21,6 @@ from hil.control.motions import CampaignMotion, StraightMoves, require_allowed
 from .dry_run import OVERRIDE, DryRunState
 from .gates import require_as_rehearsed, require_dry_run, require_gates
 from .operator import RunWatch
-from .precision import PrecisionStage
 from .quality import Rejected
 from .runner import RunArchives, Runner, RunOptions
 from .stages import DryRunStage, WarmUpStage

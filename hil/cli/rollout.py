@@ -25,10 +25,17 @@ from hil.pipeline.options import Options
 from hil.plots.chart_picture import draw_charts
 from hil.plots.plan_picture import save
 from hil.report.output_files import REPORT
-from hil.report.rollout import overview_charts, overview_legends
+from hil.report.rollout_section import overview_charts, overview_legends
 from hil.results.rollout_result import ROLLOUT
-from hil.rollout.rollout import PICTURE, POLISHED, Rollout, RolloutOptions, roll_out, write_rollout
 from hil.rollout.servo_rollout import roll_out_servo, without_torque
+from hil.rollout.torque_rollout import (
+    PICTURE,
+    POLISHED,
+    Rollout,
+    RolloutOptions,
+    roll_out,
+    write_rollout,
+)
 
 
 @with_options(Identifying, "how")

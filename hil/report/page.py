@@ -12,7 +12,7 @@ from hil.report import figures
 from hil.report.drawing import chart_panel
 from hil.report.interactive import chart_data, library
 from hil.report.rendering import environment, page_bytes, template_text
-from hil.report.rollout import ROLLOUT_LEGENDS, rollout_charts
+from hil.report.rollout_section import ROLLOUT_LEGENDS, rollout_charts
 from hil.results.results import ParameterResult, Results, by_id, outside_mark
 from hil.results.rollout_result import RolloutResult
 from hil.results.series import ReportSeries

@@ -19,7 +19,7 @@ from hil.pipeline.prepared import samples_of, stated_settings
 from hil.pipeline.sources import Source, Sources, archives_in, gather_sources
 from hil.results.rollout_result import JUDGED, ArmErrors, RolloutResult, ServoParameter, ServoResult
 from hil.rollout.polishing import polish
-from hil.rollout.rollout import (
+from hil.rollout.torque_rollout import (
     MOST_WINDOWS,
     POLISHED_WINDOWS,
     STRIDE,

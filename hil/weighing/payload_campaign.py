@@ -29,8 +29,8 @@ from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.folder import PAYLOADS, SIDES, CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.plan import CampaignPlan
-from hil.campaign.precision import further
 from hil.campaign.precision_record import Look, PrecisionRecord, Reached
+from hil.campaign.reached_precision import further
 from hil.campaign.run import RunResult
 from hil.cell import Cell
 from hil.cell.schema import CellFile

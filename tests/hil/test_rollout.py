@@ -24,10 +24,10 @@ from hil.pipeline import identified_model
 from hil.pipeline.identified_model import predicted_parts
 from hil.plots.chart_picture import draw_charts
 from hil.report.output_files import REPORT
-from hil.report.rollout import overview_charts, overview_legends
+from hil.report.rollout_section import overview_charts, overview_legends
 from hil.results.provenance import PARAMETERS_JSON
 from hil.results.rollout_result import ROLLOUT, ArmErrors, RolloutResult
-from hil.rollout.rollout import POLISHED
+from hil.rollout.torque_rollout import POLISHED
 from identification.rollout.servo import Servo
 from identification.text import percentage
 from tests import messages
@@ -264,7 +264,7 @@ def test_gains_of_an_identified_servo_are_named(
         n = len(joint_names)
         return Servo(np.full(n, 2e4), np.full(n, 200.0), 0.004)
 
-    monkeypatch.setattr("hil.rollout.rollout.identify_servo", stiff)
+    monkeypatch.setattr("hil.rollout.torque_rollout.identify_servo", stiff)
     done = run("rollout", folder, "--servo", "identified", "--samples", "3")
     assert done.exit_code in (0, 5), done.output
     result = RolloutResult.load(folder / ROLLOUT)

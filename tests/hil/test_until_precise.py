@@ -13,8 +13,8 @@ from hil.base.progress import Silent
 from hil.campaign import Campaign
 from hil.campaign.identified import identify_campaign
 from hil.campaign.plan import design
-from hil.campaign.precision import PrecisionMeter, further, noise_shares, requirements_of
 from hil.campaign.precision_record import Look, PrecisionRecord, Reached
+from hil.campaign.reached_precision import PrecisionMeter, further, noise_shares, requirements_of
 from hil.cli import app
 from hil.control.motion_watch import Stop
 from hil.pipeline import estimating
