@@ -77,11 +77,11 @@ from benchmarks.cramer_rao import PROJECT_ORDER, base_regressor, bound, least_sq
 from benchmarks.degradations import CAUSES
 from benchmarks.joint_log import JointLog
 from benchmarks.plain_fit import robot_from_urdf
-from hil.identified_model import IdentifiedModel, ensemble_of, model_of
-from hil.identify import identify_archives
-from hil.importers import IMPORTED_LAW, Robot
-from hil.progress import Silent
-from hil.results import Results
+from hil.base.progress import Silent
+from hil.importers.robot import IMPORTED_LAW, Robot
+from hil.pipeline.identified_model import IdentifiedModel, ensemble_of, model_of
+from hil.pipeline.run import identify_archives
+from hil.results.results import Results
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion as SampledMotion
 from identification.model.robot import RobotModel

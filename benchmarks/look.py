@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from benchmarks import parser_of, show
 from benchmarks.arms import urdf as arm_urdf
 from hil.archive import open_archive
-from hil.errors import HilError
-from hil.identify.sources import cell_of, source_of
-from hil.importers import Robot
+from hil.base.errors import HilError
 from hil.importers.recording import ImportOptions, RobotOf, import_recording
+from hil.importers.robot import Robot
 from hil.look import Look, look_at
+from hil.pipeline.sources import cell_of, source_of
 from identification.estimators.prior import body_prior, fit_posterior
 from identification.factor.factor import Factor
 from identification.model.motion import Motion

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.identify.estimating import posterior_of
-from hil.identify.estimators import fit_of
+from hil.pipeline.estimating import posterior_of
+from hil.pipeline.estimators import fit_of
 from identification import IdentificationError
 from identification.estimators.consistent import SolverError
 from identification.estimators.covariance import solve_with_prior

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Archive
-from hil.errors import ArchiveError
-from hil.files import json_digest
-from hil.identify.prepared import known_parameters, reduction_of, versions_of
-from hil.identify.sources import Source, known_warnings, source_of
+from hil.base.errors import ArchiveError
+from hil.base.files import json_digest
+from hil.pipeline.prepared import known_parameters, reduction_of, versions_of
+from hil.pipeline.sources import Source, known_warnings, source_of
 from identification.estimators.elasticity import ElasticTorque
 from identification.estimators.friction_drift import PIECES
 from identification.estimators.least_squares import fit_least_squares

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import open_archive
-from hil.errors import ArchiveError
-from hil.recorded_campaign import load_record
+from hil.archive.recorded_campaign import load_record
+from hil.base.errors import ArchiveError
 from identification.model.motion import Motion
 
 from .errors import AgainstGravityError, DryRunError

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import open_archive
+from hil.archive.recorded_campaign import load_record
 from hil.cell import Cell
-from hil.recorded_campaign import load_record
 from identification.model.motion import Motion
 from identification.text import percentage
 from planner import FourierSeries, PiecewiseCubic

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from hil.errors import InputError
+from hil.base.errors import InputError
 
 
 class CellError(InputError):

@@ -19,7 +19,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from hil.errors import SourceError
+from hil.base.errors import SourceError
 from hil.importers.bags import Bag, BagMessage
 from hil.importers.mcap_messages import Topic
 from hil.importers.ros_messages import CONTROLLER_STATE, JOINT_STATE

@@ -15,8 +15,8 @@ import scipy
 from numpy.typing import NDArray
 
 from hil.archive import Findings, Samples
+from hil.base.errors import SourceError
 from hil.cell.text import UrdfLimits, urdf_limits
-from hil.errors import SourceError
 from hil.importers.publishers import APART, alternating_samples
 from hil.importers.stamps import FASTEST, SLOWEST
 from identification.model.motion import Motion

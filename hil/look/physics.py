@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.identify.cell_context import nominal_of
+from hil.cell.nominal import nominal_of
 from hil.look.maps import entries_of
 from hil.look.result import Certainty, Choice, Group, Row
 from identification.estimators.delay import DelayEstimate

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array, Indices
 from identification.errors import ShapeError
-from identification.excitation.collision_bodies import Workspace, link_bodies, obstacles
+from identification.excitation.collision_bodies import link_bodies, obstacles
 from identification.excitation.separation import (
     Bodies,
     Frames,
@@ -27,6 +27,7 @@ from identification.excitation.separation import (
     reaches,
 )
 from identification.model.kinematics import Chain, chain_from_urdf
+from identification.model.workspace import Workspace
 from planner import FourierSeries, JointLimits, PiecewiseCubic
 
 # Another contact may be deeper by this: in given postures, and along a motion [m].

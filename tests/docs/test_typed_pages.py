@@ -21,14 +21,14 @@ from typer.testing import CliRunner
 
 from hil import Campaign, Cell
 from hil.archive import open_archive
+from hil.base.progress import Silent
 from hil.campaign import design
 from hil.cell.errors import UnknownFieldsError
 from hil.cell.text import with_values
 from hil.cli import app
-from hil.demo_link import free_port
-from hil.progress import Silent
-from hil.results import Results
-from hil.rollout_result import RolloutResult
+from hil.control.simulator_process import free_port
+from hil.results.results import Results
+from hil.results.rollout_result import RolloutResult
 from identification.model.motion import Motion
 from tests.docs.typed import ROOT, commands
 from tests.hil.simulated_logs import simulate

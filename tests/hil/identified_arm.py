@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hil.base.files import write_files
 from hil.cell import Cell
-from hil.files import write_files
-from hil.identify.estimating import posterior_of
-from hil.outcome import Exports, exports_of
+from hil.pipeline.estimating import posterior_of
+from hil.report.output_files import Exports, exports_of
 from identification import Estimate
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.estimate import estimate, joint_weights

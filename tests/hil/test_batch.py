@@ -20,23 +20,23 @@ from typer.testing import CliRunner
 from benchmarks import archive_files
 from hil.archive import ArchiveWriter, Samples, write_samples
 from hil.archive.repair import repair, repaired_name
+from hil.base.errors import ArchiveError, InputError
+from hil.base.progress import Silent
 from hil.batch import discovery, reduction
-from hil.batch import run as batch_run
+from hil.batch import graph as batch_run
 from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster
 from hil.batch.discovery import discover, open_ref
 from hil.batch.estimates import BatchEstimator
+from hil.batch.graph import reidentify
 from hil.batch.reduction import ToReduce, cached_reduction, reduce_archives
-from hil.batch.run import reidentify
+from hil.campaign.identified import identify_campaign
 from hil.cell import Cell
 from hil.cli import app
-from hil.errors import ArchiveError, InputError
-from hil.identify import Options, identify_campaign
-from hil.identify.estimating import estimate_with, with_transmitted_load
-from hil.identify.options import FIXED
-from hil.identify.prepared import decide, prepare_sources
-from hil.identify.sources import gather_sources
-from hil.progress import Silent
+from hil.pipeline.estimating import estimate_with, with_transmitted_load
+from hil.pipeline.options import FIXED, Options
+from hil.pipeline.prepared import decide, prepare_sources
+from hil.pipeline.sources import gather_sources
 from identification.factor import factor
 from identification.factor.blocks import FINE_BLOCK
 from identification.selection.settings import Settings, Strength
@@ -183,7 +183,7 @@ class TestNumbers:
             decisions = decide(sources, FIXED, reporter)
             return decisions._replace(settings=replace(decisions.settings, **changes))
 
-        monkeypatch.setattr("hil.identify.prepared.decide", decided)
+        monkeypatch.setattr("hil.pipeline.prepared.decide", decided)
         monkeypatch.setattr(batch_run, "decide", decided)
         options = replace(FIXED, estimator="auto")
         ready = with_transmitted_load(prepare(campaign, options))

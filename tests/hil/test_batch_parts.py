@@ -28,6 +28,7 @@ from hil.batch.cache import HEADER, JSON, NPZ, NUMBERS, CacheError, CacheLocatio
 from hil.batch.cluster import SkippedArchive
 from hil.batch.discovery import ArchiveRef, arm_digest
 from hil.batch.estimates import Arm
+from hil.batch.graph import PARTITION, BatchResult, _Campaign
 from hil.batch.reduction import (
     ToReduce,
     _matrices,
@@ -36,7 +37,6 @@ from hil.batch.reduction import (
     reduction_key,
     settings_digest,
 )
-from hil.batch.run import PARTITION, BatchResult, _Campaign
 from hil.batch.table import COLUMNS, write_tables
 from hil.batch.thread import ThreadClient
 from hil.cell import Cell
@@ -306,7 +306,7 @@ class TestCache:
 
 class TestDigests:
     @pytest.mark.parametrize(
-        "name", ["batch/discovery.py", "batch/run.py", "signals/samples.py", "record.py"]
+        "name", ["batch/discovery.py", "batch/graph.py", "signals/samples.py", "record.py"]
     )
     def test_that_of_the_programs_depends_on_each(self, name, monkeypatch):
         here = code_digest()

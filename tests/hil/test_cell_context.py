@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hil.identify.cell_context import _friction_law, _resolution, _sampling_rate, grid_step
+from hil.pipeline.cell_context import _friction_law, _resolution, _sampling_rate, grid_step
 from identification.model.friction import FrictionLaw
 from identification.selection.inner_prediction import LOAD
 from identification.selection.settings import Choice

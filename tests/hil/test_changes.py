@@ -14,13 +14,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
+from hil.base.errors import InputError
+from hil.base.progress import Silent
 from hil.batch.cluster import Cluster
 from hil.batch.estimates import Arm
 from hil.campaign import Campaign
 from hil.campaign.plan import design
 from hil.cell import Cell
 from hil.cli import app
-from hil.compare import (
+from hil.compare.changes_page import comparison_page
+from hil.compare.comparison import (
     against_first,
     compare,
     compare_campaigns,
@@ -29,9 +32,6 @@ from hil.compare import (
     holm,
     quantities,
 )
-from hil.errors import InputError
-from hil.progress import Silent
-from hil.report.changes import comparison_page
 from identification.model.motion import Motion
 
 from . import arm_histories
@@ -118,7 +118,7 @@ class TestRecorded:
     )
     def test_refused_before_anything_is_estimated(self, folders, monkeypatch, other, why):
         """Different arms, whichever comes first, with what they differ in; one campaign."""
-        monkeypatch.setattr("hil.batch.run._Batch", pytest.fail)
+        monkeypatch.setattr("hil.batch.graph._Batch", pytest.fail)
         with pytest.raises(InputError, match=why):
             compared(folders["march"], folders[other])
 

@@ -20,11 +20,11 @@ from typer.testing import CliRunner
 
 import hil as hil_package
 from hil.archive import Samples, open_archive, write_samples
+from hil.base.errors import InputError
+from hil.base.progress import reporter
 from hil.campaign import Campaign
 from hil.cli import COMMANDS, app, main
-from hil.errors import InputError
-from hil.progress import reporter
-from hil.results import Results
+from hil.results.results import Results
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 
 pytestmark = pytest.mark.long
@@ -244,9 +244,7 @@ def test_ctrl_c_stops_on_the_path_with_complete_archives(tmp_path: Path) -> None
     assert archive.outcome.entries["outcome"] == "stopped"
 
 
-@pytest.mark.parametrize(
-    "package", ["hil", "hil.campaign", "hil.identify", "hil.testing", "identification"]
-)
+@pytest.mark.parametrize("package", ["hil", "hil.campaign", "hil.testing", "identification"])
 def test_tab_completion_lists_names_that_are_not_loaded_yet(package: str) -> None:
     look = f"import {package} as package; print(set(package.__all__) - set(dir(package)))"
     shown = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)

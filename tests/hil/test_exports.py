@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 from typer.testing import CliRunner
 
-from hil import identified_model
 from hil.cli import app
-from hil.identify import Identification
-from hil.importers import ColumnMap, Robot, import_log
-from hil.outcome import FILES, Exports
-from hil.results import Results
+from hil.importers.column_map import ColumnMap
+from hil.importers.log import import_log
+from hil.importers.robot import Robot
+from hil.pipeline import identified_model
+from hil.pipeline.run import Identification
+from hil.report.output_files import FILES, Exports
+from hil.results.results import Results
 from identification.export.parameters import parameters_json
 from identification.model.kinematics import chain_from_urdf
 from identification.model.motion import Motion

@@ -20,11 +20,11 @@ from typer.testing import CliRunner
 
 from benchmarks.look import measure
 from hil.archive import open_archive
+from hil.base.errors import SourceError
 from hil.cli import app
-from hil.errors import SourceError
-from hil.identify.sources import cell_of, source_of
-from hil.importers import ColumnMap, Robot
+from hil.importers.column_map import ColumnMap
 from hil.importers.recording import ImportOptions, import_recording
+from hil.importers.robot import Robot
 from hil.look import Look, look_at
 from hil.look.conclusions import concluded, undecided
 from hil.look.maps import entries_of
@@ -32,6 +32,7 @@ from hil.look.other_arm import Contradictions
 from hil.look.physics import channel_rows
 from hil.look.result import Choice
 from hil.look.run import SETTINGS
+from hil.pipeline.sources import cell_of, source_of
 from identification.estimators.delay import DelayEstimate
 from identification.model.robot import RobotModel
 from identification.signals.samples import prepare

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from hil.report.series import example_series, torque_parts
+from hil.results.series import example_series, torque_parts
 from identification.signals.spectrum import HARRIS, power_density
 from tests.identification.two_link import MODEL, NOISE, a_motion, recording, truth
 

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from identification.excitation import CRITERIA, validation_motions
 from identification.excitation.collision import CollisionChecker
-from identification.excitation.collision_bodies import Workspace
 from identification.excitation.constraints import (
     SAMPLE_PERIOD,
     Constraints,
@@ -42,6 +41,7 @@ from identification.excitation.validation_motions import random_validation_motio
 from identification.excitation.violation import KINDS, NoFeasibleMotionError, excess_by_kind
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
+from identification.model.workspace import Workspace
 from planner import (
     FourierSeries,
     JointLimits,

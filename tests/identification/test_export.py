@@ -17,7 +17,6 @@ import pytest
 from identification.errors import ModelError, ShapeError
 from identification.estimators.consistent import consistent_estimate
 from identification.excitation.collision import CollisionChecker
-from identification.excitation.collision_bodies import Workspace
 from identification.excitation.errors import CollisionModelError
 from identification.export.arm import Arm, Ranges
 from identification.export.friction import friction_curve, median_load
@@ -34,6 +33,7 @@ from identification.model.motion import Motion
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.model.urdf_text import LONGEST, MOST_LINKS, refusal, urdf_tree
+from identification.model.workspace import Workspace
 from identification.signals.smoothing import LowPassShape, low_passed, noiseless_above
 from sim_fixtures.ns16 import urdf_text
 from tests import messages

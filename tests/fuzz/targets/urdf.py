@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.errors import InputError
-from hil.importers import Robot
+from hil.base.errors import InputError
+from hil.importers.robot import Robot
 from hil.new import cell_of_urdf
 from identification.errors import ModelError
 from identification.excitation import Workspace
