@@ -9,6 +9,7 @@ from hil.archive.header import (
     ArchiveOutcome,
     Findings,
 )
+from hil.archive.imported import imported_archive, write_archive
 from hil.archive.reader import Archive, open_archive
 from hil.archive.recorder import ArchiveSpec, Recorder
 from hil.archive.schema import ArchivedEvent, Level
@@ -29,6 +30,8 @@ __all__ = [
     "Level",
     "Recorder",
     "Samples",
+    "imported_archive",
     "open_archive",
+    "write_archive",
     "write_samples",
 ]

@@ -140,11 +140,13 @@ class ArchiveFile:
         attachments: Mapping[str, bytes],
         durable: bool,
     ) -> None:
-        described = _checked_metadata(path, metadata) | {"joint_names": json.dumps([*joint_names])}
-        if period is not None:
-            described["period"] = json.dumps(period)
-        described["format_version"] = str(FORMAT_VERSION)
-        described["attachments"] = json.dumps(sorted(attachments))
+        entries = described(
+            path,
+            joint_names=joint_names,
+            metadata=metadata,
+            period=period,
+            attachments=attachments,
+        )
         self._description_message = description_message(attachments.get("robot.urdf", b""))
         by_topic = profile(len(joint_names))
         shown = [] if self._description_message is None else [DESCRIPTION_TOPIC]
@@ -154,12 +156,12 @@ class ArchiveFile:
         self.closed = False
         self._path = path
         self._durable = durable
-        self._description = checksum(described)
+        self._description = checksum(entries)
         self._descriptor = _create(path)
         self._pending = _Pending()
         self._writer = mcap_writer(self._pending)
         with self._guarded():
-            self._writer.add_metadata(METADATA, with_checksum(described))
+            self._writer.add_metadata(METADATA, with_checksum(entries))
             for name, data in sorted(attachments.items()):
                 media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
                 self._writer.add_attachment(0, 0, name, media_type, data)
@@ -265,6 +267,27 @@ def _create(path: Path) -> int:
             f"cannot be created: {error.strerror}",
             remedy="make sure that its folder exists, is writable and has room, and record again",
         ) from error
+
+
+def described(
+    path: Path,
+    *,
+    joint_names: Sequence[str],
+    metadata: Mapping[str, str],
+    period: float | None,
+    attachments: Mapping[str, bytes],
+) -> dict[str, str]:
+    """Return the entries of the ``hil`` record of an archive; arguments as of `ArchiveFile`.
+
+    Raises:
+        ArchiveWriteError: the metadata are invalid.
+    """
+    entries = _checked_metadata(path, metadata) | {"joint_names": json.dumps([*joint_names])}
+    if period is not None:
+        entries["period"] = json.dumps(period)
+    entries["format_version"] = str(FORMAT_VERSION)
+    entries["attachments"] = json.dumps(sorted(attachments))
+    return entries
 
 
 def _checked_metadata(path: Path, metadata: Mapping[str, str]) -> dict[str, str]:
@@ -490,6 +513,15 @@ class Samples:
     commanded_position: Array | None = None
 
 
+def require_storable(path: Path, samples: Samples) -> None:
+    """Raise ArchiveWriteError if a stamp cannot be stored."""
+    stamp = samples.stamp
+    if stamp.size and not 0 <= stamp.min() <= stamp.max() < 2**31 * 10**9:
+        raise ArchiveWriteError(
+            path, "a stamp is outside 0 .. 2^31 s", remedy="shift the recording's clock"
+        )
+
+
 def write_samples(
     path: str | PathLike[str],
     samples: Samples,
@@ -508,11 +540,8 @@ def write_samples(
         ArchiveWriteError: the file exists or cannot be written, or a stamp cannot be stored.
     """
     path = Path(path)
+    require_storable(path, samples)
     stamp = samples.stamp
-    if stamp.size and not 0 <= stamp.min() <= stamp.max() < 2**31 * 10**9:
-        raise ArchiveWriteError(
-            path, "a stamp is outside 0 .. 2^31 s", remedy="shift the recording's clock"
-        )
     recorded = {
         "position": samples.position, "velocity": samples.velocity, "effort": samples.torque
     }  # fmt: skip
