@@ -10,7 +10,7 @@ from hil.archive.header import (
     Findings,
 )
 from hil.archive.imported import imported_archive, write_archive
-from hil.archive.reader import Archive, open_archive
+from hil.archive.reader import Archive, open_archive, opened, place_of
 from hil.archive.recorder import ArchiveSpec, Recorder
 from hil.archive.schema import ArchivedEvent, Level
 from hil.archive.writer import ArchiveWriter, Samples, write_samples
@@ -32,6 +32,8 @@ __all__ = [
     "Samples",
     "imported_archive",
     "open_archive",
+    "opened",
+    "place_of",
     "write_archive",
     "write_samples",
 ]

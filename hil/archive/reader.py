@@ -165,6 +165,16 @@ def open_archive(
     return scan_archive(path, fields=fields, times=times)[0]
 
 
+def opened(archive: Path | Archive) -> Archive:
+    """Return an archive, read unless it is in memory; errors as `open_archive`."""
+    return archive if isinstance(archive, Archive) else open_archive(archive)
+
+
+def place_of(archive: Path | Archive) -> Path:
+    """Return the path of an archive, of one in memory that of the file that may be written."""
+    return archive.path if isinstance(archive, Archive) else archive
+
+
 def scan_archive(path: str | PathLike[str], **options: Any) -> tuple[Archive, Scan]:
     """Scan an archive with the options of `Scan`; errors as `open_archive`."""
     path = Path(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from hil.archive import Archive
 from hil.archive.recorded_campaign import RecordedCampaign
 from hil.base.errors import InputError
 from hil.base.progress import Reporter
@@ -15,36 +16,40 @@ from hil.pipeline.run import Identification, identify_archives
 
 @one_thread()
 def identify_paths(
-    paths: Sequence[Path],
+    archives: Sequence[Path | Archive],
     reporter: Reporter,
     options: Options = Options(),
     *,
-    predict: Sequence[Path] = (),
+    predict: Sequence[Path | Archive] = (),
 ) -> Identification:
     """Identify from a campaign folder, a folder of archives, or archives.
 
     Raises:
         InputError: the folder contains neither, or is not the only path.
     """
-    folder = next((path for path in paths if path.is_dir()), None)
+    folder = next((path for path in archives if isinstance(path, Path) and path.is_dir()), None)
     if folder is None:
-        return identify_archives(paths, reporter, options, predict=predict)
-    if len(paths) > 1:
+        return identify_archives(archives, reporter, options, predict=predict)
+    if len(archives) > 1:
         raise InputError(
             folder, "is a folder among files", remedy="give one campaign folder, or files only"
         )
     if RecordedCampaign(folder).sealed:
         return identify_recorded(folder, reporter, options, predict=predict)
-    archives = sorted(folder.glob("*.mcap"))  # of `hil record`
-    if not archives:
+    recorded = sorted(folder.glob("*.mcap"))  # of `hil record`
+    if not recorded:
         remedy = "give a campaign folder (`hil design -o`), or archives (*.mcap)"
         raise InputError(folder, "contains neither a campaign nor archives", remedy=remedy)
-    return identify_archives(archives, reporter, options, predict=predict)
+    return identify_archives(recorded, reporter, options, predict=predict)
 
 
 @one_thread()
 def identify_recorded(
-    root: Path, reporter: Reporter, options: Options = Options(), *, predict: Sequence[Path] = ()
+    root: Path,
+    reporter: Reporter,
+    options: Options = Options(),
+    *,
+    predict: Sequence[Path | Archive] = (),
 ) -> Identification:
     """Identify from the complete archives of a campaign folder; `predict` adds held-out archives.
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+from hil.archive import Archive, place_of
 from hil.base.progress import Reporter
 from hil.base.threads import one_thread
 from hil.cell import Cell
@@ -21,7 +22,7 @@ from .estimating import Estimation, estimate_with, with_transmitted_load
 from .figure_series import report_series
 from .options import Options
 from .prepared import Prepared, prepare_sources
-from .sources import gather_sources, payload_warnings
+from .sources import Source, gather_sources, payload_warnings
 from .summary import summary
 from .validation import Validation, validate
 
@@ -61,6 +62,20 @@ class Identification:
         """Whether the model may be used."""
         return self.validation.verdict
 
+    def moved(self, places: Mapping[Path, Path]) -> Identification:
+        """Return the same with other paths of its archives."""
+
+        def at(sources: Sequence[Source]) -> tuple[Source, ...]:
+            return tuple(replace(each, path=places.get(each.path, each.path)) for each in sources)
+
+        sources = self.prepared.sources
+        sources = replace(sources, training=at(sources.training), held_out=at(sources.held_out))
+        return replace(
+            self,
+            paths=tuple(places.get(path, path) for path in self.paths),
+            prepared=replace(self.prepared, sources=sources),
+        )
+
     @cached_property
     def series(self) -> ReportSeries:
         """Data of the report's figures."""
@@ -69,15 +84,17 @@ class Identification:
 
 @one_thread()
 def identify_archives(
-    paths: Sequence[Path],
+    archives: Sequence[Path | Archive],
     reporter: Reporter,
     options: Options = Options(),
     *,
-    predict: Sequence[Path] = (),
+    predict: Sequence[Path | Archive] = (),
     name: str = "",
     warnings: Sequence[str] = (),
 ) -> Identification:
-    """Identify from archives; their kind decides what is fitted, `predict` is held out.
+    """Identify from archives, files or in memory; `predict` is held out.
+
+    The kind of the others decides which are fitted.
 
     Archives are read as recordings (`gather_sources`), which become samples (`prepare_sources`),
     factors and an estimate (`estimate_with`), evidence and a verdict (`validate`), and results.
@@ -85,11 +102,12 @@ def identify_archives(
     Raises:
         InputError: the archives cannot be used, not together, or not by the chosen estimator.
     """
-    sources = gather_sources(paths, options.split, predict, in_sample=options.in_sample)
+    sources = gather_sources(archives, options.split, predict, in_sample=options.in_sample)
     prepared = with_transmitted_load(prepare_sources(sources, options, reporter))
     estimation = estimate_with(prepared, options, reporter)
     validation = validate(prepared, estimation, reporter)
     warnings = (*warnings, *payload_warnings(prepared.sources.cell))
     prepared = prepared.warned(*warnings, *estimation.warnings, *validation.warnings)
+    paths = tuple(map(place_of, (*archives, *predict)))
     results = summary(name or paths[0].stem, prepared, estimation, validation)
-    return Identification((*paths, *predict), prepared, estimation, validation, results)
+    return Identification(paths, prepared, estimation, validation, results)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.packets import DRIVE_ON
-from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive
+from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive, opened, place_of
 from hil.archive.header import REJECTED
 from hil.archive.recorded_campaign import RecordedCampaign
 from hil.archive.recordings import recording_of
@@ -109,14 +109,14 @@ def arm_differences(cell: Cell, other: Cell) -> list[str]:
 
 
 def gather_sources(
-    paths: Sequence[Path],
+    given: Sequence[Path | Archive],
     split: float,
-    predict: Sequence[Path] = (),
+    predict: Sequence[Path | Archive] = (),
     *,
     in_sample: bool = False,
     with_torque: bool = True,
 ) -> Sources:
-    """Open archives and sort them into fitted and held-out recordings.
+    """Open archives that are not in memory, and sort all into fitted and held-out recordings.
 
     Excitations are fitted, validation runs and `predict` are held out; imported recordings state
     their use. Without held-out archives, the last part of a single recording (see `Options.split`)
@@ -130,11 +130,13 @@ def gather_sources(
     """
     if in_sample and predict:
         raise InputError(
-            predict[0], "cannot be held out if everything is fitted", remedy="omit --fit-all"
+            place_of(predict[0]),
+            "cannot be held out if everything is fitted",
+            remedy="omit --fit-all",
         )
-    refuse_duplicates([*paths, *predict])
-    archives = [open_archive(path) for path in [*paths, *predict]]
-    by_use = _by_use(archives, len(paths))
+    refuse_duplicates([*given, *predict])
+    archives = [opened(archive) for archive in [*given, *predict]]
+    by_use = _by_use(archives, len(given))
     fitted = by_use["excitation"]
     predicted = by_use["validation"]
     if in_sample:
@@ -142,7 +144,7 @@ def gather_sources(
         predicted = []
     if not fitted:
         raise InputError(
-            paths[0] if paths else None,
+            place_of(given[0]) if given else None,
             "the archives contain no excitation and no imported recording"
             + (" that was not rejected" if by_use[REJECTED] else ""),
             remedy="give archives of kind excitation or imported",
@@ -291,12 +293,20 @@ def archives_in(paths: Sequence[Path]) -> Iterator[Path]:
         yield from inside
 
 
-def refuse_duplicates(paths: Sequence[Path]) -> None:
-    """Raise InputError if two files are equal: fitted recordings must not be held out as well."""
+def refuse_duplicates(archives: Sequence[Path | Archive]) -> None:
+    """Raise InputError if two are equal: fitted recordings must not be held out as well.
+
+    Files with the same bytes, or imports of these.
+    """
     seen: dict[str, Path] = {}
-    for path in paths:
+    for archive in archives:
+        path = place_of(archive)
         try:
-            digest = file_digest(path)
+            digest = (
+                archive.header.entries["source_sha256"]
+                if isinstance(archive, Archive)
+                else file_digest(archive)
+            )
         except OSError:
             continue  # reported when it is opened
         if digest in seen:
