@@ -13,9 +13,9 @@ from unittest.mock import patch
 
 import numpy as np
 
-from identification.selection import inner_prediction as names
+from identification.selection import questions as names
+from identification.selection.scores import Decision, Trial
 from identification.selection.settings import Choice, Settings
-from identification.selection.trial import Decision, Trial
 
 CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "rotors": (names.ROTORS,),

@@ -26,7 +26,7 @@ from benchmarks import parser_of, show
 from benchmarks.board import DATA, cut, fit_errors, identified_parts, split_logs
 from benchmarks.published import known
 from identification.estimators import prior
-from identification.selection import folds, inner_prediction, trial
+from identification.selection import folds, questions, scores
 
 ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
     "WORTHWHILE": (0.0, 0.03),
@@ -50,7 +50,7 @@ ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
 }
 """Other values of each default; of a sequence, the first is the one that others have to beat."""
 PRESENT: Final = "present values"
-_MODULES: Final = (folds, trial, inner_prediction, prior)
+_MODULES: Final = (folds, scores, questions, prior)
 
 
 def ratios(name: str, data: Path, defaults: Sequence[str]) -> dict[tuple[str, str], float]:

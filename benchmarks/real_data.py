@@ -53,7 +53,7 @@ from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.selection.essential import eliminate
-from identification.selection.inner_prediction import choose_settings
+from identification.selection.questions import choose_settings
 from identification.selection.settings import Settings
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples, prepare

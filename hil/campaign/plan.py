@@ -18,7 +18,7 @@ from hil.control.errors import MotionRefusedError
 from hil.control.motion_checks import MotionChecks, planned
 from hil.control.motions import moves_from_dict, moves_to_dict
 from hil.design import DesignSettings, preset, run_search
-from hil.design.advice import NoExcitationError, infeasible_text
+from hil.design.messages import NoExcitationError, infeasible_text
 from identification.excitation import (
     RESCORE_PERIOD,
     Excitation,

@@ -30,7 +30,7 @@ from identification.excitation import (
 from identification.excitation.constraints import clearance
 from identification.model.motion import Motion
 
-from .advice import NoExcitationError
+from .messages import NoExcitationError
 from .settings import DesignSettings, SettingsError
 
 Array = NDArray[np.float64]

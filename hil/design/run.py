@@ -18,7 +18,7 @@ from hil.cell import AngleFrame, Cell
 from hil.control.motion_checks import violation_text
 from identification import excitation
 
-from .advice import criteria_text, infeasible_text, no_excitation
+from .messages import criteria_text, infeasible_text, no_excitation
 from .problem import problem_of, search_settings
 from .result import RESULT, DesignResult, fingerprint
 from .settings import DesignSettings, SettingsError, load_settings

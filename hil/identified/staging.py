@@ -24,8 +24,8 @@ from hil.importers.recording import (
     import_recording,
     is_archive,
 )
+from hil.importers.required_signals import require_motion, require_torque
 from hil.importers.robot import Use
-from hil.importers.usable import require_motion, require_torque
 from hil.look.conclusions import concluded
 
 MAP: Final = "map.toml"

@@ -14,7 +14,7 @@ from hil.archive import open_archive
 from hil.base.errors import SourceError
 from hil.cell import Cell
 from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, import_recording
-from hil.importers.usable import require_motion
+from hil.importers.required_signals import require_motion
 from hil.look import physics, signals
 from hil.look.maps import with_entries
 from hil.look.other_arm import Contradictions

@@ -19,7 +19,7 @@ from identification.estimators.torque_channel import torque_noiseless_above
 from identification.estimators.torque_scale import DATA_SHEET, described
 from identification.factor.estimate import Estimate
 from identification.model.friction import TERMS, FrictionLaw
-from identification.selection.inner_prediction import FRICTION_AT_SPEED, LOAD, LOW_PASS, REVERSAL
+from identification.selection.questions import FRICTION_AT_SPEED, LOAD, LOW_PASS, REVERSAL
 from identification.signals.masks import SATURATED
 from identification.signals.recording import UNWRAPPED, Recording
 from identification.signals.samples import Samples

@@ -21,7 +21,7 @@ Method = Literal["default", "paper"]
 class Options:
     """Options of an identification.
 
-    Those that are "auto" are chosen by :mod:`identification.selection.inner_prediction`.
+    Those that are "auto" are chosen by :mod:`identification.selection.questions`.
 
     Raises:
         InputError: the method or estimator is unknown.

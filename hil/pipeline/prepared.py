@@ -28,15 +28,15 @@ from identification.estimators.torque_channel import possible_low_passes
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
 from identification.reduction.reduction import ALIKE, Reduction, reduce
-from identification.selection.inner_prediction import (
+from identification.selection.questions import (
     DELAY,
     RATE,
     Question,
     SuggestedDelay,
     choose_settings,
 )
+from identification.selection.scores import Known
 from identification.selection.settings import Settings
-from identification.selection.trial import Known
 from identification.signals.clock import time_base
 from identification.signals.masks import SHORTEST_STRETCH
 from identification.signals.recording import Recording, in_succession

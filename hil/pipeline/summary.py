@@ -117,6 +117,7 @@ def _consistency(model: RobotModel, check: ConsistencyCheck) -> results.Consiste
         unconstrained_in_sample=consistent.unconstrained_relative_error,
         shift=consistent.shift,
         status=consistent.status,
+        bounds=check.violations,
         links=results.LinkResult.rows(
             joint=model.joint_names,
             mass=inertial[:, 9],

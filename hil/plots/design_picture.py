@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hil.cell import AngleFrame, Cell
-from hil.design.advice import criteria_text
+from hil.design.messages import criteria_text
 from hil.plots import style
 from hil.plots.plan_picture import draw_motion
 from hil.report.chart import label

@@ -316,14 +316,14 @@ class ParameterResult(Frozen):
         return outside_mark(self.deviation)
 
     @property
-    def grade(self) -> Literal["well", "roughly", "hardly", "undetermined"]:
+    def grade(self) -> Literal["within 10 %", "within 50 %", "not identified", "undetermined"]:
         """Accuracy: 10 % or better, 50 % or better, worse, or undetermined."""
         if self.undetermined or not math.isfinite(self.std):
             return "undetermined"
         size = abs(self.estimate)
-        return (
-            "well" if self.std <= 0.1 * size else "roughly" if self.std <= 0.5 * size else "hardly"
-        )
+        if self.std <= 0.1 * size:
+            return "within 10 %"
+        return "within 50 %" if self.std <= 0.5 * size else "not identified"
 
     def deviation_of(self, estimate: float, std: float) -> float | None:
         """Return the deviation of another estimate of this parameter."""

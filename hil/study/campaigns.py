@@ -18,7 +18,7 @@ from hil.cell import Cell
 from hil.control.motion_checks import MotionChecks
 from hil.control.simulation import simulated_link, simulated_provenance
 from hil.design import DesignResult, DesignSettings, preset
-from hil.design.advice import NoExcitationError
+from hil.design.messages import NoExcitationError
 from hil.design.run import DesignFolder, run_design
 from identification.excitation import Excitation
 

@@ -16,8 +16,8 @@ from identification.estimators.prior import (
 )
 from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
+from identification.selection.scores import Known
 from identification.selection.settings import Strength
-from identification.selection.trial import Known
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,7 +40,7 @@ _FALL: Final = 16.0
 LONGEST_HALT: Final = 0.25  # s
 
 # The time around a reversal in which no row shows dry friction: two rows at the rate to which
-# recordings are averaged for the choice of rows (`inner_prediction.RATE`), so that the fit of a
+# recordings are averaged for the choice of rows (`questions.RATE`), so that the fit of a
 # faster recording leaves out as much as was judged.
 TURN: Final = 0.016  # s
 

@@ -23,7 +23,7 @@ from identification.signals.smoothing import (
     low_passed,
 )
 
-# Default (see :mod:`identification.selection.inner_prediction`). Planned motion is below 10 Hz, the
+# Default (see :mod:`identification.selection.questions`). Planned motion is below 10 Hz, the
 # first resonance of large arms at 10 to 30 Hz; on the simulated NS 16 20 to 60 Hz are equal.
 RIGID_BANDWIDTH: Final = 40.0  # Hz
 _MOST_PREDICTIONS: Final = 2  # in memory: those of the result and of the nominal model

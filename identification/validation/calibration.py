@@ -3,7 +3,7 @@ r"""Coverage of intervals of predicted torque on held-out motion.
 The mean torque of joint j over half a second differs from its prediction with variance :math:`\bar
 w_j C \bar w_j^T + s_j^2`: mean row of the regressor, covariance C of the estimate, and mean square
 s² of the same error between inner folds of the fitted part
-(:mod:`identification.selection.inner_prediction`), which includes coloured residuals and model
+(:mod:`identification.selection.questions`), which includes coloured residuals and model
 errors. Rows at rest and at reversals are included.
 """
 

@@ -21,7 +21,7 @@ from identification.validation.physical_signs import SIGMAS
 
 # Smallest second moment of a link relative to the nominal body's at which a bound counts as active.
 _EDGE: Final = 0.01
-_SHOWN_BOUNDS: Final = 4
+_SHOWN_VIOLATIONS: Final = 4
 # Rise of the relative held-out torque error over all joints, and of one joint, that is noticeable,
 # or means that no consistent parameters exist. NS 16 campaigns without a fault: below 0.0001 over
 # all joints. With torque or position of one joint negated: at least 0.13 for joints 1 and 2; for
@@ -53,7 +53,7 @@ class ConsistencyCheck:
     room: Array
     moved: tuple[str, ...]  # parameters changed by more than three standard deviations
     # messages on impossible parameters of the unconstrained estimate, by rise of the joint's error
-    bounds: tuple[str, ...]
+    violations: tuple[str, ...]
     judged_on: str = "held-out"  # "held-out" or "in-sample"
     # the joint that gravity loads, if the rise of the error is mostly its own; else empty
     overloaded: str = ""
@@ -106,7 +106,7 @@ class ConsistencyCheck:
             else "the parameters are not physically consistent, and the nearest consistent ones"
             " predict worse"
         )
-        return f"{start} ({error}): {joined(self.bounds, _SHOWN_BOUNDS)}".removesuffix(": ")
+        return f"{start} ({error}): {joined(self.violations, _SHOWN_VIOLATIONS)}".removesuffix(": ")
 
 
 def check_consistency(
@@ -144,7 +144,7 @@ def check_consistency(
     inner = np.linalg.solve(frames, pseudo_inertia(consistent.standard[links]))
     inner = np.linalg.solve(frames, inner.transpose(0, 2, 1))
     room = np.asarray(np.linalg.eigvalsh(inner)[:, 0])
-    bounds: list[str] = []
+    violations: list[str] = []
     single = np.count_nonzero(model.base.grouping, axis=1) == 1
     for joint in np.argsort(-np.nan_to_num(rise), kind="stable").tolist():
         name = model.joint_names[joint]
@@ -153,9 +153,9 @@ def check_consistency(
                 k = unconstrained.names.index(parameter)
                 alone = k >= model.base.rank or bool(single[k])
                 if alone and free[k] < -SIGMAS * unconstrained.std[k]:
-                    bounds.append(f"{what} of {name} would be negative ({free[k]:.3g})")
+                    violations.append(f"{what} of {name} would be negative ({free[k]:.3g})")
         if room[joint] < _EDGE:
-            bounds.append(f"the link of {name} would need a negative mass or moment of inertia")
+            violations.append(f"the link of {name} would need a negative mass or moment of inertia")
     return ConsistencyCheck(
         consistent=consistent,
         held_out=held_out.relative_error(values),
@@ -165,7 +165,7 @@ def check_consistency(
         moved=tuple(
             unconstrained.names[k] for k in np.argsort(-shift, kind="stable") if shift[k] > SIGMAS
         ),
-        bounds=tuple(bounds),
+        violations=tuple(violations),
         judged_on="in-sample" if in_sample else "held-out",
         overloaded=_overloaded(model, training, held_out, values, free),
     )

@@ -18,9 +18,9 @@ from benchmarks.joint_log import JointLog
 from benchmarks.plain_fit import Measured
 from benchmarks.published import Published, Split, known
 from hil.importers.robot import Robot
-from identification.selection.inner_prediction import BANDWIDTH
+from identification.selection.questions import BANDWIDTH
+from identification.selection.scores import Trial
 from identification.selection.settings import Settings
-from identification.selection.trial import Trial
 from identification.signals.samples import Preprocessing
 from tests.identification.two_link import MODEL
 

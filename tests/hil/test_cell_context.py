@@ -7,7 +7,7 @@ import pytest
 
 from hil.pipeline.cell_context import _friction_law, _resolution, _sampling_rate, grid_step
 from identification.model.friction import FrictionLaw
-from identification.selection.inner_prediction import LOAD
+from identification.selection.questions import LOAD
 from identification.selection.settings import Choice
 from identification.signals.recording import UNWRAPPED, Recording, unwrap, unwrapped
 from identification.signals.samples import Preprocessing

@@ -21,7 +21,7 @@ from hil.base.files import lock_folder
 from hil.cell import Cell
 from hil.cli import app
 from hil.design import METHODS, DesignResult, load_design
-from hil.design.advice import NoExcitationError
+from hil.design.messages import NoExcitationError
 from hil.design.settings import preset_text
 from hil.plots import design_picture
 from identification.excitation import CRITERIA

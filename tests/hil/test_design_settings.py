@@ -15,7 +15,7 @@ from hil.base.toml_text import to_text
 from hil.cell import AngleFrame, Cell
 from hil.cli import app
 from hil.design import METHODS, load_settings, preset, problem_of, search_settings
-from hil.design.advice import NoExcitationError, advice_on_branches, no_excitation
+from hil.design.messages import NoExcitationError, advice_on_branches, no_excitation
 from hil.design.settings import SettingsError, preset_text, settings_of
 from hil.new import cell_of_urdf
 from identification.excitation import NoFeasibleMotionError, Violation

@@ -35,7 +35,7 @@ from identification.errors import IdentificationError
 from identification.estimators.consistent import SolverError
 from identification.estimators.delay import DelayEstimate
 from identification.model.friction import FrictionLaw
-from identification.selection.inner_prediction import SuggestedDelay
+from identification.selection.questions import SuggestedDelay
 from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Preprocessing
 from sim_fixtures.ns16 import URDF_PATH

@@ -13,7 +13,7 @@ from hil.cell.text import with_values
 from hil.control.motion_checks import MotionChecks, always_so, collision_checker, violation_text
 from hil.control.motions import rest
 from hil.design import preset, problem_of
-from hil.design.advice import NoExcitationError
+from hil.design.messages import NoExcitationError
 from identification.excitation import CollisionChecker, Violation, Workspace
 from identification.model.motion import Motion
 from sim_fixtures.ns16 import CELL_PATH

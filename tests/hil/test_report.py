@@ -619,7 +619,12 @@ class TestParameters:
 
     @pytest.mark.parametrize(
         ("std", "grade"),
-        [(0.1, "well"), (0.5, "roughly"), (0.6, "hardly"), (math.inf, "undetermined")],
+        [
+            (0.1, "within 10 %"),
+            (0.5, "within 50 %"),
+            (0.6, "not identified"),
+            (math.inf, "undetermined"),
+        ],
     )
     def test_are_graded_by_relative_standard_deviation(self, std, grade):
         parameter = make_results().parameters[0].model_copy(update={"estimate": 1.0, "std": std})

@@ -19,7 +19,7 @@ from hil.base.progress import Silent
 from hil.cell import Cell
 from hil.cli import app
 from hil.control.simulation import planted_values
-from hil.design.advice import NoExcitationError
+from hil.design.messages import NoExcitationError
 from hil.study import StudyResults, StudySettings, run_study, study_settings
 from hil.study.campaigns import SINES, Execution, chosen, execute
 from hil.study.results import (

@@ -22,7 +22,7 @@ from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.selection.essential import CutRule, choose_essential, eliminate
 from identification.selection.folds import Errors, Folds
-from identification.selection.inner_prediction import (
+from identification.selection.questions import (
     CONSISTENT,
     DELAY,
     LOAD,
@@ -33,8 +33,8 @@ from identification.selection.inner_prediction import (
     Question,
     choose_settings,
 )
+from identification.selection.scores import IMPOSSIBLE_WORTHWHILE, WORTHWHILE, Trial
 from identification.selection.settings import Settings, Strength
-from identification.selection.trial import IMPOSSIBLE_WORTHWHILE, WORTHWHILE, Trial
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
 from identification.signals.smoothing import FORWARDS, WITHOUT_PHASE, LowPassShape, low_passed

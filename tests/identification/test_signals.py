@@ -15,7 +15,7 @@ from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.selection.inner_prediction import RATE
+from identification.selection.questions import RATE
 from identification.signals.clock import time_base, true_times
 from identification.signals.masks import (
     EDGE,

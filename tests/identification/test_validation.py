@@ -570,7 +570,7 @@ class TestConsistencyCheck:
         check = consistency_of(runs())
         assert abs(check.cost) < 0.001
         assert not check.costly and not check.impossible
-        assert check.bounds == () and np.all(check.room > 0.1)
+        assert check.violations == () and np.all(check.room > 0.1)
         assert "consistent parameters predict as well" in check.sentence
 
     def test_the_cost_is_the_rise_of_the_error(self):
@@ -599,7 +599,7 @@ class TestConsistencyCheck:
     def test_active_bounds_are_named_with_their_joint(self, change, bound_text):
         check = consistency_of(runs(**change))
         assert check.costly and bound_text in check.sentence
-        assert any(bound_text in bound for bound in check.bounds)
+        assert any(bound_text in bound for bound in check.violations)
 
     def test_a_torque_of_the_wrong_sign_is_impossible(self):
         check = consistency_of([replace(run, torque=run.torque * [-1.0, 1.0]) for run in runs()])
@@ -624,7 +624,7 @@ class TestConsistencyCheck:
         """That of the elbow's link about its own centre."""
         check = consistency_of(runs(I2yy=0.05, I2m=0.0))
         assert check.room[1] < 0.01
-        assert any("link of elbow" in bound for bound in check.bounds)
+        assert any("link of elbow" in bound for bound in check.violations)
 
 
 def uneven(rate, *, jitter=0.0, seed=0):

@@ -20,7 +20,7 @@ from identification.estimators.least_squares import fit_least_squares
 from identification.factor.factor import Factor
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
-from identification.selection.inner_prediction import SuggestedDelay, choose_settings
+from identification.selection.questions import SuggestedDelay, choose_settings
 from identification.selection.settings import Settings
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare

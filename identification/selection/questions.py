@@ -2,7 +2,7 @@
 
 One question after the other is answered by the errors of its candidates in parts that are predicted
 from the rest (:mod:`~identification.selection.folds`), compared by
-:mod:`~identification.selection.trial`. Held-out data are not read.
+:mod:`~identification.selection.scores`. Held-out data are not read.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
-from identification.selection.settings import Choice, Hedge, Settings
-from identification.selection.trial import (
+from identification.selection.scores import (
     IMPOSSIBLE_WORTHWHILE,
     MEANINGLESS,
     TRANSFER,
@@ -28,6 +27,7 @@ from identification.selection.trial import (
     Ready,
     Trial,
 )
+from identification.selection.settings import Choice, Hedge, Settings
 from identification.signals.masks import LeftOut
 from identification.signals.samples import Preprocessing, VelocitySource
 
@@ -135,39 +135,39 @@ def choose_settings(
     """
     trial = Trial(model, ready, stated, ripples)
     now = _first_candidates(start, questions)
-    asked: set[str] = {*questions}
-    if "estimator" in asked:
-        asked |= {"strength", "consistency"}
+    requested: set[str] = {*questions}
+    if "estimator" in requested:
+        requested |= {"strength", "consistency"}
     first = now
     trial.weigh(first)
-    if "estimator" in asked and trial.has_grouped_rotors(first):
-        asked |= {"rotors"}
-    now, choices = _sweep(trial, first, asked)
-    if "delay" in asked:
-        first, now, choices = _compare_delays(trial, first, now, choices, asked, delays)
-    if "low-pass" in asked:
-        now, choices = _compare_low_passes(trial, first, now, choices, asked, low_passes)
-    if "friction" in asked:
+    if "estimator" in requested and trial.has_grouped_rotors(first):
+        requested |= {"rotors"}
+    now, choices = _sweep(trial, first, requested)
+    if "delay" in requested:
+        first, now, choices = _compare_delays(trial, first, now, choices, requested, delays)
+    if "low-pass" in requested:
+        now, choices = _compare_low_passes(trial, first, now, choices, requested, low_passes)
+    if "friction" in requested:
         for decide in (_friction_terms, _load_friction):
             decision = decide(trial, now)
             now = decision.settings
             choices = [*choices, decision.choice]
-    if "ripple" in asked:
+    if "ripple" in requested:
         rippled = [now.with_friction(ripple=orders) for orders in trial.ripples]
         decision = trial.decide("torque ripple", [now, *rippled])
         now = decision.settings
         choices = [*choices, decision.choice]
     trial.weigh(now)
-    compared, now, decided = _choose_prior(trial, now, asked)
+    compared, now, decided = _choose_prior(trial, now, requested)
     if not trial.errors(compared).overall < MEANINGLESS:
         return start
     choices = [*choices, *decided]
-    if "springs" in asked:
+    if "springs" in requested:
         # Last: what is left of a spring that impossible bodies stand for is theirs as before.
         for decision in _torsion_springs(trial, now, springs):
             now = decision.settings
             choices = [*choices, decision.choice]
-    if "bandwidth" in asked:
+    if "bandwidth" in requested:
         now = replace(now, hedge=_hedge(trial, now))
     return replace(now, choices=tuple(choice for choice in choices if len(choice.candidates) > 1))
 
@@ -194,20 +194,20 @@ def _first_candidates(start: Settings, questions: Collection[Question]) -> Setti
 
 
 def _choose_prior(
-    trial: Trial, now: Settings, asked: Collection[str]
+    trial: Trial, now: Settings, requested: Collection[str]
 ) -> tuple[Settings, Settings, list[Choice]]:
     """Choose the strength of the prior, then whether bodies must be possible.
 
     Returns the settings after each of the two, and the decisions.
     """
     choices: list[Choice] = []
-    if "strength" in asked and trial.knows_bodies(now):
+    if "strength" in requested and trial.knows_bodies(now):
         weights = [replace(now.strength, weight=weight) for weight in STRENGTHS]
         decision = trial.decide_last(STRENGTH, [replace(now, strength=each) for each in weights])
         now = decision.settings
         choices = [decision.choice]
     compared = now
-    if "consistency" in asked:
+    if "consistency" in requested:
         possible = replace(now, strength=replace(now.strength, consistent=True))
         if trial.fits_impossible(now, possible):
             decision = trial.decide(
@@ -397,12 +397,12 @@ def _sweep(
     trial: Trial, now: Settings, questions: Collection[str]
 ) -> tuple[Settings, list[Choice]]:
     """Decide interdependent settings in turn until nothing changes."""
-    asked = [swept for swept in _SWEPT if swept.question in questions]
+    requested = [swept for swept in _SETTINGS_SEARCHED if swept.question in questions]
     choices: list[Choice] = []
     for _ in range(_MOST_SWEEPS):
         before = now
         choices = []
-        for swept in asked:
+        for swept in requested:
             candidates = swept.vary(now)
             if swept.size is not None:
                 candidates = [candidates[k] for k in trial.walk(candidates, swept.size)]
@@ -436,7 +436,7 @@ def _rows_for_motion(trial: Trial, now: Settings, candidates: Sequence[Settings]
     return trial.decide(ROWS_IN_MOTION, [now, *others], 0.0, rows="moving")
 
 
-class _Swept(NamedTuple):
+class _SearchedSetting(NamedTuple):
     """Setting that is decided repeatedly."""
 
     question: Question
@@ -448,8 +448,8 @@ class _Swept(NamedTuple):
     transfer: float = 0.0  # relative standard deviation in addition
 
 
-_SWEPT: Final = (
-    _Swept(
+_SETTINGS_SEARCHED: Final = (
+    _SearchedSetting(
         "rotors",
         ROTORS,
         lambda now: [
@@ -458,24 +458,24 @@ _SWEPT: Final = (
         share=ROTORS_WORTHWHILE,
         certainty=CERTAIN,
     ),
-    _Swept(
+    _SearchedSetting(
         "presliding",
         PRESLIDING_DISPLACEMENT,
         lambda now: [now.with_friction(presliding=distance) for distance in PRESLIDING],
         lambda now: float(now.friction["presliding"]),
         transfer=TRANSFER,
     ),
-    _Swept(
+    _SearchedSetting(
         "rows",
         ROWS,
         lambda now: [now.preprocessed(left_out=rows) for rows in LEFT_OUT],
     ),
-    _Swept(
+    _SearchedSetting(
         "velocity",
         VELOCITY,
         lambda now: [now.preprocessed(velocity=source) for source in VELOCITIES],
     ),
-    _Swept(
+    _SearchedSetting(
         "bandwidth",
         BANDWIDTH,
         lambda now: [now.preprocessed(rigid_bandwidth=width) for width in BANDWIDTHS],
