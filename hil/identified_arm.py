@@ -24,6 +24,7 @@ from hil.files import make_folder, write_output
 from hil.identified_campaign import identify_paths
 from hil.identify.options import Options
 from hil.identify.run import Identification
+from hil.importers.messages import sentence
 from hil.importers.recording import ImportOptions, RobotOf, is_archive
 from hil.importers.robot import Robot
 from hil.importers.staging import Staging, staged
@@ -322,9 +323,9 @@ def _require_archives(paths: Sequence[Path]) -> None:
 
 def _channels(staging: Staging) -> tuple[str, ...]:
     return tuple(
-        f"{staging.sources[archive].name}: {line}"
+        f"{staging.sources[archive].name}: {sentence(conclusion)}"
         for archive, recording in staging.recordings.items()
-        for line in recording.lines
+        for conclusion in recording.concluded
     )
 
 
