@@ -35,11 +35,12 @@ from hil.cli import app
 from hil.errors import ArchiveWriteError, InputError, SourceError
 from hil.identify.cell_context import nominal_of
 from hil.identify.sources import cell_of
-from hil.importers import ColumnMap, Convention, Robot, import_log, matlab, messages, urdf_of_dh
+from hil.importers import ColumnMap, Convention, Robot, import_log, matlab, urdf_of_dh
 from hil.importers import arrays as array_files
 from hil.importers.arrays import ArrayFile
 from hil.importers.column_map import UNITS, Format, ready_map, ready_maps
 from hil.importers.findings import examine
+from hil.importers.messages import sentence as worded
 from hil.importers.robot import _cell_text
 from hil.importers.stamps import check_clock
 from hil.importers.table import Table
@@ -904,7 +905,7 @@ def warnings(
     robot = Robot.from_urdf(arm.urdf, recorded=arm.joint_names)
     nominal = robot.nominal_torque() if masses else None
     found = examine(samples, arm.joint_names, robot.urdf, nominal=nominal)
-    return list(map(messages.sentence, found.warnings))
+    return list(map(worded, found.warnings))
 
 
 def factors(warning: str) -> dict[str, float]:
@@ -948,7 +949,7 @@ class TestWarnings:
 
         def findings(held_joints: Sequence[str] = ()) -> list[str]:
             result = examine(samples, arm.joint_names, robot.urdf, held_joints=held_joints)
-            return list(map(messages.sentence, result.warnings))
+            return list(map(worded, result.warnings))
 
         (sentence,) = findings()
         assert sentence.startswith("the position of elbow_joint is the same in all")
