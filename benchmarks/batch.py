@@ -30,11 +30,11 @@ from typing import Any
 
 from benchmarks import parser_of, show
 from benchmarks.archive_files import PERIOD, repetitions
+from hil.base.progress import Silent
 from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster
-from hil.batch.run import BatchResult, reidentify
-from hil.identify.options import FIXED
-from hil.progress import Silent
+from hil.batch.graph import BatchResult, reidentify
+from hil.pipeline.options import FIXED
 
 _CAMPAIGN = 25  # repetitions
 

@@ -48,11 +48,12 @@ from benchmarks.fetch import FETCHED, fetch, show_fetched
 from benchmarks.identification_study import recorded, study
 from benchmarks.joint_log import JointLog
 from benchmarks.published import FITTED_SHARE, Published, Split, known
-from hil.errors import HilError
-from hil.identify import Options, identify_archives
-from hil.importers import Robot
-from hil.progress import Silent
-from hil.results import Results
+from hil.base.errors import HilError
+from hil.base.progress import Silent
+from hil.importers.robot import Robot
+from hil.pipeline.options import Options
+from hil.pipeline.run import identify_archives
+from hil.results.results import Results
 from identification.errors import IdentificationError
 from identification.validation.facts.errors import LEFT_OPEN
 from identification.validation.finding import Finding

@@ -23,6 +23,7 @@ CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "rows": (names.ROWS, names.ROWS_IN_MOTION),
     "velocity": (names.VELOCITY,),
     "bandwidth": (names.BANDWIDTH,),
+    "averaging": (),
     "delay": (names.DELAY,),
     "low-pass": (names.LOW_PASS,),
     "reversal": (names.REVERSAL,),
@@ -32,12 +33,16 @@ CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "consistency": (names.CONSISTENT,),
     "springs": (names.SPRINGS,),
 }
-"""Names of the decisions of each choice."""
+"""Names of the decisions of each choice; none of a chosen bandwidth averaged with the usual one."""
 
 
 @contextmanager
 def without(choice: str) -> Iterator[None]:
     """Leave out a choice: its decisions return the first candidate, a delay the stated one."""
+    if choice == "averaging":
+        with patch.object(Trial, "odds", lambda *_: 0.0):
+            yield
+        return
     left_out = CHOICES[choice]
 
     def deciding(decide: Callable[..., Decision]) -> Callable[..., Decision]:

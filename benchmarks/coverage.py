@@ -77,12 +77,13 @@ from benchmarks.cramer_rao import PROJECT_ORDER, base_regressor, bound, least_sq
 from benchmarks.degradations import CAUSES
 from benchmarks.joint_log import JointLog
 from benchmarks.plain_fit import robot_from_urdf
-from hil.identified_model import IdentifiedModel, ensemble_of, model_of
-from hil.identify import identify_archives
-from hil.importers import IMPORTED_LAW, Robot
-from hil.progress import Silent
-from hil.results import Results
+from hil.base.progress import Silent
+from hil.importers.robot import IMPORTED_LAW, Robot
+from hil.pipeline.identified_model import IdentifiedModel, ensemble_of, model_of
+from hil.pipeline.run import identify_archives
+from hil.results.results import Results
 from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion as SampledMotion
 from identification.model.robot import RobotModel
 from identification.validation.facts.form import FORM
 
@@ -574,8 +575,9 @@ def ensemble_spread(
         return np.asarray(np.sqrt(np.mean(values**2, axis=0, where=moving)) / torque.std(axis=0))
 
     arms = ensemble_of(identified, conditions.ensemble, seed)
-    drawn = np.array([model.torque(values, *states) for values in arms.values])
-    estimated = model.torque(identified.estimate.values, *states)
+    sampled = SampledMotion.of_states(*states)
+    drawn = np.array([model.torque(values, sampled) for values in arms.values])
+    estimated = model.torque(identified.estimate.values, sampled)
     return rms(drawn.std(axis=0, ddof=1)), rms(estimated - torque)
 
 

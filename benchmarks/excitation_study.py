@@ -24,10 +24,10 @@ from functools import cached_property
 from typing import Any, Final
 
 from benchmarks import parser_of, processor_time, show
+from hil.base.errors import InputError
 from hil.cell import Cell
 from hil.design.problem import problem_of, search_settings
 from hil.design.settings import DesignSettings, preset
-from hil.errors import InputError
 from identification.excitation import (
     RESCORE_PERIOD,
     NoFeasibleMotionError,

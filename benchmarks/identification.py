@@ -165,7 +165,7 @@ def case(friction: FrictionLaw, coupling: Coupling | None = None) -> Case:
     values = np.concatenate([model.base.grouping @ model.nominal, random.uniform(
         1.0, 10.0, model.n_parameters - model.base.rank
     )])  # fmt: skip
-    torque = model.torque(values, *motion[1:])
+    torque = model.torque(values, motion)
     torque += _TORQUE_NOISE * random.standard_normal(torque.shape)
     samples = Samples(
         motion=motion,
@@ -302,7 +302,7 @@ def _spread(name: str, seconds: Array) -> dict[str, float]:
 def _difference(arm_case: Case, theirs: Array) -> float:
     """Largest difference of the predicted torques as a share of their RMS."""
     motion: Motion = arm_case.samples.motion
-    ours = arm_case.model.torque(fit(arm_case.model, arm_case.samples).values, *motion[1:])
+    ours = arm_case.model.torque(fit(arm_case.model, arm_case.samples).values, motion)
     apart = np.abs(ours.T.reshape(-1) - theirs).max()
     return float(apart / np.sqrt(np.mean(ours**2)))
 

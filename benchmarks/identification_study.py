@@ -23,11 +23,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from benchmarks import parser_of, show
+from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, design
 from hil.cell import Cell
-from hil.identify.sources import Sources, gather_sources
-from hil.progress import Silent
-from hil.simulation import planted_values, simulated_link
+from hil.control.simulation import planted_values, simulated_link
+from hil.pipeline.sources import Sources, gather_sources
 from identification.estimators.least_squares import estimate_repetitions
 from identification.signals.samples import Preprocessing, prepare
 from planner.arrays import Array

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from benchmarks.plain_fit import Measured, robot_from_urdf
 from hil.archive import open_archive
 from hil.cell import Cell
-from hil.importers import ColumnMap, Quantity, Robot, TimeColumn, import_log
+from hil.importers.column_map import ColumnMap, Quantity, TimeColumn
+from hil.importers.log import import_log
+from hil.importers.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -23,15 +23,16 @@ from numpy.typing import NDArray
 from benchmarks import parser_of, show
 from benchmarks.arms import urdf as arm_urdf
 from hil.archive import open_archive
-from hil.errors import HilError
-from hil.identify.sources import cell_of, source_of
-from hil.importers import Robot
+from hil.base.errors import HilError
 from hil.importers.conclusions import Certainty
 from hil.importers.recording import ImportOptions, RobotOf, import_recording
+from hil.importers.robot import Robot
 from hil.look import Look, look_at
 from hil.look.messages import choice_text, row_text
+from hil.pipeline.sources import cell_of, source_of
 from identification.estimators.prior import body_prior, fit_posterior
 from identification.factor.factor import Factor
+from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
@@ -113,9 +114,8 @@ def _weight(recording: Recording, model: RobotModel) -> Array:
     samples = prepare(recording, model, options=Preprocessing(14.0, left_out="rests"))
     factor = Factor.by_time(model, samples)
     values = fit_posterior(model, factor, body_prior(model, factor).gaussian).estimate.values
-    still = np.zeros_like(recording.position)
     rigid = np.where(model.friction_columns, 0.0, values)
-    return np.asarray(model.torque(rigid, recording.position, still, still))
+    return np.asarray(model.torque(rigid, Motion.at_rest(recording.position)))
 
 
 def plants(arm: Arm) -> Iterator[Planted]:

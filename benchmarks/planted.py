@@ -52,9 +52,9 @@ from benchmarks.coverage import (
 )
 from benchmarks.degradations import CAUSES
 from benchmarks.joint_log import JointLog
-from hil.identify import Identification, identify_archives
-from hil.importers import Robot
-from hil.progress import Silent
+from hil.base.progress import Silent
+from hil.importers.robot import Robot
+from hil.pipeline.run import Identification, identify_archives
 
 Array = NDArray[np.float64]
 

@@ -38,8 +38,8 @@ from benchmarks.board import ABOVE_PLAIN, identified
 from benchmarks.coverage import drawn_body
 from benchmarks.joint_log import JointLog
 from benchmarks.plain_fit import robot_from_urdf
-from hil.errors import HilError
-from hil.importers import Robot
+from hil.base.errors import HilError
+from hil.importers.robot import Robot
 from identification.errors import IdentificationError
 from identification.model.urdf_text import urdf_tree
 

@@ -39,36 +39,36 @@ from benchmarks import parser_of, show
 from benchmarks.payload import arm_model, load_of, recordings_of, samples_of
 from benchmarks.simulated_cells import DATA_SHEETS, simulated_cell
 from drivers.transports.simulated import SimulatedTransport
+from hil.base.progress import Silent, Task
 from hil.campaign import Campaign, Stop
 from hil.campaign.errors import RepetitionsRejectedError
-from hil.campaign.link import MotionLink
 from hil.campaign.plan import CampaignPlan, plan_around, validation_motions
-from hil.campaign.precision import PrecisionMeter
 from hil.campaign.precision_record import IN_A_ROW
-from hil.campaign.virtual_link import VirtualLink
+from hil.campaign.reached_precision import PrecisionMeter
 from hil.cell import Cell
-from hil.design.precision import PrecisionDesign, payload_search, short_search
-from hil.design.problem import problem_of
-from hil.design.requirements import Requirement, requirements_from
-from hil.design.run import run_search
-from hil.identify.payload_run import flange_of
-from hil.motion_checks import MotionChecks
-from hil.payload_campaign import (
-    FEWEST,
-    Mounting,
-    PayloadCampaign,
-    Weighed,
-    assumed_payload,
-    loaded_cell,
-)
-from hil.progress import Silent, Task
-from hil.simulation import (
+from hil.control.link import MotionLink
+from hil.control.motion_checks import MotionChecks
+from hil.control.simulation import (
     controller_settings,
     planted_truth,
     planted_values,
     simulated_controller,
     simulated_link,
     simulated_provenance,
+)
+from hil.control.virtual_link import VirtualLink
+from hil.design.problem import problem_of
+from hil.design.run import run_search
+from hil.payload.payload_run import flange_of
+from hil.precision.forecast import PrecisionDesign, payload_search, short_search
+from hil.precision.requirements import Requirement, requirements_from
+from hil.weighing.payload_campaign import (
+    FEWEST,
+    Mounting,
+    PayloadCampaign,
+    Weighed,
+    assumed_payload,
+    loaded_cell,
 )
 from identification.estimators.payload import NAMES, figures_of, identify_payload
 from identification.estimators.payload_problem import KnownArm, Run
@@ -290,7 +290,7 @@ def stops(count: int) -> dict[str, Any]:
         recording = next(iter(recordings_of(seed, model.joint_names, (None,))))
         samples = samples_of(recording, model)
         truth = _posterior(model, Factor.by_time(model, samples))[0].values
-        clean = model.torque(truth, *samples.motion[1:4])
+        clean = model.torque(truth, samples.motion.kinematics())
         scatter = clean.std(axis=0)
         repeated = clean + _REPEATED * scatter * _coloured(random, clean.shape)
         factors = []

@@ -16,8 +16,8 @@ from typing import Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict
 
+from hil.base.toml_text import to_text
 from hil.cli import imports
-from hil.toml_text import to_text
 
 CONFIGURATIONS: Final = Path(__file__).parent / "recordings"
 FITTED_SHARE: Final = 0.7

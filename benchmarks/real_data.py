@@ -34,12 +34,12 @@ import numpy as np
 
 from benchmarks import parser_of, show
 from benchmarks.published import FITTED_SHARE, Published
-from hil.identify import Options
-from hil.identify.estimating import estimate_with
-from hil.identify.prepared import prepare_sources, samples_of
-from hil.identify.sources import gather_sources
-from hil.progress import Silent
-from hil.recordings import open_recording
+from hil.archive.recordings import open_recording
+from hil.base.progress import Silent
+from hil.pipeline.estimating import estimate_with
+from hil.pipeline.options import Options
+from hil.pipeline.prepared import prepare_sources, samples_of
+from hil.pipeline.sources import gather_sources
 from identification.estimators.consistent import consistent_estimate
 from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.losses import Huber, Tukey

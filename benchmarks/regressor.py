@@ -49,8 +49,7 @@ def pinocchio_gram(model: pin.Model, motion: Motion, stacked: Array) -> Array:
     """Return the Gram matrix of pinocchio's stacked regressor, shape (60, 60)."""
     data = model.createData()
     regressor = pin.computeJointTorqueRegressor
-    states = zip(motion.position, motion.velocity, motion.acceleration, strict=True)
-    for sample, (q, qd, qdd) in enumerate(states):
+    for sample, (q, qd, qdd) in enumerate(motion.states()):
         stacked[sample] = regressor(model, data, q, qd, qdd)
     rows = stacked.reshape(-1, 10 * model.nv)
     return rows.T @ rows
@@ -86,9 +85,7 @@ def main() -> None:
     model = RobotModel.from_urdf(urdf)
     reference = pin.buildModelFromXML(urdf)
     motion = sine_motion(model.n_joints)
-    torque = model.torque(
-        np.ones(model.n_parameters), motion.position, motion.velocity, motion.acceleration
-    )
+    torque = model.torque(np.ones(model.n_parameters), motion)
 
     def ours() -> Array:
         total: Array = Factor.from_samples(model, motion, torque).gram.sum(axis=0)

@@ -36,12 +36,12 @@ from numpy.typing import NDArray
 from benchmarks import parser_of
 from benchmarks.board import DATA, import_all, simulated_logs
 from benchmarks.published import Published, known
+from hil.base.progress import Silent
 from hil.cell import Cell
-from hil.identified_model import IdentifiedModel, model_of
-from hil.identify import identify_paths
-from hil.progress import Silent
-from hil.rollout import RolloutOptions, nominal_arm, roll_out
-from hil.rollout_result import JUDGED, RolloutResult
+from hil.pipeline.identified_model import IdentifiedModel, model_of
+from hil.pipeline.identify_folder import identify_paths
+from hil.results.rollout_result import JUDGED, RolloutResult
+from hil.rollout.torque_rollout import RolloutOptions, nominal_arm, roll_out
 from identification import Samples
 from identification.export.arm import Arm, Ranges
 from identification.model.motion import Motion
@@ -82,7 +82,7 @@ def recorded(arm: Arm) -> RecordedMotion:
     motion = Motion(
         grid, 0.3 * np.sin(angle), 0.3 * rate * np.cos(angle), -0.3 * rate**2 * np.sin(angle)
     )
-    torque = model.torque(arm.values, *motion[1:4])
+    torque = model.torque(arm.values, motion)
     everything = np.ones(torque.shape, dtype=np.bool_)
     bandwidth = np.full(model.n_joints, np.inf)
     samples = Samples(motion, torque, everything, (slice(0, len(grid)),), 0.0, bandwidth)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.arms import ARMS, urdf
-from hil.campaign.rehearsal import Twin
+from hil.campaign.twin import Twin
 from hil.cell import Cell
 from hil.cell.text import with_values
 from hil.cli import new

@@ -40,7 +40,7 @@ from drivers import MotionEnded
 from drivers.exchange.process import ExchangeProcess, ExchangeSettings
 from drivers.exchange.realtime import RealTimeSettings
 from drivers.transports.udp import UdpSpec
-from hil.demo_link import free_port
+from hil.control.simulator_process import free_port
 
 Array = NDArray[np.float64]
 

@@ -19,11 +19,10 @@ from rich.segment import Segment
 from rich.style import Style
 from rich.terminal_theme import MONOKAI, TerminalTheme
 
-from hil import Campaign, Cell
-from hil.campaign import Stop, design
+from hil import Campaign, Cell, Silent, Stop, reporter
+from hil.campaign import design
 from hil.campaign.operator import RunStatus
-from hil.progress import Silent, reporter
-from hil.screen import Keyboard, Screen
+from hil.campaign.screen import Keyboard, Screen
 
 HERE: Final = Path(__file__).parent
 COLUMNS = 80

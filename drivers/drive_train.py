@@ -22,11 +22,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drivers.arrays import Array
 from drivers.errors import DriveTrainError, PacketError
 from drivers.packets import InitPacket
 from drivers.safe_reply import D1, Floats
-
-Array = NDArray[np.float64]
 
 TURN: Final = 2.0 * np.pi
 WRIST_AXES: Final = 6

@@ -15,8 +15,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from drivers.arrays import Array
 from drivers.errors import SourceFailed, error_text
-from drivers.guard import RANK, Array
+from drivers.guard import RANK
 from drivers.motion_source import BoundsName, MotionSource, has_members
 from drivers.states import Outcome
 

@@ -20,10 +20,10 @@ from typing import Final, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.arrays import Array
 from drivers.errors import Check, GuardError
 from drivers.motion_source import BoundsName
 
-Array = NDArray[np.float64]
 Joints = NDArray[np.bool_]
 
 

@@ -8,12 +8,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.arrays import Array
 from drivers.drive_train import DriveTrain
 from drivers.errors import PacketError
 from drivers.events import InitReceived
 from drivers.packets import InitPacket
-
-Array = NDArray[np.float64]
 
 _RELATIVE: Final = 1e-6
 """Relative tolerance: float32 rounds by 6e-8 at most; a cell file has six digits or more."""

@@ -6,10 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Literal, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
+from drivers.arrays import Array
 
-Array = NDArray[np.float64]
 BoundsName = Literal["plan", "override", "stop"]
 
 

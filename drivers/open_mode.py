@@ -38,6 +38,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from drivers.arrays import Array
 from drivers.drive_train import ArmWire
 from drivers.errors import (
     AxisNotInMode,
@@ -47,7 +48,7 @@ from drivers.errors import (
     as_refusal,
 )
 from drivers.execution import Execution
-from drivers.guard import FIRST_FRACTION, Array, Guard, Joints, all_true, require
+from drivers.guard import FIRST_FRACTION, Guard, Joints, all_true, require
 from drivers.packets import Mode
 from drivers.safe_reply import D1, D2, PacketStatus, ReplyBuilder
 from drivers.states import LossTracker, State

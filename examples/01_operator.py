@@ -8,12 +8,11 @@ name its cell file: `examples/01_operator.py my_cell.toml runs/mine`.
 import sys
 from pathlib import Path
 
-from hil import Campaign, Cell
-from hil.campaign import design, stop_on_interrupt
+from hil import Campaign, Cell, Screen, stop_on_interrupt
+from hil import reporter as progress
+from hil.campaign import design
 from hil.plots import save
 from hil.plots.archive_view import draw_archive, view_of
-from hil.progress import reporter as progress
-from hil.screen import Screen
 
 PICTURE = Path("runs/examples/01_operator.png")
 

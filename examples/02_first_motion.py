@@ -9,10 +9,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from hil import Cell
-from hil.campaign import stop_on_interrupt
-from hil.cell_link import cell_link
-from hil.move import plan_move, send
+from hil import Cell, cell_link, plan_move, send, stop_on_interrupt
 from hil.plots import save
 from hil.plots.archive_view import draw_archive, view_of
 

@@ -11,9 +11,8 @@ from tempfile import TemporaryDirectory
 
 import matplotlib.pyplot as plt
 
-from hil import Campaign, Cell
+from hil import Campaign, Cell, Silent
 from hil.campaign import design
-from hil.progress import Silent
 
 HERE = Path(__file__).parent
 PICTURE = Path("runs/examples/03_own_robot.png")

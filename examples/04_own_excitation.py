@@ -14,9 +14,8 @@ from tempfile import TemporaryDirectory
 import matplotlib.pyplot as plt
 import numpy as np
 
-from hil import Campaign, Cell
+from hil import Campaign, Cell, Silent
 from hil.campaign import design
-from hil.progress import Silent
 from identification.excitation import Excitation, Objective, correlation, midpoints
 from identification.excitation.excitation import moves_through
 from planner import plan_moves

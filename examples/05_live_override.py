@@ -12,12 +12,8 @@ from tempfile import TemporaryDirectory
 import matplotlib.pyplot as plt
 import numpy as np
 
-from hil import Cell
-from hil.archive import open_archive
-from hil.campaign import stop_on_interrupt
-from hil.campaign.operator import MotionProgress, OperatorRequest
-from hil.cell_link import cell_link
-from hil.move import plan_move, send
+from hil import Cell, cell_link, open_archive, plan_move, send, stop_on_interrupt
+from hil.control.motion_watch import MotionProgress, OperatorRequest
 
 PICTURE = Path("runs/examples/05_live_override.png")
 

@@ -9,12 +9,9 @@ from tempfile import TemporaryDirectory
 
 import matplotlib.pyplot as plt
 
-from hil import Campaign, Cell
+from hil import Campaign, Cell, Options, Silent, reidentify
 from hil.batch.cluster import Cluster
-from hil.batch.run import reidentify
 from hil.campaign import design
-from hil.identify.options import Options
-from hil.progress import Silent
 
 HERE = Path(__file__).parent
 PICTURE = Path("runs/examples/06_batch.png")

@@ -12,12 +12,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from drivers import CycleRing, Guard, Session, TransportClosed
-from hil import Cell
-from hil.campaign import VirtualLink, stop_on_interrupt
-from hil.move import plan_move, send
+from hil import Cell, plan_move, send, simulated_controller, stop_on_interrupt
+from hil.campaign import VirtualLink
 from hil.plots import save
 from hil.plots.archive_view import draw_archive, view_of
-from hil.simulation import simulated_controller
 
 CELL = "sim_fixtures/ns16/cell.toml"
 PICTURE = Path("runs/examples/07_own_transport.png")

@@ -7,7 +7,9 @@ Campaigns:
 - `simulated_controller`: a simulated controller with the arm of a cell.
 - `plan_move`, `send`: plan a straight motion in joint space; send a motion and archive it.
 - `Stop`, `stop_on_interrupt`: stop the arm on its path, also on Ctrl-C.
-- `reporter`, `Silent`: progress bars, or none.
+- `cell_link`: open the link to the controller of a cell.
+- `Screen`: the screen of a run, with its keys.
+- `reporter`, `LineReporter`, `Silent`: progress bars, lines, or nothing.
 
 Archives and other recordings:
 
@@ -32,41 +34,60 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from hil import errors
+from hil.base import errors
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from os import PathLike
+
     from hil.archive import open_archive
-    from hil.batch.run import reidentify
-    from hil.campaign import Campaign, Stop, stop_on_interrupt
+    from hil.archive.recordings import open_recording
+    from hil.base.progress import LineReporter, Reporter, Silent, reporter
+    from hil.batch.graph import reidentify
+    from hil.campaign import Campaign
+    from hil.campaign.identified import identify_campaign
+    from hil.campaign.screen import Screen
     from hil.cell import Cell
-    from hil.exporting import export_model
-    from hil.identified_arm import IdentifiedArm, identify
-    from hil.identify import Options, identify_archives, identify_campaign
-    from hil.importers import ColumnMap, Robot, import_log, import_rosbag2
-    from hil.importers.recording import ImportOptions
-    from hil.move import plan_move, send
-    from hil.progress import Silent, reporter
-    from hil.recordings import open_recording
-    from hil.results import Results
-    from hil.simulation import simulated_controller
+    from hil.control.cell_link import cell_link
+    from hil.control.motion_watch import Stop, stop_on_interrupt
+    from hil.control.move import plan_move, send
+    from hil.control.simulation import simulated_controller
+    from hil.export.model_files import export_model
+    from hil.identified.identified_arm import IdentifiedArm
+    from hil.importers.column_map import ColumnMap
+    from hil.importers.log import import_log
+    from hil.importers.recording import ImportOptions, RobotOf
+    from hil.importers.robot import Robot
+    from hil.importers.rosbag2 import import_rosbag2
+    from hil.pipeline.options import Options
+    from hil.pipeline.run import identify_archives
+    from hil.results.results import Results
     from hil.study import run_study
 
 _HOME = {
-    **dict.fromkeys(("Campaign", "Stop", "stop_on_interrupt"), "campaign"),
-    **dict.fromkeys(("Options", "identify_archives", "identify_campaign"), "identify"),
-    **dict.fromkeys(("ColumnMap", "Robot", "import_log", "import_rosbag2"), "importers"),
-    **dict.fromkeys(("send", "plan_move"), "move"),
-    **dict.fromkeys(("Silent", "reporter"), "progress"),
+    **dict.fromkeys(("LineReporter", "Silent", "reporter"), "base.progress"),
+    **dict.fromkeys(("Stop", "stop_on_interrupt"), "control.motion_watch"),
+    **dict.fromkeys(("plan_move", "send"), "control.move"),
+    "Campaign": "campaign",
     "Cell": "cell",
-    "IdentifiedArm": "identified_arm",
+    "ColumnMap": "importers.column_map",
+    "IdentifiedArm": "identified.identified_arm",
     "ImportOptions": "importers.recording",
-    "Results": "results",
-    "export_model": "exporting",
+    "Options": "pipeline.options",
+    "Results": "results.results",
+    "Robot": "importers.robot",
+    "Screen": "campaign.screen",
+    "cell_link": "control.cell_link",
+    "export_model": "export.model_files",
+    "identify_archives": "pipeline.run",
+    "identify_campaign": "campaign.identified",
+    "import_log": "importers.log",
+    "import_rosbag2": "importers.rosbag2",
     "open_archive": "archive",
-    "open_recording": "recordings",
-    "reidentify": "batch.run",
+    "open_recording": "archive.recordings",
+    "reidentify": "batch.graph",
     "run_study": "study",
-    "simulated_controller": "simulation",
+    "simulated_controller": "control.simulation",
 }
 
 __all__ = [
@@ -75,11 +96,14 @@ __all__ = [
     "ColumnMap",
     "IdentifiedArm",
     "ImportOptions",
+    "LineReporter",
     "Options",
     "Results",
     "Robot",
+    "Screen",
     "Silent",
     "Stop",
+    "cell_link",
     "errors",
     "export_model",
     "identify",
@@ -99,9 +123,40 @@ __all__ = [
 ]
 
 
+def identify(
+    recordings: str | PathLike[str] | Sequence[str | PathLike[str]],
+    *,
+    urdf: str | PathLike[str] | None = None,
+    robot: Robot | RobotOf | None = None,
+    predict: str | PathLike[str] | Sequence[str | PathLike[str]] = (),
+    reading: ImportOptions | None = None,
+    options: Options | None = None,
+    reporter: Reporter | None = None,
+) -> IdentifiedArm:
+    """Identify an arm from recordings, as `hil identify` does; nothing is written before `save`.
+
+    Args:
+        recordings: logs or bags, with the `urdf` or `robot` of their arm; or archives, or a
+            campaign folder.
+        urdf: description of the arm.
+        robot: in place of `urdf`, with gravity, friction law or joints that were not recorded: see
+            :meth:`hil.Robot.from_urdf`.
+        predict: recordings of any kind to predict and not to fit. Without any, the end of a single
+            recording is held out.
+        reading: what the channels are, where that cannot be concluded from names and units.
+        options: of the estimation.
+        reporter: receives messages and progress; None for none. `hil.reporter()` prints them.
+
+    Raises:
+        InputError: a recording or the URDF cannot be read, a quantity is left open, or nothing can
+            be identified from it.
+    """
+    from hil.identified.identified_arm import arm_from  # which loads numpy
+
+    return arm_from(recordings, urdf, robot, predict, reading, options, reporter)
+
+
 def __getattr__(name: str) -> Any:
-    if name == "identify":  # a package that can be called
-        return import_module("hil.identify")
     if name in _HOME:
         return getattr(import_module(f"hil.{_HOME[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

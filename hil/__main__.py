@@ -1,14 +1,14 @@
 """`python -m hil`, and the console script.
 
-Linear algebra uses one thread, see :mod:`hil.threads`; set here, before numpy is loaded.
+Linear algebra uses one thread, see :mod:`hil.base.threads`; set here, before numpy is loaded.
 """
 
 from __future__ import annotations
 
 import os
 
-from hil.importing import leave_if_interrupted
-from hil.threads import VARIABLES
+from hil.base.startup_interrupt import leave_if_interrupted
+from hil.base.threads import VARIABLES
 
 
 def main() -> None:

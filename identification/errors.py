@@ -33,3 +33,7 @@ class ShapeError(IdentificationError, ValueError):
         self.name = name
         self.shape = shape
         self.expected = expected
+
+
+class WorkspaceError(IdentificationError, ValueError):
+    """A box whose corners are not in order."""

@@ -8,14 +8,13 @@ from math import pi
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sim_fixtures.arrays import Array
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.plant import ElasticPlant, Plant, PlantTruth
 from sim_fixtures.servo import CurrentLoop, loops_per_cycle
 from sim_fixtures.settings import ControllerSettings
-
-Array = NDArray[np.float64]
 
 DisturbanceKind = Literal["jam", "load", "slip"]
 

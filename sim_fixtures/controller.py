@@ -47,6 +47,7 @@ from drivers.packets import (
     packet_number,
 )
 from sim_fixtures.arm import DisturbanceKind, SimulatedArm, UnmodelledEffects
+from sim_fixtures.arrays import Array
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.faults import InjectedFault
 from sim_fixtures.plant import Carried, PlantTruth
@@ -438,9 +439,6 @@ class Layout:
         )  # fmt: skip
         init.record["n_axes"] = self.n_slots
         return init.encode()
-
-
-Array = NDArray[np.float64]
 
 
 class MoveInterpolator(Protocol):

@@ -19,11 +19,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sim_fixtures.arrays import Array
 from sim_fixtures.settings import PlantDiverged, SettingError
-
-Array = NDArray[np.float64]
 
 
 class Carried(NamedTuple):

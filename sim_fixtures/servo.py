@@ -21,13 +21,12 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sim_fixtures.arrays import Array
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.plant import Carried, PlantTruth, build_model, carry, scale_bodies
 from sim_fixtures.settings import ServoSettings
-
-Array = NDArray[np.float64]
 
 LOOP_PERIOD = 0.001
 """Period of the loops, s; a cycle of the controller has a whole number of them."""

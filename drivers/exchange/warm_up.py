@@ -7,8 +7,9 @@ from contextlib import suppress
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from drivers.arrays import Array
 from drivers.drive_train import DriveTrain
 from drivers.guard import Guard, GuardLimits
 from drivers.motion_source import BoundsName
@@ -25,8 +26,6 @@ from drivers.record import CycleRing
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import PollingTransport, Transport
-
-Array = NDArray[np.float64]
 
 _CYCLES: Final = 200
 """Cycles before the first packet."""

@@ -22,7 +22,7 @@ from hil.archive.header import (
 from hil.archive.reader import Archive, open_archive, scan_archive, scan_file
 from hil.archive.repair import is_intact
 from hil.archive.scan import Scan
-from hil.errors import InputError
+from hil.base.errors import InputError
 
 OUTCOMES = ("completed", REJECTED, "stopped", "refused", "lost", "void", "interrupted", "unknown")
 

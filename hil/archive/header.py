@@ -26,7 +26,7 @@ from pydantic import (
     field_validator,
 )
 
-from hil.reading import parse_count
+from hil.base.safe_input import parse_count
 
 KINDS = ("standstill", "move", "warmup", "dryrun", "excitation", "validation", "imported")
 SUFFIX = ".mcap"

@@ -30,9 +30,9 @@ from hil.archive.schema import (
     cycle_messages,
     profile,
 )
-from hil.errors import InputError
-from hil.reading import LARGEST_PORT
-from hil.version import install_command
+from hil.base.errors import InputError
+from hil.base.safe_input import LARGEST_PORT
+from hil.base.version import install_command
 
 if TYPE_CHECKING:
     import foxglove

@@ -39,7 +39,7 @@ from hil.archive.supervised import (
     Opened,
     Serving,
 )
-from hil.errors import ArchiveError, InputError
+from hil.base.errors import ArchiveError, InputError
 
 Records = NDArray[np.void]
 

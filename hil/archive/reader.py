@@ -22,8 +22,8 @@ from hil.archive.header import (
 )
 from hil.archive.scan import ALWAYS, Scan
 from hil.archive.schema import ArchivedEvent
-from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
-from hil.reading import open_file, parse_json, remedy_for_missing
+from hil.base.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
+from hil.base.safe_input import open_file, parse_json, remedy_for_missing
 
 _MOST_SHOWN = 5  # faults in one message
 

@@ -25,10 +25,10 @@ from hil.archive.index import FileIndex, span
 from hil.archive.reader import open_archive, scan_archive
 from hil.archive.scan import Scan
 from hil.archive.writer import mcap_writer
-from hil.errors import ArchiveError, ArchiveWriteError
-from hil.files import replace_file, sync_folder
-from hil.reading import open_file
-from hil.terminal_text import typed
+from hil.base.errors import ArchiveError, ArchiveWriteError
+from hil.base.files import replace_file, sync_folder
+from hil.base.safe_input import open_file
+from hil.base.terminal_text import typed
 
 _MESSAGE: Final = struct.Struct("<HIQQ")
 """Channel, sequence, log time and publish time in front of the data of a message."""

@@ -29,7 +29,7 @@ from hil.archive.cdr import (
     fixed_layout,
     joint_state_layout,
 )
-from hil.reading import parse_json
+from hil.base.safe_input import parse_json
 
 Array = NDArray[np.float64]
 

@@ -46,9 +46,9 @@ from hil.archive.schema import (
     sample_messages,
 )
 from hil.archive.schema import DESCRIPTION as DESCRIPTION_TOPIC
-from hil.errors import ArchiveWriteError
-from hil.files import sync_folder
-from hil.terminal_text import with_joint_names
+from hil.base.errors import ArchiveWriteError
+from hil.base.files import sync_folder
+from hil.base.terminal_text import with_joint_names
 
 Array = NDArray[np.float64]
 

@@ -25,10 +25,10 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.errors import InputError
-from hil.files import digest, json_digest, replace_file, user_cache
-from hil.reading import open_file
-from hil.type_adapter import adapter_of
+from hil.base.errors import InputError
+from hil.base.files import digest, json_digest, replace_file, user_cache
+from hil.base.safe_input import open_file
+from hil.base.type_adapter import adapter_of
 from planner.arrays import DAMAGED
 
 from .places import folder_of, is_url

@@ -19,10 +19,10 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self, TypeAlias, TypeVar
 from uuid import uuid4
 
-from hil.errors import HilError, InputError
-from hil.progress import Reporter, Silent
-from hil.threads import VARIABLES
-from hil.version import software
+from hil.base.errors import HilError, InputError
+from hil.base.progress import Reporter, Silent
+from hil.base.threads import VARIABLES
+from hil.base.version import software
 from identification import IdentificationError
 
 from .cache import CacheError, code_digest

@@ -16,14 +16,14 @@ from typing import Any, Final, NamedTuple
 
 from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
 from hil.archive.header import KINDS
+from hil.archive.recorded_campaign import Entry, RecordedCampaign
+from hil.base.errors import ArchiveError, CampaignFolderError, InputError
+from hil.base.files import digest, file_digest, json_digest
+from hil.base.progress import Reporter
+from hil.base.safe_input import remedy_for_missing
+from hil.base.terminal_text import typed
 from hil.cell import Cell
-from hil.errors import ArchiveError, CampaignFolderError, InputError
-from hil.files import digest, file_digest, json_digest
-from hil.identify.prepared import stated_delay
-from hil.progress import Reporter
-from hil.reading import remedy_for_missing
-from hil.recorded_campaign import Entry, RecordedCampaign
-from hil.terminal_text import typed
+from hil.pipeline.prepared import stated_delay
 from identification.selection.settings import Settings
 
 from .cache import BESIDE, JSON, CacheError, CacheLocation, code_digest
@@ -45,7 +45,7 @@ USES: Final = ("excitation", "validation", "standstill")
 
 _ARCHIVES: Final = "/archives"  # folder of a campaign's archives
 _REHEARSAL: Final = "/rehearsal/"  # see `hil.campaign.folder`
-_LOADED: Final = re.compile(r"/payload/[^/]+/loaded/")  # see `hil.payload_campaign`
+_LOADED: Final = re.compile(r"/payload/[^/]+/loaded/")  # see `hil.weighing.payload_campaign`
 _COMPLETED: Final = "completed"
 _NEVER_FITTED: Final = frozenset(KINDS) - {*USES, "imported"}
 _UNCHECKED: Final = (

@@ -12,22 +12,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.identify.estimating import Posterior
-from hil.identify.estimators import fit_of
+from hil.pipeline.estimating import posterior_of
+from hil.pipeline.estimators import fit_of
 from identification import IdentificationError
 from identification.estimators.consistent import SolverError
 from identification.estimators.covariance import solve_with_prior
-from identification.estimators.delay import with_uncertain_delay
 from identification.estimators.least_squares import no_narrower
 from identification.estimators.prior import posterior_method
 from identification.factor.estimate import Estimate
 from identification.factor.factor import QR_CONDITION, Factor, require_rows
+from identification.reduction.intervals import delayed, widened
+from identification.reduction.posterior import Posterior
+from identification.reduction.reduction import Reduction
 from identification.selection.settings import Settings
 
 from .cache import CacheLocation
 from .cluster import SkippedArchive
 from .discovery import ArchiveRef, cell_from
-from .reduction import Reduction, Summary, added, plus, reduce_archives, settings_digest
+from .reduction import (
+    ReducedArchives,
+    Summary,
+    ToReduce,
+    added,
+    plus,
+    reduce_archives,
+    settings_digest,
+)
 
 Array = NDArray[np.float64]
 
@@ -90,30 +100,27 @@ class Group:
     """Archives that are fitted together: the sums that predict and are predicted."""
 
     refs: tuple[ArchiveRef, ...] = ()  #: archives that were fitted
-    total: Factor | None = None  #: sum of their factors; None if there are none
+    total: Reduction | None = None  #: sum over them; None if there are none
     values: tuple[Array, ...] = ()  #: parameters (p,) from each of them
     unseen: Factor | None = None  #: sum of the totals of validation runs; None if none
-    products: Array | None = None  #: sum of those of the archives, see :attr:`Summary.products`
     #: every archive, with the warnings about it
     warned: tuple[tuple[ArchiveRef, tuple[str, ...]], ...] = ()
     settings: frozenset[str] = frozenset()  #: digests
     setups: frozenset[str] = frozenset()  #: payloads and delays that the cells state
 
     @classmethod
-    def of(cls, reduction: Reduction, settings: Settings) -> Group:
+    def of(cls, reduced: ReducedArchives, settings: Settings) -> Group:
         """Return the group of one campaign, without the estimates from each archive."""
-        fitted = [summary for summary in reduction.summaries if summary.ref.use == "excitation"]
+        fitted = [summary for summary in reduced.summaries if summary.ref.use == "excitation"]
         group = cls(
             refs=tuple(summary.ref for summary in fitted),
-            total=reduction.total,
-            warned=tuple((summary.ref, summary.warnings) for summary in reduction.summaries),
+            total=reduced.total,
+            warned=tuple((summary.ref, summary.warnings) for summary in reduced.summaries),
             settings=frozenset({settings_digest(settings)}),
             setups=frozenset(summary.ref.setup for summary in fitted),
         )
-        for summary in reduction.summaries:
-            if summary.ref.use == "excitation":
-                group = replace(group, products=plus(group.products, summary.products))
-            else:
+        for summary in reduced.summaries:
+            if summary.ref.use != "excitation":
                 group = replace(group, unseen=plus(group.unseen, summary.total))
         return group
 
@@ -124,7 +131,6 @@ class Group:
             total=plus(self.total, other.total),
             values=self.values + other.values,
             unseen=plus(self.unseen, other.unseen),
-            products=plus(self.products, other.products),
             warned=self.warned + other.warned,
             settings=self.settings | other.settings,
             setups=self.setups | other.setups,
@@ -145,37 +151,41 @@ class CampaignResult:
 
 
 def estimate_campaign(
-    parts: Sequence[Reduction | SkippedArchive], arm: ArmModel, settings: Settings, campaign: str
+    parts: Sequence[ReducedArchives | SkippedArchive],
+    arm: ArmModel,
+    settings: Settings,
+    campaign: str,
 ) -> tuple[CampaignResult, Group]:
     """Estimate one campaign from its reduced archives; return also what a pooled estimate needs.
 
     `settings` are those of the campaign, with its own noise.
     """
-    reduction = added(part for part in parts if isinstance(part, Reduction))
+    reduced = added(part for part in parts if isinstance(part, ReducedArchives))
     estimator = Estimator(arm)
-    group = Group.of(reduction, settings)
+    group = Group.of(reduced, settings)
     estimates: list[BatchEstimate] = []
-    broken = [*reduction.broken, *(part for part in parts if isinstance(part, SkippedArchive))]
+    broken = [*reduced.broken, *(part for part in parts if isinstance(part, SkippedArchive))]
     if group.total is not None:
         try:
-            posterior, notes = estimator.posterior(group.total)
+            posterior, notes = estimator.posterior(group.total.factor)
             share = 1.0 / len(group.refs)
             digest = settings_digest(settings)
+            fitted = [each for each in reduced.summaries if each.ref.use == "excitation"]
             repetitions = [
-                estimator.repetition(summary, digest, posterior, share)
-                for summary in reduction.summaries
-                if summary.ref.use == "excitation"
+                estimator.repetition(summary, digest, posterior, share) for summary in fitted
             ]
             group = replace(group, values=tuple(each.estimate.values for each in repetitions))
-            estimates = [*repetitions, estimator.sum("campaign", group, posterior, notes)]
+            recordings = [summary.total for summary in fitted]
+            whole = estimator.sum("campaign", group, posterior, notes, recordings)
+            estimates = [*repetitions, whole]
         except IdentificationError as error:
             broken.append(SkippedArchive(campaign, str(error)))
-    result = CampaignResult(tuple(estimates), tuple(broken), reduction.read, reduction.cached)
+    result = CampaignResult(tuple(estimates), tuple(broken), reduced.read, reduced.cached)
     return result, group
 
 
 def estimate_cached(
-    partitions: Sequence[Sequence[ArchiveRef]],
+    partitions: Sequence[Sequence[ToReduce]],
     cache: CacheLocation,
     arm: ArmModel,
     settings: Settings,
@@ -188,7 +198,7 @@ def estimate_cached(
     Raises:
         CacheError: a damaged sum is computed again, and the cache cannot be written.
     """
-    parts = [reduce_archives(refs, settings, cache) for refs in partitions]
+    parts = [reduce_archives(wanted, settings, cache) for wanted in partitions]
     return estimate_campaign(parts, arm, settings, campaign)
 
 
@@ -219,7 +229,7 @@ def estimate_arm(parts: Sequence[Group], arm: ArmModel) -> BatchEstimate | Skipp
         ]
     estimator = Estimator(arm)
     try:
-        posterior, others = estimator.posterior(group.total)
+        posterior, others = estimator.posterior(group.total.factor)
         return estimator.sum("pooled", group, posterior, [*others, *notes])
     except IdentificationError as error:
         return SkippedArchive(f"arm {arm.digest[:8]}", str(error))
@@ -239,20 +249,20 @@ class Estimator:
         self._delay_variance = settings.delay_variance
         self._strength = settings.strength
 
-    def posterior(self, total: Factor) -> tuple[Posterior | None, list[str]]:
-        """Return the posterior of a sum and its archives, and notes; None: there is no prior.
+    def posterior(self, total: Factor) -> tuple[Posterior, list[str]]:
+        """Return the posterior of a sum and its archives, and notes.
 
         Raises:
             IdentificationError: there is no usable row.
         """
         require_rows(self.model, total)
+        prior = posterior_of(self.cell, total, self.name, self._strength)
         if self.name != "auto":
-            return None, []
-        prior = Posterior.of(self.cell, total, self.name, self._strength)
+            return prior, []
         posterior, _, notes = prior.solved(total)
         return posterior, notes
 
-    def of_archive(self, summary: Summary, posterior: Posterior | None, share: float) -> Estimate:
+    def of_archive(self, summary: Summary, posterior: Posterior, share: float) -> Estimate:
         """Return the estimate from one archive, this share of those of the posterior.
 
         That of the consistent estimator is unconstrained, as in `hil identify`. The scatter of the
@@ -261,10 +271,10 @@ class Estimator:
         fit = summary.fit
         scatter = summary.scatter
         assert fit is not None and scatter is not None, "it was fitted"
-        if posterior is None:
+        if self.name != "auto":
             return fit
         # A copy: the total itself does not cache what is computed here.
-        total = replace(summary.total)
+        total = summary.total.merged(max(1, len(summary.total)))
         try:
             result = posterior.fit(total, share)
         except SolverError:
@@ -280,32 +290,35 @@ class Estimator:
             method=posterior_method(result.origin, result.design_effect, scatter.description),
         )
 
-    def of_group(self, group: Group, posterior: Posterior | None) -> Estimate:
+    def of_group(
+        self, group: Group, posterior: Posterior, recordings: Sequence[Factor]
+    ) -> Estimate:
         """Return the estimate from a sum over archives, with the posterior of that sum.
 
-        Its intervals are at least as wide as the scatter of repetitions of one motion.
+        Its intervals are at least as wide as the scatter of repetitions of one motion, and allow
+        for all that those of `hil identify` do. Friction may drift over `recordings`.
 
         Raises:
             IdentificationError: there is no consistent solution.
         """
-        assert group.total is not None
-        if posterior is None:
-            estimate = fit_of(self.model, self.name)((), group.total)
+        total = group.total
+        assert total is not None
+        precision = None
+        if self.name == "auto":
+            estimate = posterior.fit(total.factor).estimate
+            precision = posterior.precision
         else:
-            estimate = posterior.fit(group.total).estimate
+            estimate = fit_of(self.model, self.name)((), total.factor)
         motions = {ref.motion for ref in group.refs}
         if len(motions) == 1 and "" not in motions:
             covariance = no_narrower(estimate.covariance, np.array(group.values))
             estimate = replace(estimate, covariance=covariance)
-        if group.products is None:
-            return estimate
-        precision = None if posterior is None else posterior.precision
-        return with_uncertain_delay(
-            estimate, group.total, group.products, self._delay_variance, precision
-        )
+        estimate = delayed(estimate, total, self._delay_variance, precision)
+        exact = np.zeros(self.model.n_joints)  # in units of the torque of the arm
+        return widened(estimate, total, posterior, precision, exact, recordings).estimate
 
     def repetition(
-        self, summary: Summary, settings: str, posterior: Posterior | None, share: float
+        self, summary: Summary, settings: str, posterior: Posterior, share: float
     ) -> BatchEstimate:
         """Return the estimate of one archive, this share of its campaign."""
         ref = summary.ref
@@ -329,19 +342,26 @@ class Estimator:
         )
 
     def sum(
-        self, level: Level, group: Group, posterior: Posterior | None, warnings: Sequence[str]
+        self,
+        level: Level,
+        group: Group,
+        posterior: Posterior,
+        warnings: Sequence[str],
+        recordings: Sequence[Factor] = (),
     ) -> BatchEstimate:
         """Return the estimate of a campaign, or of all campaigns of the arm.
+
+        Friction may drift over the `recordings` of a campaign.
 
         Raises:
             IdentificationError: there is no estimate.
         """
         assert group.total is not None
         refs = group.refs
-        estimate = self.of_group(group, posterior)
+        estimate = self.of_group(group, posterior, recordings)
         unseen = Factor.zero(self.model) if group.unseen is None else group.unseen
         is_poor = not estimate.undetermined and estimate.condition > QR_CONDITION
-        if posterior is None and is_poor:
+        if self.name != "auto" and is_poor:
             conditioning = (
                 f"the scaled condition number is {estimate.condition:.2g}: the motion separates"
                 " some parameters poorly, and sums of squares lose digits there; `hil identify` on"
@@ -355,7 +375,7 @@ class Estimator:
             when=min((ref.when for ref in refs if ref.when), default=""),
             repetitions=len(refs),
             estimate=estimate,
-            torque_rms=_rms(group.total),
+            torque_rms=_rms(group.total.factor),
             unseen_rms=_rms(unseen, unseen.squared_errors(estimate.values)),
             unseen_torque_rms=_rms(unseen),
             settings=next(iter(group.settings)) if len(group.settings) == 1 else "",

@@ -10,8 +10,8 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
 from urllib.parse import urlsplit
 
-from hil.errors import ArchiveError, InputError
-from hil.files import json_digest
+from hil.base.errors import ArchiveError, InputError
+from hil.base.files import json_digest
 
 SUFFIX: Final = ".mcap"
 

@@ -1,26 +1,29 @@
-"""Archives reduced to the sum of their factors and a summary of each, cached as `.npz`."""
+"""Archives reduced to the sum of their rows and a summary of each, cached as `.npz`."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from sys import intern
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Archive
-from hil.errors import ArchiveError
-from hil.files import json_digest
-from hil.identify.prepared import known_parameters, samples_of, validation_samples
-from hil.identify.sources import Source, known_warnings, source_of
-from identification.estimators.delay import rate_products
+from hil.base.errors import ArchiveError
+from hil.base.files import json_digest
+from hil.pipeline.prepared import known_parameters, reduction_of, versions_of
+from hil.pipeline.sources import Source, known_warnings, source_of
+from identification.estimators.elasticity import ElasticTorque
+from identification.estimators.friction_drift import PIECES
 from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.prior import ScoreScatter, body_prior
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
+from identification.reduction.reduction import ALIKE, Reduction, Unmodelled
 from identification.selection.settings import Settings
 
 from .cache import Arrays, CacheLocation, code_digest
@@ -28,7 +31,7 @@ from .cluster import SkippedArchive, reason_of
 from .discovery import ArchiveRef, cell_in, open_ref
 
 Array = NDArray[np.float64]
-Term = TypeVar("Term", Factor, Array)
+Term = TypeVar("Term", Factor, Reduction)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,24 +39,21 @@ class Summary:
     """Results of one archive, beside the sum of several."""
 
     ref: ArchiveRef
-    total: Factor  #: its factor as one block
+    #: its factor as one block, or as several parts if the archives are few
+    total: Factor
     #: the estimate from it alone without prior, with cluster-robust covariance; None of a
     #: validation run
     fit: Estimate | None
     scatter: ScoreScatter | None  #: for the estimate with a prior; None of a validation run
     warnings: tuple[str, ...] = ()  #: about the archive
-    #: (n, p, p + 1), see :func:`identification.estimators.delay.rate_products`; None where the
-    #: delay is known, or the archive is not fitted
-    products: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Reduction:
+class ReducedArchives:
     """One archive, or several of one campaign, reduced."""
 
     summaries: tuple[Summary, ...] = ()  #: of the readable ones, in their order
-    #: sum of the factors, by time, of those that are fitted; None if there are none
-    total: Factor | None = None
+    total: Reduction | None = None  #: sum over those that are fitted; None if there are none
     broken: tuple[SkippedArchive, ...] = ()  #: the others
     read: int = 0  #: number of archives that were read, broken ones included
     cached: int = 0  #: number of the others
@@ -67,9 +67,34 @@ def settings_digest(settings: Settings) -> str:
     return json_digest([entries, code_digest()])
 
 
-def reduction_key(refs: Sequence[ArchiveRef], settings: Settings) -> str:
+class ToReduce(NamedTuple):
+    """An archive, and what its campaign needs of it."""
+
+    ref: ArchiveRef
+    unmodelled: bool = False  #: whether it is one of those that show what the model lacks
+    parts: int = 1  #: parts of its own total, more of few archives, whose friction may drift
+
+
+def to_reduce(refs: Sequence[ArchiveRef]) -> list[ToReduce]:
+    """Return the archives of a campaign with what it needs of each.
+
+    The first of each motion show what the model lacks; of unknown motions the first of all.
+    """
+    fitted = [ref for ref in refs if ref.use == "excitation"]
+    seen: Counter[str] = Counter()
+    shown = set()
+    for ref in fitted:
+        seen[ref.motion] += 1
+        if seen[ref.motion] <= ALIKE:
+            shown.add(ref)
+    parts = PIECES if len(fitted) < PIECES else 1
+    return [ToReduce(ref, ref in shown, parts if ref.use == "excitation" else 1) for ref in refs]
+
+
+def reduction_key(wanted: Sequence[ToReduce], settings: Settings) -> str:
     """Return the key of archives that are reduced, and added in this order."""
-    return json_digest(["sum", [ref.sha256 for ref in refs], settings_digest(settings)])
+    each = [(one.ref.sha256, one.unmodelled, one.parts) for one in wanted]
+    return json_digest(["sum", each, settings_digest(settings)])
 
 
 def load_source(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Source]:
@@ -89,25 +114,26 @@ def load_source(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Sourc
     return archive, source
 
 
-def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, Factor]:
-    """Reduce one archive to its summary and its factor by blocks of time.
+def reduced_archive(wanted: ToReduce, settings: Settings) -> tuple[Summary, Reduction]:
+    """Reduce one archive to its summary and its sums.
 
     Raises:
         HilError: it cannot be read, is damaged, was changed, or cannot be identified from.
         IdentificationError: it has no usable row.
     """
+    ref = wanted.ref
     archive, source = load_source(ref)
     cell = cell_in(archive, settings)
     is_fitted = ref.use == "excitation"
-    samples = (samples_of if is_fitted else validation_samples)(source, cell, settings)
+    versions = versions_of(source, cell, settings, for_fit=is_fitted)
     model = cell.model
-    if settings.loading is not None:
-        samples = samples.with_load(model, np.array(settings.loading))
-    factor = Factor.by_time(model, samples)
+    how = settings if is_fitted else replace(settings, delay_variance=0.0)
+    reduction = reduction_of(cell, how, versions, unmodelled=wanted.unmodelled)
+    factor = reduction.factor
     fit = None
     scatter = None
     if is_fitted:
-        fit = fit_least_squares(model, [samples], factor=factor)
+        fit = fit_least_squares(model, versions[:1], factor=factor)
         prior = body_prior(model, factor, stated=known_parameters(cell))
         scatter = ScoreScatter.of(factor, prior.gaussian)
     warnings = [*known_warnings(cell, archive), *archive.header.findings.warnings]
@@ -115,20 +141,13 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, Factor
         warnings.append(source.merged)
     if archive.outcome is not None and archive.outcome.repaired:
         warnings.append("it was repaired with loss")
-    has_products = is_fitted and settings.delay_variance
-    return Summary(
-        ref=ref,
-        total=factor.merged(max(1, len(factor))),
-        fit=fit,
-        scatter=scatter,
-        warnings=tuple(warnings),
-        products=rate_products(model, samples) if has_products else None,
-    ), factor
+    summary = Summary(ref, factor.parts(wanted.parts), fit, scatter, tuple(warnings))
+    return summary, reduction
 
 
 def reduce_archives(
-    refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation
-) -> Reduction:
+    wanted: Sequence[ToReduce], settings: Settings, cache: CacheLocation
+) -> ReducedArchives:
     """Reduce archives of one campaign and add them up.
 
     Each is cached by itself; so is the sum, if all of them are usable.
@@ -136,38 +155,40 @@ def reduce_archives(
     Raises:
         CacheError: the cache cannot be written.
     """
-    cached = cached_reduction(refs, settings, cache)
+    cached = cached_reduction(wanted, settings, cache)
     if cached is not None:
         return cached
-    if len(refs) == 1:
-        return _reduce_archive(refs[0], settings, cache)
-    result = added(_reduce_archive(ref, settings, cache) for ref in refs)
+    if len(wanted) == 1:
+        return _reduce_archive(wanted[0], settings, cache)
+    result = added(_reduce_archive(one, settings, cache) for one in wanted)
     if not result.broken:
-        _write(result, settings, cache)
+        _write(wanted, result, settings, cache)
     return result
 
 
-def _reduce_archive(ref: ArchiveRef, settings: Settings, cache: CacheLocation) -> Reduction:
-    cached = cached_reduction((ref,), settings, cache)
+def _reduce_archive(wanted: ToReduce, settings: Settings, cache: CacheLocation) -> ReducedArchives:
+    cached = cached_reduction((wanted,), settings, cache)
     if cached is not None:
         return cached
+    ref = wanted.ref
     try:
-        summary, factor = archive_factor(ref, settings)
+        summary, reduction = reduced_archive(wanted, settings)
     except Exception as error:
-        return Reduction(broken=(SkippedArchive(ref.location, reason_of(error)),), read=1)
-    result = Reduction((summary,), factor if ref.use == "excitation" else None, read=1)
-    _write(result, settings, cache)
+        return ReducedArchives(broken=(SkippedArchive(ref.location, reason_of(error)),), read=1)
+    total = reduction if ref.use == "excitation" else None
+    result = ReducedArchives((summary,), total, read=1)
+    _write((wanted,), result, settings, cache)
     return result
 
 
-def ensure_reduced(ref: ArchiveRef, settings: Settings, cache: CacheLocation) -> None:
+def ensure_reduced(wanted: ToReduce, settings: Settings, cache: CacheLocation) -> None:
     """Reduce one archive, to find out whether that ends the process."""
-    reduce_archives((ref,), settings, cache)
+    reduce_archives((wanted,), settings, cache)
 
 
-def added(parts: Iterable[Reduction]) -> Reduction:
-    """Add reductions in their order."""
-    result = Reduction()
+def added(parts: Iterable[ReducedArchives]) -> ReducedArchives:
+    """Add reduced archives in their order."""
+    result = ReducedArchives()
     summaries = list[Summary]()
     broken = list[SkippedArchive]()
     for part in parts:
@@ -191,15 +212,19 @@ def plus(first: Term | None, second: Term | None) -> Term | None:
 
 # Files
 
+ELASTIC: Final = ("products", "squares", "measured", "compliance")
+"""Arrays of the torque of elastic gears."""
+
 FIT: Final = ("values", "covariance", "noise_std", "samples")
 """Arrays of the estimate of an archive. It outlives the sum, and so has copies of its own."""
 
 
 def cached_reduction(
-    refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation
-) -> Reduction | None:
+    wanted: Sequence[ToReduce], settings: Settings, cache: CacheLocation
+) -> ReducedArchives | None:
     """Return the cached reduction of exactly these archives; None if there is none."""
-    entry = cache.read(refs[0].location, reduction_key(refs, settings))
+    refs = [one.ref for one in wanted]
+    entry = cache.read(refs[0].location, reduction_key(wanted, settings))
     if entry is None:
         return None
     try:
@@ -208,39 +233,62 @@ def cached_reduction(
         return None
 
 
-def _write(reduction: Reduction, settings: Settings, cache: CacheLocation) -> None:
-    refs = [summary.ref for summary in reduction.summaries]
-    cache.write(refs[0].location, reduction_key(refs, settings), *_packed(reduction))
+def _write(
+    wanted: Sequence[ToReduce],
+    reduced: ReducedArchives,
+    settings: Settings,
+    cache: CacheLocation,
+) -> None:
+    place = wanted[0].ref.location
+    cache.write(place, reduction_key(wanted, settings), *_packed(reduced))
 
 
-def _packed(reduction: Reduction) -> tuple[dict[str, Any], Arrays]:
-    """Return a reduction as JSON data and arrays: each kind in one array for all archives."""
-    summaries = reduction.summaries
+def _packed(reduced: ReducedArchives) -> tuple[dict[str, Any], Arrays]:
+    """Return reduced archives as JSON data and arrays: each kind in one array for all archives."""
+    summaries = reduced.summaries
     first = summaries[0].total
-    totals = [_triangles(summary.total) for summary in summaries]
     arrays: Arrays = {
         "counts": np.concatenate([summary.total.counts for summary in summaries]),
-        "totals": np.concatenate(totals),
+        "totals": np.concatenate([_triangles(summary.total) for summary in summaries]),
     }
-    if reduction.total is not None:
-        arrays["sum_counts"] = reduction.total.counts
-        arrays["sum"] = _triangles(reduction.total)
     fits = [summary.fit for summary in summaries if summary.fit is not None]
     for name in FIT:
         arrays[name] = np.array([getattr(fit, name) for fit in fits])
     scatters = [summary.scatter for summary in summaries if summary.scatter is not None]
     if scatters:
         arrays["scatter"] = np.concatenate([scatter.rows for scatter in scatters])
-    products = [summary.products for summary in summaries if summary.products is not None]
-    if products:
-        arrays["products"] = np.array(products)
-    return {
+    content: dict[str, Any] = {
         "parameters": first.parameter_names,
         "units": fits[0].units if fits else (),
         "columns": [columns.tolist() for columns in first.columns],
-        "block": None if reduction.total is None else reduction.total.block,
         "archives": [_entry(summary) for summary in summaries],
-    }, arrays
+        "sum": None if reduced.total is None else _packed_sum(reduced.total, arrays),
+    }
+    return content, arrays
+
+
+def _packed_sum(total: Reduction, arrays: Arrays) -> dict[str, Any]:
+    """Add the arrays of a sum to others, and return what is no array as JSON data."""
+    arrays["sum_counts"] = total.factor.counts
+    arrays["sum"] = _triangles(total.factor)
+    if total.rates is not None:
+        arrays["rates"] = total.rates
+    content: dict[str, Any] = {"block": total.factor.block}
+    unmodelled = total.unmodelled
+    if unmodelled is not None:
+        forms = unmodelled.forms
+        arrays["forms_counts"] = forms.counts
+        arrays["forms"] = _triangles(forms)
+        content["forms"] = {
+            "names": forms.parameter_names,
+            "columns": [columns.tolist() for columns in forms.columns],
+            "block": forms.block,
+        }
+        if unmodelled.elastic is not None:
+            for name in ELASTIC:
+                arrays[name] = getattr(unmodelled.elastic, name)
+            content["elastic"] = unmodelled.elastic.recordings
+    return content
 
 
 def _triangles(factor: Factor) -> Array:
@@ -282,7 +330,7 @@ def _entry(summary: Summary) -> dict[str, Any]:
     scatter = summary.scatter
     entry: dict[str, Any] = {
         "warnings": summary.warnings,
-        "products": summary.products is not None,
+        "blocks": len(summary.total),
     }
     if fit is not None and scatter is not None:
         entry["fit"] = {
@@ -301,8 +349,8 @@ def _entry(summary: Summary) -> dict[str, Any]:
 
 def _unpacked(
     refs: Sequence[ArchiveRef], content: dict[str, Any], arrays: Arrays
-) -> Reduction | None:
-    """Return the reduction of a file, whose archives may have been moved since."""
+) -> ReducedArchives | None:
+    """Return the reduced archives of a file, which may have been moved since."""
     if len(content["archives"]) != len(refs):
         return None
     names = tuple(map(intern, content["parameters"]))
@@ -312,12 +360,12 @@ def _unpacked(
     summaries = []
     fit_number = 0
     scatter_begin = 0
-    products_number = 0
-    for number, (ref, entry) in enumerate(zip(refs, content["archives"], strict=True)):
-        rows = slice(number, number + 1)
+    block_begin = 0
+    for ref, entry in zip(refs, content["archives"], strict=True):
+        rows = slice(block_begin, block_begin + entry["blocks"])
+        block_begin = rows.stop
         fit = None
         scatter = None
-        products = None
         if "fit" in entry:
             stated = entry["fit"]
             fit = Estimate(
@@ -334,9 +382,6 @@ def _unpacked(
             scatter = ScoreScatter(scatter_rows, **entry["scatter"])
             fit_number += 1
             scatter_begin = scatter_end
-        if entry["products"]:
-            products = arrays["products"][products_number]
-            products_number += 1
         summaries.append(
             Summary(
                 ref=ref,
@@ -346,11 +391,33 @@ def _unpacked(
                 fit=fit,
                 scatter=scatter,
                 warnings=tuple(map(intern, entry["warnings"])),
-                products=products,
             )
         )
     total = None
-    if "sum_counts" in arrays:
+    if content["sum"] is not None:
         grams = _matrices(arrays["sum"], columns)
-        total = Factor(grams, columns, arrays["sum_counts"], names, block=content["block"])
-    return Reduction(tuple(summaries), total, cached=len(refs))
+        block = content["sum"]["block"]
+        factor = Factor(grams, columns, arrays["sum_counts"], names, block=block)
+        unmodelled = _unmodelled(content["sum"], arrays)
+        total = Reduction(factor, arrays.get("rates"), unmodelled)
+    return ReducedArchives(tuple(summaries), total, cached=len(refs))
+
+
+def _unmodelled(content: dict[str, Any], arrays: Arrays) -> Unmodelled | None:
+    """Return the sums with what the model lacks of a file, None if it has none."""
+    if "forms" not in content:
+        return None
+    stated = content["forms"]
+    columns = tuple(np.array(joint, dtype=np.intp) for joint in stated["columns"])
+    forms = Factor(
+        _matrices(arrays["forms"], columns),
+        columns,
+        arrays["forms_counts"],
+        tuple(map(intern, stated["names"])),
+        block=stated["block"],
+    )
+    elastic = None
+    if "elastic" in content:
+        parts = {name: arrays[name] for name in ELASTIC}
+        elastic = ElasticTorque(**parts, recordings=content["elastic"])
+    return Unmodelled(forms, elastic)

@@ -9,12 +9,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
-from hil.files import replace_file
-from hil.reading import parse_time
-from hil.version import software
+from hil.base.files import replace_file
+from hil.base.safe_input import parse_time
+from hil.base.version import software
+from hil.batch.graph import BatchResult
 
 from .estimates import BatchEstimate, relative_error
-from .run import BatchResult
 
 Row = dict[str, Any]
 

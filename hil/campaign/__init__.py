@@ -3,20 +3,18 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from hil.errors import CampaignFolderError
+from hil.base.errors import CampaignFolderError
 
 if TYPE_CHECKING:
+    from hil.control.errors import MotionFailedError, MotionRefusedError
+    from hil.control.link import MotionLink, Progress
+    from hil.control.motion_watch import Stop, stop_on_interrupt
+    from hil.control.virtual_link import VirtualLink
+
     from .campaign import Campaign
-    from .errors import (
-        MotionFailedError,
-        MotionRefusedError,
-        NotRehearsedError,
-    )
+    from .errors import NotRehearsedError
     from .folder import CampaignFolder
-    from .link import MotionLink, Progress
-    from .operator import Stop, stop_on_interrupt
     from .plan import CampaignPlan, PlannedMotion, design, plan_around
-    from .virtual_link import VirtualLink
 
 __all__ = [
     "Campaign",
@@ -36,20 +34,24 @@ __all__ = [
     "stop_on_interrupt",
 ]
 _HOME = {
-    "Campaign": "campaign",
-    "CampaignFolder": "folder",
-    **dict.fromkeys(("MotionLink", "Progress"), "link"),
-    "VirtualLink": "virtual_link",
-    **dict.fromkeys(("Stop", "stop_on_interrupt"), "operator"),
-    **dict.fromkeys(("CampaignPlan", "PlannedMotion", "design", "plan_around"), "plan"),
+    "Campaign": "hil.campaign.campaign",
+    "CampaignFolder": "hil.campaign.folder",
+    **dict.fromkeys(("MotionFailedError", "MotionRefusedError"), "hil.control.errors"),
+    **dict.fromkeys(("MotionLink", "Progress"), "hil.control.link"),
+    "NotRehearsedError": "hil.campaign.errors",
+    "VirtualLink": "hil.control.virtual_link",
+    **dict.fromkeys(("Stop", "stop_on_interrupt"), "hil.control.motion_watch"),
+    **dict.fromkeys(
+        ("CampaignPlan", "PlannedMotion", "design", "plan_around"), "hil.campaign.plan"
+    ),
 }
 
 if not TYPE_CHECKING:  # which would accept any name
 
     def __getattr__(name: str) -> Any:
-        if name not in __all__:
+        if name not in _HOME:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(f"{__name__}.{_HOME.get(name, 'errors')}"), name)
+        return getattr(import_module(_HOME[name]), name)
 
 
 def __dir__() -> list[str]:

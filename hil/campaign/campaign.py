@@ -10,16 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hil.archive.live import LiveView
+from hil.base.errors import CampaignFolderError, HilError, InputError
+from hil.base.progress import Reporter, Silent
 from hil.cell import Cell
-from hil.design.requirements import Requirement
-from hil.errors import CampaignFolderError, HilError, InputError
-from hil.identify.options import Options
-from hil.progress import Reporter, Silent
+from hil.control.link import MotionLink
+from hil.control.motion_watch import Stop, Unattended
+from hil.pipeline.options import Options
+from hil.precision.requirements import Requirement
 from identification.excitation import Excitation
 
 from .folder import LOCK, PAYLOADS, CampaignFolder
-from .link import MotionLink
-from .operator import Operator, RunWatch, Stop, Unattended
+from .operator import Operator, RunWatch
 from .plan import CampaignPlan
 from .rehearsal import Rehearsal
 from .rehearsing import SEED, rehearse
@@ -29,7 +30,7 @@ from .state import CampaignState
 from .status import CampaignStatus, status_of
 
 if TYPE_CHECKING:
-    from hil.identify import Identification
+    from hil.pipeline.run import Identification
 
 
 class Campaign(CampaignState):
@@ -77,8 +78,8 @@ class Campaign(CampaignState):
             InputError: there is no complete excitation yet, or the archives cannot be used.
             OutputError: the folder cannot be written to.
         """
-        from hil.identified_campaign import identify_campaign  # which loads matplotlib, as below
-        from hil.outcome import write_outcome
+        from hil.campaign.identified import identify_campaign
+        from hil.report.output_files import write_outcome
 
         reporter = reporter or Silent()
         identification = identify_campaign(self.folder.root, reporter, options or Options())
@@ -93,7 +94,7 @@ class Campaign(CampaignState):
             InputError: nothing can be identified yet.
             OutputError: the folder cannot be written to.
         """
-        from hil.outcome import rewrite_report
+        from hil.report.output_files import rewrite_report
 
         steps = {step.name: step.state for step in self.status().steps}
         if steps["identify"] == "done":

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import open_archive
-from hil.errors import ArchiveError
-from hil.recorded_campaign import load_record
+from hil.archive.recorded_campaign import load_record
+from hil.base.errors import ArchiveError
+from identification.model.motion import Motion
 
 from .errors import AgainstGravityError, DryRunError
 from .folder import CampaignFolder, save_record
@@ -187,10 +188,10 @@ class DryRunRecord:
         correlation = np.full(len(limit), np.nan)
         if slow:
             q, qd, torque = (np.concatenate(parts) for parts in zip(*slow, strict=True))
-            still = np.zeros_like(q)
+            rest = Motion.at_rest(q)
             model = cell.model
             rigid = np.where(model.friction_columns, 0.0, cell.nominal_values())
-            gravity = model.torque(rigid, q, still, still) + model.load_torque(q, still, still)
+            gravity = model.torque(rigid, rest) + model.load_torque(rest)
             correlation = agreement(gravity, torque, qd, model.moving(qd))
         joints = np.array(cell.joint_names)
         return cls(

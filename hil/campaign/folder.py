@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from hil.archive import ArchiveName
-from hil.errors import CampaignFolderError
-from hil.files import (
+from hil.archive.recorded_campaign import Below, Entry, Manifest, RecordedCampaign
+from hil.base.errors import CampaignFolderError
+from hil.base.files import (
     digest,
     file_digest,
     file_lock,
@@ -25,9 +26,8 @@ from hil.files import (
     write_atomically,
     write_output,
 )
-from hil.reading import open_file, parse_toml
-from hil.recorded_campaign import Below, Entry, Manifest, RecordedCampaign
-from hil.terminal_text import typed
+from hil.base.safe_input import open_file, parse_toml
+from hil.base.terminal_text import typed
 from identification.errors import ModelError
 from identification.model.urdf_text import urdf_tree
 

@@ -6,15 +6,15 @@ from contextlib import suppress
 from typing import Any, Final
 
 from hil.archive import open_archive
+from hil.base.errors import ArchiveError, CampaignFolderError
+from hil.base.terminal_text import typed
 from hil.cell import Cell
-from hil.errors import ArchiveError, CampaignFolderError
-from hil.terminal_text import typed
+from hil.control.connection import Connection, narrower_limits
+from hil.control.link import MotionLink
 
-from .connection import Connection, narrower_limits
 from .dry_run import DryRunRecord, not_accepted, yes_or_no
 from .errors import DryRunError, NotRehearsedError
 from .folder import CampaignFolder
-from .link import MotionLink
 from .rehearsal import Rehearsal
 from .runner import RunOptions
 from .state import CampaignState

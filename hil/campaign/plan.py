@@ -9,14 +9,16 @@ from math import isqrt
 from pathlib import Path
 from typing import Any, Final, Self
 
+from hil.base.errors import InputError
+from hil.base.files import write_atomically
+from hil.base.progress import Reporter
+from hil.base.safe_input import parse_json, read_text
 from hil.cell import Cell
+from hil.control.errors import MotionRefusedError
+from hil.control.motion_checks import MotionChecks, planned
+from hil.control.motions import moves_from_dict, moves_to_dict
 from hil.design import DesignSettings, preset, run_search
 from hil.design.advice import NoExcitationError, infeasible_text
-from hil.errors import InputError
-from hil.files import write_atomically
-from hil.motion_checks import MotionChecks, planned
-from hil.progress import Reporter
-from hil.reading import parse_json, read_text
 from identification.excitation import (
     RESCORE_PERIOD,
     Excitation,
@@ -27,8 +29,6 @@ from identification.excitation import (
 )
 from identification.excitation.excitation import trajectory_from_dict
 from planner import FourierSeries, PiecewiseCubic, PlanFile
-
-from .errors import MotionRefusedError
 
 LEAST: Final = 4  # Least population of a genetic search
 SLOWEST: Final = 0.5  # Smallest share of a joint's speed in the search: slow motions excite little
@@ -51,16 +51,6 @@ class PlannedMotion:
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Restore what `to_dict` returned (KeyError, TypeError, ValueError for other data)."""
         return cls(trajectory_from_dict(data["trajectory"]), moves_from_dict(data))
-
-
-def moves_to_dict(moves: PlanFile | None) -> dict[str, Any]:
-    """Return the entry `moves` of data, a plan file without its motion; {} without moves."""
-    return {} if moves is None else {"moves": replace(moves, trajectory=None).to_dict()}
-
-
-def moves_from_dict(data: Mapping[str, Any]) -> PlanFile | None:
-    """Return the entry `moves` of data, None if there is none."""
-    return PlanFile.from_dict(data["moves"]) if "moves" in data else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal, Self
 
-from hil.design.requirements import Requirement, requirements_from
-from hil.recorded_campaign import load_record
-from hil.terminal_text import plural
+from hil.archive.recorded_campaign import load_record
+from hil.base.terminal_text import plural
+from hil.precision.requirements import Requirement, requirements_from
 
 from .folder import save_record
 

@@ -21,15 +21,15 @@ from drivers.exchange.serving import ARM_MOVED
 from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive
 from hil.archive.header import REJECTED
 from hil.archive.repair import amend_outcome
+from hil.base.errors import ArchiveError
 from hil.cell import Cell
-from hil.errors import ArchiveError
+from hil.control.motions import CampaignMotion
 from identification.signals.recording import stuck
 from identification.signals.smoothing import STANDSTILL_WINDOW
 from identification.text import percentage
 from planner import FourierSeries, PiecewiseCubic
 
 from .folder import CampaignFolder
-from .motions import CampaignMotion
 
 Array = NDArray[np.float64]
 

@@ -6,33 +6,26 @@ import shutil
 from contextlib import suppress
 from typing import Final
 
+from hil.base.errors import CampaignFolderError, ExecutionError, HilError, OperatorStopError
+from hil.base.files import make_folder
+from hil.base.progress import Reporter
+from hil.base.version import software
+from hil.campaign.planned_motions import planned_motions, require_runnable
+from hil.campaign.rehearsal_criteria import SATURATED, of_currents, of_estimate, of_motions
+from hil.campaign.twin import Twin
 from hil.cell import Cell
-from hil.errors import CampaignFolderError, ExecutionError, HilError, OperatorStopError
-from hil.files import make_folder
-from hil.motion_checks import PLANNED_CURRENT
-from hil.progress import Reporter
-from hil.version import software
+from hil.control.errors import MotionFailedError
+from hil.control.motion_checks import PLANNED_CURRENT
+from hil.control.motion_watch import Stop, Unattended
+from hil.control.virtual_link import VirtualLink
 from sim_fixtures import SimulationError
 
-from .errors import MotionFailedError, RepetitionsRejectedError
-from .motions import planned_motions, require_runnable
-from .operator import RunWatch, Stop, Unattended
-from .rehearsal import (
-    AS_MODELLED,
-    CRITERIA,
-    EFFECTS,
-    SATURATED,
-    Criterion,
-    Rehearsal,
-    Twin,
-    of_currents,
-    of_estimate,
-    of_motions,
-)
+from .errors import RepetitionsRejectedError
+from .operator import RunWatch
+from .rehearsal import AS_MODELLED, CRITERIA, EFFECTS, Criterion, Rehearsal
 from .run import run_motions
 from .runner import RunOptions
 from .state import CampaignState
-from .virtual_link import VirtualLink
 
 REPETITIONS: Final = 3
 """Repetitions of the excitation: enough for their scatter, few enough for a minute."""

@@ -10,17 +10,17 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from hil.cell_link import cell_link
-from hil.motion_checks import MotionChecks
-from hil.progress import Reporter
+from hil.base.progress import Reporter
+from hil.campaign.reached_precision import PrecisionStage
+from hil.control.cell_link import cell_link
+from hil.control.connection import active_checks, narrower_limits
+from hil.control.link import MotionLink
+from hil.control.motion_checks import MotionChecks
+from hil.control.motions import CampaignMotion, StraightMoves, require_allowed
 
-from .connection import active_checks, narrower_limits
 from .dry_run import OVERRIDE, DryRunState
 from .gates import require_as_rehearsed, require_dry_run, require_gates
-from .link import MotionLink
-from .motions import CampaignMotion, StraightMoves, require_allowed
 from .operator import RunWatch
-from .precision import PrecisionStage
 from .quality import Rejected
 from .runner import RunArchives, Runner, RunOptions
 from .stages import DryRunStage, WarmUpStage

@@ -16,23 +16,23 @@ from numpy.typing import NDArray
 
 from hil.archive import ArchiveHeader, ArchiveSpec, open_archive
 from hil.archive.live import LiveView
+from hil.base.errors import ArchiveError
+from hil.base.progress import Reporter, Task
+from hil.base.safe_input import parse_json
+from hil.base.version import software
 from hil.cell import Cell
-from hil.design.requirements import Requirement
-from hil.errors import ArchiveError
-from hil.progress import Reporter, Task
-from hil.reading import parse_json
-from hil.recording import archive_spec, origin_of, with_present_date
-from hil.simulation import simulated_provenance
-from hil.version import software
+from hil.control.errors import MotionFailedError
+from hil.control.link import NOT_STARTED, MotionLink
+from hil.control.motions import REPEATED, CampaignMotion, StraightMoves, moves_to_dict, player_of
+from hil.control.record import archive_spec, origin_of, with_present_date
+from hil.control.simulation import simulated_provenance
+from hil.precision.requirements import Requirement
 from identification.excitation.excitation import trajectory_from_dict
 
 from .dry_run import OVERRIDE, SIMULATED, yes_or_no
-from .errors import MotionFailedError, RepetitionsRejectedError
+from .errors import RepetitionsRejectedError
 from .folder import CampaignFolder
-from .link import NOT_STARTED, MotionLink
-from .motions import REPEATED, CampaignMotion, StraightMoves, player_of
 from .operator import RunWatch
-from .plan import moves_to_dict
 from .quality import ArchiveReview, Problem
 from .state import CampaignState
 

@@ -6,11 +6,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 
-from hil.errors import OperatorStopError
-from hil.progress import Reporter
+from hil.base.errors import OperatorStopError
+from hil.base.progress import Reporter
+from hil.control.motions import CampaignMotion
 
 from .dry_run import OVERRIDE, DryRunRecord, DryRunState, is_from, not_accepted
-from .motions import CampaignMotion
 from .operator import RunWatch
 from .quality import Problem
 from .runner import RunArchives, Runner, RunOptions

@@ -10,16 +10,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import Self
 
+from hil.base.errors import CampaignFolderError, OutputError
+from hil.base.files import make_folder, write_atomically
+from hil.base.safe_input import path_exists, remedy_for_missing
+from hil.campaign.planned_motions import planned_motions, require_runnable
 from hil.cell import Cell
+from hil.control.motion_checks import MotionChecks
+from hil.control.motions import CampaignMotion
 from hil.design.run import DESIGN_FILES
-from hil.errors import CampaignFolderError, OutputError
-from hil.files import make_folder, write_atomically
-from hil.motion_checks import MotionChecks
-from hil.reading import path_exists, remedy_for_missing
 from identification.excitation import Excitation
 
 from .folder import CampaignFolder
-from .motions import CampaignMotion, planned_motions, require_runnable
 from .plan import CampaignPlan, plan_around
 from .precision_record import PrecisionRecord
 

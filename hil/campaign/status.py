@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from hil.archive import ArchiveName, open_archive
+from hil.base.errors import HilError
+from hil.base.safe_input import path_exists
+from hil.base.terminal_text import plural, typed
 from hil.cell import Cell
 from hil.design.result import RESULT, DesignResult
-from hil.errors import HilError
-from hil.reading import path_exists
-from hil.results import ConductResult, PrecisionResult, Results, StepResult
-from hil.terminal_text import plural, typed
+from hil.results.results import ConductResult, PrecisionResult, Results, StepResult
 from identification.text import percentage
 
 from .dry_run import DryRunRecord

@@ -16,9 +16,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hil.base.files import write_files
+from hil.base.version import software
 from hil.cell import Cell
-from hil.files import write_files
-from hil.version import software
 from identification.excitation import Excitation
 from identification.text import percentage
 from planner import Trajectory, to_csv

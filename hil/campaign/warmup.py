@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import open_archive
+from hil.archive.recorded_campaign import load_record
 from hil.cell import Cell
-from hil.recorded_campaign import load_record
+from identification.model.motion import Motion
 from identification.text import percentage
 from planner import FourierSeries, PiecewiseCubic
 
@@ -171,10 +172,10 @@ class FrictionMeter:
         values = cell.nominal_values()
         rigid = np.where(model.friction_columns, 0.0, values)
         times = np.arange(0.0, trajectory.duration, cell.period)
-        q, qd, qdd = trajectory.sample(times)
-        torque = model.torque(rigid, q, qd, qdd) + model.load_torque(q, qd, qdd)
-        self._rigid_work = (torque * qd).sum(axis=0) * cell.period
-        self._way = np.abs(qd).sum(axis=0) * cell.period
+        motion = Motion(times, *trajectory.sample(times))
+        torque = model.torque(rigid, motion) + model.load_torque(motion)
+        self._rigid_work = (torque * motion.velocity).sum(axis=0) * cell.period
+        self._way = np.abs(motion.velocity).sum(axis=0) * cell.period
 
     def measure(self, path: Path) -> Array:
         """Return the mean friction torque of each joint (n,) [N·m]; NaN where it is unknown."""

@@ -11,9 +11,9 @@ from typing import Final
 
 from pydantic import BaseModel, ConfigDict
 
+from hil.base.errors import InputError
+from hil.base.terminal_text import typed
 from hil.cell.gripper import links_of
-from hil.errors import InputError
-from hil.terminal_text import typed
 
 LINKS_REMEDY: Final = "name links of the URDF, the tip farther from the root than the base"
 _MOST_NAMES: Final = 12

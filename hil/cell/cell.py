@@ -17,10 +17,10 @@ from drivers.drive_train import DriveTrain
 from drivers.errors import DriverError
 from drivers.guard import GuardLimits
 from drivers.transports.base import TransportError, TransportSpec
-from hil.reading import parse_toml, read_text, remedy_for_missing
-from hil.terminal_text import typed
-from identification.excitation import Box, Workspace
+from hil.base.safe_input import parse_toml, read_text, remedy_for_missing
+from hil.base.terminal_text import typed
 from identification.model.robot import RobotModel
+from identification.model.workspace import Box, Workspace
 from planner import JointLimits
 
 from .errors import CellError, first_error, require_known

@@ -8,8 +8,8 @@ from typing import Any, Final, NamedTuple, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from hil.base.errors import InputError
 from hil.cell.field_error import FieldError
-from hil.errors import InputError
 
 
 class CellError(InputError):

@@ -22,8 +22,8 @@ from pydantic import (
 
 from drivers.transports.base import TransportSpec
 from drivers.transports.udp import UdpSpec
+from hil.base.safe_input import parse_port
 from hil.cell.field_error import FieldError
-from hil.reading import parse_port
 
 # Strict: TOML has types, so "yes" and "3" are errors.
 Number = Annotated[FiniteFloat, Field(strict=True)]

@@ -13,9 +13,9 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Array as List
 from tomlkit.items import Item, Table
 
-from hil.errors import InputError
-from hil.reading import parse_toml
-from hil.toml_text import inline
+from hil.base.errors import InputError
+from hil.base.safe_input import parse_toml
+from hil.base.toml_text import inline
 from identification.model.urdf_text import urdf_tree
 
 

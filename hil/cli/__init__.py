@@ -25,11 +25,11 @@ from rich.console import Console
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
+from hil.base.errors import DISK_REFUSES, HilError, InputError, OperatorStopError
+from hil.base.startup_interrupt import leave_if_interrupted
+from hil.base.terminal_text import printable
+from hil.base.version import software
 from hil.cli.suggestions import OTHER_COMMANDS, improve, with_present_names
-from hil.errors import DISK_REFUSES, HilError, InputError, OperatorStopError
-from hil.importing import leave_if_interrupted
-from hil.terminal_text import printable
-from hil.version import software
 
 INTERNAL = 1
 """Exit status of an internal error, or of a disk that cannot be written."""

@@ -12,10 +12,10 @@ import typer
 
 from hil.archive.check import ArchiveCheck, Overview, archive_files, check_archive, read_overview
 from hil.archive.repair import repair as repair_archive
+from hil.base.errors import ArchiveError, InputError
+from hil.base.terminal_text import printable, typed
 from hil.cli import exit_code_of
 from hil.cli.arguments import JsonOption, print_json
-from hil.errors import ArchiveError, InputError
-from hil.terminal_text import printable, typed
 
 app = typer.Typer(help="Inspect, check and repair archives.", no_args_is_help=True)
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hil.errors import InputError
+from hil.base.errors import InputError
 
 ARM = "Arm"
 CHANNELS = "Channels of logs and bags"

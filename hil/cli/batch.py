@@ -11,17 +11,17 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from hil.batch import run
+from hil.base.files import convert_write_errors, make_folder
+from hil.base.progress import reporter as make_reporter
+from hil.base.terminal_text import plural, printable
+from hil.batch import graph as run
 from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster, SkippedArchive
 from hil.batch.estimates import BatchEstimate, BatchEstimator, relative_error
-from hil.batch.run import BatchResult
+from hil.batch.graph import BatchResult
 from hil.batch.table import write_tables
 from hil.cli.arguments import JsonOption, QuietOption, print_json, with_options
 from hil.cli.identify_options import Identifying
-from hil.files import convert_write_errors, make_folder
-from hil.progress import reporter as make_reporter
-from hil.terminal_text import plural, printable
 from identification.text import percentage
 
 SOME_BROKEN: Final = 5

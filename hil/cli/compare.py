@@ -7,12 +7,12 @@ from typing import Annotated, Final
 
 import typer
 
-from hil import compare as comparing
+from hil.base.files import make_folder, write_files
+from hil.base.progress import reporter as make_reporter
+from hil.base.terminal_text import printable
 from hil.batch.cluster import Cluster
 from hil.cli.arguments import JsonOption, QuietOption, print_json
-from hil.files import make_folder, write_files
-from hil.progress import reporter as make_reporter
-from hil.terminal_text import printable
+from hil.compare import comparison as comparing
 from identification.text import unit_text
 
 CHANGED: Final = 5
@@ -41,7 +41,7 @@ def compare(
     with Cluster(reporter=reporter) as cluster:
         comparison = comparing.compare(campaigns, cluster, reporter)
     if output is not None:
-        from hil.report.changes import comparison_page  # figures are slow to import
+        from hil.compare.changes_page import comparison_page  # figures are slow to import
 
         make_folder(output.parent)
         write_files(output.parent, {output.name: comparison_page(comparison)})

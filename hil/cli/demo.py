@@ -9,6 +9,9 @@ from typing import Annotated
 
 import typer
 
+from hil.base.errors import ExecutionError, InputError, OperatorStopError
+from hil.base.progress import Reporter
+from hil.base.progress import reporter as make_reporter
 from hil.campaign import (
     Campaign,
     CampaignFolder,
@@ -17,16 +20,14 @@ from hil.campaign import (
     plan_around,
     stop_on_interrupt,
 )
-from hil.campaign.motions import require_runnable
+from hil.campaign.planned_motions import require_runnable
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption
 from hil.cli.verdict import finish
+from hil.control.simulation import simulated_link, simulated_provenance
 from hil.design import load_design
-from hil.errors import ExecutionError, InputError, OperatorStopError
-from hil.outcome import FILES, REPORT, RESULTS, SERIES
-from hil.progress import Reporter
-from hil.progress import reporter as make_reporter
-from hil.simulation import simulated_link, simulated_provenance
+from hil.report.output_files import FILES, REPORT, SERIES
+from hil.results.provenance import RESULTS
 from sim_fixtures.ns16 import CELL_PATH
 
 

@@ -11,28 +11,28 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from hil.base.errors import HilError, InputError, OperatorStopError
+from hil.base.progress import Reporter, say
+from hil.base.progress import reporter as make_reporter
+from hil.base.terminal_text import printable, typed
 from hil.campaign.campaign import campaign_of_design, require_replaceable
-from hil.campaign.operator import stop_on_interrupt
 from hil.campaign.plan import quick_settings, validation_motions
 from hil.campaign.trajectory_files import write_trajectories
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
 from hil.cli.weigh import centre_from
+from hil.control.motion_checks import MotionChecks
+from hil.control.motion_watch import stop_on_interrupt
 from hil.design import METHODS, Method, load_settings, preset
 from hil.design.advice import criteria_text
-from hil.design.given import given_of
-from hil.design.precision import PrecisionDesign, payload_search, short_search
-from hil.design.requirements import requirements_from
 from hil.design.run import Designed, DesignFolder, run_design
 from hil.design.settings import preset_text
-from hil.errors import HilError, InputError, OperatorStopError
-from hil.motion_checks import MotionChecks
-from hil.payload_campaign import assumed_payload, loaded_cell, payload_options
 from hil.plots import save
 from hil.plots.design_picture import draw_design
-from hil.progress import Reporter, say
-from hil.progress import reporter as make_reporter
-from hil.terminal_text import printable, typed
+from hil.precision.forecast import PrecisionDesign, payload_search, short_search
+from hil.precision.given_recordings import given_of
+from hil.precision.requirements import requirements_from
+from hil.weighing.payload_campaign import assumed_payload, loaded_cell, payload_options
 from identification.model.payload import Payload
 
 

@@ -8,11 +8,11 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from hil.base.progress import reporter
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, print_json
 from hil.cli.verdict import NOT_GOOD
 from hil.doctor.diagnosis import as_json, examine, show
-from hil.progress import reporter
 
 QUICK_SECONDS = 5.0
 

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from hil.base.progress import reporter as make_reporter
+from hil.base.progress import say
 from hil.cli.arguments import (
     ArchivesArgument,
     JsonOption,
@@ -16,7 +18,7 @@ from hil.cli.arguments import (
 )
 from hil.cli.identify_options import FEW, EstimatorOption, Identifying
 from hil.cli.verdict import NOT_GOOD
-from hil.exporting import (
+from hil.export.model_files import (
     Exported,
     ExportedEnsemble,
     FormatName,
@@ -24,10 +26,8 @@ from hil.exporting import (
     export_ensemble,
     export_model,
 )
-from hil.identified_model import read_or_identify
-from hil.identify import Options
-from hil.progress import reporter as make_reporter
-from hil.progress import say
+from hil.pipeline.identified_model import read_or_identify
+from hil.pipeline.options import Options
 
 
 @with_options(Identifying, "how", but=FEW)

@@ -7,16 +7,16 @@ from typing import Annotated
 
 import typer
 
+from hil.base.output_folder import require_possible
+from hil.base.progress import reporter as make_reporter
+from hil.base.safe_input import path_exists
 from hil.cli.arguments import JsonOption, QuietOption, with_options
 from hil.cli.identify_options import EstimatorOption, Identifying
 from hil.cli.imports import Described, Reading
 from hil.cli.verdict import finish
-from hil.identified_arm import identify_recordings, write_arm
+from hil.identified.identified_arm import identify_recordings, write_arm
 from hil.importers.recording import is_archive
-from hil.outcome import REPORT
-from hil.output_folder import require_possible
-from hil.progress import reporter as make_reporter
-from hil.reading import path_exists
+from hil.report.output_files import REPORT
 
 RecordingsArgument = Annotated[
     list[Path],

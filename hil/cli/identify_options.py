@@ -9,10 +9,10 @@ from typing import Annotated, Any, Final, Literal, cast
 import numpy as np
 import typer
 
+from hil.base.errors import InputError
 from hil.cli.arguments import ESTIMATION
-from hil.errors import InputError
-from hil.identify.estimators import ESTIMATORS, Estimator
-from hil.identify.options import Options, friction_from
+from hil.pipeline.estimators import ESTIMATORS, Estimator
+from hil.pipeline.options import Options, friction_from
 from identification.rollout.servo import Servo
 
 LONGEST_DELAY: Final = 0.5

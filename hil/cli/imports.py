@@ -10,6 +10,10 @@ from typing import Annotated
 
 import typer
 
+from hil.base.errors import InputError
+from hil.base.files import write_output
+from hil.base.progress import say
+from hil.base.terminal_text import printable
 from hil.cell.arms import Links
 from hil.cli.arguments import (
     ARM,
@@ -23,29 +27,15 @@ from hil.cli.arguments import (
     print_json,
     with_options,
 )
-from hil.errors import InputError
-from hil.files import write_output
-from hil.identify.options import friction_from
-from hil.importers import (
-    STANDARD_GRAVITY,
-    Clock,
-    Effort,
-    Robot,
-    Use,
-    convention_of,
-)
 from hil.importers.bag_map import BagMap
 from hil.importers.channels import CHANNEL_NAMES
 from hil.importers.column_map import ready_map, ready_maps
+from hil.importers.dh import convention_of
 from hil.importers.messages import sentence
-from hil.importers.recording import (
-    ImportedRecording,
-    ImportOptions,
-    import_bag,
-    import_recording,
-)
-from hil.progress import say
-from hil.terminal_text import printable
+from hil.importers.recording import ImportedRecording, ImportOptions, import_bag, import_recording
+from hil.importers.robot import STANDARD_GRAVITY, Robot, Use
+from hil.importers.rosbag2 import Clock, Effort
+from hil.pipeline.options import friction_from
 from identification import FrictionLaw
 
 app = typer.Typer(

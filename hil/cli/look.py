@@ -9,9 +9,11 @@ from typing import Annotated
 
 import typer
 
+from hil.base.files import write_output
+from hil.base.progress import say
+from hil.base.terminal_text import printable
 from hil.cli.arguments import JsonOption, print_json, with_options
 from hil.cli.imports import Described, Reading
-from hil.files import write_output
 from hil.importers.conclusions import Certainty
 from hil.look import Choice, Group, Look, Row, look_at
 from hil.look.maps import with_entries
@@ -23,8 +25,6 @@ from hil.look.messages import (
     row_text,
     setting_text,
 )
-from hil.progress import say
-from hil.terminal_text import printable
 from identification.text import percentage
 
 IN_DOUBT = 2

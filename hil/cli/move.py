@@ -13,19 +13,25 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from hil.base.errors import (
+    ControllerError,
+    ExecutionError,
+    InputError,
+    OperatorStopError,
+    UnsafeError,
+)
+from hil.base.files import make_folder
+from hil.base.progress import Task, say
+from hil.base.progress import reporter as make_reporter
+from hil.base.terminal_text import printable
 from hil.campaign import Campaign, MotionLink, stop_on_interrupt
-from hil.campaign.connection import active_checks, narrower_limits
-from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell import AngleFrame, Cell
-from hil.cell_link import cell_link
 from hil.cli.arguments import JsonOption
-from hil.errors import ControllerError, ExecutionError, InputError, OperatorStopError, UnsafeError
-from hil.files import make_folder
-from hil.move import THERE, CheckedMove, axis_alone, plan_move, posture, send, turned
-from hil.progress import Task, say
-from hil.progress import reporter as make_reporter
-from hil.recording import archive_path
-from hil.terminal_text import printable
+from hil.control.cell_link import cell_link
+from hil.control.connection import active_checks, narrower_limits
+from hil.control.motion_watch import MotionProgress, OperatorRequest
+from hil.control.move import THERE, CheckedMove, axis_alone, plan_move, posture, send, turned
+from hil.control.record import archive_path
 
 
 def move(

@@ -9,7 +9,11 @@ from typing import Annotated
 import typer
 
 from drivers.transports.udp import UdpSpec
-from hil.campaign import stop_on_interrupt
+from hil.base.errors import InputError
+from hil.base.files import convert_write_errors, write_atomically
+from hil.base.progress import say
+from hil.base.safe_input import parse_port
+from hil.base.terminal_text import typed
 from hil.cli.arguments import (
     ARM,
     ConventionOption,
@@ -20,9 +24,8 @@ from hil.cli.arguments import (
     figures,
     print_json,
 )
-from hil.errors import InputError
-from hil.files import convert_write_errors, write_atomically
-from hil.importers import convention_of
+from hil.control.motion_watch import stop_on_interrupt
+from hil.importers.dh import convention_of
 from hil.new import (
     CellValues,
     cell_of_dh,
@@ -31,9 +34,6 @@ from hil.new import (
     from_init,
     read_init,
 )
-from hil.progress import say
-from hil.reading import parse_port
-from hil.terminal_text import typed
 
 PORT = 1000
 """Default UDP port of C4G Open."""

@@ -8,13 +8,13 @@ from typing import Annotated
 
 import typer
 
+from hil.base.progress import reporter as make_reporter
 from hil.cli.arguments import JsonOption, QuietOption, figures
 from hil.cli.identify_options import DelayOption, delay_from
 from hil.cli.verdict import NOT_GOOD
-from hil.identify.options import Options
-from hil.identify.payload_by_model import weigh_by_model
-from hil.identify.payload_run import find_payload
-from hil.progress import reporter as make_reporter
+from hil.payload.payload_by_model import weigh_by_model
+from hil.payload.payload_run import find_payload
+from hil.pipeline.options import Options
 
 
 def payload(

@@ -11,13 +11,13 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from hil.base.errors import InputError
+from hil.base.safe_input import read_input
+from hil.base.terminal_text import printable
 from hil.cell import AngleFrame, Cell
 from hil.cli.arguments import JsonOption, exactly_one, print_json
-from hil.errors import InputError
-from hil.move import random_via_points
+from hil.control.move import random_via_points
 from hil.plots import check_format, draw_plan, save
-from hil.reading import read_input
-from hil.terminal_text import printable
 from planner.moves import MotionPlan, Move, plan_moves
 from planner.worker import in_child
 

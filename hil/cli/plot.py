@@ -8,12 +8,12 @@ from typing import Annotated
 import typer
 
 from hil.archive.check import archive_files
+from hil.base.files import make_folder
+from hil.base.progress import say
+from hil.base.terminal_text import printable
 from hil.cli.arguments import JsonOption, print_json
-from hil.files import make_folder
 from hil.plots import check_format, save
 from hil.plots.archive_view import draw_archive, view_of
-from hil.progress import say
-from hil.terminal_text import printable
 
 
 def plot(

@@ -13,14 +13,14 @@ import typer
 
 from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded
+from hil.base.errors import ControllerError, HilError, OperatorStopError
+from hil.base.progress import progress_console, put, say
 from hil.campaign import Progress, stop_on_interrupt
-from hil.campaign.live_link import LiveLink
 from hil.cell import AngleFrame, Cell
 from hil.cli.arguments import JsonOption, QuietOption, print_json
-from hil.errors import ControllerError, HilError, OperatorStopError
-from hil.progress import progress_console, put, say
-from hil.recording import archive_path
-from hil.recording import record as record_motion
+from hil.control.live_link import LiveLink
+from hil.control.record import archive_path
+from hil.control.record import record as record_motion
 
 Kind = Annotated[Literal["excitation", "validation", "standstill"], typer.Option(metavar="USE")]
 LINE_PERIOD = 5.0

@@ -6,12 +6,12 @@ from typing import Annotated
 
 import typer
 
+from hil.base.progress import reporter as make_reporter
+from hil.base.progress import say
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.rehearsal import Rehearsal
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption
 from hil.cli.verdict import NOT_GOOD
-from hil.progress import reporter as make_reporter
-from hil.progress import say
 
 
 def rehearse(

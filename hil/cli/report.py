@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import typer
 
+from hil.base.progress import reporter as make_reporter
 from hil.campaign import Campaign
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, print_json
-from hil.progress import reporter as make_reporter
-from hil.results import Results
+from hil.results.results import Results
 
 
 def report(

@@ -7,6 +7,10 @@ from typing import Annotated
 
 import typer
 
+from hil.base.errors import InputError
+from hil.base.files import make_folder
+from hil.base.progress import Reporter, say
+from hil.base.progress import reporter as make_reporter
 from hil.cli.arguments import (
     ArchivesArgument,
     JsonOption,
@@ -16,19 +20,22 @@ from hil.cli.arguments import (
 )
 from hil.cli.identify_options import EstimatorOption, Identifying, servo_from
 from hil.cli.verdict import NOT_GOOD
-from hil.errors import InputError
-from hil.files import make_folder
-from hil.identified_model import read_or_identify
-from hil.identify import Options
-from hil.outcome import REPORT
+from hil.pipeline.identified_model import read_or_identify
+from hil.pipeline.options import Options
 from hil.plots.chart_picture import draw_charts
 from hil.plots.plan_picture import save
-from hil.progress import Reporter, say
-from hil.progress import reporter as make_reporter
-from hil.report.rollout import overview_charts, overview_legends
-from hil.rollout import PICTURE, POLISHED, Rollout, RolloutOptions, roll_out, write_rollout
-from hil.rollout_result import ROLLOUT
-from hil.servo_rollout import roll_out_servo, without_torque
+from hil.report.output_files import REPORT
+from hil.report.rollout_section import overview_charts, overview_legends
+from hil.results.rollout_result import ROLLOUT
+from hil.rollout.servo_rollout import roll_out_servo, without_torque
+from hil.rollout.torque_rollout import (
+    PICTURE,
+    POLISHED,
+    Rollout,
+    RolloutOptions,
+    roll_out,
+    write_rollout,
+)
 
 
 @with_options(Identifying, "how")

@@ -12,11 +12,14 @@ import typer
 
 from hil.archive import ArchiveName
 from hil.archive.live import LiveView
+from hil.base.errors import ExecutionError, InputError, OperatorStopError
+from hil.base.progress import reporter as make_reporter
+from hil.base.progress import say
 from hil.campaign import Campaign, MotionFailedError, stop_on_interrupt
 from hil.campaign.folder import CampaignFolder
-from hil.campaign.precision import requirements_of
+from hil.campaign.reached_precision import requirements_of
 from hil.campaign.run import RunResult
-from hil.cell_link import require_real_time
+from hil.campaign.screen import Screen
 from hil.cli.arguments import (
     CampaignArgument,
     JsonOption,
@@ -26,12 +29,9 @@ from hil.cli.arguments import (
 )
 from hil.cli.verdict import NOT_GOOD, as_json, finish
 from hil.cli.weigh import Weighing, weigh
-from hil.design.requirements import Requirement
-from hil.errors import ExecutionError, InputError, OperatorStopError
-from hil.payload_campaign import assumes_payload
-from hil.progress import reporter as make_reporter
-from hil.progress import say
-from hil.screen import Screen
+from hil.control.cell_link import require_real_time
+from hil.precision.requirements import Requirement
+from hil.weighing.payload_campaign import assumes_payload
 
 
 @with_options(Weighing, "weighing")

@@ -11,19 +11,25 @@ from typing import Annotated, Final, Literal
 
 import typer
 
+from hil.base.errors import InputError
+from hil.base.progress import say_at_once
+from hil.base.terminal_text import plural, printable
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, print_json
-from hil.errors import InputError
-from hil.move import joint_index
-from hil.progress import say_at_once
-from hil.serving import Served, buttons, open_controller_link, realtime_process, serve_session
-from hil.simulation import (
+from hil.control.move import joint_index
+from hil.control.serving import (
+    Served,
+    buttons,
+    open_controller_link,
+    realtime_process,
+    serve_session,
+)
+from hil.control.simulation import (
     OWN_SPEED,
     controller_settings,
     own_postures,
     simulated_controller,
 )
-from hil.terminal_text import plural, printable
 from sim_fixtures import ControllerSettings, Phase, SimulatedController
 from sim_fixtures.faults import parse_fault, split_faults
 from sim_fixtures.serve import PATIENCE, Latencies, Request, ServeCounts

@@ -6,11 +6,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from hil.base.progress import put
+from hil.base.terminal_text import printable
 from hil.campaign import Campaign
 from hil.campaign.status import CampaignStatus
 from hil.cli.arguments import CampaignArgument, JsonOption, print_json
-from hil.progress import put
-from hil.terminal_text import printable
 
 _MARKS = {"done": ("done", "green"), "next": ("next", "bold yellow"), "blocked": ("blocked", "dim")}
 

@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
+from hil.base.errors import OperatorStopError
+from hil.base.progress import reporter as make_reporter
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, print_json
-from hil.errors import OperatorStopError
-from hil.progress import reporter as make_reporter
 from hil.study import run_study, study_settings
 
 

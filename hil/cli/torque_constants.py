@@ -9,14 +9,14 @@ from typing import Annotated, Any
 import tomlkit
 import typer
 
+from hil.base.errors import InputError
+from hil.base.progress import reporter as make_reporter
+from hil.base.toml_text import comment_lines, inline
 from hil.cli.arguments import JsonOption, QuietOption, numbers, print_json
 from hil.cli.identify_options import delay_from
 from hil.cli.verdict import NOT_GOOD
-from hil.errors import InputError
-from hil.identify.gain_run import GainsFound, find_gains
-from hil.identify.sources import archives_in
-from hil.progress import reporter as make_reporter
-from hil.toml_text import comment_lines, inline
+from hil.pipeline.gain_run import GainsFound, find_gains
+from hil.pipeline.sources import archives_in
 from identification.model.payload import Payload
 
 

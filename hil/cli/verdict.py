@@ -10,8 +10,8 @@ from typing import Final
 
 import typer
 
-from hil.progress import say
-from hil.results import JointJudgement, Results
+from hil.base.progress import say
+from hil.results.results import JointJudgement, Results
 from identification.text import percentage
 
 NOT_GOOD = 5

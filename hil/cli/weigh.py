@@ -10,15 +10,21 @@ from typing import Annotated, Any, Final, Literal
 import typer
 from rich.console import Console
 
+from hil.base.errors import InputError
+from hil.base.progress import reporter as make_reporter
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.run import RunResult
+from hil.campaign.screen import can_read, confirmed
 from hil.cli.arguments import PAYLOAD, numbers, print_json
 from hil.cli.verdict import NOT_GOOD
-from hil.design.requirements import Requirement
-from hil.errors import InputError
-from hil.payload_campaign import CENTRE, Execute, Mounting, PayloadCampaign, assumed_payload
-from hil.progress import reporter as make_reporter
-from hil.screen import can_read, confirmed
+from hil.precision.requirements import Requirement
+from hil.weighing.payload_campaign import (
+    CENTRE,
+    Execute,
+    Mounting,
+    PayloadCampaign,
+    assumed_payload,
+)
 from identification.model.payload import Payload
 
 _ANSWER: Final = "Type yes when the arm may move; anything else ends the run: "

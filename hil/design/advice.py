@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import Final
 
+from hil.base.errors import UnsafeError
 from hil.cell import AngleFrame
-from hil.errors import UnsafeError
-from hil.motion_checks import always_so, violation_text
+from hil.control.motion_checks import always_so, violation_text
 from identification import excitation
 from identification.model.kinematics import Chain
 

@@ -8,7 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import AngleFrame, Cell
-from hil.motion_checks import always_so, collision_checker, current_model, planned, violation_text
+from hil.control.motion_checks import (
+    always_so,
+    collision_checker,
+    current_model,
+    planned,
+    violation_text,
+)
 from identification.excitation import (
     CollisionChecker,
     Constraints,
@@ -52,14 +58,14 @@ def problem_of(
             None,
             "names recordings, and their information was not read",
             field="objective.given",
-            remedy="pass given = hil.design.given.given_of(cell, paths)",
+            remedy="pass given = hil.precision.given_recordings.given_of(cell, paths)",
         )
     if settings.objective.precision and precision is None:
         raise SettingsError(
             None,
             "names requirements, and what they stand for was not computed",
             field="objective.precision",
-            remedy="pass precision = hil.design.precision.PrecisionDesign.of(...).precision(30)",
+            remedy="pass precision = hil.precision.forecast.PrecisionDesign.of(...).precision(30)",
         )
     checker = collision_checker(cell) if constraints.collision else None
     currents = planned(current_model(cell)) if constraints.current else None
@@ -101,10 +107,9 @@ def _require_start(
         setting = "home_deg in [campaign]"
     else:
         return
-    zero = np.zeros_like(posture[None])
     frame = AngleFrame.of(cell)
     contact = None if checker is None else clearance(checker, posture[None])
-    exceeded = currents.check(Motion(np.zeros(1), posture[None], zero, zero)) if currents else []
+    exceeded = currents.check(Motion.at_rest(posture[None])) if currents else []
     if checker is not None and contact is not None:
         reason = violation_text(contact, frame)
         remedy = always_so(contact, checker) or f"correct [workspace] or {setting}"

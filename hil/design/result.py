@@ -11,12 +11,12 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.base.errors import InputError
+from hil.base.files import json_digest, write_atomically
+from hil.base.safe_input import read_text, remedy_for_missing
+from hil.base.toml_text import Angles, from_text, to_text
+from hil.base.version import software
 from hil.cell import Cell
-from hil.errors import InputError
-from hil.files import json_digest, write_atomically
-from hil.reading import read_text, remedy_for_missing
-from hil.toml_text import Angles, from_text, to_text
-from hil.version import software
 from identification.excitation import (
     Criteria,
     Design,

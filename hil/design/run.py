@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
+from hil.base.errors import HilError, InputError, OperatorStopError, UnsafeError
+from hil.base.files import convert_write_errors, json_digest, lock_folder, write_atomically
+from hil.base.progress import Reporter
+from hil.base.safe_input import open_file
+from hil.base.toml_text import to_text
 from hil.cell import AngleFrame, Cell
-from hil.errors import HilError, InputError, OperatorStopError, UnsafeError
-from hil.files import convert_write_errors, json_digest, lock_folder, write_atomically
-from hil.motion_checks import violation_text
-from hil.progress import Reporter
-from hil.reading import open_file
-from hil.toml_text import to_text
+from hil.control.motion_checks import violation_text
 from identification import excitation
 
 from .advice import criteria_text, infeasible_text, no_excitation

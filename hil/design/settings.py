@@ -13,11 +13,11 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
+from hil.base.errors import InputError
+from hil.base.safe_input import parse_toml, read_text
 from hil.cell.errors import first_error
 from hil.cell.field_error import FieldError
 from hil.cell.schema import Choice, NonNegative, Number, Positive, Table, Whole, field
-from hil.errors import InputError
-from hil.reading import parse_toml, read_text
 from identification.excitation import METHODS, Method
 
 Share = Annotated[Number, Field(ge=0, le=1)]

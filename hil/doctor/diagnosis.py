@@ -19,8 +19,8 @@ from scipy.special import gammaincinv
 
 from drivers.child_process import ChildProcess
 from drivers.exchange.realtime import RealTimeReport
-from hil.progress import Reporter
-from hil.terminal_text import printable
+from hil.base.progress import Reporter
+from hil.base.terminal_text import printable
 
 from .checks import (
     DiskTrial,

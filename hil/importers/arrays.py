@@ -14,14 +14,14 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from hil.errors import SourceError
+from hil.base.errors import SourceError
+from hil.base.safe_input import open_file
 from hil.importers import mcap_messages
 from hil.importers.column_map import Column
 from hil.importers.conclusions import LeftOut
 from hil.importers.document_messages import ENCODINGS, columns_of_trees, trees
 from hil.importers.matlab import NUMBERS, lost_bytes, mat_array, mat_shapes, script_matrices
 from hil.importers.ros_messages import MessageError, columns_of, decoded, typestore_of
-from hil.reading import open_file
 
 Array = NDArray[np.float64]
 

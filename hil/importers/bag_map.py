@@ -8,13 +8,13 @@ from typing import Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from hil.base.errors import SourceError
+from hil.base.safe_input import parse_toml
+from hil.base.toml_text import to_text
 from hil.cell.arms import Links
 from hil.cell.errors import first_error
-from hil.errors import SourceError
 from hil.importers.column_map import map_text
 from hil.importers.rosbag2 import Clock, Effort
-from hil.reading import parse_toml
-from hil.toml_text import to_text
 
 _COMMENT: Final = "How hil read the joint states of the bag; joints by their names"
 _DOCUMENTATION: Final = "docs/bring-your-own-robot.md"

@@ -18,12 +18,12 @@ from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.typesys import Stores, get_typestore
 
 from hil.archive.container import MOST_INFLATION
-from hil.errors import SourceError
+from hil.base.errors import SourceError
+from hil.base.safe_input import open_file, read_text
+from hil.base.terminal_text import typed
 from hil.importers import mcap_messages
 from hil.importers.mcap_messages import Topic
 from hil.importers.ros_messages import MessageError, decoded, definitions_of, typestore_of
-from hil.reading import open_file, read_text
-from hil.terminal_text import typed
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

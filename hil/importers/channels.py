@@ -15,7 +15,7 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.errors import SourceError
+from hil.base.errors import SourceError
 from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.bags import SUFFIXES, open_bag
 from hil.importers.column_map import Format

@@ -13,12 +13,12 @@ from typing import Annotated, Final, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
+from hil.base.errors import SourceError
+from hil.base.safe_input import parse_toml, path_exists, read_text, remedy_for_missing
 from hil.cell.arms import Links
 from hil.cell.errors import first_error
 from hil.cell.field_error import FieldError
-from hil.errors import SourceError
 from hil.importers.units import PER_CENT, UNITS, names_of_units
-from hil.reading import parse_toml, path_exists, read_text, remedy_for_missing
 
 KINEMATIC: Final = ("position", "velocity", "commanded_position")
 """Quantities of the motion."""

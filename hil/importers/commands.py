@@ -19,7 +19,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from hil.errors import SourceError
+from hil.base.errors import SourceError
 from hil.importers.bags import Bag, BagMessage
 from hil.importers.conclusions import Conclusion, DifferentCommands, KnownCommands, NotCommands
 from hil.importers.mcap_messages import Topic

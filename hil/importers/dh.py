@@ -9,8 +9,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Final, Literal, NamedTuple, cast, get_args
 
-from hil.errors import InputError
-from hil.reading import read_input
+from hil.base.errors import InputError
+from hil.base.safe_input import read_input
 
 Convention = Literal["standard", "modified"]
 

@@ -15,8 +15,8 @@ import scipy
 from numpy.typing import NDArray
 
 from hil.archive import Samples
+from hil.base.errors import SourceError
 from hil.cell.text import UrdfLimits, urdf_limits
-from hil.errors import SourceError
 from hil.importers.conclusions import (
     Conclusion,
     ConstantPositions,
@@ -42,6 +42,7 @@ from hil.importers.conclusions import (
 from hil.importers.messages import problem_of, remedy_of
 from hil.importers.publishers import APART, alternating_samples
 from hil.importers.stamps import FASTEST, SLOWEST
+from identification.model.motion import Motion
 from identification.model.urdf_text import urdf_tree
 from identification.signals.clock import time_base
 from identification.signals.recording import STUCK_MOVEMENT, unwrap
@@ -59,8 +60,8 @@ _BLOCK: Final = 0.05  # s, over which signals are averaged before they are diffe
 _MOST_BLOCKS: Final = 2000
 _SIGNIFICANT: Final = 0.01  # of the largest nominal torque
 
-NominalTorque = Callable[[Array, Array, Array], Array]
-"""Torque of the nominal inertias by position, velocity and acceleration, each (m, n)."""
+NominalTorque = Callable[[Motion], Array]
+"""Torque (m, n) of the nominal inertias along a motion."""
 
 
 def examine(
@@ -405,6 +406,6 @@ def _nominal_rms(samples: Samples, nominal: NominalTorque) -> Array | None:
     slopes = np.diff(mean, axis=0) / np.diff(time)[:, None]
     velocity = (slopes[:-1] * after + slopes[1:] * before) / (before + after)
     acceleration = 2.0 * np.diff(slopes, axis=0) / (before + after)
-    rows = slice(None, None, -(-len(velocity) // _MOST_BLOCKS))
-    torque = nominal(mean[1:-1][rows], velocity[rows], acceleration[rows])
+    motion = Motion(time[1:-1], mean[1:-1], velocity, acceleration)
+    torque = nominal(motion.rows(slice(None, None, -(-len(velocity) // _MOST_BLOCKS))))
     return np.asarray(np.sqrt(np.mean(np.square(torque), axis=0)))

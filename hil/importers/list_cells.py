@@ -12,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
-from hil.errors import SourceError
+from hil.base.errors import SourceError
 from hil.importers.column_map import HOLE
 
 _CELL: Final = re.compile(r"""(?:^|[,;\t|])\s*"?[\[(]\s*[-+.\d][^\])"]*[\])]"?\s*(?=[,;\t|\n]|$)""")

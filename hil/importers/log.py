@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Samples
-from hil.errors import SourceError, UnrecordedJointError
+from hil.base.errors import SourceError, UnrecordedJointError
 from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.column_map import HOLE, KINEMATIC, ColumnMap, Quantity, TimeColumn
 from hil.importers.conclusions import (

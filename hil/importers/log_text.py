@@ -6,10 +6,10 @@ import re
 from pathlib import Path
 from typing import Final
 
-from hil.errors import SourceError
+from hil.base.errors import SourceError
+from hil.base.safe_input import open_file, read_text, remedy_for_missing
 from hil.importers.arrays import READERS
 from hil.importers.column_map import Format
-from hil.reading import open_file, read_text, remedy_for_missing
 
 _ROSTOPIC = "%time,"  # of `rostopic echo -p`
 _LONGEST: Final = 1 << 31  # bytes; several times as many in memory

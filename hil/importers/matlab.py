@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from hil.reading import read_text
+from hil.base.safe_input import read_text
 from planner.errors import PlannerCrashed, PlanningTimedOut
 from planner.worker import WorkerProcess
 

@@ -16,8 +16,8 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from hil.archive import container
 from hil.archive.container import Damage
-from hil.errors import SourceError
-from hil.reading import open_file
+from hil.base.errors import SourceError
+from hil.base.safe_input import open_file
 
 LARGEST_CHUNK: Final = 1 << 28
 """Bytes of records in one chunk; usually one to sixteen million."""

@@ -13,7 +13,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NoReturn
 
-from hil.errors import SourceError, UnrecordedJointError
+from hil.base.errors import SourceError, UnrecordedJointError
+from hil.base.safe_input import parse_toml
+from hil.base.toml_text import to_text
 from hil.importers.channels import CHANNEL_NAMES, Channel, channels_of, kind_of
 from hil.importers.column_map import ColumnMap, Format, ready_map, ready_maps
 from hil.importers.conclusions import (
@@ -28,8 +30,6 @@ from hil.importers.name_words import is_measured, kind_by_words, kinds_said, wor
 from hil.importers.robot import Robot
 from hil.importers.row_names import row_names
 from hil.importers.units import Kind, kind_named, unit_of, without_unit
-from hil.reading import parse_toml
-from hil.toml_text import to_text
 
 _NUMBER: Final = re.compile(r"\d{1,2}(?=\D*$)")
 _JOINT_KINDS: Final[tuple[Kind, ...]] = (

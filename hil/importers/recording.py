@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Final
 
 from hil.archive import open_archive
+from hil.base.errors import ArchiveError, NotAnArchiveError, SourceError, UnrecordedJointError
+from hil.base.safe_input import parse_toml
+from hil.base.toml_text import to_text
 from hil.cell.arms import Arm, Links, arms_of, recorded_arms
-from hil.errors import ArchiveError, NotAnArchiveError, SourceError, UnrecordedJointError
 from hil.importers.bag_map import BagMap
 from hil.importers.bags import open_bag
 from hil.importers.channels import channels_of
@@ -29,8 +31,6 @@ from hil.importers.proposal import proposed_map
 from hil.importers.robot import Robot, Use
 from hil.importers.rosbag2 import Effort, joint_state_topics, read_rosbag2, recorded_joints
 from hil.importers.units import UNITS, Kind
-from hil.reading import parse_toml
-from hil.toml_text import to_text
 
 _BAGS: Final = (".db3", ".bag", ".mcap", ".zstd", ".zst")
 RobotOf = Callable[[Callable[[], tuple[str, ...] | None]], Robot]
@@ -130,7 +130,7 @@ def import_recording(
 
     Joints of a gripper that were not recorded are fixed, and of a robot with several arms all
     joints but those of the recorded one. `held_joints` and the following are those of
-    :func:`hil.importers.import_log`.
+    :func:`hil.import_log`.
 
     Raises:
         SourceError: it cannot be read, or its channels leave a quantity open.

@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Samples, write_samples
+from hil.base.errors import ArchiveWriteError, SourceError
+from hil.base.files import file_digest, make_folder, replace_file
+from hil.base.safe_input import path_exists, read_input
+from hil.base.toml_text import to_text
 from hil.cell import Cell
 from hil.cell.arms import Links, joints_outside
 from hil.cell.gripper import gripper_joints
+from hil.cell.nominal import nominal_of
 from hil.cell.text import urdf_limits, with_values
-from hil.errors import ArchiveWriteError, SourceError
-from hil.files import file_digest, make_folder, replace_file
-from hil.identify.cell_context import nominal_of
 from hil.importers.conclusions import Conclusion, Examined
 from hil.importers.dh import Convention, urdf_of_dh
 from hil.importers.findings import (
@@ -31,10 +33,8 @@ from hil.importers.findings import (
 )
 from hil.importers.messages import as_findings
 from hil.importers.stamps import check_clock
-from hil.reading import path_exists, read_input
-from hil.toml_text import to_text
-from identification import FrictionLaw
 from identification.errors import ModelError
+from identification.model.friction import FrictionLaw
 from identification.model.kinematics import pinocchio_model
 
 Use = Literal["excitation", "validation", "standstill"]

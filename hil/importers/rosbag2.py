@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Samples
-from hil.errors import SourceError, UnrecordedJointError
+from hil.base.errors import SourceError, UnrecordedJointError
 from hil.importers.bags import Bag, BagMessage, open_bag
 from hil.importers.commands import Clock as CommandClock
 from hil.importers.commands import (

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.errors import SourceError
+from hil.base.errors import SourceError
 from hil.importers.conclusions import CounterContinued, Sample, SortedSamples
 from hil.importers.units import TIMES
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.errors import SourceError
+from hil.base.errors import SourceError
 from hil.importers.column_map import HOLE, Column, Format
 from hil.importers.conclusions import LeftOut, Omitted
 from hil.importers.date_stamps import nanoseconds_of_dates

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from hil.archive import open_archive
-from hil.errors import SourceError
+from hil.base.errors import SourceError
 
 _SHORTEST: Final = 1.0  # s
 

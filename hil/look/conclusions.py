@@ -9,9 +9,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from hil.archive import open_archive
+from hil.base.errors import SourceError
+from hil.base.terminal_text import typed
 from hil.cell import Cell
-from hil.errors import SourceError
-from hil.identify.sources import cell_of, source_of
 from hil.importers.conclusions import Certainty
 from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, import_recording
 from hil.importers.robot import Robot, Use
@@ -20,7 +20,7 @@ from hil.look.other_arm import Contradictions
 from hil.look.readings import DoubtfulArm, ExplainedTorque, GravityOption
 from hil.look.result import ChangedReading, Choice, Look, Row
 from hil.look.run import SETTINGS, look_at_joints, mountings
-from hil.terminal_text import typed
+from hil.pipeline.sources import cell_of, source_of
 from identification.errors import IdentificationError
 from identification.estimators.torque_channel import possible_low_passes
 from identification.signals.samples import Samples, prepare

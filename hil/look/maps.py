@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.base.safe_input import parse_toml
+from hil.base.toml_text import to_text
 from hil.importers.channels import channels_of
-from hil.reading import parse_toml
-from hil.toml_text import to_text
 from identification.validation.reading_changes import Axes
 
 _COMMENT = "Proposed by hil from names, units, the URDF and the motion of the recording"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.identify.cell_context import nominal_of
+from hil.cell.nominal import nominal_of
 from hil.importers.conclusions import Certainty
 from hil.look.maps import entries_of
 from hil.look.readings import (
@@ -56,6 +56,7 @@ from identification.estimators.delay import DelayEstimate
 from identification.estimators.prior import LEARNED, body_prior, fit_posterior
 from identification.factor.factor import Factor
 from identification.model.link_wrenches import LINK_SYMBOLS
+from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples
@@ -160,9 +161,8 @@ def _by_reach(model: RobotModel, samples: Samples) -> float | None:
         return None
     factor = Factor.by_time(model, samples)
     values = fit_posterior(model, factor, body_prior(model, factor).gaussian, 5.0).estimate.values
-    still = np.zeros_like(samples.torque)
     rigid = np.where(model.friction_columns, 0.0, values)
-    weight = np.ptp(model.torque(rigid, samples.motion.position, still, still), axis=0).max()
+    weight = np.ptp(model.torque(rigid, Motion.at_rest(samples.motion.position)), axis=0).max()
     reach = float(np.linalg.norm(model.chain.translation[1:], axis=1).sum())
     if not weight > 0.0 or not reach > 0.0:
         return None

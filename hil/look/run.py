@@ -11,9 +11,8 @@ from typing import Final
 import numpy as np
 
 from hil.archive import open_archive
+from hil.base.errors import SourceError
 from hil.cell import Cell
-from hil.errors import SourceError
-from hil.identify.sources import Source, cell_of, source_of
 from hil.importers.conclusions import Certainty, ChannelMeaning, UnitBasis
 from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, import_recording
 from hil.importers.usable import require_motion
@@ -23,6 +22,7 @@ from hil.look.other_arm import Contradictions
 from hil.look.readings import Basis, Fact, Step
 from hil.look.result import Aspect, Group, Look, Row
 from hil.look.undescribed import undescribed_robot
+from hil.pipeline.sources import Source, cell_of, source_of
 from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate, estimate_delay
 from identification.estimators.torque_channel import possible_low_passes

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hil.errors import SourceError
+from hil.base.errors import SourceError
 from hil.importers.channels import CHANNEL_NAMES, channels_of
 from hil.importers.recording import ImportOptions
 from hil.importers.robot import Robot

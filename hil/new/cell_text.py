@@ -21,15 +21,15 @@ from scipy.spatial.transform import Rotation
 from tomlkit.items import Table
 
 from drivers.drive_train import WRIST_AXES
+from hil.base.errors import InputError
+from hil.base.safe_input import read_input, read_text
+from hil.base.toml_text import comment_lines, inline
 from hil.cell.arms import Links, joints_outside
 from hil.cell.errors import UNKNOWN, WHERE, models_of
 from hil.cell.gripper import gripper_joints, links_of
 from hil.cell.schema import CellFile
 from hil.cell.text import urdf_limits
-from hil.errors import InputError
-from hil.importers import Convention, urdf_of_dh
-from hil.reading import read_input, read_text
-from hil.toml_text import comment_lines, inline
+from hil.importers.dh import Convention, urdf_of_dh
 from identification.errors import ModelError
 from identification.model.kinematics import MOST_JOINTS, Chain, chain_from_urdf, pinocchio_model
 from identification.model.urdf_text import urdf_tree

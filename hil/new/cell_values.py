@@ -20,13 +20,13 @@ from drivers.guard import GuardLimits
 from drivers.packets import N_ARMS, InitPacket
 from drivers.transports.base import TransportSpec
 from hil.archive import open_archive
-from hil.campaign import Stop
-from hil.campaign.connection import Connection
-from hil.campaign.live_link import END_TIMEOUT, ExchangeMonitor
+from hil.base.errors import ArchiveError, ControllerError, OperatorStopError
+from hil.base.safe_input import parse_toml
 from hil.cell.errors import UNKNOWN
 from hil.cell.text import urdf_limits
-from hil.errors import ArchiveError, ControllerError, OperatorStopError
-from hil.reading import parse_toml
+from hil.control.connection import Connection
+from hil.control.live_link import END_TIMEOUT, ExchangeMonitor
+from hil.control.motion_watch import Stop
 from identification.excitation import CollisionChecker, CollisionModelError, Workspace
 from planner import JointLimits
 

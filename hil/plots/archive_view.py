@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from drivers.packets import DRIVE_ON
 from hil.archive import Archive, open_archive
 from hil.archive.check import Overview, read_overview
+from hil.base.errors import ArchiveError, HilError, InputError
+from hil.base.terminal_text import plural
 from hil.cell import AngleFrame, Cell
-from hil.errors import ArchiveError, HilError, InputError
 from hil.plots import style
 from hil.plots.plan_picture import wrapped
 from hil.report.chart import thinned
-from hil.terminal_text import plural
 from identification.errors import ModelError
 from identification.model.kinematics import chain_from_urdf
 

@@ -12,9 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from hil.base.errors import InputError
+from hil.base.files import write_atomically
 from hil.cell import AngleFrame
-from hil.errors import InputError
-from hil.files import write_atomically
 from hil.plots import style
 from hil.report.chart import label, thinned
 from identification.text import percentage

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from hil.report.chart import Caption, Chart, Legend, Plot, padded
 from hil.report.drawing import BAND, FIRST, MUTED, Panel, matrix_panel, panel, single
 from hil.report.numbers import MISSING, fixed, percent, significant
-from hil.report.series import ReportSeries
-from hil.results import FittedResult, Results, ValidationResult, by_id
+from hil.results.results import FittedResult, Results, ValidationResult, by_id
+from hil.results.series import ReportSeries
 
 Array = NDArray[np.float64]
 

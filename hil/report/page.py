@@ -12,10 +12,10 @@ from hil.report import figures
 from hil.report.drawing import chart_panel
 from hil.report.interactive import chart_data, library
 from hil.report.rendering import environment, page_bytes, template_text
-from hil.report.rollout import ROLLOUT_LEGENDS, rollout_charts
-from hil.report.series import ReportSeries
-from hil.results import ParameterResult, Results, by_id, outside_mark
-from hil.rollout_result import RolloutResult
+from hil.report.rollout_section import ROLLOUT_LEGENDS, rollout_charts
+from hil.results.results import ParameterResult, Results, by_id, outside_mark
+from hil.results.rollout_result import RolloutResult
+from hil.results.series import ReportSeries
 from identification.excitation import CRITERIA, METHODS
 from identification.selection.settings import Choice
 

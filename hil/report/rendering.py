@@ -22,9 +22,9 @@ from jinja2 import (
 )
 from markupsafe import Markup
 
-from hil.files import digest, user_cache
+from hil.base.files import digest, user_cache
+from hil.base.terminal_text import escape
 from hil.report import numbers
-from hil.terminal_text import escape
 from identification.text import unit_text
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"

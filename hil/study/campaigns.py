@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from hil.base.errors import ExecutionError, HilError
+from hil.base.progress import Reporter, Silent
 from hil.batch.cluster import Cluster, SkippedArchive, Task
 from hil.campaign import Campaign, CampaignFolder, CampaignPlan, Stop
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.plan import moves_of, plan_around
 from hil.cell import Cell
+from hil.control.motion_checks import MotionChecks
+from hil.control.simulation import simulated_link, simulated_provenance
 from hil.design import DesignResult, DesignSettings, preset
 from hil.design.advice import NoExcitationError
 from hil.design.run import DesignFolder, run_design
-from hil.errors import ExecutionError, HilError
-from hil.motion_checks import MotionChecks
-from hil.progress import Reporter, Silent
-from hil.simulation import simulated_link, simulated_provenance
 from identification.excitation import Excitation
 
 from .settings import StudyFolder, StudySettings

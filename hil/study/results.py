@@ -19,16 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from hil.base.errors import InputError
+from hil.base.progress import Silent
+from hil.base.safe_input import read_text
 from hil.campaign import CampaignFolder
 from hil.cell import Cell
-from hil.errors import InputError
-from hil.identify.options import FIXED
-from hil.identify.prepared import Prepared, executed_rows, moving_rows, prepare_sources
-from hil.identify.sources import gather_sources
-from hil.progress import Silent
-from hil.reading import read_text
+from hil.pipeline.options import FIXED
+from hil.pipeline.prepared import Prepared, executed_rows, moving_rows, prepare_sources
+from hil.pipeline.sources import gather_sources
 from hil.report.numbers import capitalised, fixed, significant
-from hil.results import Frozen
+from hil.results.results import Frozen
 from identification import Factor, RobotModel
 from identification.estimators.least_squares import estimate_repetitions
 from identification.excitation import correlation, coupling_index, information, log10_det

@@ -12,18 +12,18 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.base.files import digest, write_files
+from hil.base.progress import Reporter
+from hil.base.threads import one_thread
+from hil.base.version import software
 from hil.batch.cluster import Cluster
 from hil.cell import Cell
+from hil.control.simulation import planted_values, simulated_link, simulated_provenance
 from hil.design import preset
-from hil.files import digest, write_files
-from hil.progress import Reporter
 from hil.report import drawing
 from hil.report.chart import Caption, Chart, Plot, Trace
 from hil.report.numbers import significant
 from hil.report.rendering import environment, page_bytes
-from hil.simulation import planted_values, simulated_link, simulated_provenance
-from hil.threads import one_thread
-from hil.version import software
 from sim_fixtures.ns16 import CELL_PATH
 
 from . import campaigns, results

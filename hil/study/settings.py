@@ -9,10 +9,10 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from hil.errors import InputError
-from hil.files import lock_folder, write_output
-from hil.reading import read_text
-from hil.results import Frozen
+from hil.base.errors import InputError
+from hil.base.files import lock_folder, write_output
+from hil.base.safe_input import read_text
+from hil.results.results import Frozen
 
 Count = Annotated[int, Field(strict=True, ge=1)]
 

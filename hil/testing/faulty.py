@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from drivers.transports.simulated import SimulatedTransport
+from hil.base.errors import HilError
+from hil.base.progress import Silent
 from hil.campaign import Campaign, VirtualLink, design
 from hil.cell import Cell
-from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
-from hil.errors import HilError
-from hil.progress import Silent
-from hil.simulation import simulated_controller, simulated_link
+from hil.control.simulation import simulated_controller, simulated_link
+from hil.control.simulator_process import LOOPBACK, SimulatorProcess, free_port
 from sim_fixtures import SimulatedController
 from sim_fixtures.faults import parse_fault, split_faults
 

@@ -24,6 +24,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.estimators.prior import BodyPrior, body_prior
 from identification.factor.estimate import Estimate, estimate, joint_weights
@@ -38,8 +39,6 @@ from identification.model.pseudo_inertia import (
     reference_bodies,
 )
 from identification.model.robot import RobotModel
-
-Array = NDArray[np.float64]
 
 _N_LINK: Final = len(LINK_SYMBOLS)
 _INSIDE: Final = 1e-6  # smallest eigenvalue of a pseudo-inertia relative to the reference's

@@ -23,6 +23,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.distributions import student_limit
 from identification.estimators.losses import Loss
 from identification.factor.blocks import FINE_BLOCK, block_slices, fine_blocks, merged
@@ -32,9 +33,6 @@ from identification.factor.normal_equations import NormalEquations, Solution, so
 from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
-
 
 # Model errors are correlated over some tenths of a second.
 SHORTEST_BLOCK: Final = 2  # fine blocks

@@ -21,6 +21,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.distributions import fisher_limit, student_limit
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread
@@ -36,7 +37,6 @@ from identification.signals.masks import near_any_reversal
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples, prepare
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 LONGEST_DELAY: Final = 0.05  # s, either way
@@ -522,7 +522,7 @@ class _Reader:
         """Return the bins with the motion of an earlier time, by a shift."""
         time = self.binned.motion.time
         usable = self.binned.usable.copy()
-        fields = {k: v for k, v in self.samples.motion._asdict().items() if v is not None}
+        fields = self.samples.motion.columns()
         del fields["time"]
         moved = {name: np.zeros((len(time), field.shape[1])) for name, field in fields.items()}
         for raw, b in self.parts:

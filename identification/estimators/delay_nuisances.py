@@ -16,12 +16,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.estimators.prior import LOAD_SHARE
 from identification.estimators.torque_scale import DATA_SHEET
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 ZERO: Final = 0.03
 """Standard deviation of the error of an encoder's zero [rad, m]: marks that are aligned by eye, or
@@ -78,7 +77,7 @@ def _of_zeros(model: RobotModel, samples: Samples, values: Array, torque: Array)
     for joint in range(model.n_joints):
         position = motion.position.copy()
         position[:, joint] += _STEP
-        moved = replace(samples, motion=motion._replace(position=position))
+        moved = replace(samples, motion=replace(motion, position=position))
         derivatives.append((moved.predicted_torque(model, values) - torque) / _STEP)
     return np.array(derivatives)
 
@@ -100,5 +99,5 @@ def _of_friction(
     relative = speed / max(float(speed.max(initial=0.0)), _TINY)
     yield "quadratic friction", CURVATURE * size * sign * relative**2
     if not model.friction.has_load:
-        load = np.abs(model.gear_torque(values, *motion[1:4])[:, joint])
+        load = np.abs(model.gear_torque(values, motion)[:, joint])
         yield "friction over load", LOAD_SHARE * load * sign

@@ -13,23 +13,21 @@ to the covariance of the parameters, which stay those of rigid gears.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Final, NamedTuple, Self
+from dataclasses import dataclass, replace
+from typing import Final, Self
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.estimators.delay import DELAY_BANDWIDTH
 from identification.factor.estimate import Estimate, inverse_variance
 from identification.factor.factor import Factor
 from identification.factor.normal_equations import solve
 from identification.factor.rows import augmented_rows
+from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 RESONANCE: Final = 2.0 * np.pi * 15.0
 """Resonance of a joint's links on its gear [rad/s] that compliances are expected at: industrial
@@ -40,33 +38,57 @@ _RATE: Final = 125.0  # Hz, at which the torque of elastic gears is computed: it
 _LINEAR: Final = 1e-3  # share of the expected compliances by which it is linearised
 
 
-class ElasticTorque(NamedTuple):
-    """Sums over the rows of each joint with the torque E (m, n) of expected compliances."""
+@dataclass(frozen=True, eq=False)
+class ElasticTorque:
+    """Sums over the rows of each joint with the torque E (m, n) of compliances of one."""
 
-    products: Array  # W' E (n, p, n)
-    squares: Array  # E' E (n, n, n)
-    measured: Array  # E' t (n, n)
+    products: Array  #: W' E (n, p, n)
+    squares: Array  #: E' E (n, n, n)
+    measured: Array  #: E' t (n, n)
+    #: expected compliances (n,) [rad/(N·m) or m/N], summed over the recordings
+    compliance: Array
+    recordings: int = 1
 
     @classmethod
-    def of(cls, model: RobotModel, samples: Samples, values: Array, compliance: Array) -> Self:
-        """Return the sums over a recording, with parameters (p,) and compliances (n,)."""
+    def of(cls, model: RobotModel, samples: Samples, values: Array) -> Self:
+        """Return the sums over a recording, with parameters (p,)."""
         n = model.n_joints
-        p = model.n_parameters
-        sums = cls(np.zeros((n, p, n)), np.zeros((n, n, n)), np.zeros((n, n)))
+        compliance = expected_compliance(model, samples, values)
+        products = np.zeros((n, model.n_parameters, n))
+        squares = np.zeros((n, n, n))
+        measured = np.zeros((n, n))
         torque = elastic_torque(model, samples, values, compliance)
+        torque /= np.where(compliance > 0.0, compliance, 1.0)
         for part, tables in augmented_rows(model, samples):
             for joint, (table, used) in enumerate(zip(tables, model.plan.columns, strict=True)):
                 usable = samples.usable[part, joint]
                 effect = torque[part][usable, joint]
-                sums.products[joint][used] += table[:-1, usable] @ effect
-                sums.squares[joint] += effect.T @ effect
-                sums.measured[joint] += effect.T @ table[-1, usable]
-        return sums
+                products[joint][used] += table[:-1, usable] @ effect
+                squares[joint] += effect.T @ effect
+                measured[joint] += effect.T @ table[-1, usable]
+        return cls(products, squares, measured, compliance)
 
-    @classmethod
-    def total(cls, recordings: Sequence[ElasticTorque], times: float = 1.0) -> ElasticTorque:
-        """Return the sums over recordings, each of which counts so many times."""
-        return cls(*(times * np.sum(parts, axis=0) for parts in zip(*recordings, strict=True)))
+    def plus(self, other: ElasticTorque) -> ElasticTorque:
+        """Return the sums over both."""
+        return ElasticTorque(
+            self.products + other.products,
+            self.squares + other.squares,
+            self.measured + other.measured,
+            self.compliance + other.compliance,
+            self.recordings + other.recordings,
+        )
+
+    def weighted(self, weights: Array, times: float) -> tuple[Array, Array, Array]:
+        """Return W' E (p, n), E' E (n, n) and E' t (n,) of the expected compliances.
+
+        With joint weights (n,), of rows that count so many times.
+        """
+        size = self.compliance / self.recordings
+        products, squares, measured = (
+            times * np.tensordot(weights, part, axes=1)
+            for part in (self.products, self.squares, self.measured)
+        )
+        return products * size, squares * np.outer(size, size), measured * size
 
 
 def expected_compliance(model: RobotModel, samples: Samples, values: Array) -> Array:
@@ -78,8 +100,8 @@ def expected_compliance(model: RobotModel, samples: Samples, values: Array) -> A
     rows = np.linspace(0, len(samples.torque) - 1, _POSTURES).astype(int)
     postures = np.repeat(samples.motion.position[rows], n + 1, axis=0)
     pushes = np.tile(np.concatenate((np.eye(n), np.zeros((1, n)))), (_POSTURES, 1))
-    still = np.zeros_like(postures)
-    torque = model.gear_torque(values, postures, still, pushes).reshape(_POSTURES, n + 1, n)
+    pushed = replace(Motion.at_rest(postures), acceleration=pushes)
+    torque = model.gear_torque(values, pushed).reshape(_POSTURES, n + 1, n)
     inertia = np.einsum("bjj->bj", torque[:, :n] - torque[:, n:]).mean(axis=0)
     return np.where(inertia > 0.0, 1.0 / np.where(inertia > 0.0, inertia, 1.0), 0.0) / RESONANCE**2
 
@@ -94,20 +116,25 @@ def elastic_torque(model: RobotModel, samples: Samples, values: Array, complianc
         step = float(np.median(np.diff(time[segment])))
         rows = np.arange(segment.start, segment.stop, max(1, int(1.0 / (_RATE * step))))
         at = time[rows]
-        states = [np.asarray(part)[rows] for part in samples.motion[1:4]]
-        rigid = model.gear_torque(values, *states)
+        motion = samples.motion.rows(rows)
+        rigid = model.gear_torque(values, motion)
         order = 2
         rate = len(rows) / max(float(np.ptp(at)), step)
         if len(rows) <= 3 * (2 * order + 1) or rate <= 2.0 * DELAY_BANDWIDTH:
             continue
         low_pass = scipy.signal.butter(order, DELAY_BANDWIDTH, fs=rate, output="sos")
         sag = _LINEAR * compliance * scipy.signal.sosfiltfilt(low_pass, rigid, axis=0)
-        sags = [sag, np.gradient(sag, at, axis=0)]
-        sags.append(np.gradient(sags[1], at, axis=0))
+        sag_rate = np.gradient(sag, at, axis=0)
+        sag_acceleration = np.gradient(sag_rate, at, axis=0)
         for joint in np.flatnonzero(compliance):
             only = np.arange(model.n_joints) == joint
-            moved = [state - only * part for state, part in zip(states, sags, strict=True)]
-            change = (model.gear_torque(values, *moved) - rigid) / _LINEAR
+            moved = replace(
+                motion,
+                position=motion.position - only * sag,
+                velocity=motion.velocity - only * sag_rate,
+                acceleration=motion.acceleration - only * sag_acceleration,
+            )
+            change = (model.gear_torque(values, moved) - rigid) / _LINEAR
             for row in range(model.n_joints):
                 torque[segment, row, joint] = np.interp(time[segment], at, change[:, row])
     return torque
@@ -148,16 +175,25 @@ def with_elastic_gears(
     design_effect: float,
     precision: Array | None = None,
     believed: Array | None = None,
+    times: float = 1.0,
 ) -> Estimate:
     """Return the estimate with the mean square of the compliances in its covariance.
 
-    `torque` are the sums of the factor's rows, of which `design_effect` count as one; `precision`
-    (p, p) is that of a prior beside them, by which `believed` (p,) are the parameters of rigid
-    gears, by default those of the estimate: what a stronger prior leaves unexplained is no torque
-    of gears. No gear has a negative compliance.
+    No gear has a negative compliance.
+
+    Args:
+        estimate: of p parameters and n joints, with rigid gears.
+        factor: of the fitted rows.
+        torque: sums of the factor's rows, or of such a share of them that each stands for `times`
+            rows.
+        design_effect: rows that count as one.
+        precision: information (p, p) of a prior in addition to the rows.
+        believed: parameters (p,) of rigid gears by that prior, by default those of the estimate;
+            what a stronger prior leaves unexplained is no torque of gears.
+        times: see `torque`.
     """
     weights = inverse_variance(estimate.noise_std**2)
-    products, squares, measured = (np.tensordot(weights, part, axes=1) for part in torque)
+    products, squares, measured = torque.weighted(weights, times)
     errors = measured - products.T @ (estimate.values if believed is None else believed)
     equations = factor.weighted(weights)
     if precision is not None:

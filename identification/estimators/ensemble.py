@@ -18,14 +18,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.estimators.consistent import Program, is_consistent, without_rounding
 from identification.estimators.prior import BodyPrior
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
-
-Array = NDArray[np.float64]
 
 FEWEST = 10
 """Arms of which a spread is estimated."""

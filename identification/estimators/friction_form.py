@@ -29,6 +29,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.distributions import normal_limit
 from identification.estimators.covariance import block_length, lag_correlation
 from identification.factor.blocks import merged
@@ -39,8 +40,6 @@ from identification.factor.normal_equations import solve
 from identification.model.friction import ASYMMETRIC, QUADRATIC, STRIBECK, FrictionTerm
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 # Speeds over which measured Stribeck friction decays, in steps in which terms of neighbours are
 # alike (correlation above 0.9).

@@ -23,6 +23,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.estimators.covariance import Clustered, cluster_covariance
 from identification.estimators.payload_problem import DRIFT, OFFSET, STRETCH
@@ -31,8 +32,6 @@ from identification.factor.factor import Factor
 from identification.factor.normal_equations import NormalEquations, Solution, solve
 from identification.model.robot import RobotModel
 from identification.text import percentage
-
-Array = NDArray[np.float64]
 
 WORST_RELATIVE_STD: Final = 0.05  # tolerance of a maker's torque constant
 MOST_BLOCKS: Final = 400

@@ -20,6 +20,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.distributions import student_limit
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread
@@ -38,9 +39,6 @@ from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import RIGID_BANDWIDTH, Samples
 from identification.signals.smoothing import ORDER, SmoothingSpline, fit_smoothing_spline
-
-Array = NDArray[np.float64]
-
 
 LONGEST_LAG: Final = 0.5  # s; position loops of industrial arms lag 5 to 100 ms
 _LAG_STEP: Final = 0.01  # s

@@ -8,17 +8,14 @@ from typing import Final, Literal
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.estimators.covariance import Clustered, block_covariance, clustered_covariance
 from identification.factor.estimate import Estimate, estimate, estimate_of, joint_weights
 from identification.factor.factor import Factor, reduced, total_factor
 from identification.factor.normal_equations import Solution
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
-
 
 Weighting = Literal["ordinary", "weighted"]
 

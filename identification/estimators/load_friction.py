@@ -14,12 +14,10 @@ from dataclasses import dataclass
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 CONVERGED: Final = 1e-3
 """Change of the predicted torque by a pass below which it is the last, relative to its rms."""

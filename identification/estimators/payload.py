@@ -21,6 +21,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.estimators.payload_problem import (
     N_BODY,
@@ -41,8 +42,6 @@ from identification.model.pseudo_inertia import (
     pseudo_inertia,
 )
 from identification.model.robot import RobotModel
-
-Array = NDArray[np.float64]
 
 _INERTIA: Final = np.arange(6)
 _DIAGONAL: Final = [4, 7, 9]  # of a tensor, among `NAMES`

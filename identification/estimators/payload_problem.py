@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.estimators.covariance import Clustered, cluster_covariance
 from identification.estimators.torque_scale import scale_sensitivity
@@ -24,8 +25,6 @@ from identification.model.pseudo_inertia import inertial_from_pseudo, pseudo_ine
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 DRIFT: Final = 0.1
 """Prior standard deviation of the relative change of friction between recordings."""
@@ -64,7 +63,7 @@ class Run:
         p = model.n_parameters
         plan = RegressorPlan.of_bodies(model.chain, model.gravity, joint)
         blocks, columns = samples.regressor(model)
-        loads = plan.evaluate(*samples.motion[1:4])
+        loads = plan.evaluate(samples.motion.kinematics())
         index = fine_blocks(samples)
         tables = []
         places = []

@@ -21,6 +21,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_covariance
 from identification.factor.estimate import (
@@ -32,10 +33,8 @@ from identification.factor.estimate import (
 )
 from identification.factor.factor import Factor, require_rows
 from identification.factor.normal_equations import Solution, solve_positive, solve_rows
+from identification.model.nominal_masses import without_masses
 from identification.model.robot import RobotModel
-
-Array = NDArray[np.float64]
-
 
 # Posterior over prior standard deviation of a parameter that is determined by the data, which then
 # gave three quarters of its information (inverse variance).
@@ -618,16 +617,6 @@ def _torque_scale(model: RobotModel, factor: Factor, combinations: Array, std: A
     if not both.any():
         return 1.0
     return float(np.exp(0.5 * np.mean(np.log(measured[both] / expected[both]))))
-
-
-def without_masses(model: RobotModel) -> str:
-    """Return why the bodies of the description have no masses of an arm, or nothing."""
-    masses = model.nominal[model.layout.links][:, _MASS]
-    if not np.any(masses > 0.0):
-        return "the description has no masses"
-    if len(masses) > 1 and np.ptp(masses) <= 1e-6 * masses.max():
-        return "all bodies of the description have the same mass"
-    return ""
 
 
 def _placeholder(model: RobotModel, factor: Factor) -> str:

@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.estimators.covariance import clustered_covariance
 from identification.estimators.losses import Huber, Loss, Tukey
 from identification.factor.estimate import Estimate, estimate_of, inverse_variance
@@ -17,8 +18,6 @@ from identification.factor.normal_equations import Solution
 from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 MOST_ITERATIONS: Final = 60
 TOLERANCE: Final = 1e-4  # final change of the parameters, in standard deviations of white noise

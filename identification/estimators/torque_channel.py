@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.factor.blocks import EqualRuns, add_grams, equal_runs
 from identification.model.robot import RobotModel
 from identification.signals.masks import LONGEST_END, edge_rows
@@ -28,7 +29,6 @@ from identification.signals.smoothing import (
     noiseless_above,
 )
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 LOWEST_BANDWIDTH: Final = 0.5  # Hz
@@ -216,7 +216,7 @@ class _Spectra:
         rows = np.zeros(model.n_joints)
         for segment in segments:
             part = segment.rows
-            blocks = model.regressor(*samples.motion.rows(part)[1:]).blocks
+            blocks = model.regressor(samples.motion.rows(part)).blocks
             for joint, (gram, block) in enumerate(zip(grams, blocks, strict=True)):
                 table = np.vstack([block.T, load[part, joint], torque[part, joint]])
                 rows[joint] += segment.add(gram, table, usable[part, joint])

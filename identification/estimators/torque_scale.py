@@ -21,12 +21,10 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
-
-Array = NDArray[np.float64]
 
 DATA_SHEET: Final = 0.03
 """Relative standard deviation of a torque constant from a data sheet, or of a torque sensor.

@@ -3,8 +3,8 @@
 # ruff: noqa: F401
 import types
 
+from identification.errors import WorkspaceError
 from identification.excitation.collision import CollisionChecker, Contact
-from identification.excitation.collision_bodies import Box, Workspace
 from identification.excitation.constraints import (
     SAMPLE_PERIOD,
     Constraints,
@@ -32,7 +32,6 @@ from identification.excitation.errors import (
     DesignError,
     JournalError,
     MissingMeshError,
-    WorkspaceError,
 )
 from identification.excitation.excitation import Excitation, ViaPointMotion
 from identification.excitation.genomes import Genome, SineGenome, ViaPointGenome
@@ -56,6 +55,7 @@ from identification.excitation.searches.run import (
 )
 from identification.excitation.validation_motions import random_validation_motions
 from identification.excitation.violation import KINDS, NoFeasibleMotionError, Violation
+from identification.model.workspace import Box, Workspace
 
 __all__ = [
     name

@@ -15,21 +15,20 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from identification.arrays import Array, Indices
 from identification.errors import ShapeError
-from identification.excitation.collision_bodies import Workspace, link_bodies, obstacles
+from identification.excitation.collision_bodies import link_bodies, obstacles
 from identification.excitation.separation import (
     Bodies,
     Frames,
-    Indices,
     Separation,
     frames,
     placed,
     reaches,
 )
 from identification.model.kinematics import Chain, chain_from_urdf
+from identification.model.workspace import Workspace
 from planner import FourierSeries, JointLimits, PiecewiseCubic
-
-Array = NDArray[np.float64]
 
 # Another contact may be deeper by this: in given postures, and along a motion [m].
 _DEPTH: Final = 0.005

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.excitation.collision import CollisionChecker, Contact
 from identification.excitation.violation import Kind, Violation
 from identification.model.motion import Motion
@@ -43,9 +43,6 @@ def midpoints(trajectory: Trajectory, period: float = SAMPLE_PERIOD) -> Motion:
 
 def _steps(trajectory: Trajectory, period: float) -> int:
     return max(1, math.ceil(trajectory.duration / period - _ROUNDING))
-
-
-Array = NDArray[np.float64]
 
 
 _RATES = ("velocity", "acceleration", "jerk")
@@ -144,8 +141,7 @@ class CurrentModel:
 
     def torque(self, motion: Motion) -> Array:
         """Return the largest expected joint torques (m, n) [N·m], payload included."""
-        q, qd, qdd = motion[1:4]
-        nominal = self.model.torque(self.values, q, qd, qdd) + self.model.load_torque(q, qd, qdd)
+        nominal = self.model.torque(self.values, motion) + self.model.load_torque(motion)
         return (1.0 + self.uncertainty) * nominal
 
     def current(self, torque: Array) -> Array:
@@ -220,7 +216,7 @@ class Constraints:
         bound = min(max(duration, self.min_duration), self.max_duration)
         if bound != duration:
             violations.append(Violation("duration", "the motion", duration, bound, None))
-        if beyond and not all(np.all(np.isfinite(column)) for column in motion[:4]):
+        if beyond and not motion.finite:
             return tuple(violations)
         if self.checker is not None:
             # With rates beyond the limits, the bounds between samples are too wide to be of use.

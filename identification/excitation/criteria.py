@@ -15,17 +15,15 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.excitation.constraints import midpoints
 from identification.excitation.precision import Precision
 from identification.factor.factor import Factor
 from identification.model.friction import JointFriction
 from identification.model.motion import Motion
-from identification.model.regressor import joint_arrays
 from identification.model.robot import RobotModel
 from planner import Trajectory
 from planner.arrays import Whole, strict
-
-Array = NDArray[np.float64]
 
 
 def information(factor: Factor) -> Array:
@@ -442,36 +440,28 @@ class Objective:
         if weights is not None:
             blocks = [weight * block for weight, block in zip(weights, blocks, strict=True)]
         total = np.zeros(motion.n_samples)
-        q, qd, qdd = self._states(motion)
-        for part, rows in model.chunks(q, qd, qdd, self._direction(q, qd)):
+        for part, rows in model.chunks(self._with_direction(motion)):
             for joint, (columns, block) in enumerate(zip(rows, blocks, strict=True)):
                 if means is not None:
                     columns = columns - means[joint][:, None]
                 total[part] += np.einsum("pm,pm->m", columns, block @ columns)
         return total
 
-    def _states(self, motion: Motion) -> tuple[Array, ...]:
-        """Return position, velocity and acceleration, checked."""
-        return joint_arrays(
-            self.model.n_joints,
-            position=motion.position,
-            velocity=motion.velocity,
-            acceleration=motion.acceleration,
-        )
-
     @cached_property
     def _friction(self) -> JointFriction:
         return friction_of_excitation(self.model)
 
-    def _direction(self, position: Array, velocity: Array) -> Array:
-        return self._friction.direction(np.zeros(len(position)), position, velocity)
+    def _with_direction(self, motion: Motion) -> Motion:
+        """Return the motion, checked, with the direction of dry friction in an excitation."""
+        motion = motion.checked(self.model.n_joints)
+        timeless = replace(motion, time=np.zeros(motion.n_samples))
+        return replace(motion, direction=self._friction.direction(timeless))
 
     def _joint_sums(self, motion: Motion) -> _JointSums:
         """Return the sums over the rows of each joint."""
         grams = [np.zeros((len(used), len(used))) for used in self.model.plan.columns]
         totals = [np.zeros(len(used)) for used in self.model.plan.columns]
-        q, qd, qdd = self._states(motion)
-        for _, rows in self.model.chunks(q, qd, qdd, self._direction(q, qd)):
+        for _, rows in self.model.chunks(self._with_direction(motion)):
             for joint, block in enumerate(rows):
                 grams[joint] += block @ block.T
                 totals[joint] += block.sum(axis=1)

@@ -21,10 +21,6 @@ class MissingMeshError(CollisionModelError):
         super().__init__(f"the collision mesh {mesh} cannot be found")
 
 
-class WorkspaceError(IdentificationError, ValueError):
-    """A box whose corners are not in order."""
-
-
 class DesignError(IdentificationError, ValueError):
     """A setting of a design is outside its valid range.
 

@@ -6,14 +6,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
+from identification.arrays import Array
 from identification.excitation.criteria import Criteria
 from planner import FourierSeries, Move, PiecewiseCubic
 from planner.arrays import DAMAGED, Whole, numbers, strict
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from identification.arrays import Array
 from identification.excitation.collision import CollisionChecker
 from identification.excitation.errors import DesignError
 from planner import (
@@ -21,7 +22,6 @@ from planner import (
     plan_chunk,
 )
 
-Array = NDArray[np.float64]
 Motion: TypeAlias = PiecewiseCubic | FourierSeries
 
 _TOGETHER: Final = 48

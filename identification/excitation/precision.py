@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from identification.arrays import Array
 
 INTERVAL: Final = 2.0
 """Standard deviations in half a 95 % interval: Student's factor for some sixty blocks of time."""

@@ -13,11 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array, Indices
 from identification.excitation.collision_bodies import Body
 from identification.model.kinematics import Chain, skew
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 _CROSSING = 1e-9  # axes closer than this [m] intersect
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.excitation.collision import CollisionChecker
 from identification.excitation.constraints import CurrentModel, check_motion, clearance
 from identification.excitation.excitation import ViaPointMotion
@@ -22,8 +22,6 @@ from planner import (
     PlanningTimedOut,
     plan_in_child,
 )
-
-Array = NDArray[np.float64]
 
 _DRAWS_PER_POINT: Final = 50  # of one via point before the path is rejected
 _TRIES_PER_MOTION: Final = 100

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 
-Array = NDArray[np.float64]
 Kind = Literal["planning", "joint limit", "duration", "collision", "torque", "current"]
 
 _UNITS: Final[dict[Kind, str]] = {

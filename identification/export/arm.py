@@ -6,14 +6,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.export.friction import equivalent_coulomb
 from identification.model.elements import TorsionSpring
 from identification.model.pseudo_inertia import Body, body
 from identification.model.robot import RobotModel
-
-Array = NDArray[np.float64]
 
 
 class Ranges(NamedTuple):

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.model.friction import COULOMB, LOAD
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 SPEEDS: Final = 120
 """Points of a curve in each direction."""
@@ -58,7 +56,7 @@ def median_load(model: RobotModel, values: Array, recordings: Sequence[Samples])
     """
     if not model.friction.has_load:
         return np.zeros(model.n_joints)
-    sizes = [np.abs(model.gear_torque(values, *recording.motion[1:4])) for recording in recordings]
+    sizes = [np.abs(model.gear_torque(values, recording.motion)) for recording in recordings]
     size = np.concatenate(sizes)
     usable = np.concatenate([recording.usable for recording in recordings])
     return np.array(

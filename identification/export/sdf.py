@@ -9,8 +9,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.export.arm import Arm
 from identification.export.friction import load_remarks
@@ -18,7 +18,6 @@ from identification.export.urdf import TENSOR, WriteBackError, as_text, comment_
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import body
 
-Array = NDArray[np.float64]
 Node = ElementTree.Element
 
 _BASE = "base"
@@ -88,7 +87,7 @@ def drake_torque(text: str, arm: Arm, motion: Motion) -> Array:
     joints = [plant.GetJointByName(name) for name in arm.model.joint_names]
     order = [joint.velocity_start() for joint in joints]
     torque = np.empty(motion.position.shape)
-    for k, (q, qd, qdd) in enumerate(zip(*motion[1:4], strict=True)):
+    for k, (q, qd, qdd) in enumerate(motion.states()):
         position, velocity, acceleration = (np.zeros(len(order)) for _ in range(3))
         position[order] = q
         velocity[order] = qd

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final, NamedTuple
 from xml.etree import ElementTree
@@ -12,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.export.arm import Arm
 from identification.export.friction import load_remarks
@@ -31,7 +33,6 @@ from identification.model.kinematics import pinocchio_model
 from identification.model.motion import Motion
 from identification.model.regressor import RegressorPlan
 
-Array = NDArray[np.float64]
 Node = ElementTree.Element
 
 STATES: Final = 1000
@@ -188,7 +189,7 @@ def compare(text: str, form: Format, arm: Arm, motion: Motion) -> Comparison:
     if form.read is _mujoco_torque:
         dry = _mujoco_torque(text, arm, motion, friction=True) - _supported(form, arm, motion)
         left[_REVERSALS] = _rms(dry - _dry(arm, motion))
-    whole = arm.model.torque(arm.values, *motion[1:5]) + arm.model.load_torque(*motion[1:4])
+    whole = arm.model.torque(arm.values, motion.without_load()) + arm.model.load_torque(motion)
     return Comparison(difference, _rms(whole), {k: v for k, v in left.items() if v.any()})
 
 
@@ -274,7 +275,7 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[Part]:
     yield "friction of coupled motors", lambda: _friction(arm, motion, motors), form.drives
     yield (
         "the payload",
-        lambda: model.load_torque(*motion[1:4]) - model.elements.known_torque(q),
+        lambda: model.load_torque(motion) - model.elements.known_torque(q),
         form.drives,
     )
     for placed in model.elements.placed:
@@ -332,7 +333,7 @@ def _rounding(arm: Arm, motion: Motion) -> tuple[Array, Array]:
     """
     model = arm.model
     base = np.where(np.arange(model.n_parameters) < model.base.rank, arm.values, 0.0)
-    whole = model.torque(base, *motion[1:5])
+    whole = model.torque(base, motion.without_load())
     return whole - rigid_torque(arm, motion) - motion.acceleration @ arm.rotors, whole
 
 
@@ -355,18 +356,18 @@ def rigid_torque(arm: Arm, motion: Motion) -> Array:
     """Return the torque (m, n) of the links, without the payload."""
     model = arm.model
     plan = RegressorPlan.of_bodies(model.chain, model.gravity)
-    return plan.torque(arm.standard[model.layout.links].reshape(-1), *motion[1:4])
+    return plan.torque(arm.standard[model.layout.links].reshape(-1), motion.kinematics())
 
 
 def _friction(arm: Arm, motion: Motion, chosen: Sequence[bool], load: Array | None = None) -> Array:
     """Return the torque (m, n) of some friction terms, at a load (m, n), by default the arm's."""
     model = arm.model
     if load is None and model.friction.has_load:
-        load = model.gear_torque(arm.values, *motion[1:4])
+        load = model.gear_torque(arm.values, motion)
     values = np.zeros(model.n_parameters)
     part = model.friction_part
     values[part] = np.where(chosen, arm.values[part], 0.0)
-    return model.torque(values, *motion[1:5], load)
+    return model.torque(values, replace(motion, load=load))
 
 
 def _at_load(arm: Arm, motion: Motion) -> Array:
@@ -395,7 +396,7 @@ def _pinocchio_torque(text: str, arm: Arm, motion: Motion) -> Array:
     """Return the torques of a URDF's bodies and damping."""
     model = pinocchio_model(text, arm.model.locked)
     model.gravity.linear = arm.model.gravity
-    return rnea(model, *motion[1:4]) + np.asarray(model.damping) * motion.velocity
+    return rnea(model, motion) + np.asarray(model.damping) * motion.velocity
 
 
 def _archive_torque(text: str, arm: Arm, motion: Motion) -> Array:
@@ -403,7 +404,7 @@ def _archive_torque(text: str, arm: Arm, motion: Motion) -> Array:
     del arm
     model = pin.Model()
     model.loadFromString(text)
-    return rnea(model, *motion[1:4]) + np.asarray(model.damping) * motion.velocity
+    return rnea(model, motion) + np.asarray(model.damping) * motion.velocity
 
 
 def _mujoco_torque(text: str, arm: Arm, motion: Motion, *, friction: bool = False) -> Array:
@@ -418,7 +419,7 @@ def _mujoco_torque(text: str, arm: Arm, motion: Motion, *, friction: bool = Fals
     data = mujoco.MjData(model)
     order = [int(model.joint(name).dofadr[0]) for name in arm.model.joint_names]
     torque = np.empty(motion.position.shape)
-    for k, (q, qd, qdd) in enumerate(zip(*motion[1:4], strict=True)):
+    for k, (q, qd, qdd) in enumerate(motion.states()):
         data.qpos[order] = q
         data.qvel[order] = qd
         data.qacc[order] = qdd

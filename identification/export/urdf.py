@@ -15,8 +15,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.export.friction import equivalent_coulomb, load_remarks
 from identification.model.friction import TERMS
@@ -26,12 +26,11 @@ from identification.model.kinematics import (
     locked_posture,
     pinocchio_model,
 )
+from identification.model.motion import Motion
 from identification.model.pseudo_inertia import Body, body, margin
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.model.urdf_text import urdf_tree
-
-Array = NDArray[np.float64]
 
 TENSOR: Final = {
     "ixx": (0, 0),
@@ -291,12 +290,13 @@ def _compare(text: str, model: RobotModel, inertial: Array) -> None:
     chain = chain_from_urdf(text, model.locked)
     if chain.joint_names != model.joint_names:
         raise WriteBackError("the description has other joints than the model")
-    motion = np.random.default_rng(_SEED).uniform(-2.0, 2.0, (3, _STATES, model.n_joints))
+    states = np.random.default_rng(_SEED).uniform(-2.0, 2.0, (3, _STATES, model.n_joints))
+    motion = Motion.of_states(*states)
     plan = RegressorPlan.of_bodies(model.chain, model.gravity)
-    expected = plan.torque(inertial.reshape(-1), *motion)
+    expected = plan.torque(inertial.reshape(-1), motion)
     arm = pinocchio_model(text, model.locked)
     arm.gravity.linear = model.gravity
-    error = np.abs(rnea(arm, *motion) - expected).max(axis=0)
+    error = np.abs(rnea(arm, motion) - expected).max(axis=0)
     allowed = _ROUNDING * max(float(np.abs(expected).max()), 1.0)
     for joint in np.flatnonzero(~(error <= allowed)):
         raise WriteBackError(
@@ -308,13 +308,10 @@ def _compare(text: str, model: RobotModel, inertial: Array) -> None:
     _require_consistent_links(model, chain.inertial, "by rounding in the written text")
 
 
-def rnea(arm: pin.Model, q: Array, qd: Array, qdd: Array) -> Array:
-    """Return pinocchio's torques (m, n) of a model, for motion arrays (m, n)."""
+def rnea(arm: pin.Model, motion: Motion) -> Array:
+    """Return pinocchio's torques (m, n) of a model along a motion."""
     data = arm.createData()
     neutral = pin.neutral(arm)  # continuous joints have two coordinates
     return np.array(
-        [
-            pin.rnea(arm, data, pin.integrate(arm, neutral, a), b, c)
-            for a, b, c in zip(q, qd, qdd, strict=True)
-        ]
+        [pin.rnea(arm, data, pin.integrate(arm, neutral, a), b, c) for a, b, c in motion.states()]
     )

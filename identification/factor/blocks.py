@@ -9,10 +9,9 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array, Indices
 from identification.signals.samples import Samples
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Blocks = TypeVar("Blocks", NDArray[np.float64], NDArray[np.intp])
 
 FINE_BLOCK: Final = 0.125  # s
@@ -80,6 +79,11 @@ def merged(blocks: Blocks, length: int) -> Blocks:
         addend = blocks[later::length]
         total[: len(addend)] += addend
     return total
+
+
+def part_edges(blocks: int, count: int) -> Indices:
+    """Return the first of the blocks of each of `count` equal parts (count,)."""
+    return np.arange(count) * blocks // count
 
 
 def added(first: Blocks, second: Blocks) -> Blocks:

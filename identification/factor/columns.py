@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.factor.blocks import FINE_BLOCK, count_by_block, fine_blocks
 from identification.factor.factor import Factor, time_blocks
 from identification.factor.rows import augmented_rows
@@ -22,8 +23,6 @@ from identification.model.payload import Load, Payload
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 _MOST_ROWS: Final = 500  # of one recording, in standard parameters
 _PARTS: Final = ("W0", "Wx", "Wy", "Wz")
@@ -46,7 +45,7 @@ def instrument_factor(
     )
     measured = augmented_rows(model, replace(samples, usable=rows))
     # The same rows, with the same torque low-pass.
-    instrument = instrument._replace(load=samples.motion.load)
+    instrument = replace(instrument, load=samples.motion.load)
     planned = augmented_rows(model, replace(samples, motion=instrument, usable=rows))
     index = fine_blocks(samples)
     both = (
@@ -85,7 +84,7 @@ def gain_factor(
     blocks, columns = samples.regressor(model)
     load = model.elements.known_torque(samples.motion.position)
     if payload is not None:
-        load = load + Load(model.chain, model.gravity, payload).torque(*samples.motion[1:4])
+        load = load + Load(model.chain, model.gravity, payload).torque(samples.motion)
     since = samples.motion.time - samples.origin
     index = np.maximum(np.floor(since / block + 1e-9).astype(np.intp), 0)
     usable = np.zeros((m, n), dtype=np.bool_)
@@ -152,7 +151,7 @@ def _friction_columns(
     motion = samples.motion
     direction = motion.direction
     if direction is None:
-        direction = model.friction.direction(*motion[:3])
+        direction = model.friction.direction(motion)
     columns = [
         np.array([term.column(motion.velocity[:, j], direction[:, j]) for term in terms])
         for j in range(model.n_joints)
@@ -239,9 +238,8 @@ def standard_factor(model: RobotModel, recordings: Sequence[Samples]) -> Factor:
         every = max(1, len(samples.torque) // _MOST_ROWS)
         filtered = samples.torque_bandwidth is not None
         part = slice(None, None, 1 if filtered else every)  # filters need all rows
-        motion = samples.motion.rows(part)
-        load = model.gear_load(*motion[1:4], motion.load)
-        evaluated = [plan.evaluate(*motion[1:4], load=load) for plan in plans]
+        motion = model.with_gear_load(replace(samples.motion.rows(part), direction=None))
+        evaluated = [plan.evaluate(motion) for plan in plans]
         for joint in range(n):
             usable = samples.usable[::every, joint]
             table = np.zeros((len(usable), 4 * s + 1))

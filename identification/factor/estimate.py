@@ -8,12 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array, Indices
 from identification.factor.factor import Factor, require_rows
 from identification.factor.normal_equations import Solution
 from identification.model.robot import RobotModel
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 
 def residual_variance(factor: Factor, values: Array, root: Array, weights: Array) -> Array:

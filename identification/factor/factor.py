@@ -15,6 +15,7 @@ from typing import Final, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array, Indices
 from identification.errors import IdentificationError
 from identification.factor.blocks import (
     FINE_BLOCK,
@@ -25,6 +26,7 @@ from identification.factor.blocks import (
     equal_runs,
     fine_blocks,
     merged,
+    part_edges,
 )
 from identification.factor.normal_equations import (
     NormalEquations,
@@ -38,8 +40,6 @@ from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Storage = Literal["gram", "qr"]
 
 _COARSEST: Final = 4  # fine blocks in a block of a long recording
@@ -353,6 +353,16 @@ class Factor:
         block = length * self.block
         return replace(self, matrices=matrices, counts=counts, block=block)
 
+    def parts(self, count: int) -> Self:
+        """Return the sums of equal parts of the occupied blocks; these, if they are fewer."""
+        assert self.storage == "gram"
+        factor = self.occupied()
+        if len(factor) <= count:
+            return factor
+        edges = part_edges(len(factor), count)
+        matrices = tuple(np.add.reduceat(matrix, edges) for matrix in factor.matrices)
+        return replace(factor, matrices=matrices, counts=np.add.reduceat(factor.counts, edges))
+
     def of_blocks(self, block: float) -> Self:
         """Merge blocks to this duration [s], a multiple of theirs."""
         length = round(block / self.block)
@@ -411,6 +421,19 @@ def joined(parts: Sequence[Factor]) -> Factor:
 def total_factor(model: RobotModel, recordings: Iterable[Samples]) -> Factor:
     """Return the sum of the factors of recordings by time, each read once."""
     return sum((Factor.by_time(model, samples) for samples in recordings), Factor.zero(model))
+
+
+def mean_factor(factors: Sequence[Factor], shares: Sequence[float]) -> Factor:
+    """Return the weighted mean of factors by time of the same rows, smoothed differently."""
+    if len(factors) == 1:
+        return factors[0]
+
+    def mean(stack: Sequence[Array | Indices]) -> Array:
+        return np.asarray(sum(s * part for s, part in zip(shares, stack, strict=True)))
+
+    matrices = tuple(map(mean, zip(*(factor.matrices for factor in factors), strict=True)))
+    counts = np.rint(mean([factor.counts for factor in factors])).astype(np.intp)
+    return replace(factors[0], matrices=matrices, counts=counts)
 
 
 def _triangles_of_both(first: Array, second: Array) -> Array:

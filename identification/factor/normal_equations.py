@@ -8,8 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from identification.arrays import Array, Indices
 
 # Condition 1e6 leaves four digits of a Gram matrix, enough for torque measurements; rank deficiency
 # shows as 1e8 and more.

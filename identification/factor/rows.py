@@ -6,13 +6,12 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from identification.model.regressor import CHUNK, joint_arrays
+from identification.arrays import Array
+from identification.model.motion import joint_arrays
+from identification.model.regressor import CHUNK
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 
 class Rows(NamedTuple):
@@ -32,18 +31,12 @@ def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
     Raises:
         ShapeError: wrong shape of an array.
     """
-    q, qd, qdd, torque = joint_arrays(
-        model.n_joints,
-        position=samples.motion.position,
-        velocity=samples.motion.velocity,
-        acceleration=samples.motion.acceleration,
-        torque=samples.torque,
+    _, torque = joint_arrays(
+        model.n_joints, position=samples.motion.position, torque=samples.torque
     )
     chunks: Iterable[tuple[slice, list[Array]]]
     if samples.torque_bandwidth is None:
-        direction = samples.motion.direction
-        load = samples.motion.load
-        chunks = model.chunks(q, qd, qdd, direction, load, response=torque)
+        chunks = model.chunks(samples.motion, response=torque)
     else:
         chunks = _filtered(model, samples)
     for part, blocks in chunks:

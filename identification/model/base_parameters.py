@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from identification.arrays import Array
 
 # Smallest residual of a base column after projection on the columns before it, relative to the
 # longest column of its unit. Exact geometry leaves 1e-15 of a dependent column, a URDF with rounded

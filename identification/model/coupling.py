@@ -11,11 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import ModelError
-
-Array = NDArray[np.float64]
 
 _UNCOUPLED = 1e-9  # relative to the largest entry of a row
 

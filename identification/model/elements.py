@@ -9,11 +9,9 @@ from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import ModelError
-
-Array = NDArray[np.float64]
 
 _SAME_DISTANCE: Final = 1e-6  # relative; equal distances allow a length of zero
 

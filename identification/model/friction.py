@@ -34,10 +34,11 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import ModelError, ShapeError
 from identification.model.coupling import Coupling
+from identification.model.motion import Motion
 
-Array = NDArray[np.float64]
 ThirdTerm = Literal["quadratic", "cubic"]
 Zone = Literal["exclude", "linear"]
 Pair = tuple[str, tuple[tuple[float, float], tuple[float, float]]]
@@ -440,11 +441,9 @@ class JointFriction:
             return np.zeros((0, self.n_joints))
         return self.coupling.speeds[list(self.motors)]
 
-    def direction(self, time: Array, position: Array, velocity: Array) -> Array:
-        """Return the direction of dry friction (m, n + k) of joints, then of `motors`.
-
-        Times (m,) [s], positions [rad or m] and velocities of the joints (m, n).
-        """
+    def direction(self, motion: Motion) -> Array:
+        """Return the direction of dry friction (m, n + k) of joints, then of `motors`."""
+        time, position, velocity = motion.time, motion.position, motion.velocity
         joints = [
             law.direction(time, position[:, j], velocity[:, j]) for j, law in enumerate(self.laws)
         ]

@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import ModelError
 from identification.model.urdf_text import XACRO, left_by_xacro, refusal, urdf_tree
 
@@ -81,8 +82,6 @@ def closed_chain(text: str) -> str | None:
     name, count = children.most_common(1)[0] if children else ("", 0)
     return f"link {name!r} is the child of {count} joints: a closed chain" if count > 1 else None
 
-
-Array = NDArray[np.float64]
 
 # Indices of `LINK_SYMBOLS` in pinocchio's order m, mcx, mcy, mcz, Ixx, Ixy, Iyy, Ixz, ...
 FROM_PINOCCHIO = (4, 5, 7, 6, 8, 9, 1, 2, 3, 0)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.model.kinematics import Chain, skew
-
-Array = NDArray[np.float64]
+from identification.model.motion import Motion
 
 _ROUNDING = 1e-15  # of direction cosines
 
@@ -51,10 +50,11 @@ class LinkMotion:
             self._steps.append(_Step(chain, joint, before, rotation, after, self._joints[:, joint]))
         self._blend = np.array([step.blend for step in self._steps])
 
-    def set_joints(self, q: Array, qd: Array, qdd: Array) -> None:
-        """Set the joint motion of k <= size samples (k, n); the other samples are at rest."""
-        k = len(q)
-        for target, given in zip(self._joints, (q, qd, qdd), strict=True):
+    def set_joints(self, motion: Motion) -> None:
+        """Set the joint motion of k <= size samples; the other samples are at rest."""
+        k = motion.n_samples
+        states = motion.position, motion.velocity, motion.acceleration
+        for target, given in zip(self._joints, states, strict=True):
             target[:, :k] = given.T
             target[:, k:] = 0.0
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import ModelError
 from identification.model.kinematics import Chain
+from identification.model.motion import Motion
 from identification.model.pseudo_inertia import Body, inertial_parameters, tensors
-from identification.model.regressor import RegressorPlan, joint_arrays
-
-Array = NDArray[np.float64]
+from identification.model.regressor import RegressorPlan
 
 _ROUNDING = 1e-9  # relative to the largest principal moment
 _MOST = 1e9  # kg, m, kg·m²; products of larger numbers could overflow
@@ -84,7 +83,10 @@ class Load:
         self.joint, self.parameters = payload.carried_by(chain)
         self._plan = RegressorPlan.of_bodies(chain, gravity, self.joint)
 
-    def torque(self, q: Array, qd: Array, qdd: Array) -> Array:
-        """Return the joint torques (m, n) [N·m or N] that the payload requires."""
-        q, qd, qdd = joint_arrays(self._plan.chain.n_joints, q=q, qd=qd, qdd=qdd)
-        return self._plan.torque(self.parameters, q, qd, qdd)
+    def torque(self, motion: Motion) -> Array:
+        """Return the joint torques (m, n) [N·m or N] that the payload requires.
+
+        Raises:
+            ShapeError: a motion of another arm.
+        """
+        return self._plan.torque(self.parameters, motion.checked(self._plan.chain.n_joints))

@@ -15,12 +15,10 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.model.kinematics import skew
-
-Array = NDArray[np.float64]
 
 # Rows and columns of a symmetric 3x3 matrix, in the order xx, xy, xz, yy, yz, zz.
 _UPPER = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import ShapeError
+from identification.arrays import Array
 from identification.model.elements import JointElements, PlacedElement
 from identification.model.friction import FrictionLaw, JointFriction, JointTerm
 from identification.model.kinematics import Chain
@@ -23,8 +23,7 @@ from identification.model.link_wrenches import (
     wrench_matrix,
     write_primitives,
 )
-
-Array = NDArray[np.float64]
+from identification.model.motion import Motion
 
 Rows = slice | NDArray[np.intp]
 
@@ -106,24 +105,15 @@ class RegressorPlan:
         return cls(chain, gravity, links, [False] * n, None)
 
     def chunks(
-        self,
-        q: Array,
-        qd: Array,
-        qdd: Array,
-        direction: Array | None = None,
-        load: Array | None = None,
-        *,
-        response: Array | None = None,
+        self, motion: Motion, *, response: Array | None = None
     ) -> Iterator[tuple[slice, list[Array]]]:
         """Yield the regressor in chunks of samples: (slice of samples, rows of each joint).
 
-        `direction` of dry friction (m, n + k) is that of joints and coupled motors, by default the
-        sign of their speeds. `load` (m, n) is the torque that the gears transmit; without it the
-        columns of load-dependent friction are zero. The rows of joint j have shape (c_j, k) for k
-        samples, one more with `response` (m, n) as the last. They are views that are valid until
-        the next chunk.
+        Without a load of the motion the columns of load-dependent friction are zero. The rows of
+        joint j have shape (c_j, k) for k samples, one more with `response` (m, n) as the last. They
+        are views that are valid until the next chunk.
         """
-        m, n = q.shape
+        m, n = motion.position.shape
         rows = self.rows
         if response is not None:
             rows = tuple(_append(r, self.response_row(j)) for j, r in enumerate(rows))
@@ -131,8 +121,7 @@ class RegressorPlan:
             for start in range(0, m, work.size):
                 part = slice(start, min(start + work.size, m))
                 k = part.stop - start
-                given = (None if array is None else array[part] for array in (direction, load))
-                work.update(q[part], qd[part], qdd[part], *given)
+                work.update(motion.rows(part))
                 if response is not None:
                     for joint in range(n):
                         work.rows[joint, self.response_row(joint), :k] = response[part, joint]
@@ -153,46 +142,31 @@ class RegressorPlan:
             with self._lock:
                 self._spare = [*self._spare, work][-_SPARE:]
 
-    def evaluate(
-        self,
-        q: Array,
-        qd: Array,
-        qdd: Array,
-        direction: Array | None = None,
-        load: Array | None = None,
-    ) -> Regressor:
-        """Return the whole regressor for motion arrays (m, n), see :meth:`chunks`."""
-        m = q.shape[0]
+    def evaluate(self, motion: Motion) -> Regressor:
+        """Return the whole regressor of a motion, see :meth:`chunks`."""
+        m = motion.n_samples
         full = [np.empty((len(columns), m)) for columns in self.columns]
-        for part, rows in self.chunks(q, qd, qdd, direction, load):
+        for part, rows in self.chunks(motion):
             for target, block in zip(full, rows, strict=True):
                 target[:, part] = block
         return Regressor(tuple(block.T for block in full), self.columns)
 
-    def torque(
-        self,
-        values: Array,
-        q: Array,
-        qd: Array,
-        qdd: Array,
-        direction: Array | None = None,
-        load: Array | None = None,
-    ) -> Array:
-        """Return the torques (m, n) of parameters (p,) for motion arrays, see :meth:`chunks`.
+    def torque(self, values: Array, motion: Motion) -> Array:
+        """Return the torques (m, n) of parameters (p,) along a motion, see :meth:`chunks`.
 
         The wrenches of a link's parameters are added up first, so it takes half the time of the
         regressor, and hardly any for parameters of the drives alone.
         """
-        m, n = q.shape
+        m, n = motion.position.shape
         torque = np.empty((m, n))
         bodies = self._body_weights(values)
         drives = self._drive_weights(values)
         with self._borrowed(m) as work:
             for start in range(0, m, work.size):
                 part = slice(start, min(start + work.size, m))
-                given = (None if array is None else array[part] for array in (direction, load))
-                work.set_motion(q[part], qd[part], qdd[part], links=bool(bodies))
-                work.update_drives(*given)
+                rows = motion.rows(part)
+                work.set_motion(rows, links=bool(bodies))
+                work.update_drives(rows)
                 torque[part] = work.torque(bodies, drives)[:, : part.stop - start].T
         return torque
 
@@ -265,7 +239,6 @@ class _Workspace:
         self._drive_rows = plan.drive_rows
         self._joint_friction = plan.friction
         self._first_drive_row = plan.first_drive_row
-        self._q = np.empty((0, n))  # of the motion that is set
         self._motion = LinkMotion(plan.chain, plan.gravity, size)
         motors = 0 if plan.friction is None else len(plan.friction.motors)
         self._direction = np.zeros((n + motors, size))
@@ -368,9 +341,9 @@ class _Workspace:
                         column = term.column(speed, direction)
                         np.multiply(share[joint], column, out=self.rows[joint, row])
 
-    def _write_direction(self, friction: JointFriction, direction: Array | None, k: int) -> None:
-        if direction is not None:
-            self._direction[:, :k] = direction.T
+    def _write_direction(self, friction: JointFriction, motion: Motion) -> None:
+        if motion.direction is not None:
+            self._direction[:, : motion.n_samples] = motion.direction.T
             return
         velocity = self._motion.velocity
         n = friction.n_joints
@@ -384,40 +357,32 @@ class _Workspace:
         ):
             friction.laws[motor].sign(share @ velocity, out=out)
 
-    def update(
-        self,
-        q: Array,
-        qd: Array,
-        qdd: Array,
-        direction: Array | None = None,
-        load: Array | None = None,
-    ) -> None:
-        """Compute all columns for k <= size samples (k, n); the others are undefined."""
-        self.set_motion(q, qd, qdd)
+    def update(self, motion: Motion) -> None:
+        """Compute all columns for k <= size samples; the others are undefined."""
+        self.set_motion(motion)
         for c in self._contractions:
             np.matmul(c.matrix, c.primitives, out=c.flat_wrenches)
             if c.joints is None:
                 np.einsum("jrt,crt->jct", c.twists, c.wrenches, out=c.target)
             else:
                 c.target[c.joints] = np.einsum("jrt,crt->jct", c.twists, c.wrenches)
-        self.update_drives(direction, load)
+        self.update_drives(motion)
 
-    def set_motion(self, q: Array, qd: Array, qdd: Array, *, links: bool = True) -> None:
-        """Set the motion of k <= size samples (k, n), of joints alone or of the links as well."""
-        self._q = q
-        self._motion.set_joints(q, qd, qdd)
+    def set_motion(self, motion: Motion, *, links: bool = True) -> None:
+        """Set the motion of k <= size samples, of joints alone or of the links as well."""
+        self._motion.set_joints(motion)
         if links:
             self._motion.update()
             write_primitives(self._motion.motion, self._primitives)
 
-    def update_drives(self, direction: Array | None = None, load: Array | None = None) -> None:
+    def update_drives(self, motion: Motion) -> None:
         """Compute the columns of drives, friction and elements for the motion that is set."""
-        q = self._q
-        k = len(self._q)
+        q = motion.position
+        k = motion.n_samples
         if self._joint_friction is not None:
-            self._write_direction(self._joint_friction, direction, k)
+            self._write_direction(self._joint_friction, motion)
             if self._joint_friction.has_load:
-                self._load[:, :k] = 0.0 if load is None else load.T
+                self._load[:, :k] = 0.0 if motion.load is None else motion.load.T
         for law, velocity, sign, transmitted, target in self._friction:
             target[...] = law.columns(velocity, sign, transmitted)
         for source, target in self._drives:
@@ -456,24 +421,6 @@ class _Contraction(NamedTuple):
     wrenches: Array  # the same memory as flat_wrenches, (columns, r, size)
     target: Array  # (a, columns, size), or of all joints
     joints: NDArray[np.intp] | None  # which of all joints
-
-
-def joint_arrays(n_joints: int, **arrays: Array) -> tuple[Array, ...]:
-    """Return arrays as float64 of one shape (m, n_joints).
-
-    Raises:
-        ShapeError: an array has another shape.
-    """
-    checked = []
-    rows: int | None = None
-    for name, array in arrays.items():
-        values = np.asarray(array, dtype=np.float64)
-        m = "m" if rows is None else rows
-        if values.ndim != 2 or values.shape[1] != n_joints or rows not in (None, len(values)):
-            raise ShapeError(name, values.shape, f"({m}, {n_joints})")
-        rows = len(values)
-        checked.append(values)
-    return tuple(checked)
 
 
 def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.intp], ...]]:

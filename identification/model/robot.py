@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array, Indices
 from identification.errors import ModelError, ShapeError
 from identification.model.base_parameters import TOLERANCE, BaseParameters, select_base, share_left
 from identification.model.coupling import Coupling
@@ -18,11 +19,9 @@ from identification.model.elements import Element, ElementError, JointElements, 
 from identification.model.friction import OFFSET, FrictionLaw, JointFriction
 from identification.model.kinematics import Chain, chain_from_urdf
 from identification.model.link_wrenches import LINK_SYMBOLS
+from identification.model.motion import Motion, joint_arrays
 from identification.model.payload import Load, Payload
-from identification.model.regressor import Regressor, RegressorPlan, joint_arrays
-
-Array = NDArray[np.float64]
-Places = NDArray[np.intp]
+from identification.model.regressor import Regressor, RegressorPlan
 
 _N_LINK = len(LINK_SYMBOLS)
 _N_SINGLE_DIGITS = 9
@@ -56,17 +55,17 @@ class StandardLayout:
         return self.n_joints * self.width + len(self.pairs)
 
     @cached_property
-    def links(self) -> Places:
+    def links(self) -> Indices:
         """Indices of the ten inertial parameters of each link (n, 10)."""
         return self._joint_blocks[:, :_N_LINK]
 
     @cached_property
-    def rotors(self) -> Places:
+    def rotors(self) -> Indices:
         """Indices of the rotor inertias (n,), or (0,)."""
         return self._joint_blocks[:, _N_LINK:].reshape(-1)
 
     @property
-    def couplings(self) -> Places:
+    def couplings(self) -> Indices:
         """Indices of the coupling inertias (c,), in the order of `pairs`."""
         return np.arange(self.n_joints * self.width, self.size)
 
@@ -114,7 +113,7 @@ class StandardLayout:
         return values
 
     @property
-    def _joint_blocks(self) -> Places:
+    def _joint_blocks(self) -> Indices:
         return np.arange(self.n_joints * self.width).reshape(self.n_joints, self.width)
 
     def _unit(self, standard: int) -> str:
@@ -285,66 +284,38 @@ class RobotModel:
         values[self.layout.links] = self.chain.inertial
         return values
 
-    def regressor(
-        self,
-        q: Array,
-        qd: Array,
-        qdd: Array,
-        direction: Array | None = None,
-        load: Array | None = None,
-    ) -> Regressor:
-        """Return W for m samples of motion, each array (m, n).
-
-        `direction` (m, n + k) of dry friction and `load` (m, n) as in :class:`Motion`; a load of
-        None is that of :meth:`gear_load`.
+    def regressor(self, motion: Motion) -> Regressor:
+        """Return W for m samples of motion; an unknown load is that of the URDF's bodies.
 
         Raises:
             ShapeError: an array has another shape.
         """
-        q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
-        return self.plan.evaluate(q, qd, qdd, direction, self.gear_load(q, qd, qdd, load))
+        return self.plan.evaluate(self.with_gear_load(motion.checked(self.n_joints)))
 
     def chunks(
-        self,
-        q: Array,
-        qd: Array,
-        qdd: Array,
-        direction: Array | None = None,
-        load: Array | None = None,
-        *,
-        response: Array | None = None,
+        self, motion: Motion, *, response: Array | None = None
     ) -> Iterator[tuple[slice, list[Array]]]:
-        """Yield W in chunks, see :meth:`RegressorPlan.chunks`; `load` as in :meth:`regressor`.
+        """Yield W in chunks, see :meth:`RegressorPlan.chunks`; the load as in :meth:`regressor`.
 
         Raises:
             ShapeError: an array has another shape.
         """
-        q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
-        load = self.gear_load(q, qd, qdd, load)
-        return self.plan.chunks(q, qd, qdd, direction, load, response=response)
+        motion = self.with_gear_load(motion.checked(self.n_joints))
+        return self.plan.chunks(motion, response=response)
 
-    def torque(
-        self,
-        values: Array,
-        q: Array,
-        qd: Array,
-        qdd: Array,
-        direction: Array | None = None,
-        load: Array | None = None,
-    ) -> Array:
+    def torque(self, values: Array, motion: Motion) -> Array:
         """Return the joint torques [N·m, N] of parameter values (p,), shape (m, n).
 
-        Without :meth:`load_torque`; `direction` and `load` as in :class:`Motion`, a load of None is
-        that of the values.
+        Without :meth:`load_torque`; an unknown load of the motion is that of the values.
 
         Raises:
             ShapeError: an array has another shape.
         """
         values = self._checked(values)
-        q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
-        if self.friction.has_load and load is None:
-            load = self.gear_torque(values, q, qd, qdd)
-        return self.plan.torque(values, q, qd, qdd, direction, load)
+        motion = motion.checked(self.n_joints)
+        if self.friction.has_load and motion.load is None:
+            motion = replace(motion, load=self.gear_torque(values, motion))
+        return self.plan.torque(values, motion)
 
     def joint_inertia(self, values: Array, q: Array) -> Array:
         """Return the inertia of the joints (m, n, n) by parameters (p,) at positions (m, n).
@@ -357,12 +328,15 @@ class RobotModel:
         rigid = self._checked(values).copy()
         rigid[self.base.rank :] = 0.0
         (q,) = joint_arrays(self.n_joints, q=q)
-        still = np.zeros_like(q)
-        weight = self.plan.torque(rigid, q, still, still)
-        columns = [self.plan.torque(rigid, q, still, still + unit) for unit in np.eye(q.shape[1])]
+        rest = Motion.at_rest(q)
+        weight = self.plan.torque(rigid, rest)
+        columns = [
+            self.plan.torque(rigid, replace(rest, acceleration=rest.acceleration + unit))
+            for unit in np.eye(q.shape[1])
+        ]
         return np.stack([column - weight for column in columns], axis=-1)
 
-    def gear_torque(self, values: Array, q: Array, qd: Array, qdd: Array) -> Array:
+    def gear_torque(self, values: Array, motion: Motion) -> Array:
         """Return the torque [N·m, N] that the gears transmit, of parameters (p,), shape (m, n).
 
         That of the bodies, the payload, springs and balancers; without friction, offsets, torque
@@ -372,20 +346,20 @@ class RobotModel:
             ShapeError: an array has another shape.
         """
         transmitted = np.where(self._transmitted, self._checked(values), 0.0)
-        q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
-        return self.plan.torque(transmitted, q, qd, qdd) + self.load_torque(q, qd, qdd)
+        motion = motion.checked(self.n_joints).kinematics()
+        return self.plan.torque(transmitted, motion) + self.load_torque(motion)
 
-    def gear_load(self, q: Array, qd: Array, qdd: Array, load: Array | None = None) -> Array | None:
-        """Return the transmitted torque (m, n) of load-dependent friction, None without it.
+    def with_gear_load(self, motion: Motion) -> Motion:
+        """Return the motion with the transmitted torque that load-dependent friction needs.
 
-        A given `load`, else that of the URDF's bodies and of nominal springs and balancers.
+        A known load, else that of the URDF's bodies and of nominal springs and balancers.
         """
-        if not self.friction.has_load or load is not None:
-            return load
+        if not self.friction.has_load or motion.load is not None:
+            return motion
         values = np.zeros(self.n_parameters)
         values[: self.base.rank] = self.base.grouping @ self.nominal
         values[self.element_part] = self.elements.nominal
-        return self.gear_torque(values, q, qd, qdd)
+        return replace(motion, load=self.gear_torque(values, motion))
 
     def _checked(self, values: Array) -> Array:
         values = np.asarray(values, dtype=np.float64)
@@ -409,15 +383,15 @@ class RobotModel:
         """Whether a payload or an element has a known torque."""
         return self._load is not None or bool(self.elements.placed)
 
-    def load_torque(self, q: Array, qd: Array, qdd: Array) -> Array:
+    def load_torque(self, motion: Motion) -> Array:
         """Return the known torque [N·m, N] of payload, springs and balancers (m, n).
 
         Raises:
             ShapeError: an array has another shape.
         """
-        (q,) = joint_arrays(self.n_joints, q=q)
-        torque = self.elements.known_torque(q)
-        return torque if self._load is None else torque + self._load.torque(q, qd, qdd)
+        (position,) = joint_arrays(self.n_joints, position=motion.position)
+        torque = self.elements.known_torque(position)
+        return torque if self._load is None else torque + self._load.torque(motion)
 
     def moving(self, qd: Array) -> NDArray[np.bool_]:
         """Return which rows can be fitted, shape (m, n); see :meth:`JointFriction.moving`."""
@@ -482,8 +456,9 @@ def _base_parameters(
     q = random.uniform(-np.pi, np.pi, shape)
     qd = random.uniform(-3.0, 3.0, shape)
     qdd = random.uniform(-10.0, 10.0, shape)
+    states = Motion.of_states(q, qd, qdd)
     plan = _plan(chain, gravity, layout, everything, None)
-    rows = plan.evaluate(q, qd, qdd).dense(layout.size).reshape(-1, layout.size)
+    rows = plan.evaluate(states).dense(layout.size).reshape(-1, layout.size)
     base = select_base(rows, layout.names, layout.units)
     base = _without_carried_rotors(layout, friction, rows, base)
     _require_separate_elements(friction, elements, rows[:, base.pivots], q)

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.distributions import student_limit
 from identification.export.arm import Arm
 from identification.export.simulators import unsupported_torque
@@ -21,8 +22,6 @@ from identification.rollout.servo import Servo, command_of
 from identification.rollout.simulation import LARGEST_ERROR, Feedback, SimulatedArm
 from identification.rollout.windows import Stretch, Windows, stretches_of
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 HORIZONS: Final = (0.1, 0.2, 0.5, 1.0)
 """Times after the start of a window at which positions are compared [s]."""
@@ -129,11 +128,7 @@ def _removed(stretch: Stretch, samples: Samples, arm: Arm) -> Array:
     if samples.torque_bandwidth is None:
         return np.zeros_like(stretch.motion.position)
     model = arm.model
-    motion = samples.motion
-    load = None
-    if model.friction.has_load:
-        load = model.gear_torque(arm.values, *motion[1:4])
-    whole = model.torque(arm.values, *motion[1:5], load)
+    whole = model.torque(arm.values, samples.motion.without_load())
     removed = whole - samples.predicted_torque(model, arm.values)
     return stretch.mean_about_instants(removed[stretch.part])
 
@@ -142,9 +137,9 @@ def _late(stretch: Stretch, arm: Arm) -> Array:
     """Return what centrifugal torques (g, n) lack, which MuJoCo computes half a step early."""
     model = arm.model
     motion = stretch.motion
-    before = motion._replace(velocity=stretch.before)
+    before = replace(motion, velocity=stretch.before)
     late = _late_of_links(model, arm.standard[model.layout.links].tobytes(), stretch)
-    return np.asarray(late + model.load_torque(*before[1:4]) - model.load_torque(*motion[1:4]))
+    return np.asarray(late + model.load_torque(before) - model.load_torque(motion))
 
 
 @lru_cache(maxsize=64)
@@ -152,9 +147,9 @@ def _late_of_links(model: RobotModel, links: bytes, stretch: Stretch) -> Array:
     """Return that of links without payload; a polish changes none of them in hundreds of arms."""
     plan = RegressorPlan.of_bodies(model.chain, model.gravity)
     parameters = np.frombuffer(links)
-    motion = stretch.motion
-    early = plan.torque(parameters, motion.position, stretch.before, motion.acceleration)
-    return early - plan.torque(parameters, *motion[1:4])
+    motion = stretch.motion.kinematics()
+    early = plan.torque(parameters, replace(motion, velocity=stretch.before))
+    return early - plan.torque(parameters, motion)
 
 
 def _delayed(stretch: Stretch, delay: float) -> Array:

@@ -27,6 +27,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.export.arm import Arm
 from identification.export.simulators import rigid_torque
 from identification.model.motion import Motion
@@ -40,8 +41,6 @@ from identification.rollout.servo import (
     without_means,
 )
 from identification.rollout.windows import Stretch
-
-Array = NDArray[np.float64]
 
 NAMES: Final = ("kp", "kd", "Im", "f0", "f1")
 """Parameters of a joint: gains, rotor inertia, dry and viscous friction."""

@@ -17,6 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.export.arm import Arm
 from identification.export.simulators import load_mujoco
 from identification.rollout.comparison import (
@@ -27,8 +28,6 @@ from identification.rollout.comparison import (
 )
 from identification.rollout.servo import LONGEST_DELAY
 from identification.rollout.simulation import LARGEST_ERROR, Feedback
-
-Array = NDArray[np.float64]
 
 _WEIGHT: Final = 0.03  # lambda: of a change by one unit, beside an error that stays as it is
 _UNIT: Final = 0.3  # of the logarithm of friction and gains

@@ -7,12 +7,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.rollout.windows import Stretch
-
-Array = NDArray[np.float64]
 
 BLOCK: Final = 0.5
 """Time over which the sum of gravity, friction and integral action counts as constant [s]."""

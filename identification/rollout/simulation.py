@@ -13,11 +13,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.export.arm import Arm
 from identification.export.simulators import load_mujoco, mjcf
-
-Array = NDArray[np.float64]
 
 LARGEST_ERROR: Final = np.pi
 """Position error [rad or m] from which on a simulation counts as unstable."""

@@ -11,11 +11,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.model.motion import Motion
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 STEP: Final = 5e-3
 """Time step of a simulation [s]."""

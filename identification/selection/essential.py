@@ -15,6 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array, Indices
 from identification.distributions import student_limit
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, with_block_covariance
@@ -24,9 +25,6 @@ from identification.factor.factor import Factor, joined
 from identification.factor.normal_equations import Solution, solve
 from identification.model.robot import RobotModel
 from identification.text import percentage
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 _CHANCE: Final = 0.05
 _TINY: Final = 1e-300

@@ -15,13 +15,13 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.factor.blocks import add_grams, count_by_block, equal_runs
 from identification.factor.factor import Factor
 from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 FOLDS: Final = 10

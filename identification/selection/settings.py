@@ -40,6 +40,14 @@ class Choice:
 
 
 @dataclass(frozen=True)
+class Hedge:
+    """Usual bandwidth of the motion, in case another motion prefers it to the chosen one."""
+
+    bandwidth: float  #: [Hz]
+    weight: float  #: of its rows, relative to those of the chosen bandwidth; at most 1
+
+
+@dataclass(frozen=True)
 class Settings:
     """Settings of the preprocessing and estimation of an arm's archives; serialisable.
 
@@ -55,11 +63,27 @@ class Settings:
     torque_variance: tuple[float, ...] | None = None
     stated_delay: float = 0.0  #: of the torque, by cell or options [s]
     delay_variance: float = 0.0  #: mean square error of the delay [s²]; zero if it is known
+    #: bandwidth that the chosen one is averaged with; None: with none
+    hedge: Hedge | None = None
     strength: Strength = Strength()
     choices: tuple[Choice, ...] = ()  #: made by inner prediction
     #: parameters (p,) of bodies and drives that load the gears, for friction that grows with it;
     #: None: it does not, or they are estimated with it
     loading: tuple[float, ...] | None = None
+
+    @property
+    def versions(self) -> tuple[Settings, ...]:
+        """These settings, and those with the bandwidth that theirs is averaged with, if any."""
+        if self.hedge is None:
+            return (self,)
+        return self, self.preprocessed(rigid_bandwidth=self.hedge.bandwidth)
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Share of each of the versions in sums over rows."""
+        weight = 0.0 if self.hedge is None else self.hedge.weight
+        shares = (1.0 / (1.0 + weight), weight / (1.0 + weight))
+        return shares[: len(self.versions)]
 
     def preprocessed(self, **changes: Any) -> Settings:
         """Return these settings with changes of the preprocessing."""

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.estimators.consistent import consistent_values
 from identification.estimators.prior import (
@@ -32,7 +33,6 @@ from identification.selection.folds import FOLDS, Errors, Folds, PredictedRows, 
 from identification.selection.settings import Choice, Settings, Strength
 from identification.signals.samples import Preprocessing, Samples
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 TRANSFER: Final = 0.07
@@ -195,6 +195,16 @@ class Trial:
                     break
         self._retain_samples(candidates[chosen])
         return self._decision(name, candidates, means, chosen)
+
+    def odds(self, other: Settings, chosen: Settings, transfer: float) -> float:
+        """Return the odds of other settings against chosen ones on another motion, at most one.
+
+        By the likelihood of their difference in the logarithm of the error, whose standard
+        deviation is that over the segments and `transfer`.
+        """
+        theirs, ours = (self.errors(each).segments for each in (other, chosen))
+        change, std = _change(theirs, ours, transfer)
+        return math.exp(-0.5 * (max(0.0, change) / std) ** 2)
 
     def decide_last(self, name: str, candidates: Sequence[Settings]) -> Decision:
         """Return the last candidate up to which none predicts worse than the first.

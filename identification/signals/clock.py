@@ -15,10 +15,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.signals.recording import GAP_STEPS, Recording, RecordingError
 from identification.text import percentage
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 # Largest deviation from a uniform step: 1 % displaces a sine of a tenth of the sampling rate by

@@ -10,11 +10,11 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 # Smoothed signals are inaccurate near the ends of a segment. On noisy sines the error of the

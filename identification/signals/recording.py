@@ -12,10 +12,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError, ShapeError
-
-Array = NDArray[np.float64]
-
 
 # Command range beyond which a constant position is an error.
 STUCK_MOVEMENT: Final = 0.02  # rad or m

@@ -8,6 +8,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.model.motion import Motion
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
@@ -21,8 +22,6 @@ from identification.signals.smoothing import (
     fit_smoothing_spline,
     low_passed,
 )
-
-Array = NDArray[np.float64]
 
 # Default (see :mod:`identification.selection.inner_prediction`). Planned motion is below 10 Hz, the
 # first resonance of large arms at 10 to 30 Hz; on the simulated NS 16 20 to 60 Hz are equal.
@@ -98,7 +97,7 @@ class Samples:
         part = slice(start, stop)
         motion = self.motion.rows(part)
         if motion.direction is not None:  # a view would hold the whole recording's
-            motion = motion._replace(direction=motion.direction.copy())
+            motion = replace(motion, direction=motion.direction.copy())
         segments = [
             slice(max(segment.start, start) - start, min(segment.stop, stop) - start)
             for segment in self.segments
@@ -136,15 +135,13 @@ class Samples:
         """Return samples with the direction of dry friction by a model's law."""
         direction = None
         if any(law.presliding > 0.0 for law in model.friction.laws):
-            direction = model.friction.direction(*self.whole.motion[:3])
+            direction = model.friction.direction(self.whole.motion)
         return self._with_direction(direction)
 
     def sliding(self, model: RobotModel, sign: float) -> Samples:
         """Return samples whose dry friction has the direction +1 or -1 throughout."""
         motion = self.whole.motion
-        return self._with_direction(
-            np.full_like(model.friction.direction(*motion[:3]), np.sign(sign))
-        )
+        return self._with_direction(np.full_like(model.friction.direction(motion), np.sign(sign)))
 
     def _with_direction(self, direction: Array | None) -> Samples:
         """Return samples with the direction of dry friction of all rows of their recording."""
@@ -152,11 +149,11 @@ class Samples:
             parent, part = self.parent
             parent = parent._with_direction(direction)
             return replace(self, motion=parent.motion.rows(part), parent=(parent, part))
-        return replace(self, motion=self.motion._replace(direction=direction))
+        return replace(self, motion=replace(self.motion, direction=direction))
 
     def with_load(self, model: RobotModel, values: Array) -> Samples:
         """Return samples with the torque that the gears transmit, of parameters (p,)."""
-        return self.with_given_load(model.gear_torque(values, *self.whole.motion[1:4]))
+        return self.with_given_load(model.gear_torque(values, self.whole.motion))
 
     def with_given_load(self, load: Array | None) -> Samples:
         """Return samples with a transmitted torque [N·m, N] of all rows of their recording."""
@@ -164,7 +161,7 @@ class Samples:
             parent, part = self.parent
             parent = parent.with_given_load(load)
             return replace(self, motion=parent.motion.rows(part), parent=(parent, part))
-        return replace(self, motion=self.motion._replace(load=load))
+        return replace(self, motion=replace(self.motion, load=load))
 
     @property
     def whole(self) -> Samples:
@@ -184,7 +181,7 @@ class Samples:
             samples, part = self.parent
             blocks, columns = samples.regressor(model)
             return Regressor(tuple(block[part] for block in blocks), columns)
-        blocks, columns = model.regressor(*self.motion[1:])
+        blocks, columns = model.regressor(self.motion)
         return Regressor(
             tuple(self.as_measured(joint, block) for joint, block in enumerate(blocks)), columns
         )
@@ -216,12 +213,12 @@ class Samples:
         """Return the torque (m, n) of a part of the values (p,), with the load of all."""
         load = None
         if model.friction.has_load:
-            load = model.gear_torque(values, *self.motion[1:4])
-        return self._filtered(model.torque(part, *self.motion[1:5], load))
+            load = model.gear_torque(values, self.motion)
+        return self._filtered(model.torque(part, replace(self.motion, load=load)))
 
     def known_torque(self, model: RobotModel) -> Array:
         """Return the torque (m, n) of known payload and elements, filtered likewise."""
-        torque = model.load_torque(*self.motion[1:4])
+        torque = model.load_torque(self.motion)
         return self._filtered(torque) if model.has_load else torque
 
     def _filtered(self, torque: Array) -> Array:

@@ -22,10 +22,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.signals.recording import RecordingError
 from identification.signals.spectrum import HARRIS, power_density
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from identification.arrays import Array
 
 HANN: Final = (0.5, -0.5)
 HARRIS: Final = (0.35875, -0.48829, 0.14128, -0.01168)

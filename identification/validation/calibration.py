@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.distributions import normal_limit, student_limit
 from identification.errors import IdentificationError
 from identification.factor.blocks import block_slices, count_by_block, merged
@@ -26,8 +27,6 @@ from identification.selection.folds import FOLDS
 from identification.signals.masks import EDGE, SATURATED
 from identification.signals.samples import Samples
 from identification.validation.residuals import BLOCK, FEWEST_BLOCKS, block_index
-
-Array = NDArray[np.float64]
 
 Refit = Callable[[Factor], Array]
 """Estimator: factor to parameters (p,)."""

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.factor.factor import Factor, joined
 from identification.model.robot import RobotModel
 from identification.signals.recording import STUCK_MOVEMENT
@@ -42,8 +42,6 @@ from identification.validation.faults import (
 )
 from identification.validation.physical_signs import SIGMAS, friction_at
 from identification.validation.prediction import noise_floor
-
-Array = NDArray[np.float64]
 
 _LEAST_GAIN: Final = 0.1  # relative reduction of the error by a significant correction
 _ALIKE: Final = 1.05  # error ratio up to which a fault with fewer coefficients is preferred

@@ -17,13 +17,13 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.residuals import BlockMean, block_index, block_mean
 
-Array = NDArray[np.float64]
 ChangeKind = Literal["gain", "friction"]
 
 _KINDS: Final[tuple[ChangeKind, ...]] = ("gain", "friction")

@@ -8,17 +8,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
 from identification.estimators.prior import BodyPrior
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
+from identification.model.motion import Motion
 from identification.model.pseudo_inertia import pseudo_inertia, reference_bodies
 from identification.model.robot import RobotModel
 from identification.validation.finding import joined, little_torque
 from identification.validation.physical_signs import SIGMAS
-
-Array = NDArray[np.float64]
-
 
 # Smallest second moment of a link relative to the nominal body's at which a bound counts as active.
 _EDGE: Final = 0.01
@@ -191,7 +190,7 @@ def _gravity_loaded(model: RobotModel, motion: Factor, values: Array) -> NDArray
     """Return the joints (n,) whose torque is largely weight, by parameters (p,)."""
     rng = np.random.default_rng(0)
     position = rng.uniform(-1.0, 1.0, (_POSTURES, model.n_joints))
-    still = np.zeros_like(position)
-    weight = model.torque(np.where(model.friction_columns, 0.0, values), position, still, still)
+    rigid = np.where(model.friction_columns, 0.0, values)
+    weight = model.torque(rigid, Motion.at_rest(position))
     measured = np.sqrt(motion.gram[:, -1, -1] / np.maximum(motion.samples, 1))
     return np.asarray(np.sqrt(np.mean(weight**2, axis=0)) > _LOADED * measured)

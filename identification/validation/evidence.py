@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.friction_form import FormUncertainty
 from identification.estimators.least_squares import RepeatedEstimate
@@ -41,8 +42,6 @@ from identification.validation.prediction import (
     slow_error,
 )
 from identification.validation.residuals import ResidualChecks, check_residuals
-
-Array = NDArray[np.float64]
 
 SIGMAS: Final = 3.0
 # Share of the rows in the rarer direction of motion below which friction and offset of a joint are

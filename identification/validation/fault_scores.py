@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.estimators.prior import GaussianPrior
 from identification.factor.normal_equations import solve_with_ridge
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.validation.fault_tables import FOLDS, FaultTables, folded
 from identification.validation.faults import Fault
-
-Array = NDArray[np.float64]
 
 _SIGMAS: Final = 3.0  # standard errors over the blocks of a significant correction
 # Ratio of the fit's error on the affected joints, with the correction over that without: 0.55 is

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Final
@@ -11,13 +11,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.faults import Fault
-
-Array = NDArray[np.float64]
 
 _MOST_ROWS: Final = 3000  # of all recordings together
 BLOCKS: Final = 10  # of all recordings together
@@ -116,13 +115,13 @@ def _tables(model: RobotModel, samples: Samples, values: Array, some: NDArray[np
     filtered = samples.torque_bandwidth is not None or samples.parent is not None
     part = np.arange(len(samples.torque)) if filtered else some
     motion = samples.motion.rows(part)
-    loads = payload.evaluate(*motion[1:4]).blocks
+    loads = payload.evaluate(motion.kinematics()).blocks
     if filtered:
         blocks, columns = samples.regressor(model)
         blocks = tuple(block[some] for block in blocks)
         loads = tuple(samples.as_measured(j, block)[some] for j, block in enumerate(loads))
     else:
-        blocks, columns = model.regressor(*motion[1:])
+        blocks, columns = model.regressor(motion)
     tables = np.zeros((n, len(some), p + _LOAD + 2 + n))
     for j in range(n):
         tables[j][:, columns[j]] = blocks[j]
@@ -140,8 +139,11 @@ def _rate(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.i
     now, first, last = (samples.motion.rows(rows) for rows in (some, before, after))
     direction = now.direction
     if direction is None:
-        direction = model.friction.direction(*now[:3])
-    low, high = (model.torque(values, *motion[1:4], direction) for motion in (first, last))
+        direction = model.friction.direction(now)
+    low, high = (
+        model.torque(values, replace(motion, direction=direction, load=None))
+        for motion in (first, last)
+    )
     return np.asarray((high - low) / np.maximum(last.time - first.time, 1e-9)[:, None])
 
 
@@ -159,8 +161,8 @@ def _load_friction(
     motion = samples.motion.rows(part)
     direction = motion.direction
     if direction is None:
-        direction = model.friction.direction(*motion[:3])
-    load = np.abs(model.gear_torque(values, *motion[1:4])) * direction[:, : model.n_joints]
+        direction = model.friction.direction(motion)
+    load = np.abs(model.gear_torque(values, motion)) * direction[:, : model.n_joints]
     if len(part) == len(some):
         return np.asarray(load)
     columns = [samples.as_measured(j, load[:, j : j + 1])[some] for j in range(model.n_joints)]

@@ -7,13 +7,10 @@ from dataclasses import replace
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-Array = NDArray[np.float64]
 Kind = Literal[
     "delay",
     "gain",
@@ -90,8 +87,8 @@ def corrected(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
     if fault.kind in OF_MOTION:
         load = None if motion.load is None else motion.load[:, order]
         read = (relative @ (np.eye(n)[order] * sign[:, None])).T
-        motion = Motion(motion.time, *(part @ read for part in motion[1:4]))
-        motion = motion._replace(load=load)
+        motion = motion.converted(lambda states: states @ read)
+        motion = replace(motion, direction=None, load=load)
         usable = usable[:, order]
     if fault.kind not in ("position order", *COUPLED):
         torque = torque[:, order] * sign

@@ -9,7 +9,8 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from identification.arrays import Array
+
 Mask = NDArray[np.bool_]
 Level = Literal["good", "information", "doubtful", "wrong"]
 Role = Literal["condition", "cause", "symptom"]

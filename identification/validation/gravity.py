@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.estimators.payload import mass_difference
 from identification.estimators.payload_problem import Run
@@ -19,8 +19,6 @@ from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.finding import Thresholds
-
-Array = NDArray[np.float64]
 
 _STANDARD: Final = 9.81  # m/s²
 _PASSES: Final = 2

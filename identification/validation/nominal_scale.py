@@ -7,25 +7,26 @@ shows it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.distributions import student_limit
 from identification.estimators.prior import nominal_deviations
+from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 
 def inertia_matrices(model: RobotModel, values: Array, position: Array) -> Array:
     """Return inertia matrices (k, n, n) with rotors, of parameters (p,) at positions (k, n)."""
-    still = np.zeros_like(position)
-    static_torque = model.torque(values, position, still, still)
+    rest = Motion.at_rest(position)
+    static_torque = model.torque(values, rest)
     columns = [
-        model.torque(values, position, still, still + axis) - static_torque
+        model.torque(values, replace(rest, acceleration=rest.acceleration + axis)) - static_torque
         for axis in np.eye(model.n_joints)
     ]
     return np.stack(columns, axis=2)

@@ -9,14 +9,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
 from identification.model.friction import COULOMB
 from identification.model.robot import RobotModel
 from identification.validation.finding import little_torque
-
-Array = NDArray[np.float64]
-
 
 SIGMAS: Final = 3.0  # standard deviations of a significant wrong sign or change
 # Masses, rotor inertias, moments of inertia about an axis.

@@ -14,10 +14,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.signals.recording import GAP_STEPS, Recording
-
-Array = NDArray[np.float64]
-
 
 _ROWS_AT_ONCE: Final = 50_000  # that are searched for steps
 _STANDS_OUT: Final = 15.0  # robust standard deviations of a jump

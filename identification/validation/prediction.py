@@ -12,11 +12,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.signals.smoothing import low_pass, noiseless_above
-
-Array = NDArray[np.float64]
 
 FRICTION_CHANGE: Final = 0.10
 # Hz. The torque of a rigid arm lies below, torque ripple and current noise above.

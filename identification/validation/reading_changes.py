@@ -9,12 +9,12 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples
 from identification.validation.faults import COUPLED, Fault, corrected
 
-Array = NDArray[np.float64]
 Meaning = Literal[
     "torque sign",
     "position sign",
@@ -94,14 +94,10 @@ def changed_samples(model: RobotModel, samples: Samples, change: Change) -> Samp
     if meaning == "zero":
         position = motion.position.copy()
         position[:, list(joints)] += change.size
-        motion = motion._replace(position=position)
+        motion = replace(motion, position=position)
     else:
         factor = DEGREE if meaning == "degrees" else 1.0 / DEGREE
-        motion = motion._replace(
-            position=factor * motion.position,
-            velocity=factor * motion.velocity,
-            acceleration=factor * motion.acceleration,
-        )
+        motion = motion.converted(lambda states: factor * states)
     return replace(samples, motion=motion, mask=None).with_friction_direction(model)
 
 
@@ -113,13 +109,8 @@ def _reordered(model: RobotModel, samples: Samples, change: Change) -> Samples:
     usable = samples.usable
     if change.meaning != "torque order":
         load = None if motion.load is None else motion.load[:, order]
-        motion = motion._replace(
-            position=motion.position[:, order],
-            velocity=motion.velocity[:, order],
-            acceleration=motion.acceleration[:, order],
-            direction=None,
-            load=load,
-        )
+        motion = motion.converted(lambda states: states[:, order])
+        motion = replace(motion, direction=None, load=load)
         usable = usable[:, order]
     if change.meaning != "position order":
         torque = torque[:, order]

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.estimators.prior import body_prior, posterior_values
 from identification.factor.factor import Factor
+from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.finding import little_torque
-
-Array = NDArray[np.float64]
 
 DISSIPATES: Final = 4.0  # standard errors of a friction that drives a joint
 _LEAST_FRICTION: Final = 0.02  # of the torque of a joint
@@ -125,13 +125,14 @@ def inertial_torque(model: RobotModel, samples: Samples) -> Array:
     values = posterior_values(factor, prior, ROWS_PER_FACT)[0]
     motion = samples.motion
     position = motion.position[:: max(1, len(motion.position) // _POSTURES)]
-    still = np.zeros_like(position)
-    weight = model.torque(values, position, still, still)
+    rest = Motion.at_rest(position)
+    weight = model.torque(values, rest)
     units = np.eye(model.n_joints)
     inertia = np.array(
         [
             np.mean(
-                model.torque(values, position, still, still + unit)[:, joint] - weight[:, joint]
+                model.torque(values, replace(rest, acceleration=rest.acceleration + unit))[:, joint]
+                - weight[:, joint]
             )
             for joint, unit in enumerate(units)
         ]

@@ -16,7 +16,6 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from identification.estimators.prior import body_prior, posterior_values
 from identification.factor.columns import every_torque_factor, of_torques
@@ -51,8 +50,6 @@ from identification.validation.reading_scores import (
     score_of,
     sigmas_of,
 )
-
-Array = NDArray[np.float64]
 
 SURE: Final = 4.5
 """Standard errors over the blocks of a reading that is sure, whatever the number tried: with 19

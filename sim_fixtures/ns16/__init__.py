@@ -23,9 +23,6 @@ from math import degrees
 from pathlib import Path
 from types import MappingProxyType
 
-import numpy as np
-from numpy.typing import NDArray
-
 TRUTH_PATH = Path(__file__).with_name("truth.json")
 TENSOR_KEYS = ("xx", "xy", "xz", "yy", "yz", "zz")
 
@@ -101,7 +98,6 @@ def load_truth() -> Ns16Truth:
     )
 
 
-Array = NDArray[np.float64]
 Terms = dict[str, float]
 
 TABLE2_PATH = Path(__file__).with_name("table2.csv")

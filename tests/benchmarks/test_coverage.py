@@ -18,7 +18,8 @@ from benchmarks.coverage import (
     drawn_motion,
     logged,
 )
-from hil.importers import IMPORTED_LAW
+from hil.importers.robot import IMPORTED_LAW
+from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 
 pytestmark = pytest.mark.long
@@ -44,7 +45,7 @@ class TestArm:
         fast = np.abs(states[1]).min(axis=1) > 0.01  # dry friction is that of the law there
         states = tuple(values[fast] for values in states)
         torque = arm.torque(*states)
-        modelled = model.torque(np.array(list(truth.values())), *states)
+        modelled = model.torque(np.array(list(truth.values())), Motion.of_states(*states))
         assert plain_fit.relative_error(torque, modelled) < 1e-9
 
     def test_bodies_are_consistent_and_ten_to_twenty_percent_off(self) -> None:

@@ -35,12 +35,12 @@ def pinocchios_torque(urdf: str, samples: Samples, weights: Array) -> Array:
     robot = pin.buildModelFromXML(urdf)
     usable = samples.usable
     data = robot.createData()
-    q, qd, qdd = samples.motion[1:4]
-    n = q.shape[1]
-    joint = np.arange(q.shape[1])
-    table = np.zeros((*q.shape, 14 * n))
-    for k, row in enumerate(zip(q, qd, qdd, strict=True)):
+    n = samples.motion.n_joints
+    joint = np.arange(n)
+    table = np.zeros((samples.motion.n_samples, n, 14 * n))
+    for k, row in enumerate(samples.motion.states()):
         table[k, :, : 10 * n] = pin.computeJointTorqueRegressor(robot, data, *row)
+    qd, qdd = samples.motion.velocity, samples.motion.acceleration
     for block, columns in enumerate((qdd, np.sign(qd), qd, np.ones_like(qd)), 10):
         table[:, joint, block * n + joint] = columns
     table = table[usable]
@@ -57,7 +57,7 @@ def require_same_fit(model: RobotModel, urdf: str, samples: Samples, weights: Ar
     """Least squares is what numpy makes of pinocchio's regressor."""
     expected = pinocchios_torque(urdf, samples, weights)
     values = estimate(model, Factor.of(model, samples), weights).values
-    ours = model.torque(values, *samples.motion[1:])[samples.usable]
+    ours = model.torque(values, samples.motion)[samples.usable]
     assert np.abs(ours - expected).max() < 1e-6 * np.sqrt(np.mean(expected**2))
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from hil.files import write_atomically
+from hil.base.files import write_atomically
 from tests.faults import CREATE, REFUSALS, RENAME, SYNC, WRITE, DiskFault
 
 RULES = "rules.json"

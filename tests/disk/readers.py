@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from hil.archive import Archive, container, open_archive
 from hil.archive.check import check_archive
 from hil.archive.repair import repair
-from hil.errors import HilError
-from hil.identify import Identification, identify_archives, identify_campaign
+from hil.base.errors import HilError
+from hil.base.progress import Silent
+from hil.campaign.identified import identify_campaign
+from hil.pipeline.run import Identification, identify_archives
 from hil.plots.archive_view import view_of
-from hil.progress import Silent
 from tests.hil.mcap_bytes import chunks, heads
 
 Columns = Mapping[str, NDArray[Any]]

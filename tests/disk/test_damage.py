@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from hil.archive import open_archive
-from hil.errors import ArchiveError
-from hil.identify import identify_archives
-from hil.progress import Silent
+from hil.base.errors import ArchiveError
+from hil.base.progress import Silent
+from hil.pipeline.run import identify_archives
 from tests.disk.damage import KINDS, SWAPPED, campaign, harmed, play
 from tests.disk.readers import Undamaged, blamed
 from tests.hil.mcap_bytes import chunks

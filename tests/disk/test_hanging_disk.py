@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from hil.archive import ArchiveOutcome, open_archive
+from hil.base.errors import ControllerError
+from hil.base.progress import Silent
 from hil.campaign import Campaign
 from hil.cell import Cell
-from hil.demo_link import LOOPBACK, SimulatorProcess
-from hil.errors import ControllerError
-from hil.progress import Silent
+from hil.control.simulator_process import LOOPBACK, SimulatorProcess
 from tests.disk.disks import Disk, processes_disk
 from tests.faults import DiskFault, parse_disk_fault
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
@@ -126,7 +126,7 @@ def test_link_continues_after_an_archive_that_opened_too_late(
     campaign = made(disk, "late", tmp_path)
     with loopback_link(campaign.cell) as link:
         with monkeypatch.context() as short:
-            short.setattr("hil.campaign.live_link.OPEN_TIMEOUT", 1.0)
+            short.setattr("hil.control.live_link.OPEN_TIMEOUT", 1.0)
             disk.do_wrong(parse_disk_fault("hang=8s@create:*.mcap"))
             with pytest.raises(ControllerError, match=r"did not open .*move_000_a1\.mcap.*nothing"):
                 campaign.run(link, None, Silent(), accept_dry_run=True)

@@ -18,13 +18,13 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from drivers.transports.simulated import SimulatedTransport
+from hil.base.errors import ArchiveError, HilError, NotAnArchiveError, OutputError
+from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan
-from hil.campaign.virtual_link import VirtualLink
 from hil.cell import Cell
 from hil.cli import app
-from hil.errors import ArchiveError, HilError, NotAnArchiveError, OutputError
-from hil.progress import Silent
-from hil.simulation import controller_settings, simulated_controller
+from hil.control.simulation import controller_settings, simulated_controller
+from hil.control.virtual_link import VirtualLink
 from tests.disk.disks import Disk, planted_disk
 from tests.faults import CREATE, REFUSALS, RENAME, SYNC, WRITE, DiskFault, parse_disk_fault
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal

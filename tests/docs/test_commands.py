@@ -17,9 +17,9 @@ import pytest
 from typer.testing import CliRunner
 
 from hil import Campaign, Cell
+from hil.base.progress import Silent
 from hil.campaign import design
 from hil.cli import app
-from hil.progress import Silent
 from tests import messages
 from tests.docs.typed import PAGES, ROOT, commands, parse
 from tests.hil.simulated_logs import write_moving_log

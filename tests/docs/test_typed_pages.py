@@ -21,14 +21,15 @@ from typer.testing import CliRunner
 
 from hil import Campaign, Cell
 from hil.archive import open_archive
+from hil.base.progress import Silent
 from hil.campaign import design
 from hil.cell.errors import UnknownFieldsError
 from hil.cell.text import with_values
 from hil.cli import app
-from hil.demo_link import free_port
-from hil.progress import Silent
-from hil.results import Results
-from hil.rollout_result import RolloutResult
+from hil.control.simulator_process import free_port
+from hil.results.results import Results
+from hil.results.rollout_result import RolloutResult
+from identification.model.motion import Motion
 from tests.docs.typed import ROOT, commands
 from tests.hil.simulated_logs import simulate
 from tests.hil.test_payload_command import CENTRE, MASS, archive_of_currents
@@ -140,14 +141,16 @@ def log_of(motion: str, path: str) -> None:
     trajectory = MotionTable.of(Path("runs/motion", motion).read_text())
     once = np.arange(0.0, trajectory.duration + 0.5, 2e-3)
     times = np.arange(2 * len(once)) * 2e-3
-    q, qd, qdd = (np.tile(column, (2, 1)) for column in trajectory.sample(once))
+    states = Motion(once, *trajectory.sample(once))
+    states = Motion.joined((states, states))
+    q = states.position
     n = len(cell.joint_names)
     values = cell.parameter_values(
         rotor_inertia=np.full(n, 0.3), coulomb=np.full(n, 5.0), viscous=np.full(n, 3.0),
         third=np.zeros(n),
     )  # fmt: skip
     noise = np.random.default_rng(len(motion)).standard_normal((2, *q.shape))
-    torque = cell.model.torque(values, q, qd, qdd) + 0.2 * noise[0]
+    torque = cell.model.torque(values, states) + 0.2 * noise[0]
     table = np.column_stack([times, q + 1e-5 * noise[1], torque])
     np.savetxt(path, table, delimiter=",", header="t,q1,q2,tau1,tau2", comments="")
 

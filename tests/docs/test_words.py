@@ -134,7 +134,7 @@ class TestUnits:
     """Products of units have a dot at half height; column maps have the names in `UNITS`."""
 
     WRONG = re.compile(r"\bN\.m\b|\bNm\b|\bN m\b|\bkg\.?m\b|\bkg m(?!\w)")
-    DEFINED = ("importers/units.py", "archive/schema.py", "design/requirements.py")
+    DEFINED = ("importers/units.py", "archive/schema.py", "precision/requirements.py")
 
     def test_messages_have_a_dot_between(self) -> None:
         wrong: list[str] = []

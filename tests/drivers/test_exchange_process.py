@@ -39,7 +39,7 @@ from drivers.packets import DRIVE_ON, next_number
 from drivers.record import RingReader
 from drivers.transports.base import TransportError
 from drivers.transports.udp import UdpSpec, UdpTransport
-from hil.demo_link import free_port
+from hil.control.simulator_process import free_port
 from tests.drivers.rig import (
     MOVE,
     PERIOD,

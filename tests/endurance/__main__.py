@@ -30,12 +30,12 @@ from typing import Any, Final
 from drivers.transports.udp import UdpSpec
 from hil.archive import ArchiveOutcome, open_archive
 from hil.archive.check import check_archive
+from hil.base.errors import HilError
+from hil.base.progress import Reporter, Silent, Task, reporter
 from hil.campaign import Campaign, Stop, stop_on_interrupt
-from hil.campaign.live_link import LiveLink
 from hil.campaign.plan import design
-from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
-from hil.errors import HilError
-from hil.progress import Reporter, Silent, Task, reporter
+from hil.control.live_link import LiveLink
+from hil.control.simulator_process import LOOPBACK, SimulatorProcess, free_port
 from tests.arguments import parser_of, time_above_0
 from tests.endurance.verdict import Verdict, judge, read_journal
 from tests.hil.fast_cell import fast_cell

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.own_moves import InterpolatedMoves
+from hil.control.own_moves import InterpolatedMoves
 from planner import JointLimits
 from sim_fixtures import ControllerSettings, PlantTruth, SimulatedController, SimulatedDrive
 

@@ -14,15 +14,17 @@ import pytest
 from drivers import CyclicPacket
 from drivers.transports.can.profile import DOWN, UP, BusRates, End
 from hil.archive import Samples, write_samples
+from hil.base.errors import ArchiveError, InputError, SourceError
+from hil.base.toml_text import from_text
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.rehearsal import Rehearsal
 from hil.cell import Cell
 from hil.design.result import DesignResult
-from hil.errors import ArchiveError, InputError, SourceError
-from hil.importers import ColumnMap, import_log, import_rosbag2
+from hil.importers.column_map import ColumnMap
+from hil.importers.log import import_log
+from hil.importers.rosbag2 import import_rosbag2
 from hil.new import from_archive
 from hil.plots.archive_view import view_of
-from hil.toml_text import from_text
 from identification.errors import ModelError
 from identification.model.kinematics import chain_from_urdf
 from identification.model.payload import Payload

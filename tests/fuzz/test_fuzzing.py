@@ -16,7 +16,7 @@ from drivers import CyclicPacket, Guard, Session
 from drivers.transports.can import profile
 from drivers.transports.can.profile import End, TransferAssembler, payloads
 from hil.archive import ArchiveHeader, open_archive
-from hil.errors import ArchiveError
+from hil.base.errors import ArchiveError
 from tests.fuzz import __main__ as command
 from tests.fuzz import targets
 from tests.fuzz.test_corpora import inputs

@@ -16,10 +16,10 @@ import numpy as np
 from typer.testing import CliRunner
 
 from benchmarks.published import Published
+from hil.base.progress import Silent
 from hil.campaign.plan import design
 from hil.cli import app
-from hil.progress import Silent
-from hil.results import Results
+from hil.results.results import Results
 from tests.hil.fast_cell import fast_cell
 
 HERE: Final = Path(__file__).parent

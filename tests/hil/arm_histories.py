@@ -74,8 +74,9 @@ def torque(condition):
     body = pin.Inertia(load, CENTRE, 0.01 * load * np.eye(3))
     arm.appendBodyToJoint(arm.njoints - 1, body, pin.SE3.Identity())
     data = arm.createData()
-    q, qd, qdd = motion()[1:4]
-    rigid = np.array([pin.rnea(arm, data, *state) for state in zip(q, qd, qdd, strict=True)])
+    moved = motion()
+    qd, qdd = moved.velocity, moved.acceleration
+    rigid = np.array([pin.rnea(arm, data, *state) for state in moved.states()])
     dry, viscous, third = condition.friction
     return rigid + ROTORS * qdd + np.sign(qd) * (dry + viscous * np.abs(qd) + third * qd**2)
 

@@ -16,9 +16,9 @@ from typing import Final
 
 from distributed import WorkerPlugin
 
+from hil.base.errors import ArchiveError
 from hil.batch import discovery
 from hil.batch.cluster import Cluster, SkippedArchive, Task
-from hil.errors import ArchiveError
 
 NOTHING_OPEN: Final = (
     *("--bandwidth", "40", "--velocity", "position", "--friction", "coulomb,viscous"),

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from hil.campaign import Campaign, CampaignPlan, Stop, design, operator_control
+from hil.base.progress import Silent
+from hil.campaign import Campaign, CampaignPlan, Stop, design
 from hil.cell import Cell
-from hil.progress import Silent
-from hil.simulation import simulated_link, simulated_provenance
+from hil.control import operator_control
+from hil.control.simulation import simulated_link, simulated_provenance
 from sim_fixtures import SimulatedDrive
 from sim_fixtures.ns16 import CELL_PATH
 

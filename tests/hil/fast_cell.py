@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Archive
+from hil.base.progress import Silent
 from hil.campaign import Campaign
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.plan import design
 from hil.campaign.rehearsal import CRITERIA, Criterion, Rehearsal
 from hil.cell import Cell
 from hil.cell.text import with_values
-from hil.progress import Silent
 from planner import PiecewiseCubic
 
 QUICK_GRADIENT = """\

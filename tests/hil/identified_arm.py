@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hil.base.files import write_files
 from hil.cell import Cell
-from hil.files import write_files
-from hil.identify.estimating import Posterior
-from hil.outcome import Exports, exports_of
+from hil.pipeline.estimating import posterior_of
+from hil.report.output_files import Exports, exports_of
 from identification import Estimate
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.estimate import estimate, joint_weights
@@ -91,7 +91,7 @@ def identified_arm(
     weights = joint_weights(training)
     free = with_block_covariance(estimate(model, training, weights), training, weights)
     unseen = sum(held_out, Factor.zero(model))
-    posterior = Posterior.of(cell, training, "auto", Strength())
+    posterior = posterior_of(cell, training, "auto", Strength())
     consistency = check_consistency(
         model,
         training,
@@ -108,7 +108,7 @@ def identified_arm(
 def _run(cell, truth, seed, still, noise):
     model = cell.model
     motion = a_motion(model.n_joints, seed, still)
-    size = np.sqrt(np.mean(model.torque(truth, *motion[1:]) ** 2, axis=0))
+    size = np.sqrt(np.mean(model.torque(truth, motion) ** 2, axis=0))
     return simulated(model, truth, motion, noise * size, seed)
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from drivers.transports.udp import UdpSpec
 from hil.archive.live import LiveView
-from hil.campaign.live_link import LiveLink
+from hil.base.errors import ControllerError, ExecutionError
 from hil.cell import Cell
-from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
-from hil.errors import ControllerError, ExecutionError
+from hil.control.live_link import LiveLink
+from hil.control.simulator_process import LOOPBACK, SimulatorProcess, free_port
 
 
 def on_loopback(cell: Cell, port: int | None = None) -> Cell:

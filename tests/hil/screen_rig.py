@@ -25,8 +25,9 @@ import numpy as np
 from drivers.states import State
 from hil.campaign import stop_on_interrupt
 from hil.campaign.dry_run import DryRunRecord
-from hil.campaign.operator import MotionProgress, OperatorRequest, RunStatus
-from hil.screen import Screen
+from hil.campaign.operator import RunStatus
+from hil.campaign.screen import Screen
+from hil.control.motion_watch import MotionProgress, OperatorRequest
 
 LONGEST = 60.0
 """s after which it ends with an error."""

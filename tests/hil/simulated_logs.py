@@ -13,7 +13,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from hil.archive import open_archive
-from hil.importers import ColumnMap, Robot, import_log
+from hil.importers.column_map import ColumnMap
+from hil.importers.log import import_log
+from hil.importers.robot import Robot
 from identification import FrictionLaw, RobotModel
 
 Array = NDArray[np.float64]

@@ -14,15 +14,17 @@ from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt, sosfiltfilt
 from typer.testing import CliRunner
 
+from hil.base.errors import ArchiveError
+from hil.base.progress import Silent
 from hil.cli import app
 from hil.cli.verdict import NOT_GOOD
-from hil.errors import ArchiveError
-from hil.identify.options import FIXED, Options
-from hil.identify.prepared import Prepared, prepare_sources, stated_settings
-from hil.identify.sources import gather_sources
-from hil.importers import ColumnMap, Quantity, Robot, TimeColumn, Use, import_log
-from hil.progress import Silent
-from hil.results import FittedResult, Results
+from hil.importers.column_map import ColumnMap, Quantity, TimeColumn
+from hil.importers.log import import_log
+from hil.importers.robot import Robot, Use
+from hil.pipeline.options import FIXED, Options
+from hil.pipeline.prepared import Prepared, prepare_sources, stated_settings
+from hil.pipeline.sources import gather_sources
+from hil.results.results import FittedResult, Results
 from identification import Estimate, FrictionLaw, estimate, prediction_error
 from identification.factor.factor import Factor
 from tests.hil.simulated_logs import (
@@ -277,6 +279,6 @@ class TestFilteredTorque:
 
 def test_fixed_options_decide_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("choose_settings", "estimate_delay", "possible_low_passes"):
-        monkeypatch.setattr(f"hil.identify.prepared.{name}", pytest.fail)
+        monkeypatch.setattr(f"hil.pipeline.prepared.{name}", pytest.fail)
     prepared_data = prepared(tmp_path, 2, causal=True, options=FIXED)
     assert prepared_data.settings == stated_settings(prepared_data.sources.cell, FIXED)

@@ -24,7 +24,7 @@ from hil.archive import (
     schema,
 )
 from hil.archive.check import check_archive
-from hil.errors import ArchiveError, ArchiveVersionError, ArchiveWriteError
+from hil.base.errors import ArchiveError, ArchiveVersionError, ArchiveWriteError
 
 JOINTS = ("joint_1", "joint_2", "joint_3")
 ATTACHMENTS = {"cell.toml": b"[cell]\n", "robot.urdf": b"<robot/>" * 50}

@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
+from hil.base.errors import HilError
 from hil.cli import app
-from hil.errors import HilError
 from tests.hil.simulated_logs import write_log, write_moving_log
 from tests.hil.test_log_kinds import URDF
 

@@ -17,12 +17,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from typer.testing import CliRunner
 
 from hil.archive import open_archive
+from hil.archive.recordings import open_recording
+from hil.base.errors import InputError
 from hil.cli import app
-from hil.errors import InputError
 from hil.importers.bag_map import BagMap
 from hil.importers.ros_messages import CONTROLLER_STATE, definitions_of
-from hil.recordings import open_recording
-from hil.rollout_result import ROLLOUT, RolloutResult
+from hil.results.rollout_result import ROLLOUT, RolloutResult
 from tests.hil.test_importers_rosbag2 import bag
 from tests.identification.test_encoders import DELAY, KD, KP, an_arm, on_its_servo
 from tests.identification.two_link import MODEL, URDF, four_sines
@@ -407,7 +407,7 @@ class TestSeveralTopics:
 
 def test_a_look_shows_the_commands(tmp_path, urdf) -> None:
     messages = Messages("humble")
-    torque = MODEL.torque(np.ones(MODEL.n_parameters), *four_sines(MOVED.time, 0.5)[1:])
+    torque = MODEL.torque(np.ones(MODEL.n_parameters), four_sines(MOVED.time, 0.5))
     topics = {
         "/joint_states": measured(messages, MOVED, torque),
         "/arm_controller/controller_state": controller(messages, MOVED),

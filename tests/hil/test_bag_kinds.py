@@ -17,9 +17,10 @@ from rosbags.typesys import Stores, get_typestore
 from typer.testing import CliRunner
 
 from hil.archive import Archive, open_archive
+from hil.base.errors import SourceError
 from hil.cli import app
-from hil.errors import SourceError
-from hil.importers import Robot, import_rosbag2, recorded_joints
+from hil.importers.robot import Robot
+from hil.importers.rosbag2 import import_rosbag2, recorded_joints
 from tests import messages
 from tests.hil.test_importers_rosbag2 import DEFINITION, STATE, bag, mcap, state
 from tests.hil.test_log_kinds import COUNT, JOINTS, POSITION, RATE, SLOPE, TIME, TORQUE, URDF

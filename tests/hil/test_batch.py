@@ -20,23 +20,23 @@ from typer.testing import CliRunner
 from benchmarks import archive_files
 from hil.archive import ArchiveWriter, Samples, write_samples
 from hil.archive.repair import repair, repaired_name
+from hil.base.errors import ArchiveError, InputError
+from hil.base.progress import Silent
 from hil.batch import discovery, reduction
-from hil.batch import run as batch_run
+from hil.batch import graph as batch_run
 from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster
 from hil.batch.discovery import discover, open_ref
 from hil.batch.estimates import BatchEstimator
-from hil.batch.reduction import cached_reduction, reduce_archives
-from hil.batch.run import reidentify
+from hil.batch.graph import reidentify
+from hil.batch.reduction import ToReduce, cached_reduction, reduce_archives
+from hil.campaign.identified import identify_campaign
 from hil.cell import Cell
 from hil.cli import app
-from hil.errors import ArchiveError, InputError
-from hil.identify import Options, identify_campaign
-from hil.identify.estimating import estimate_with, with_transmitted_load
-from hil.identify.options import FIXED
-from hil.identify.prepared import decide, prepare_sources
-from hil.identify.sources import gather_sources
-from hil.progress import Silent
+from hil.pipeline.estimating import estimate_with, with_transmitted_load
+from hil.pipeline.options import FIXED, Options
+from hil.pipeline.prepared import decide, prepare_sources
+from hil.pipeline.sources import gather_sources
 from identification.factor import factor
 from identification.factor.blocks import FINE_BLOCK
 from identification.selection.settings import Settings, Strength
@@ -148,7 +148,8 @@ def batch_result(campaign):
 class TestNumbers:
     def test_equal_those_of_hil_identify(self, campaign):
         """With the default options, which choose the settings."""
-        identified = identify_campaign(campaign.folder.root, Silent()).estimate
+        identification = identify_campaign(campaign.folder.root, Silent())
+        stated = identification.estimation.stated
         result = batch(campaign.folder.root, options=Options())
         (level,) = result.campaigns
         (pooled,) = result.pooled
@@ -156,16 +157,15 @@ class TestNumbers:
         level = level.estimate
         pooled = pooled.estimate
         assert pooled.values.tobytes() == level.values.tobytes()
-        np.testing.assert_allclose(level.values, identified.pooled.values, **EXACT)
-        np.testing.assert_allclose(
-            level.covariance, identified.pooled.covariance, rtol=1e-9, atol=1e-15
-        )
-        np.testing.assert_allclose(level.noise_std, identified.pooled.noise_std, **EXACT)
+        np.testing.assert_allclose(level.values, stated.values, **EXACT)
+        np.testing.assert_allclose(level.covariance, stated.covariance, rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(level.noise_std, stated.noise_std, **EXACT)
         for name in ("interval_factor", "method", "names"):
-            assert getattr(level, name) == getattr(identified.pooled, name)
-        assert list(level.samples) == list(identified.pooled.samples)
-        assert len(result.repetitions) == len(identified.repetitions) == 3
-        assert_equal_repetitions(result, identified)
+            assert getattr(level, name) == getattr(stated, name)
+        assert list(level.samples) == list(stated.samples)
+        repeated = identification.estimate
+        assert len(result.repetitions) == len(repeated.repetitions) == 3
+        assert_equal_repetitions(result, repeated)
 
     @pytest.mark.parametrize(
         "changes",
@@ -183,28 +183,29 @@ class TestNumbers:
             decisions = decide(sources, FIXED, reporter)
             return decisions._replace(settings=replace(decisions.settings, **changes))
 
-        monkeypatch.setattr("hil.identify.prepared.decide", decided)
+        monkeypatch.setattr("hil.pipeline.prepared.decide", decided)
         monkeypatch.setattr(batch_run, "decide", decided)
         options = replace(FIXED, estimator="auto")
         ready = with_transmitted_load(prepare(campaign, options))
-        identified = estimate_with(ready, options, Silent()).result
+        estimation = estimate_with(ready, options, Silent())
+        stated = estimation.stated
         result = batch(campaign.folder.root, options=options)
         level = result.campaigns[0].estimate
-        np.testing.assert_allclose(level.values, identified.pooled.values, **EXACT)
-        np.testing.assert_allclose(level.std, identified.pooled.std, **EXACT)
-        assert level.method == identified.pooled.method
-        assert_equal_repetitions(result, identified)
+        np.testing.assert_allclose(level.values, stated.values, **EXACT)
+        np.testing.assert_allclose(level.std, stated.std, **EXACT)
+        assert level.method == stated.method
+        assert_equal_repetitions(result, estimation.result)
 
     @pytest.mark.parametrize("name", get_args(BatchEstimator))
     def test_equal_those_with_samples_for_each_estimator(self, name, campaign):
         options = replace(FIXED, estimator=name)
         # The strength of its prior is chosen for "auto".
-        identified = estimate_with(prepare(campaign, options), options, Silent()).result
+        stated = estimate_with(prepare(campaign, options), options, Silent()).stated
         level = batch(campaign.folder.root, estimator=name).campaigns[0].estimate
         # The program of the consistent estimate stops at its own tolerance.
         rtol, atol = (1e-4, 1e-4) if name == "consistent" else (1e-8, 1e-12)
-        np.testing.assert_allclose(level.values, identified.pooled.values, rtol=rtol, atol=atol)
-        np.testing.assert_allclose(level.std, identified.pooled.std, rtol=1e-8)
+        np.testing.assert_allclose(level.values, stated.values, rtol=rtol, atol=atol)
+        np.testing.assert_allclose(level.std, stated.std, rtol=1e-8)
 
     def test_held_out_errors_equal_those_of_samples(self, prepared, batch_result):
         (level,) = batch_result.campaigns
@@ -300,8 +301,8 @@ class TestCache:
         monkeypatch.setattr(factor, "_MANY_BLOCKS", 4)
         (ref, *_) = found_in(excitations(folder)[0]).refs
         cache = CacheLocation(str(tmp_path / "cache"))
-        computed = reduce_archives((ref,), SETTINGS, cache).total
-        cached = cached_reduction((ref,), SETTINGS, cache).total
+        computed = reduce_archives((ToReduce(ref),), SETTINGS, cache).total.factor
+        cached = cached_reduction((ToReduce(ref),), SETTINGS, cache).total.factor
         assert cached.block == computed.block > FINE_BLOCK
         assert [matrix.tobytes() for matrix in cached.matrices] == [
             matrix.tobytes() for matrix in computed.matrices
@@ -570,13 +571,13 @@ class TestGroups:
         )
         other.replace(victim)
         used = {}
-        reduce_one = reduction.archive_factor
+        reduce_one = reduction.reduced_archive
 
-        def spied(ref, settings):
-            used[ref.name] = settings.preprocessing.torque_delay
-            return reduce_one(ref, settings)
+        def spied(wanted, settings):
+            used[wanted.ref.name] = settings.preprocessing.torque_delay
+            return reduce_one(wanted, settings)
 
-        monkeypatch.setattr(reduction, "archive_factor", spied)
+        monkeypatch.setattr(reduction, "reduced_archive", spied)
         result = batch(loose)
         assert not result.broken
         assert [campaign.repetitions for campaign in result.campaigns] == [2, 1]
@@ -666,5 +667,5 @@ class TestMetadata:
         with pytest.raises(ArchiveError, match="was changed"):
             open_ref(ref)
         cache = CacheLocation(str(tmp_path / "cache"))
-        assert reduce_archives((ref,), SETTINGS, cache).broken
-        assert cached_reduction((ref,), SETTINGS, cache) is None
+        assert reduce_archives((ToReduce(ref),), SETTINGS, cache).broken
+        assert cached_reduction((ToReduce(ref),), SETTINGS, cache) is None

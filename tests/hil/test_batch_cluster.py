@@ -21,16 +21,16 @@ import pytest
 from typer.testing import CliRunner
 
 import hil
+from hil.base.errors import InputError
+from hil.base.progress import Messages, Silent
 from hil.batch import cluster as cluster_module
+from hil.batch import graph as batch_run
 from hil.batch import places
-from hil.batch import run as batch_run
 from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster, ClusterError
-from hil.batch.run import reidentify
+from hil.batch.graph import reidentify
 from hil.cli import app
-from hil.errors import InputError
-from hil.identify.options import FIXED
-from hil.progress import Messages, Silent
+from hil.pipeline.options import FIXED
 
 from . import batch_work as work
 from .batch_work import NOTHING_OPEN, HandMade, Here
@@ -183,7 +183,7 @@ class TestSchedulersByHand:
         """Their numbers would differ."""
         source = Path(hil.__file__).parent
         shutil.copytree(source, tmp_path / "hil", ignore=shutil.ignore_patterns("__pycache__"))
-        with (tmp_path / "hil" / "version.py").open("a") as file:
+        with (tmp_path / "hil" / "base" / "version.py").open("a") as file:
             file.write("\n# another version\n")
         path = os.pathsep.join([str(tmp_path), str(source.parent)])
         with HandMade(workers=1) as processes:

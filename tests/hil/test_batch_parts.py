@@ -28,20 +28,21 @@ from hil.batch.cache import HEADER, JSON, NPZ, NUMBERS, CacheError, CacheLocatio
 from hil.batch.cluster import SkippedArchive
 from hil.batch.discovery import ArchiveRef, arm_digest
 from hil.batch.estimates import Arm
+from hil.batch.graph import PARTITION, BatchResult, _Campaign
 from hil.batch.reduction import (
+    ToReduce,
     _matrices,
     _triangles,
     cached_reduction,
     reduction_key,
     settings_digest,
 )
-from hil.batch.run import PARTITION, BatchResult, _Campaign
 from hil.batch.table import COLUMNS, write_tables
 from hil.batch.thread import ThreadClient
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, TorsionSpringTable
 from identification.factor.factor import Factor
-from identification.selection.settings import Choice, Settings, Strength
+from identification.selection.settings import Choice, Hedge, Settings, Strength
 from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
 from sim_fixtures.ns16 import CELL_PATH
@@ -68,7 +69,7 @@ def test_partitions_do_not_depend_on_the_order_of_archives(order):
     refs = [a_ref(k) for k in order]
     partitions = _Campaign(refs[0].key, refs).partitions
     assert [len(part) for part in partitions] == [PARTITION, PARTITION, 40 - 2 * PARTITION]
-    assert [ref.index for part in partitions for ref in part] == list(range(40))
+    assert [wanted.ref.index for part in partitions for wanted in part] == list(range(40))
 
 
 def test_sums_are_stored_without_loss_and_block_by_block():
@@ -185,7 +186,7 @@ class TestCache:
         [
             *(([{"gram": 3}], {}), (None, {}), ({"archives": [{}]}, {}), ("text", {})),
             (
-                {"archives": [{"warnings": [], "products": False}], "parameters": [], "units": []},
+                {"archives": [{"warnings": [], "blocks": 1}], "parameters": [], "units": []},
                 {"counts": np.zeros((1, 2), np.intp)},
             ),
         ],
@@ -193,8 +194,8 @@ class TestCache:
     def test_forged_reductions_are_ignored(self, tmp_path, content, arrays):
         stated = Settings(Preprocessing())
         cache = CacheLocation(str(tmp_path))
-        cache.write(a_ref(0).location, reduction_key([a_ref(0)], stated), content, arrays)
-        assert cached_reduction([a_ref(0)], stated, cache) is None
+        cache.write(a_ref(0).location, reduction_key([ToReduce(a_ref(0))], stated), content, arrays)
+        assert cached_reduction([ToReduce(a_ref(0))], stated, cache) is None
 
     @pytest.mark.parametrize(
         ("layout", "numbers"),
@@ -305,7 +306,7 @@ class TestCache:
 
 class TestDigests:
     @pytest.mark.parametrize(
-        "name", ["batch/discovery.py", "batch/run.py", "signals/samples.py", "record.py"]
+        "name", ["batch/discovery.py", "batch/graph.py", "signals/samples.py", "record.py"]
     )
     def test_that_of_the_programs_depends_on_each(self, name, monkeypatch):
         here = code_digest()
@@ -349,9 +350,10 @@ class TestDigests:
             replace(stated, friction={"presliding": 1e-4}),
             replace(stated, delay_variance=1e-9),
             replace(stated, loading=(1.0, 2.0)),
+            replace(stated, hedge=Hedge(14.0, 0.5)),
         ]
         assert len({settings_digest(settings) for settings in (stated, *others)}) == 1 + len(others)
-        both = [a_ref(0), a_ref(1)]
+        both = [ToReduce(a_ref(0)), ToReduce(a_ref(1))]
         assert reduction_key(both, stated) != reduction_key(both[::-1], stated)
 
 

@@ -17,6 +17,8 @@ from drivers.errors import Check, GuardError
 from drivers.states import State
 from drivers.transports.simulated import Corrupt, Lose, SimulatedTransport
 from hil.archive import ArchiveName, ArchiveWriter, open_archive
+from hil.base.errors import ArchiveWriteError, ControllerError, InputError
+from hil.base.progress import Silent, Task
 from hil.campaign import (
     Campaign,
     CampaignFolderError,
@@ -29,20 +31,12 @@ from hil.campaign import (
     VirtualLink,
 )
 from hil.campaign import state as state_module
-from hil.campaign.errors import refusal_text
-from hil.campaign.motions import (
-    CampaignMotion,
-    StraightMoves,
-    planned_motions,
-    player_of,
-    require_allowed,
-    rest,
-)
+from hil.campaign.planned_motions import planned_motions
 from hil.cell import AngleFrame, Cell
-from hil.errors import ArchiveWriteError, ControllerError, InputError
-from hil.motion_checks import MotionChecks
-from hil.progress import Silent, Task
-from hil.simulation import simulated_controller, simulated_link
+from hil.control.errors import refusal_text
+from hil.control.motion_checks import MotionChecks
+from hil.control.motions import CampaignMotion, StraightMoves, player_of, require_allowed, rest
+from hil.control.simulation import simulated_controller, simulated_link
 from planner import (
     Move,
     PiecewiseCubic,
@@ -443,7 +437,7 @@ def test_a_solver_that_crashes_ends_the_campaign_only(
     def crashing(*arguments: object, **settings: object) -> None:
         raise PlannerCrashed(-11)
 
-    monkeypatch.setattr("hil.campaign.motions.in_child", crashing)
+    monkeypatch.setattr("hil.control.motions.in_child", crashing)
     with pytest.raises(PlannerCrashed, match="signal 11"):
         execute(arm.campaign, arm.link)
     assert arm.campaign.folder.manifest() == []

@@ -18,21 +18,21 @@ import pytest
 from typer.testing import CliRunner
 
 import hil
+from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError
 from hil.campaign.campaign import campaign_of_design
 from hil.campaign.dry_run import Acceptance, DryRunRecord
 from hil.campaign.folder import CampaignFolder
-from hil.campaign.motions import at_limit, straight_move
+from hil.campaign.identified import identify_campaign
 from hil.campaign.status import conduct_of, status_of
 from hil.campaign.warmup import WarmMotion, WarmUpRecord
 from hil.cell import Cell
 from hil.cli import app
+from hil.control.motion_checks import MotionChecks
+from hil.control.motions import at_limit, straight_move
+from hil.control.move import plan_move
+from hil.control.record import origin_of, with_present_date
 from hil.design import DesignResult
-from hil.identify import identify_campaign
-from hil.motion_checks import MotionChecks
-from hil.move import plan_move
-from hil.progress import Silent
-from hil.recording import origin_of, with_present_date
 from planner import TrajectoryPlayer
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal

@@ -14,20 +14,20 @@ import pytest
 from typer.testing import CliRunner
 
 from hil.archive import ArchiveName, open_archive
+from hil.base.errors import InputError
+from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, MotionRefusedError, design, plan_around
+from hil.campaign.identified import identify_campaign
 from hil.campaign.plan import LEAST, quick_settings
 from hil.cell import Cell
 from hil.cli import app
 from hil.cli import demo as demo_module
-from hil.demo_link import SimulatorProcess
+from hil.control.motion_checks import PLANNED_CURRENT, MotionChecks
+from hil.control.simulator_process import SimulatorProcess
 from hil.design import load_design, preset
 from hil.design.run import DesignFolder, run_design
-from hil.errors import InputError
-from hil.identify import identify_campaign
-from hil.motion_checks import PLANNED_CURRENT, MotionChecks
-from hil.outcome import FILES
-from hil.progress import Silent
-from hil.results import Results
+from hil.report.output_files import FILES
+from hil.results.results import Results
 from identification.excitation import Constraints, Criteria, Excitation, sampled
 from planner import FourierSeries, PiecewiseCubic
 from sim_fixtures.ns16 import CELL_PATH

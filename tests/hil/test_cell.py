@@ -21,6 +21,7 @@ from hil.cell.errors import models_of
 from hil.cell.schema import CanTable, CellFile
 from hil.cell.text import urdf_limits
 from hil.design import preset, problem_of
+from identification.model.motion import Motion
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 from sim_fixtures.plant import build_model
 from tests.hil.new_cells import TWO_JOINTS
@@ -296,7 +297,7 @@ class TestElements:
         q[0, 1] = np.radians(85.0)
         length = np.hypot(0.8, 0.2)
         force = 1.67e-3 * 16.3e6 * 1e-3 / (1e-3 - (length - 0.6) * 1.67e-3)
-        torque = cell.model.load_torque(q, np.zeros_like(q), np.zeros_like(q))
+        torque = cell.model.load_torque(Motion.at_rest(q))
         np.testing.assert_allclose(torque[0, 1], 0.16 / length * force)
 
     def test_ripple_is_of_every_joint_with_a_gear(self, ns16: Cell) -> None:

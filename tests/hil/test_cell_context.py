@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hil.identify.cell_context import _friction_law, _resolution, _sampling_rate, grid_step
+from hil.pipeline.cell_context import _friction_law, _resolution, _sampling_rate, grid_step
 from identification.model.friction import FrictionLaw
 from identification.selection.inner_prediction import LOAD
 from identification.selection.settings import Choice
@@ -125,7 +125,7 @@ def test_a_sampling_rate_that_folds_noise_is_named(every, bandwidth, named):
     """At 50 Hz, not at 1 kHz, nor where the torque has a low-pass."""
     time = np.arange(0.0, 20.0, 1e-3)
     motion = one_sine(time)
-    torque = MODEL.torque(np.ones(MODEL.n_parameters), *motion[1:])
+    torque = MODEL.torque(np.ones(MODEL.n_parameters), motion)
     noise = np.random.default_rng(1).standard_normal(torque.shape)
     torque += 0.5 * torque.std(axis=0) * (2.0 * noise + np.sin(5.0 * time)[:, None])
     rows = slice(None, None, every)

@@ -14,13 +14,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
+from hil.base.errors import InputError
+from hil.base.progress import Silent
 from hil.batch.cluster import Cluster
 from hil.batch.estimates import Arm
 from hil.campaign import Campaign
 from hil.campaign.plan import design
 from hil.cell import Cell
 from hil.cli import app
-from hil.compare import (
+from hil.compare.changes_page import comparison_page
+from hil.compare.comparison import (
     against_first,
     compare,
     compare_campaigns,
@@ -29,9 +32,7 @@ from hil.compare import (
     holm,
     quantities,
 )
-from hil.errors import InputError
-from hil.progress import Silent
-from hil.report.changes import comparison_page
+from identification.model.motion import Motion
 
 from . import arm_histories
 from .arm_histories import FRICTION, Condition
@@ -117,7 +118,7 @@ class TestRecorded:
     )
     def test_refused_before_anything_is_estimated(self, folders, monkeypatch, other, why):
         """Different arms, whichever comes first, with what they differ in; one campaign."""
-        monkeypatch.setattr("hil.batch.run._Batch", pytest.fail)
+        monkeypatch.setattr("hil.batch.graph._Batch", pytest.fail)
         with pytest.raises(InputError, match=why):
             compared(folders["march"], folders[other])
 
@@ -182,11 +183,14 @@ class TestInMemory:
         assert [axes[name] for name in ("mc2x", "I5xz")] == ["joint_2", "joint_5"]
         values = np.random.default_rng(1).uniform(0.1, 2.0, arm.n_parameters)
         values[: arm.base.rank] = 0.0
-        still = np.zeros((1, 6))
+        still = Motion.at_rest(np.zeros((1, 6)))
         for j, quantity in enumerate(q for q in compared if q.kind == "friction"):
-            speed = still.copy()
+            speed = np.zeros((1, 6))
             speed[0, j] = float(quantity.name.split()[-2])
-            both = [arm.torque(values, still, sign * speed, still)[0, j] for sign in (1.0, -1.0)]
+            both = [
+                arm.torque(values, replace(still, velocity=sign * speed))[0, j]
+                for sign in (1.0, -1.0)
+            ]
             assert quantity.weights @ values == pytest.approx(0.5 * (both[0] - both[1]), rel=0.05)
 
     def test_scatter_of_repetitions_hides_a_change(self):

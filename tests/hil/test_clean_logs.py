@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 import hil
 from hil.cli import app
-from hil.identified_arm import IdentifiedArm
+from hil.identified.identified_arm import IdentifiedArm
 from tests.hil.simulated_logs import urdf_path
 from tests.hil.test_log_kinds import URDF
 

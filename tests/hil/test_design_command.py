@@ -16,13 +16,13 @@ import pytest
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
+from hil.base.errors import InputError
+from hil.base.files import lock_folder
 from hil.cell import Cell
 from hil.cli import app
 from hil.design import METHODS, DesignResult, load_design
 from hil.design.advice import NoExcitationError
 from hil.design.settings import preset_text
-from hil.errors import InputError
-from hil.files import lock_folder
 from hil.plots import design_picture
 from identification.excitation import CRITERIA
 from sim_fixtures.ns16 import CELL_PATH
@@ -119,7 +119,7 @@ def test_the_motion_satisfies_the_constraints_and_is_closed(made):
     np.testing.assert_allclose(ends[0], [cell.home] * 2, atol=1e-9)
     np.testing.assert_allclose(ends[1:], 0.0, atol=1e-9)
     assert excitation.trajectory.duration <= 20.0
-    from hil.motion_checks import MotionChecks  # builds the arm's shapes
+    from hil.control.motion_checks import MotionChecks  # builds the arm's shapes
 
     assert MotionChecks.of(cell).refusal(excitation.trajectory) is None
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from hil.base.errors import ArchiveError, InputError
+from hil.base.progress import Silent
 from hil.campaign import design
 from hil.cell import Cell
 from hil.cli import app
 from hil.design import load_design, load_settings, preset, problem_of
-from hil.design.given import given_of
-from hil.errors import ArchiveError, InputError
-from hil.progress import Silent
+from hil.precision.given_recordings import given_of
 from identification.excitation import Objective, midpoints
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.conftest import run_campaign, small

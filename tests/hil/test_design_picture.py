@@ -94,8 +94,8 @@ class TestPage:
         (image,) = axes.images
         motion = midpoints(design.excitation.trajectory, 0.001)
         friction = friction_of_excitation(ns16.model)  # less of it below standstill
-        direction = friction.direction(motion.time, motion.position, motion.velocity)
-        regressor = ns16.model.regressor(*motion[1:4], direction).dense(ns16.model.n_parameters)
+        motion = replace(motion, direction=friction.direction(motion))
+        regressor = ns16.model.regressor(motion).dense(ns16.model.n_parameters)
         inverse = np.linalg.inv(np.einsum("mnp,mnq->pq", regressor, regressor))
         deviation = np.sqrt(np.diag(inverse))
         expected = np.abs(inverse / np.outer(deviation, deviation))[:40, :40]

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from hil.base.toml_text import to_text
 from hil.cell import AngleFrame, Cell
 from hil.cli import app
 from hil.design import METHODS, load_settings, preset, problem_of, search_settings
 from hil.design.advice import NoExcitationError, advice_on_branches, no_excitation
 from hil.design.settings import SettingsError, preset_text, settings_of
 from hil.new import cell_of_urdf
-from hil.toml_text import to_text
 from identification.excitation import NoFeasibleMotionError, Violation
 from identification.model.kinematics import chain_from_urdf
 from sim_fixtures.ns16 import CELL_PATH

@@ -24,6 +24,7 @@ from typer.testing import CliRunner
 from drivers.exchange.realtime import RealTimeReport
 from drivers.transports.base import CanBus, FreePort
 from drivers.transports.udp import UdpSpec
+from hil.base.progress import Silent
 from hil.cli import app
 from hil.doctor import checks as system_checks
 from hil.doctor import probe
@@ -49,7 +50,6 @@ from hil.doctor.diagnosis import (
     run_probe,
     show,
 )
-from hil.progress import Silent
 from sim_fixtures.ns16 import CELL_PATH
 
 samples = st.lists(st.floats(0.0, 0.01), min_size=1, max_size=50)

@@ -14,9 +14,9 @@ from mcap.writer import Writer
 from pyarrow import parquet
 
 from hil.archive import open_archive
-from hil.errors import SourceError
-from hil.importers import Robot
+from hil.base.errors import SourceError
 from hil.importers.recording import import_recording
+from hil.importers.robot import Robot
 from tests.hil.test_log_kinds import JOINTS, POSITION, TIME, TORQUE, URDF
 
 EPOCH = 10**18  # ns

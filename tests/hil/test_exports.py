@@ -19,14 +19,17 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 from typer.testing import CliRunner
 
-from hil import identified_model
 from hil.cli import app
-from hil.identify import Identification
-from hil.importers import ColumnMap, Robot, import_log
-from hil.outcome import FILES, Exports
-from hil.results import Results
+from hil.importers.column_map import ColumnMap
+from hil.importers.log import import_log
+from hil.importers.robot import Robot
+from hil.pipeline import identified_model
+from hil.pipeline.run import Identification
+from hil.report.output_files import FILES, Exports
+from hil.results.results import Results
 from identification.export.parameters import parameters_json
 from identification.model.kinematics import chain_from_urdf
+from identification.model.motion import Motion
 
 from .identified_arm import (
     TWO_LINK,
@@ -194,10 +197,9 @@ def test_the_python_example_predicts_the_torque_of_the_model(
     command_line = [sys.executable, "-I", "-c", program]
     done = subprocess.run(command_line, cwd=tmp_path, capture_output=True, text=True, check=True)
     shown = np.fromstring(done.stdout.strip().strip("[]"), sep=" ")
-    zero = np.zeros((1, 2))
-    speed = np.full((1, 2), 0.5)
+    motion = replace(Motion.at_rest(np.zeros((1, 2))), velocity=np.full((1, 2), 0.5))
     values = arm.consistency.consistent.estimate.values
-    (expected,) = arm.cell.model.torque(values, zero, speed, zero)
+    (expected,) = arm.cell.model.torque(values, motion)
     np.testing.assert_allclose(shown, expected, rtol=1e-6)
 
 
@@ -206,7 +208,7 @@ def log(arm: IdentifiedArm, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording of the arm, imported."""
     folder = tmp_path_factory.mktemp("log")
     motion = a_motion(2, 1)
-    torque = arm.cell.model.torque(arm.truth, *motion[1:])
+    torque = arm.cell.model.torque(arm.truth, motion)
     np.savetxt(folder / "log.csv", np.column_stack([motion.time, motion.position, torque]))
     (folder / "map.toml").write_text(
         "[time]\ncolumn = 0\n[position]\ncolumns = [1, 2]\n[torque]\ncolumns = [3, 4]\n"

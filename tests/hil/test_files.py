@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.errors import OutputError
-from hil.files import write_files
-from hil.reading import parse_count, parse_port, parse_time
+from hil.base.errors import OutputError
+from hil.base.files import write_files
+from hil.base.safe_input import parse_count, parse_port, parse_time
 
 
 def test_files_are_written_replaced_and_removed(tmp_path: Path) -> None:

@@ -19,8 +19,8 @@ from hil.cli.suggestions import (
     with_present_names,
 )
 from hil.design import METHODS
-from hil.identify.estimators import ESTIMATORS
-from hil.identify.options import FRICTION_TERMS
+from hil.pipeline.estimators import ESTIMATORS
+from hil.pipeline.options import FRICTION_TERMS
 
 WIDTH = "100"
 MOST_LINES = 3

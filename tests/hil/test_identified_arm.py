@@ -6,6 +6,7 @@ import inspect
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,10 @@ import pytest
 from typer.testing import CliRunner
 
 import hil
+from hil.base.errors import InputError, SourceError
 from hil.cli import app
-from hil.errors import InputError, SourceError
 from hil.report.figures import joints_of, torque_charts
-from hil.results import Results
+from hil.results.results import Results
 from tests.hil.browser import OpenedPage, chromium
 from tests.hil.simulated_logs import write_moving_log
 from tests.hil.test_log_kinds import URDF
@@ -180,10 +181,8 @@ class TestRefused:
             hil.identify(tmp_path / "x.csv", urdf=folder / "three.urdf")
 
 
-def test_the_package_is_a_function_and_stays_a_package() -> None:
-    from hil.identify import Options
-
-    assert hil.identify.Options is Options
+def test_identify_is_a_plain_function() -> None:
+    assert inspect.isfunction(hil.identify) and type(hil) is ModuleType
     names = [*inspect.signature(hil.identify).parameters]
     assert names[:2] == ["recordings", "urdf"]
     public = [name for name in dir(hil) if not name.startswith("_")]
@@ -192,6 +191,6 @@ def test_the_package_is_a_function_and_stays_a_package() -> None:
 
 
 def test_import_hil_loads_no_library() -> None:
-    libraries = "{'numpy', 'pinocchio', 'pandas', 'matplotlib', 'scipy', 'hil.identify'}"
+    libraries = "{'numpy', 'pinocchio', 'pandas', 'matplotlib', 'scipy', 'hil.pipeline'}"
     code = f"import sys, hil; sys.exit(bool({libraries} & sys.modules.keys()))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -15,27 +15,22 @@ import typer
 from typer.testing import CliRunner
 
 from hil.archive import Samples, write_samples
+from hil.base.errors import ArchiveError, InputError, OutputError
+from hil.base.progress import Silent
+from hil.campaign.identified import identify_campaign
 from hil.cli import app
 from hil.cli.verdict import NOT_GOOD, as_json, finish, sentences, table
-from hil.errors import ArchiveError, InputError, OutputError
-from hil.identify import Options, identify_archives, identify_campaign
-from hil.identify.estimating import estimate_with
-from hil.identify.estimators import ESTIMATORS
-from hil.identify.options import FIXED, friction_from
-from hil.identify.prepared import (
-    _DelayChoice,
-    decide,
-    prepare_sources,
-    renewed_delay,
-    stated_delay,
-)
-from hil.identify.sources import gather_sources
-from hil.identify.summary import _delays
-from hil.importers import Robot
-from hil.outcome import settings_result, write_outcome
-from hil.progress import Silent
-from hil.results import SCHEMA_VERSION, Results
-from hil.simulation import planted_values
+from hil.control.simulation import planted_values
+from hil.importers.robot import Robot
+from hil.pipeline.estimating import estimate_with
+from hil.pipeline.estimators import ESTIMATORS
+from hil.pipeline.options import FIXED, Options, friction_from
+from hil.pipeline.prepared import _DelayChoice, decide, prepare_sources, renewed_delay, stated_delay
+from hil.pipeline.run import identify_archives
+from hil.pipeline.sources import gather_sources
+from hil.pipeline.summary import _delays
+from hil.report.output_files import settings_result, write_outcome
+from hil.results.results import SCHEMA_VERSION, Results
 from identification.errors import IdentificationError
 from identification.estimators.consistent import SolverError
 from identification.estimators.delay import DelayEstimate
@@ -166,7 +161,7 @@ class TestCampaign:
     def test_reports_a_failed_consistent_solution(self, campaign, monkeypatch):
         for name in ("check_consistency", "choose_essential"):
             failing = raiser(IdentificationError("the solver failed"))
-            monkeypatch.setattr(f"hil.identify.validation.{name}", failing)
+            monkeypatch.setattr(f"hil.pipeline.validation.{name}", failing)
         without = identify_campaign(campaign.folder.root, Silent(), FIXED)
         warnings = without.results.verdict.warnings
         assert sum("the solver failed" in warning for warning in warnings) == 2
@@ -495,7 +490,7 @@ class TestEstimators:
         free = replace(prepared.settings, strength=Strength(consistent=False))
         expected = estimate_with(replace(prepared, settings=free), Options(), Silent())
         failing = raiser(SolverError("no solution was found"))
-        monkeypatch.setattr("hil.identify.estimating.consistent_values", failing)
+        monkeypatch.setattr("hil.pipeline.estimating.consistent_values", failing)
         restricted = replace(prepared.settings, strength=Strength(consistent=True))
         estimation = estimate_with(replace(prepared, settings=restricted), Options(), Silent())
         np.testing.assert_array_equal(

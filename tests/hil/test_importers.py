@@ -30,21 +30,23 @@ from scipy.io import savemat
 from typer.testing import CliRunner
 
 from hil.archive import ArchiveHeader, Findings, Samples, open_archive
+from hil.archive.recordings import open_recording
+from hil.base.errors import ArchiveWriteError, InputError, SourceError
 from hil.cell import Cell
+from hil.cell.nominal import nominal_of
 from hil.cli import app
-from hil.errors import ArchiveWriteError, InputError, SourceError
-from hil.identify.cell_context import nominal_of
-from hil.identify.sources import cell_of
-from hil.importers import ColumnMap, Convention, Robot, import_log, matlab, urdf_of_dh
 from hil.importers import arrays as array_files
+from hil.importers import matlab
 from hil.importers.arrays import ArrayFile
-from hil.importers.column_map import UNITS, Format, ready_map, ready_maps
+from hil.importers.column_map import UNITS, ColumnMap, Format, ready_map, ready_maps
+from hil.importers.dh import Convention, urdf_of_dh
 from hil.importers.findings import examine
+from hil.importers.log import import_log
 from hil.importers.messages import sentence as worded
-from hil.importers.robot import _cell_text
+from hil.importers.robot import Robot, _cell_text
 from hil.importers.stamps import check_clock
 from hil.importers.table import Table
-from hil.recordings import open_recording
+from hil.pipeline.sources import cell_of
 from identification import FrictionLaw
 from identification.model.kinematics import chain_from_urdf
 from tests import messages

@@ -21,20 +21,16 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hil.archive import Archive, container, open_archive
 from hil.archive.cdr import ENCAPSULATION
+from hil.archive.recordings import open_recording
+from hil.base.errors import InputError, SourceError
 from hil.cell import Cell
-from hil.errors import InputError, SourceError
-from hil.importers import (
-    ColumnMap,
-    Robot,
-    bags,
-    import_log,
-    import_rosbag2,
-    mcap_messages,
-    recorded_joints,
-)
+from hil.importers import bags, mcap_messages
 from hil.importers.arrays import read_mcap
+from hil.importers.column_map import ColumnMap
+from hil.importers.log import import_log
+from hil.importers.robot import Robot
 from hil.importers.ros_messages import MessageError, decoded, typestore_of
-from hil.recordings import open_recording
+from hil.importers.rosbag2 import import_rosbag2, recorded_joints
 from identification import FrictionLaw
 from tests.hil import mcap_bytes
 

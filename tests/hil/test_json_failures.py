@@ -14,11 +14,11 @@ from typer.testing import CliRunner, Result
 
 from hil.archive import Samples, write_samples
 from hil.archive.supervised import Failed
+from hil.base.errors import ArchiveWriteError, ControllerError, HilError, InputError
+from hil.base.files import convert_write_errors, make_folder
 from hil.campaign import Campaign
-from hil.campaign.live_link import write_error
 from hil.cli import COMMANDS, app, as_json, exit_code_of, main
-from hil.errors import ArchiveWriteError, ControllerError, HilError, InputError
-from hil.files import convert_write_errors, make_folder
+from hil.control.live_link import write_error
 from planner import PlannerError
 from tests.messages import NO_CAMPAIGN_FOLDER
 

@@ -10,12 +10,12 @@ import pytest
 
 from drivers import Transport
 from drivers.transports.base import TransportSpec
+from hil.base.errors import InputError
 from hil.cell import Cell
 from hil.cell.schema import LINKS, CanTable, ControllerTable
+from hil.control.serving import open_controller_link
+from hil.control.simulation import controller_settings
 from hil.doctor.checks import DoctorCheck, Status, System, link_checks
-from hil.errors import InputError
-from hil.serving import open_controller_link
-from hil.simulation import controller_settings
 from sim_fixtures.ns16 import CELL_PATH
 
 CELL = Cell.load(CELL_PATH).with_link(cycle_ms=2)

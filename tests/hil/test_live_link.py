@@ -20,6 +20,8 @@ from drivers.transports.base import TransportSpec
 from drivers.transports.udp import UdpSpec
 from hil.archive import open_archive
 from hil.archive.live import LiveView, LiveViewError
+from hil.base.errors import ArchiveWriteError, ControllerError
+from hil.base.progress import Silent
 from hil.campaign import (
     Campaign,
     CampaignPlan,
@@ -27,16 +29,14 @@ from hil.campaign import (
     NotRehearsedError,
     Stop,
 )
-from hil.campaign.link import archive_silence
-from hil.campaign.live_link import LiveLink
-from hil.campaign.motions import player_of
-from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.campaign.plan import design
 from hil.cell import Cell
 from hil.cli.record import record
-from hil.demo_link import free_port
-from hil.errors import ArchiveWriteError, ControllerError
-from hil.progress import Silent
+from hil.control.link import archive_silence
+from hil.control.live_link import LiveLink
+from hil.control.motion_watch import MotionProgress, OperatorRequest
+from hil.control.motions import player_of
+from hil.control.simulator_process import free_port
 from planner import Move, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell, on_path, set_points

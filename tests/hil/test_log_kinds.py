@@ -12,10 +12,12 @@ import pytest
 from numpy.typing import NDArray
 
 from hil.archive import Archive, open_archive
+from hil.base.errors import SourceError
 from hil.cell.text import UrdfLimits
-from hil.errors import SourceError
-from hil.importers import ColumnMap, Robot, import_log
+from hil.importers.column_map import ColumnMap
 from hil.importers.findings import whole_turns
+from hil.importers.log import import_log
+from hil.importers.robot import Robot
 
 Floats = NDArray[np.float64]
 RATE = 250

@@ -20,12 +20,12 @@ from typer.testing import CliRunner
 
 from benchmarks.look import measure
 from hil.archive import open_archive
+from hil.base.errors import SourceError
 from hil.cli import app
-from hil.errors import SourceError
-from hil.identify.sources import cell_of, source_of
-from hil.importers import ColumnMap, Robot
+from hil.importers.column_map import ColumnMap
 from hil.importers.conclusions import Certainty
 from hil.importers.recording import ImportOptions, import_recording
+from hil.importers.robot import Robot
 from hil.look import Look, look_at
 from hil.look.conclusions import concluded, undecided
 from hil.look.maps import entries_of
@@ -44,6 +44,7 @@ from hil.look.readings import (
 )
 from hil.look.result import Aspect, Choice
 from hil.look.run import SETTINGS
+from hil.pipeline.sources import cell_of, source_of
 from identification.estimators.delay import DelayEstimate
 from identification.model.robot import RobotModel
 from identification.signals.samples import prepare
@@ -377,7 +378,7 @@ class TestOtherArm:
         archive = open_archive(tmp_path / "a.mcap")
         cell = cell_of(archive)
         samples = prepare(source_of(archive, cell).recording, cell.model, options=SETTINGS)
-        motor = samples.motion._replace(position=100.0 * samples.motion.position)
+        motor = replace(samples.motion, position=100.0 * samples.motion.position)
         before_gears = replace(samples, motion=motor, torque=samples.torque / 100.0)
         score = score_of(cell.model, samples)
         assert not Contradictions.of(cell, cell.model, samples, score, 0.0).found

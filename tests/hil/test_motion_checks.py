@@ -8,12 +8,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from hil.campaign.motions import rest
 from hil.cell import AngleFrame, Cell, CellError
 from hil.cell.text import with_values
+from hil.control.motion_checks import MotionChecks, always_so, collision_checker, violation_text
+from hil.control.motions import rest
 from hil.design import preset, problem_of
 from hil.design.advice import NoExcitationError
-from hil.motion_checks import MotionChecks, always_so, collision_checker, violation_text
 from identification.excitation import CollisionChecker, Violation, Workspace
 from identification.model.motion import Motion
 from sim_fixtures.ns16 import CELL_PATH

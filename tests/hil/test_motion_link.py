@@ -17,12 +17,12 @@ from drivers.exchange.process import ExchangeError, WithdrawnError
 from drivers.states import State
 from hil.archive import ArchiveSpec
 from hil.archive.recorder import Recorded
+from hil.base.errors import ArchiveWriteError, ControllerError
 from hil.campaign import Stop
-from hil.campaign.connection import OFF_TIMEOUT, START_TIMEOUT
-from hil.campaign.link import REST_TIMEOUT, MotionLink
-from hil.campaign.port import PortStatus
 from hil.cell import Cell
-from hil.errors import ArchiveWriteError, ControllerError
+from hil.control.connection import OFF_TIMEOUT, START_TIMEOUT
+from hil.control.link import REST_TIMEOUT, MotionLink
+from hil.control.port import PortStatus
 from tests.messages import DRIVE_IS_OFF, OPEN_MODE_BEING_LEFT, START_OPEN_PROGRAM
 
 TURN = 0.02

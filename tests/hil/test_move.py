@@ -12,11 +12,11 @@ import pytest
 from typer.testing import CliRunner
 
 from hil.archive import open_archive
+from hil.base.errors import ExecutionError, InputError, UnsafeError
 from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError
 from hil.cell import Cell
 from hil.cli import app
-from hil.errors import ExecutionError, InputError, UnsafeError
-from hil.move import plan_move, posture, turned
+from hil.control.move import plan_move, posture, turned
 from hil.testing import UdpController
 from sim_fixtures.ns16 import CELL_PATH
 from tests.docs.typed import ROOT, commands

@@ -21,20 +21,20 @@ from drivers.init_check import verify_controller
 from drivers.packets import InitPacket
 from drivers.transports.udp import UdpSpec
 from hil.archive import Samples, write_samples
+from hil.base.errors import ArchiveError, ControllerError, InputError
+from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, Stop, design
 from hil.cell import Cell
 from hil.cell.errors import UnknownFieldsError
 from hil.cell.text import urdf_limits
 from hil.cli import app
-from hil.demo_link import SIMULATE, free_port
-from hil.errors import ArchiveError, ControllerError, InputError
-from hil.importers import Robot
-from hil.motion_checks import collision_checker
+from hil.control.motion_checks import collision_checker
+from hil.control.simulation import simulated_link
+from hil.control.simulator_process import SIMULATE, free_port
+from hil.importers.robot import Robot
 from hil.new import cell_of_urdf, from_archive
 from hil.new.cell_text import with_fixed
 from hil.new.cell_values import _nothing_moves
-from hil.progress import Silent
-from hil.simulation import simulated_link
 from hil.testing import shortened
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 from tests.hil.new_cells import TWO_JOINTS, described_robot, filled_in

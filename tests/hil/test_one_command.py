@@ -18,16 +18,19 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from hil.archive import open_archive
+from hil.archive.recordings import open_recording
+from hil.base.errors import InputError, SourceError
+from hil.base.output_folder import SOURCES, folder_beside, sources_text
 from hil.cli import app
-from hil.errors import InputError, SourceError
-from hil.identify.sources import cell_of
-from hil.importers import ColumnMap, Robot, import_log, import_rosbag2
+from hil.importers.column_map import ColumnMap
 from hil.importers.conclusions import ChannelMeaning, NameBasis, UnitBasis, UnusedChannels
+from hil.importers.log import import_log
 from hil.importers.messages import sentence
 from hil.importers.proposal import proposed_map
 from hil.importers.recording import ImportOptions, import_recording
-from hil.output_folder import SOURCES, folder_beside, sources_text
-from hil.recordings import open_recording
+from hil.importers.robot import Robot
+from hil.importers.rosbag2 import import_rosbag2
+from hil.pipeline.sources import cell_of
 from identification.validation.position_jumps import position_jumps
 from tests.hil.simulated_logs import urdf_path, write_moving_log
 from tests.hil.simulated_logs import write_log as log

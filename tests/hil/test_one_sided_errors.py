@@ -13,13 +13,18 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-import hil.identify.sources
+import hil.pipeline.sources
+from hil.archive.recordings import recording_of
+from hil.base.progress import Silent
 from hil.campaign import CampaignPlan
+from hil.campaign.identified import identify_campaign
 from hil.cell import Cell, CellError
-from hil.identify import identify_campaign
-from hil.progress import Silent
-from hil.recordings import recording_of
-from hil.simulation import planted_truth, planted_values, simulated_controller, simulated_drive
+from hil.control.simulation import (
+    planted_truth,
+    planted_values,
+    simulated_controller,
+    simulated_drive,
+)
 from identification.model.friction import COULOMB
 from sim_fixtures.ns16 import CELL_PATH, load_truth, urdf_text
 from tests.sim_fixtures.bench import base_from_standard, standard_parameters
@@ -100,7 +105,7 @@ def test_a_negative_torque_constant_is_wrong(correct_campaign, monkeypatch, join
         signs = np.where(np.arange(recording.n_joints) == joint, -1.0, 1.0)
         return replace(recording, torque=recording.torque * signs)
 
-    monkeypatch.setattr(hil.identify.sources, "recording_of", turned)
+    monkeypatch.setattr(hil.pipeline.sources, "recording_of", turned)
     judged = verdict(correct_campaign)
     assert not judged.good, judged.line
 

@@ -16,18 +16,21 @@ from typer.testing import CliRunner
 
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import open_archive
+from hil.base.errors import InputError, OperatorStopError
+from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError, NotRehearsedError
 from hil.campaign.campaign import require_replaceable
-from hil.campaign.errors import MotionFailedError, RepetitionsRejectedError
+from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.folder import SIDES, CampaignFolder
-from hil.campaign.operator import OperatorRequest, Stop
 from hil.campaign.run import RunResult
-from hil.campaign.virtual_link import VirtualLink
 from hil.cli import app
-from hil.design.requirements import requirements_from
-from hil.errors import InputError, OperatorStopError
-from hil.identify.payload_run import find_payload
-from hil.payload_campaign import (
+from hil.control.errors import MotionFailedError
+from hil.control.motion_watch import OperatorRequest, Stop
+from hil.control.simulation import carried, planted_truth, simulated_controller
+from hil.control.virtual_link import VirtualLink
+from hil.payload.payload_run import find_payload
+from hil.precision.requirements import requirements_from
+from hil.weighing.payload_campaign import (
     Mounting,
     MountingError,
     PayloadCampaign,
@@ -35,8 +38,6 @@ from hil.payload_campaign import (
     assumed_payload,
     loaded_cell,
 )
-from hil.progress import Silent
-from hil.simulation import carried, planted_truth, simulated_controller
 from identification.estimators.payload import PayloadError
 from identification.model.payload import Payload
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
@@ -258,7 +259,7 @@ class TestPrecision:
                 raise PayloadError("the motion does not separate the mass from other parameters")
             return find_payload(bare, loaded, reporter)
 
-        monkeypatch.setattr("hil.payload_campaign.find_payload", of_two_pairs)
+        monkeypatch.setattr("hil.weighing.payload_campaign.find_payload", of_two_pairs)
         heard = Heard()
         weighed = begun(designed, "early")
         found = run(
@@ -272,7 +273,7 @@ class TestPrecision:
         def none(bare, loaded, reporter):
             raise PayloadError("the motion does not separate the mass from other parameters")
 
-        monkeypatch.setattr("hil.payload_campaign.find_payload", none)
+        monkeypatch.setattr("hil.weighing.payload_campaign.find_payload", none)
         weighed = begun(designed, "never")
         with pytest.raises(PayloadError, match="does not separate"):
             run(weighed, requirements=requirements_from(["mass of payload 10 %"]))

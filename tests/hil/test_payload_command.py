@@ -16,11 +16,11 @@ import pytest
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
+from hil.base.errors import ArchiveError, InputError
+from hil.base.progress import Silent
 from hil.cli import app
-from hil.errors import ArchiveError, InputError
-from hil.identify.payload_run import find_payload
 from hil.importers.column_map import Drive
-from hil.progress import Silent
+from hil.payload.payload_run import find_payload
 from identification import FrictionLaw
 from tests import messages
 from tests.docs.test_commands import QUICK

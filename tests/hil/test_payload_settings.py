@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
-from hil.identify.payload_settings import NOT_DETERMINED, Load, controller_settings, principal_axes
+from hil.payload.payload_settings import NOT_DETERMINED, Load, controller_settings, principal_axes
 from identification.model.pseudo_inertia import Body
 
 Array = NDArray[np.float64]

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from hil.base.errors import InputError
 from hil.cell import AngleFrame, Cell
 from hil.cli import app
-from hil.errors import InputError
 from hil.plots import draw_plan
 from planner.moves import Move, plan_moves
 from sim_fixtures.ns16 import CELL_PATH

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from hil.base.errors import HilError, InputError
 from hil.campaign.plan import validation_motions
 from hil.cli import app
+from hil.control.motion_checks import MotionChecks
 from hil.design import DesignResult, load_settings, preset, problem_of
-from hil.design.precision import PrecisionDesign, short_search
-from hil.design.predicted import PredictedRows
-from hil.design.requirements import FORMS, Requirement, require_known, requirements_from
-from hil.errors import HilError, InputError
-from hil.motion_checks import MotionChecks
+from hil.precision.forecast import PrecisionDesign, short_search
+from hil.precision.predicted import PredictedRows
+from hil.precision.requirements import FORMS, Requirement, require_known, requirements_from
 from identification.excitation import midpoints
 from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell
 
@@ -114,8 +114,8 @@ class TestPromise:
         motion = midpoints(motions[0])
         density = made.precision(1).density
         step = motion.time[1] - motion.time[0]
-        blocks, columns = cell.model.regressor(*motion[1:])
-        torque = cell.model.torque(made.values, *motion[1:])
+        blocks, columns = cell.model.regressor(motion)
+        torque = cell.model.torque(made.values, motion)
         rate = np.gradient(torque, motion.time, axis=0)
         usable = cell.model.moving(motion.velocity)
         information = made.prior.copy()

@@ -26,16 +26,21 @@ from drivers.states import State
 from drivers.transports.simulated import Corrupt, Lose, SimulatedTransport
 from hil.archive import open_archive
 from hil.archive.recorder import Recorded
+from hil.base.errors import ArchiveError, ControllerError, HilError, InputError
+from hil.base.progress import Silent
 from hil.campaign import Progress, Stop, VirtualLink
 from hil.cell import Cell
 from hil.cli import record as record_cli
 from hil.cli.record import record as record_command
-from hil.demo_link import SIMULATE, free_port
-from hil.errors import ArchiveError, ControllerError, HilError, InputError
-from hil.identify import identify_archives
-from hil.progress import Silent
-from hil.recording import archive_path, record
-from hil.simulation import OWN_SPEED, controller_settings, own_postures, simulated_controller
+from hil.control.record import archive_path, record
+from hil.control.simulation import (
+    OWN_SPEED,
+    controller_settings,
+    own_postures,
+    simulated_controller,
+)
+from hil.control.simulator_process import SIMULATE, free_port
+from hil.pipeline.run import identify_archives
 from planner.moves import SEGMENT_VELOCITY
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.loopback import on_loopback

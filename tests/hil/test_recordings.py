@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
 from hil.archive import ArchiveWriter, Samples, open_archive, write_samples
-from hil.errors import ArchiveError
-from hil.recordings import open_recording, recording_of
+from hil.archive.recordings import open_recording, recording_of
+from hil.base.errors import ArchiveError
 
 JOINTS = ("a", "b")
 NAME = "excitation_002_a1.mcap"

@@ -18,27 +18,18 @@ from typer.testing import CliRunner
 from drivers.drive_train import DriveTrain
 from drivers.transports.simulated import Lose
 from hil.archive import open_archive
-from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop
-from hil.campaign import rehearsal as rehearsal_module
+from hil.base.errors import OperatorStopError
+from hil.base.progress import Silent, Task
+from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop, rehearsal_criteria
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
-from hil.campaign.rehearsal import (
-    CRITERIA,
-    FASTEST,
-    SPREAD,
-    Rehearsal,
-    Twin,
-    link_faults,
-    of_currents,
-    of_motions,
-    too_far_without_a_packet,
-)
+from hil.campaign.identified import identify_campaign
+from hil.campaign.rehearsal import CRITERIA, Rehearsal
+from hil.campaign.rehearsal_criteria import of_currents, of_motions
+from hil.campaign.twin import FASTEST, SPREAD, Twin, link_faults, too_far_without_a_packet
 from hil.cell import Cell
 from hil.cell.text import with_values
 from hil.cli import app
-from hil.errors import OperatorStopError
-from hil.identify import identify_campaign
-from hil.progress import Silent, Task
 from planner import Move, plan_moves
 from sim_fixtures.plant import ElasticPlant, PlantTruth
 from tests import messages
@@ -212,7 +203,7 @@ def test_a_lost_packet_is_not_the_motion(
         columns["target_current"][100 + row] = share * limit
         return SimpleNamespace(columns=columns)
 
-    monkeypatch.setattr(rehearsal_module, "open_archive", with_a_loss)
+    monkeypatch.setattr(rehearsal_criteria, "open_archive", with_a_loss)
     assert of_currents(twin.cell, twin.folder, "as modelled", 0.8).passed is passed
 
 

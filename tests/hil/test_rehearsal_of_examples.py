@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from hil.base.progress import Silent
 from hil.campaign import Campaign
 from hil.campaign.plan import design
 from hil.campaign.rehearsal import CRITERIA
 from hil.cell import Cell
-from hil.progress import Silent
 
 ROOT = Path(__file__).resolve().parents[2]
 CELLS = {

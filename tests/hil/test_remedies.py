@@ -14,8 +14,8 @@ import pytest
 from typer.testing import CliRunner
 
 from hil.archive import Archive, open_archive
+from hil.base.errors import SourceError
 from hil.cli import app
-from hil.errors import SourceError
 from tests.hil.test_bag_kinds import WHOLE, message
 from tests.hil.test_importers_rosbag2 import DEFINITION, STATE, bag, mcap, state
 from tests.hil.test_log_kinds import (

@@ -19,10 +19,10 @@ from typing import Any
 import pytest
 from distributed import LocalCluster
 
+from hil.base.errors import InputError
 from hil.campaign.folder import SIDES, CampaignFolder
+from hil.control.simulation import simulated_link
 from hil.design import DesignResult
-from hil.errors import InputError
-from hil.simulation import simulated_link
 from tests.docs.test_messages import COMMAND, FIELD, OPTION, messages
 from tests.hil.fast_cell import (
     QUICK_GRADIENT,
@@ -37,7 +37,7 @@ from tests.hil.test_remedies_of_commands import message, typed
 pytestmark = pytest.mark.long
 
 PACKAGES = re.compile(
-    r"hil/(campaign|design|batch)/|hil/cli/(run|rehearse|status|design|batch)\.py"
+    r"hil/(campaign|control|design|precision|batch)/|hil/cli/(run|rehearse|status|design|batch)\.py"
 )
 TYPED = {
     "resume it (--resume), name another folder (-o), or add --force": "test_a_folder_with_a_design",
@@ -328,7 +328,7 @@ class TestCampaign:
         self, designed: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         with monkeypatch.context() as strict:
-            strict.setattr("hil.campaign.rehearsal.MOST_ERROR", 0.0)
+            strict.setattr("hil.campaign.rehearsal_criteria.MOST_ERROR", 0.0)
             text = refusal("rehearse", designed)
         assert "design a better excitation (`hil design`)" in text
         accepted(*DESIGN, "-o", "b")

@@ -18,8 +18,8 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
+from hil.base.errors import InputError
 from hil.cli import app
-from hil.errors import InputError
 from tests.hil.simulated_logs import write_log
 from tests.hil.test_log_kinds import JOINTS, URDF
 

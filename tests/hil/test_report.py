@@ -22,19 +22,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.image import imread
 
-from hil.report import (
-    ReportSeries,
-    SeriesError,
-    figures,
-    numbers,
-    page,
-    report_bytes,
-)
+from hil.report import figures, numbers, page
 from hil.report.chart import thinned
 from hil.report.drawing import _decades, chart_panel, round_ticks, single
 from hil.report.interactive import chart_data, encoded
+from hil.report.page import report_bytes
 from hil.report.rendering import environment
-from hil.results import Results
+from hil.results.results import Results
+from hil.results.series import ReportSeries, SeriesError
 from identification.excitation import CRITERIA, METHODS
 from identification.excitation.criteria import Criterion
 from identification.selection.settings import Choice
@@ -838,7 +833,7 @@ class TestDrawing:
 
     def test_of_a_report_loads_no_plotting_library(self):
         code = (
-            "import sys, hil.report.interactive as i, hil.outcome; i.library();"
+            "import sys, hil.report.interactive as i, hil.report.output_files; i.library();"
             " sys.exit(bool({'matplotlib', 'bokeh'} & {*sys.modules}))"
         )
         assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hil.report import report_bytes
+from hil.report.page import report_bytes
 from tests.hil.browser import OpenedPage, chromium, page_count
 from tests.hil.test_report import JOINTS, make_results, make_series, with_joints
 

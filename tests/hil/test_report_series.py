@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from hil.report.series import example_series, torque_parts
+from hil.results.series import example_series, torque_parts
 from identification.signals.spectrum import HARRIS, power_density
 from tests.identification.two_link import MODEL, NOISE, a_motion, recording, truth
 
@@ -45,8 +45,8 @@ class TestParts:
     def test_grow_as_their_causes_do(self, samples):
         parts = torque_parts(MODEL, truth(), samples)
         motion = samples.motion
-        faster = motion._replace(
-            velocity=2.0 * motion.velocity, acceleration=3.0 * motion.acceleration
+        faster = replace(
+            motion, velocity=2.0 * motion.velocity, acceleration=3.0 * motion.acceleration
         )
         others = torque_parts(MODEL, truth(), replace(samples, motion=faster))
         for name, factor in {"inertia": 3.0, "coriolis": 4.0, "gravity": 1.0}.items():

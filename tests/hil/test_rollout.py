@@ -15,18 +15,19 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from typer.testing import CliRunner
 
-from hil import identified_model
-from hil.annotate import FOLDER, PREDICTED, RESIDUAL
 from hil.archive.schema import MEASURED
+from hil.base.errors import HilError, InputError
 from hil.campaign import Campaign
 from hil.cli import app
-from hil.errors import HilError, InputError
-from hil.identified_model import predicted_parts
-from hil.outcome import PARAMETERS_JSON, REPORT
+from hil.identified.annotate import FOLDER, PREDICTED, RESIDUAL
+from hil.pipeline import identified_model
+from hil.pipeline.identified_model import predicted_parts
 from hil.plots.chart_picture import draw_charts
-from hil.report.rollout import overview_charts, overview_legends
-from hil.rollout import POLISHED
-from hil.rollout_result import ROLLOUT, ArmErrors, RolloutResult
+from hil.report.output_files import REPORT
+from hil.report.rollout_section import overview_charts, overview_legends
+from hil.results.provenance import PARAMETERS_JSON
+from hil.results.rollout_result import ROLLOUT, ArmErrors, RolloutResult
+from hil.rollout.torque_rollout import POLISHED
 from identification.rollout.servo import Servo
 from identification.text import percentage
 from tests import messages
@@ -155,7 +156,7 @@ def test_no_predicted_part_is_shorter_than_a_window() -> None:
 
 
 def test_to_identify_imports_nothing_of_mujoco() -> None:
-    script = "import hil.cli.identify, hil.report, hil.outcome, sys; print('mujoco' in sys.modules)"
+    script = "import hil.cli.identify, hil.report.output_files, sys; print('mujoco' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.stdout == "False\n", done.stderr
 
@@ -263,7 +264,7 @@ def test_gains_of_an_identified_servo_are_named(
         n = len(joint_names)
         return Servo(np.full(n, 2e4), np.full(n, 200.0), 0.004)
 
-    monkeypatch.setattr("hil.rollout.identify_servo", stiff)
+    monkeypatch.setattr("hil.rollout.torque_rollout.identify_servo", stiff)
     done = run("rollout", folder, "--servo", "identified", "--samples", "3")
     assert done.exit_code in (0, 5), done.output
     result = RolloutResult.load(folder / ROLLOUT)
@@ -325,7 +326,7 @@ def test_a_model_that_must_not_be_relied_on_says_so(tmp_path: Path) -> None:
     time = np.arange(0.0, 12.0, 0.004)
     motion = four_sines(time, 0.5)
     noise = np.random.default_rng(1).standard_normal((len(time), 4)) * [1e-5, 1e-5, 3.0, 0.2]
-    torque = -MODEL.torque(truth(), *motion[1:])
+    torque = -MODEL.torque(truth(), motion)
     columns = np.column_stack([time, np.column_stack([motion.position, torque]) + noise])
     log, urdf, archive = (tmp_path / name for name in ("log.csv", "robot.urdf", "log.mcap"))
     np.savetxt(log, columns, delimiter=",", header="t,q1,q2,tau1,tau2", comments="")

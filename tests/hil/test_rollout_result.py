@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.exporting import ExportedEnsemble
-from hil.rollout_result import ArmErrors, PolishResult, RolloutResult
+from hil.export.model_files import ExportedEnsemble
+from hil.results.rollout_result import ArmErrors, PolishResult, RolloutResult
 from identification.estimators.ensemble import Ensemble
 
 LIGHT = ArmErrors(

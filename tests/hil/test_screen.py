@@ -22,24 +22,13 @@ import pytest
 from rich.console import Console
 
 from drivers.states import State
-from hil import screen as layout
-from hil.campaign.operator import (
-    MotionProgress,
-    OperatorRequest,
-    RunStatus,
-    Stop,
-)
+from hil.base.progress import Bar, LineReporter, Silent, reporter
+from hil.campaign import screen as layout
+from hil.campaign.operator import RunStatus
+from hil.campaign.screen import Keyboard, Screen, ScreenError, after, single_keys, typed
 from hil.cell import Cell
 from hil.cell.schema import CanTable
-from hil.progress import Bar, LineReporter, Silent, reporter
-from hil.screen import (
-    Keyboard,
-    Screen,
-    ScreenError,
-    after,
-    single_keys,
-    typed,
-)
+from hil.control.motion_watch import MotionProgress, OperatorRequest, Stop
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil import screen_rig
 from tests.hil.screen_rig import Terminal, on_terminal
@@ -356,7 +345,7 @@ def test_a_blocked_terminal_delays_no_stop(tmp_path: Path) -> None:
 
 def test_split_key_sequences_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
     """Over a slow line the parts of an arrow come one by one; none of them is a key."""
-    monkeypatch.setattr("hil.screen._SEQUENCE_WAIT", 5.0)  # this machine may be slow, too
+    monkeypatch.setattr("hil.campaign.screen._SEQUENCE_WAIT", 5.0)  # this machine may be slow, too
     near, far = pty.openpty()
     pressed: list[str] = []
     keyboard = Keyboard(pressed.append)

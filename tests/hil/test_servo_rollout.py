@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from hil.archive.recordings import open_recording
+from hil.base.errors import HilError, InputError
 from hil.cli import app
-from hil.errors import HilError, InputError
-from hil.recordings import open_recording
-from hil.rollout_result import ROLLOUT, RolloutResult
+from hil.results.rollout_result import ROLLOUT, RolloutResult
 from tests import messages
 from tests.identification.test_encoders import DELAY, KP, TRUE, URDF, an_arm, on_its_servo
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from hil.archive import open_archive
+from hil.base.errors import InputError, SourceError
 from hil.cell.arms import Links, arms_of, recorded_arms
-from hil.errors import InputError, SourceError
-from hil.identify.sources import cell_of
-from hil.importers import Robot
 from hil.importers.messages import sentence
 from hil.importers.recording import ImportOptions, import_recording
+from hil.importers.robot import Robot
 from hil.look import look_at
+from hil.pipeline.sources import cell_of
 from tests.hil.simulated_logs import write_log as log
 from tests.hil.test_importers_rosbag2 import STATE, bag, state
 from tests.hil.test_log_kinds import POSITION, TIME, TORQUE

@@ -25,15 +25,20 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from hil.base.errors import InputError
+from hil.base.progress import say_at_once
 from hil.cell import Cell, CellError
 from hil.cli import exit_code_of, main
 from hil.cli.simulate import WORDS, Status, _sentences, simulate
-from hil.demo_link import free_port
-from hil.errors import InputError
-from hil.motion_checks import MotionChecks
-from hil.progress import say_at_once
-from hil.serving import Buttons, Served, open_controller_link
-from hil.simulation import controller_settings, own_postures, simulated_controller, simulated_link
+from hil.control.motion_checks import MotionChecks
+from hil.control.serving import Buttons, Served, open_controller_link
+from hil.control.simulation import (
+    controller_settings,
+    own_postures,
+    simulated_controller,
+    simulated_link,
+)
+from hil.control.simulator_process import free_port
 from sim_fixtures import ControllerSettings, Phase
 from sim_fixtures.ns16 import CELL_PATH
 from sim_fixtures.serve import Request, ServeCounts

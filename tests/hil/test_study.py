@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from scipy import stats
 from typer.testing import CliRunner
 
+from hil.base.errors import InputError, OperatorStopError
+from hil.base.progress import Silent
 from hil.cell import Cell
 from hil.cli import app
+from hil.control.simulation import planted_values
 from hil.design.advice import NoExcitationError
-from hil.errors import InputError, OperatorStopError
-from hil.progress import Silent
-from hil.simulation import planted_values
 from hil.study import StudyResults, StudySettings, run_study, study_settings
 from hil.study.campaigns import SINES, Execution, chosen, execute
 from hil.study.results import (

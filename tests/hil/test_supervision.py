@@ -20,16 +20,17 @@ from drivers.exchange.event_log import EventsLost
 from drivers.record import cycle_dtype
 from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
+from hil.base.errors import ControllerError
 from hil.campaign import Stop
-from hil.campaign.connection import StartTimeout
-from hil.campaign.link import Standstill
-from hil.campaign.live_link import STALL, Heartbeat
-from hil.campaign.motions import player_of
-from hil.campaign.operator import MotionProgress, OperatorRequest, RunStatus, RunWatch
-from hil.campaign.virtual_link import VirtualLink
+from hil.campaign.operator import RunStatus, RunWatch
 from hil.cell import Cell
-from hil.errors import ControllerError
-from hil.simulation import simulated_link
+from hil.control.connection import StartTimeout
+from hil.control.link import Standstill
+from hil.control.live_link import STALL, Heartbeat
+from hil.control.motion_watch import MotionProgress, OperatorRequest
+from hil.control.motions import player_of
+from hil.control.simulation import simulated_link
+from hil.control.virtual_link import VirtualLink
 from hil.testing import faulty_link
 from planner import Move, PiecewiseCubic, TrajectoryPlayer, plan_moves
 from tests.hil.fast_cell import fast_campaign, fast_cell, on_path
@@ -154,7 +155,7 @@ def test_a_motion_that_ends_during_a_hold_ends_its_supervision(
         return OperatorRequest(held=time > 0.4)
 
     monkeypatch.setattr(TrajectoryPlayer, "advance", fails_at_rest)
-    monkeypatch.setattr("hil.campaign.link.REQUEST_PERIOD", 0.0)
+    monkeypatch.setattr("hil.control.link.REQUEST_PERIOD", 0.0)
     stop = Stop()
     seen = Watcher(script)
     show = seen.show
@@ -479,7 +480,7 @@ def test_noise_recorded_while_the_arm_moved_is_recorded_again(tmp_path: Path) ->
 
 PROGRAM = """
 import numpy as np
-from hil.campaign.live_link import LARGE, return_large_arrays
+from hil.control.live_link import LARGE, return_large_arrays
 
 def mapped():
     return int(open("/proc/self/statm").read().split()[0]) * 4096

@@ -79,7 +79,7 @@ def test_a_command_computes_decodes_and_connects_nothing_itself(path: Path) -> N
         "import scipy.optimize",
         "from mcap.reader import make_reader",
         "import socket",
-        "from hil.batch.run import _Estimates",
+        "from hil.batch.graph import _Estimates",
         "import numpy as np\nx = np.linalg.lstsq(a, b)",
         "total = [weight * error for weight, error in pairs]",
         "def f():\n    for k in range(n):\n        torque += regressor[k] @ values",

@@ -9,8 +9,8 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import hil
-from hil.errors import InputError
-from hil.threads import VARIABLES
+from hil.base.errors import InputError
+from hil.base.threads import VARIABLES
 from tests.hil.simulated_logs import write_moving_log
 from tests.hil.test_log_kinds import URDF
 

@@ -13,9 +13,9 @@ import tomlkit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hil.base.errors import InputError
+from hil.base.toml_text import Angles, degrees_text, from_text, radians_of, to_text
 from hil.cell.text import with_values
-from hil.errors import InputError
-from hil.toml_text import Angles, degrees_text, from_text, radians_of, to_text
 
 texts = st.text(st.characters(codec="utf-8"))
 single = (

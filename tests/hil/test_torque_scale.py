@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hil.archive.recordings import open_recording
+from hil.base.errors import SourceError
 from hil.cell import Cell
 from hil.cell.errors import CellError
-from hil.errors import SourceError
-from hil.identify.cell_context import torque_scale
-from hil.importers import import_log
-from hil.recordings import open_recording
+from hil.importers.log import import_log
+from hil.pipeline.cell_context import torque_scale
 from identification.signals.recording import Recording
 from tests.hil.simulated_logs import JOINTS, column_map, three_joint_robot
 

@@ -17,7 +17,7 @@ from hil.campaign.trajectory_files import SCRIPT_RATE, SLOW, trajectory_files
 from hil.cell import Cell
 from hil.cell.text import with_values
 from hil.cli import app
-from hil.motion_checks import current_model
+from hil.control.motion_checks import current_model
 from identification.model.motion import Motion
 from planner import JointLimits, Move, plan_moves
 from sim_fixtures.ns16 import CELL_PATH

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from hil.base.errors import ExecutionError, InputError
+from hil.base.progress import Silent
 from hil.campaign import Campaign
-from hil.campaign.operator import Stop
+from hil.campaign.identified import identify_campaign
 from hil.campaign.plan import design
-from hil.campaign.precision import PrecisionMeter, further, noise_shares, requirements_of
 from hil.campaign.precision_record import Look, PrecisionRecord, Reached
+from hil.campaign.reached_precision import PrecisionMeter, further, noise_shares, requirements_of
 from hil.cli import app
-from hil.errors import ExecutionError, InputError
-from hil.identified_campaign import identify_campaign
-from hil.identify import estimating
-from hil.progress import Silent
+from hil.control.motion_watch import Stop
 from identification.estimators.elasticity import ElasticTorque
 from identification.factor.factor import Factor
+from identification.reduction import reduction
 from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell, pass_rehearsal
 from tests.messages import ALL_REQUIREMENTS_MET
 
@@ -97,7 +97,7 @@ class TestEnd:
         meter.measure(paths[:1])
         reduced: list[str] = []
         for owner, name in (
-            (Factor, "by_time"), (ElasticTorque, "of"), (estimating, "form_factor"),
+            (Factor, "by_time"), (ElasticTorque, "of"), (reduction, "form_factor"),
         ):  # fmt: skip
             original = getattr(owner, name)
 
@@ -107,7 +107,7 @@ class TestEnd:
 
             monkeypatch.setattr(owner, name, noting)
         meter.measure(paths)
-        assert reduced == ["by_time", "of", "form_factor"]
+        assert reduced == ["form_factor", "of"]
         reduced.clear()
         meter.measure(paths)
         assert reduced == []

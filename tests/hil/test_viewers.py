@@ -15,11 +15,11 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from hil.annotate import PREDICTED, RESIDUAL
 from hil.archive import Samples, open_archive, write_samples
+from hil.base.errors import ArchiveError, InputError
 from hil.campaign import Campaign
 from hil.cli import app
-from hil.errors import ArchiveError, InputError
+from hil.identified.annotate import PREDICTED, RESIDUAL
 from hil.plots.archive_view import (
     ArchiveView,
     draw_archive,

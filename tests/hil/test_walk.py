@@ -10,12 +10,12 @@ from types import FrameType
 from typing import Any
 
 import hil
+from hil.base.progress import Silent
 from hil.cli import identify as command
-from hil.identified_arm import identify_recordings
-from hil.identify.options import Options
+from hil.identified.identified_arm import identify_recordings
 from hil.importers.recording import ImportOptions
 from hil.importers.robot import Robot
-from hil.progress import Silent
+from hil.pipeline.options import Options
 from identification.validation.verdict import Verdict
 from tests.hil.simulated_logs import write_moving_log
 from tests.hil.test_log_kinds import URDF
@@ -70,7 +70,7 @@ def test_each_file_is_called_by_one_before_it(tmp_path: Path) -> None:
     assert 0 < len(files) == len(set(files)) <= MOST
     assert files[0] == "hil/cli/identify.py"
     assert command.identify_recordings is identify_recordings  # which the command calls
-    assert files[1] == "hil/identified_arm.py"
+    assert files[1] == "hil/identified/identified_arm.py"
     assert files[-1] == "identification/validation/verdict.py"
     for number, name in enumerate(files[2:], start=2):
         assert callers[name] & set(files[1:number]), f"{name} is called by {callers[name]}"

@@ -16,6 +16,7 @@ from identification.estimators.least_squares import fit_least_squares
 from identification.factor.estimate import inverse_variance
 from identification.factor.factor import Factor
 from identification.factor.normal_equations import solve
+from identification.model.motion import Motion
 from tests.identification.two_link import MODEL, NOISE, as_samples, four_sines, truth
 
 STEP = 0.002
@@ -30,11 +31,13 @@ def recorded(compliance, noise=0.0, seed=0):
     for _ in range(4):  # a fixed point: what the gears transmit is that of the links
         rate = np.gradient(sag, STEP, axis=0)
         bend = np.gradient(rate, STEP, axis=0)
-        states = motor.position - sag, motor.velocity - rate, motor.acceleration - bend
-        transmitted = MODEL.gear_torque(truth(), *states)
+        links = Motion(
+            motor.time, motor.position - sag, motor.velocity - rate, motor.acceleration - bend
+        )
+        transmitted = MODEL.gear_torque(truth(), links)
         sag = compliance * transmitted
-    at_motors = MODEL.torque(truth(), *motor[1:4])
-    torque = at_motors + transmitted - MODEL.gear_torque(truth(), *motor[1:4])
+    at_motors = MODEL.torque(truth(), motor)
+    torque = at_motors + transmitted - MODEL.gear_torque(truth(), motor)
     torque += noise * np.random.default_rng(seed).standard_normal(torque.shape)
     inside = slice(50, -50)  # differences are one-sided at the ends
     return as_samples(MODEL, motor.rows(inside), torque[inside])
@@ -50,8 +53,7 @@ def fitted(samples):
     """The estimate of rigid gears, and the same with elastic ones allowed for."""
     estimate = fit_least_squares(MODEL, [samples])
     factor = Factor.by_time(MODEL, samples)
-    expected = expected_compliance(MODEL, samples, estimate.values)
-    torque = ElasticTorque.of(MODEL, samples, estimate.values, expected)
+    torque = ElasticTorque.of(MODEL, samples, estimate.values)
     return estimate, with_elastic_gears(estimate, factor, torque, 1.0)
 
 
@@ -98,7 +100,7 @@ def test_the_noise_of_rigid_gears_makes_none_elastic():
     each[:, :, 1] = each[:, :, 0] + 0.01 * each[:, :, 1]
     opposed = replace(samples, torque=samples.torque + 3.0 * (each[:, :, 0] - each[:, :, 1]))
     sums = _sums(opposed, each)
-    products, squares, measured = (np.tensordot(weights, part, axes=1) for part in sums)
+    products, squares, measured = sums.weighted(weights, 1.0)
     inverse = solve(factor.weighted(weights)).inverse
     moved, covariance = open_compliance(inverse, products, squares)
     errors = measured - products.T @ estimate.values
@@ -124,16 +126,18 @@ def _sums(samples, each):
         products[joint][used] = block[some].T @ effect
         squares[joint] = effect.T @ effect
         measured[joint] = effect.T @ samples.torque[some, joint]
-    return ElasticTorque(products, squares, measured)
+    return ElasticTorque(products, squares, measured, compliance=np.ones(2))
 
 
 def test_repetitions_count_like_more_rows():
     samples = recorded(COMPLIANCE, NOISE)
     estimate, _ = fitted(samples)
-    expected = expected_compliance(MODEL, samples, estimate.values)
-    single = ElasticTorque.of(MODEL, samples, estimate.values, expected)
-    double = ElasticTorque.total([single, single])
-    for once, twice in zip(ElasticTorque.total([single], 2.0), double, strict=True):
+    weights = np.array([1.0, 2.0])
+    single = ElasticTorque.of(MODEL, samples, estimate.values)
+    double = single.plus(single)
+    for once, twice in zip(
+        single.weighted(weights, 2.0), double.weighted(weights, 1.0), strict=True
+    ):
         np.testing.assert_allclose(once, twice)
 
 
@@ -141,10 +145,11 @@ def test_links_resonate_on_the_expected_gears():
     """One joint alone is an inertia on a spring."""
     samples = recorded(np.zeros(2))
     still = as_samples(
-        MODEL, samples.motion._replace(position=np.zeros_like(samples.torque)), samples.torque
+        MODEL, replace(samples.motion, position=np.zeros_like(samples.torque)), samples.torque
     )
-    inertia = MODEL.gear_torque(truth(), np.zeros((2, 2)), np.zeros((2, 2)), np.eye(2))
-    inertia -= MODEL.gear_torque(truth(), *np.zeros((3, 2, 2)))
+    rest = Motion.at_rest(np.zeros((2, 2)))
+    inertia = MODEL.gear_torque(truth(), replace(rest, acceleration=np.eye(2)))
+    inertia -= MODEL.gear_torque(truth(), rest)
     expected = expected_compliance(MODEL, still, truth())
     np.testing.assert_allclose(1.0 / np.sqrt(expected * np.diag(inertia)), RESONANCE)
 
@@ -161,8 +166,7 @@ def test_an_undetermined_parameter_stays_so():
     covariance[0, :] = covariance[:, 0] = 0.0
     covariance[0, 0] = np.inf
     unknown = replace(estimate, covariance=covariance)
-    expected = expected_compliance(MODEL, samples, estimate.values)
-    torque = ElasticTorque.of(MODEL, samples, estimate.values, expected)
+    torque = ElasticTorque.of(MODEL, samples, estimate.values)
     wider = with_elastic_gears(unknown, Factor.by_time(MODEL, samples), torque, 1.0)
     assert np.isinf(wider.covariance[0, 0])
     np.testing.assert_array_equal(wider.covariance[0, 1:], 0.0)

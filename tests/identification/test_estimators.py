@@ -62,6 +62,7 @@ from identification.export.urdf import NotConsistentError
 from identification.factor.estimate import joint_weights
 from identification.factor.factor import total_factor
 from identification.factor.normal_equations import NormalEquations, rows_of, solve
+from identification.model.motion import Motion
 from identification.model.pseudo_inertia import pseudo_inertia
 from identification.signals.recording import in_succession
 from identification.signals.smoothing import low_pass
@@ -132,7 +133,7 @@ def whole():
     """A recording with outliers, and its plan."""
     plan = a_motion(5.0)
     rng = np.random.default_rng(7)
-    motion = plan._replace(acceleration=plan.acceleration + rng.normal(0.0, 0.3, (1000, 2)))
+    motion = replace(plan, acceleration=plan.acceleration + rng.normal(0.0, 0.3, (1000, 2)))
     samples = recording(coloured(rng, 1000, 5e-3, 0.02), motion)
     samples.torque[100:110] += 40.0
     return samples, plan
@@ -291,7 +292,7 @@ class TestBlocks:
         motion = a_motion()
         at = np.clip((motion.time - 5.0) / 0.2, 0.0, 1.0)
         for array, elbow_rate in zip(
-            motion[1:4],
+            (motion.position, motion.velocity, motion.acceleration),
             (
                 0.6 * (10 * at**3 - 15 * at**4 + 6 * at**5),
                 3.0 * (30 * at**2 - 60 * at**3 + 30 * at**4),
@@ -392,7 +393,7 @@ class TestRobustEstimate:
         rng = np.random.default_rng(3)
         samples = recording(with_outliers(rng, gaussian(rng, motion), 0.05, 15.0), motion)
         result = robust_estimate(MODEL, [samples], loss)
-        rows = MODEL.regressor(*motion[1:]).dense(P)
+        rows = MODEL.regressor(motion).dense(P)
         scale = result.estimate.noise_std
         usable = samples.usable
 
@@ -706,7 +707,7 @@ class TestWeightOfBodies:
                 self.PRIOR.std * rng.standard_normal(len(self.PRIOR.std))
             )
             values = self.PRIOR.gaussian.mean + spread
-            torque = MODEL.torque(values, *motion[1:]) + gaussian(rng, motion)
+            torque = MODEL.torque(values, motion) + gaussian(rng, motion)
             factor = Factor.by_time(MODEL, as_samples(MODEL, motion, torque))
             estimate = fit_posterior(MODEL, factor, stronger).estimate
             half = estimate.interval_factor * estimate.std
@@ -826,7 +827,8 @@ class TestBodyPrior:
         model = RobotModel.from_urdf(URDF, friction=law)
         motion = a_motion()
         drift = 1.1 * np.abs(motion.velocity).max(axis=0)
-        motion = motion._replace(
+        motion = replace(
+            motion,
             position=motion.position + drift * motion.time[:, None],
             velocity=motion.velocity + drift,
         )
@@ -847,12 +849,10 @@ class TestBodyPrior:
         law = replace(MODEL.friction.laws[0], offset=True)
         model = RobotModel.from_urdf(URDF, friction=law)
         motion = a_motion()
-        position, velocity, acceleration = (np.array(part) for part in motion[1:4])
-        position[:, 1] = 0.3 + speed * motion.time
-        velocity[:, 1] = speed
-        acceleration[:, 1] = 0.0
-        motion = motion._replace(position=position, velocity=velocity, acceleration=acceleration)
-        torque = MODEL.torque(truth(), *motion[1:]) + gaussian(np.random.default_rng(1), motion)
+        motion.position[:, 1] = 0.3 + speed * motion.time
+        motion.velocity[:, 1] = speed
+        motion.acceleration[:, 1] = 0.0
+        torque = MODEL.torque(truth(), motion) + gaussian(np.random.default_rng(1), motion)
         factor = Factor.of(model, as_samples(model, motion, torque))
         with patch.object(prior_module, "OFFSET_SHARE", 1.0):
             free = body_prior(model, factor)
@@ -957,7 +957,7 @@ def five_sines(model, seed, samples=2000):
 
 def measured(model, motion, values, noise, seed):
     """Return torque with noise, a share of each joint's RMS."""
-    rms = np.sqrt((model.torque(values, *motion[1:]) ** 2).mean(axis=0))
+    rms = np.sqrt((model.torque(values, motion) ** 2).mean(axis=0))
     return simulated(model, values, motion, noise * rms, seed).torque
 
 
@@ -1064,7 +1064,7 @@ class TestConsistentEstimate:
         mapping = np.zeros((MODEL.n_parameters, s + 4))
         mapping[:rank, :s] = MODEL.base.grouping
         mapping[rank:, s:] = np.eye(4)
-        rows = MODEL.regressor(*motion[1:]).dense(MODEL.n_parameters) @ mapping
+        rows = MODEL.regressor(motion).dense(MODEL.n_parameters) @ mapping
         x = np.concatenate([consistent.standard, consistent.friction])
         error = rows @ x - torque
         gradient = 2.0 * np.einsum("tj,j,tjk->k", error, weights / effect, rows)
@@ -1101,7 +1101,7 @@ class TestConsistentEstimate:
         motion = five_sines(MODEL, 7, samples=300)
         torque = measured(MODEL, motion, truth(), 0.3, 7)
         consistent = fitted(MODEL, motion, torque)
-        error = MODEL.torque(consistent.estimate.values, *motion[1:]) - torque
+        error = MODEL.torque(consistent.estimate.values, motion) - torque
         rms = np.sqrt((error**2).mean(axis=0))
         np.testing.assert_allclose(consistent.estimate.noise_std, rms, rtol=1e-6)
         relative = np.linalg.norm(error) / np.linalg.norm(torque)
@@ -1140,7 +1140,7 @@ class TestConsistentEstimate:
         law = FrictionLaw(third=None)
         model = RobotModel.from_urdf(URDF, friction=law, gravity=(0, 0, 0))
         motion = five_sines(model, 10)
-        for array in motion[1:4]:
+        for array in (motion.position, motion.velocity, motion.acceleration):
             array[:, 1] = 0.0
         values = values_of(model, [4.0, 2.0, 1.5, 0.8])
         torque = measured(model, motion, values, 0.01, 10)
@@ -1268,11 +1268,6 @@ CARRYING = RobotModel.from_urdf(
 )
 
 
-def four_sines_at(time, speed=1.0):
-    """Position, velocity and acceleration (m, 2) of four sines for each joint."""
-    return four_sines(time, speed)[1:4]
-
-
 def delayed(
     delays, *, model=MODEL, seed=0, speed=1.0, torque_noise=1.0, position_noise=2e-5, time=None
 ):
@@ -1280,17 +1275,17 @@ def delayed(
     if time is None:
         time = np.arange(6000) * STEP
     rng = np.random.default_rng(seed)
-    late = [four_sines_at(time - delay, speed) for delay in np.broadcast_to(delays, 2)]
+    late = [four_sines(time - delay, speed) for delay in np.broadcast_to(delays, 2)]
     torque = np.column_stack(
         [
-            (model.torque(TRUTH, *motion) + model.load_torque(*motion))[:, j]
+            (model.torque(TRUTH, motion) + model.load_torque(motion))[:, j]
             for j, motion in enumerate(late)
         ]
     )
     shape = torque.shape
     return Recording(
         time=time,
-        position=four_sines_at(time, speed)[0] + position_noise * rng.standard_normal(shape),
+        position=four_sines(time, speed).position + position_noise * rng.standard_normal(shape),
         joint_names=model.joint_names,
         torque=torque + torque_noise * np.array([1.0, 0.2]) * rng.standard_normal(shape),
     )
@@ -1337,21 +1332,22 @@ class TestDelay:
         time = np.arange(6000) * STEP
 
         def moved(at):
-            q, qd, qdd = four_sines_at(at)
+            slow = four_sines(at)
+            q, qd, qdd = slow.position, slow.velocity, slow.acceleration
             for rate, size in ((12.0, 2e-3), (17.0, 1e-3)):
                 w = 2.0 * np.pi * rate
                 phase = w * at[:, None] + np.arange(2)
                 q = q + size * np.sin(phase)
                 qd = qd + size * w * np.cos(phase)
                 qdd = qdd - size * w**2 * np.sin(phase)
-            return q, qd, qdd
+            return Motion(at, q, qd, qdd)
 
         noise = np.random.default_rng(0).standard_normal((2, 6000, 2))
         recording = Recording(
             time=time,
-            position=moved(time)[0] + 1e-7 * noise[0],
+            position=moved(time).position + 1e-7 * noise[0],
             joint_names=MODEL.joint_names,
-            torque=MODEL.torque(TRUTH, *moved(time - 7e-4)) + 0.1 * noise[1],
+            torque=MODEL.torque(TRUTH, moved(time - 7e-4)) + 0.1 * noise[1],
         )
         estimate = estimate_delay(recording, MODEL)
         assert estimate.delay == pytest.approx(7e-4, abs=3e-5)
@@ -1372,8 +1368,8 @@ class TestDelay:
     def test_friction_that_grows_with_load_does_not_bias_it(self):
         """A tenth of the transmitted torque, whether or not the law has the term."""
         recording = delayed(1.6e-3, torque_noise=0.3)
-        motion = four_sines_at(recording.time - 1.6e-3)
-        grown = 0.1 * np.abs(MODEL.gear_torque(TRUTH, *motion)) * np.sign(motion[1])
+        motion = four_sines(recording.time - 1.6e-3)
+        grown = 0.1 * np.abs(MODEL.gear_torque(TRUTH, motion)) * np.sign(motion.velocity)
         loaded = replace(recording, torque=recording.torque + grown)
         without, beside = (
             estimate_delay(loaded, MODEL.with_friction(load=load)) for load in (False, True)
@@ -1464,13 +1460,13 @@ class TestDelay:
         assert estimate_delay(recorded, model).delay == pytest.approx(planted, abs=5e-5)
 
     def test_a_resting_axis_does_not_matter(self):
-        late = [part * [1.0, 0.0] for part in four_sines_at(np.arange(6000) * STEP - 7e-4)]
+        late = four_sines(np.arange(6000) * STEP - 7e-4).converted(lambda part: part * [1.0, 0.0])
         noise = np.random.default_rng(1).standard_normal((2, 6000, 2))
         still = delayed(0.0)
         still = replace(
             still,
-            position=four_sines_at(still.time)[0] * [1.0, 0.0] + 1e-6 * noise[0],
-            torque=MODEL.torque(TRUTH, *late) + 0.1 * noise[1],
+            position=four_sines(still.time).position * [1.0, 0.0] + 1e-6 * noise[0],
+            torque=MODEL.torque(TRUTH, late) + 0.1 * noise[1],
         )
         assert estimate_delay(still, MODEL).applied == pytest.approx(7e-4, abs=1e-4)
 
@@ -1478,9 +1474,9 @@ class TestDelay:
         law = FrictionLaw(third=None, presliding=1e-3)
         model = RobotModel.from_urdf(URDF, friction=law)
         time = np.arange(6000) * STEP
-        late = four_sines_at(time - 0.005)
-        direction = model.friction.direction(time, late[0], late[1])
-        recording = replace(delayed(0.0, model=model), torque=model.torque(TRUTH, *late, direction))
+        late = replace(four_sines(time - 0.005), time=time)
+        late = replace(late, direction=model.friction.direction(late))
+        recording = replace(delayed(0.0, model=model), torque=model.torque(TRUTH, late))
         assert estimate_delay(recording, model).delay == pytest.approx(0.005, abs=5e-5)
 
 

@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 import pickle
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cache, partial
 from itertools import pairwise
 
@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from identification.excitation import CRITERIA, validation_motions
 from identification.excitation.collision import CollisionChecker
-from identification.excitation.collision_bodies import Workspace
 from identification.excitation.constraints import (
     SAMPLE_PERIOD,
     Constraints,
@@ -42,6 +41,7 @@ from identification.excitation.validation_motions import random_validation_motio
 from identification.excitation.violation import KINDS, NoFeasibleMotionError, excess_by_kind
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
+from identification.model.workspace import Workspace
 from planner import (
     FourierSeries,
     JointLimits,
@@ -465,7 +465,7 @@ def some_motion(seed, n_via=5):
 def rows_of(motion):
     """Phi of one motion: a row per sample and joint, with less dry friction below standstill."""
     direction = np.clip(motion.velocity / MODEL.friction.standstill, -1.0, 1.0)
-    return MODEL.regressor(*motion[1:4], direction).dense(P).reshape(-1, P)
+    return MODEL.regressor(replace(motion, direction=direction)).dense(P).reshape(-1, P)
 
 
 def assert_measures(criteria, columns, n_samples):
@@ -495,7 +495,10 @@ class TestSamples:
         np.testing.assert_allclose(middles.time, 0.5 * (ends.time[1:] + ends.time[:-1]), rtol=1e-12)
         assert np.all(middles.velocity[[0, -1]] != 0.0)  # neither end, where nothing moves
         for motion in (ends, middles):
-            for series, expected in zip(motion[1:4], trajectory.sample(motion.time), strict=True):
+            sampled_states = motion.position, motion.velocity, motion.acceleration
+            for series, expected in zip(
+                sampled_states, trajectory.sample(motion.time), strict=True
+            ):
                 np.testing.assert_array_equal(series, expected)
 
 
@@ -564,8 +567,8 @@ class TestMeasures:
         motion = midpoints(some_motion(3))
         rests = np.arange(motion.n_samples) > motion.n_samples // 2
         velocity = np.where(rests[:, None] & [False, True], 0.0, motion.velocity)
-        still = motion._replace(velocity=velocity)
-        rounded = still._replace(velocity=velocity + 1e-12)
+        still = replace(motion, velocity=velocity)
+        rounded = replace(still, velocity=velocity + 1e-12)
         expected = Objective(MODEL).measures(still)
         assert Objective(MODEL).measures(rounded) == pytest.approx(expected, rel=1e-6)
 

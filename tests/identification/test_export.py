@@ -17,7 +17,6 @@ import pytest
 from identification.errors import ModelError, ShapeError
 from identification.estimators.consistent import consistent_estimate
 from identification.excitation.collision import CollisionChecker
-from identification.excitation.collision_bodies import Workspace
 from identification.excitation.errors import CollisionModelError
 from identification.export.arm import Arm, Ranges
 from identification.export.friction import friction_curve, median_load
@@ -34,6 +33,7 @@ from identification.model.motion import Motion
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.model.urdf_text import LONGEST, MOST_LINKS, refusal, urdf_tree
+from identification.model.workspace import Workspace
 from identification.signals.smoothing import LowPassShape, low_passed, noiseless_above
 from sim_fixtures.ns16 import urdf_text
 from tests import messages
@@ -370,7 +370,8 @@ class TestWriting:
         for _ in range(20):
             q, qd, qdd = rng.uniform(-2, 2, (3, n))
             expected = model.torque(
-                np.concatenate([base, np.zeros(4 * n)]), q[None], qd[None], qdd[None]
+                np.concatenate([base, np.zeros(4 * n)]),
+                Motion.of_states(q[None], qd[None], qdd[None]),
             )[0]
             torque = pin.rnea(read, data, pin.integrate(read, pin.neutral(read), q), qd, qdd)
             # The base parameters neglect the effect of rounded angles on dependent columns.
@@ -492,8 +493,9 @@ def fit():
     rng = np.random.default_rng(0)
     q, qd, qdd = rng.normal(size=(3, 300, 2))
     values = np.concatenate([model.base.grouping @ model.nominal, [4.0, 2.0, 1.5, 0.8]])
-    torque = model.torque(values, q, qd, qdd) + rng.normal(size=(300, 2))
-    factor = Factor.from_samples(model, Motion(np.arange(300.0), q, qd, qdd), torque)
+    motion = Motion(np.arange(300.0), q, qd, qdd)
+    torque = model.torque(values, motion) + rng.normal(size=(300, 2))
+    factor = Factor.from_samples(model, motion, torque)
     estimated = estimate(model, factor)
     return model, estimated, consistent_estimate(model, factor, estimated)
 
@@ -700,7 +702,7 @@ class TestLoadFriction:
         shares = np.array(
             [row["fl"] for row in model.friction.table(arm.values[model.friction_part])]
         )
-        sizes = np.abs(model.gear_torque(arm.values, *motion[1:4]))
+        sizes = np.abs(model.gear_torque(arm.values, motion))
         expected = np.sqrt(np.mean((shares * (sizes - self.LOAD)) ** 2, axis=0))
         np.testing.assert_allclose(beyond, [expected], rtol=1e-6)
         assert comparison.difference < AGREES
@@ -736,7 +738,7 @@ class TestLoadFriction:
         model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(load=True))
         motion = four_sines(np.arange(0.0, 2.0, 0.01))
         values = np.arange(1.0, model.n_parameters + 1.0)
-        sizes = np.abs(model.gear_torque(values, *motion[1:4]))
+        sizes = np.abs(model.gear_torque(values, motion))
         usable = np.zeros(sizes.shape, dtype=bool)
         usable[50:, 0] = True  # the other joint never moves
         run = as_samples(model, motion, sizes, usable=usable)

@@ -69,7 +69,7 @@ def summed(storage, parts):
 
 def exact_solution(samples):
     """Solve least squares in rational arithmetic from the float rows."""
-    blocks = MODEL.regressor(*samples.motion[1:]).dense(P)
+    blocks = MODEL.regressor(samples.motion).dense(P)
     table = np.concatenate([blocks, samples.torque[:, :, None]], axis=2)[samples.usable]
     rows = [[Fraction(float(x)) for x in row] for row in table]
     gram = [[sum(r[i] * r[j] for r in rows) for j in range(P + 1)] for i in range(P)]
@@ -91,11 +91,13 @@ class TestFactor:
         mask = np.ones((200, 6), dtype=bool)
         mask[40:80, 2] = False
         torque[40:80, 2] = np.nan
-        before = [array.copy() for array in (*motion[:4], torque)]
+        before = {name: array.copy() for name, array in motion.columns().items()}
+        of_torque = torque.copy()
         factor = Factor.from_samples(model, motion, torque, mask)
-        for array, copy in zip((*motion[:4], torque), before, strict=True):
-            np.testing.assert_array_equal(array, copy)
-        dense = model.regressor(*motion[1:]).dense(58)
+        for name, array in motion.columns().items():
+            np.testing.assert_array_equal(array, before[name])
+        np.testing.assert_array_equal(torque, of_torque)
+        dense = model.regressor(motion).dense(58)
         for joint in range(6):
             rows = np.column_stack([dense[:, joint], torque[:, joint]])[mask[:, joint]]
             np.testing.assert_allclose(factor.gram[joint], rows.T @ rows, rtol=1e-12, atol=1e-9)
@@ -210,7 +212,7 @@ class TestConditioning:
         assert np.isfinite(result.std[determined]).all()
         np.testing.assert_allclose(result.values[determined], truth()[determined], rtol=1e-3)
         # It still predicts the fitted motion.
-        predicted = MODEL.torque(result.values, *motion[1:])
+        predicted = MODEL.torque(result.values, motion)
         np.testing.assert_allclose(predicted, samples.torque, atol=1e-4)
 
     def test_dependent_parameters_are_both_named_in_any_units(self):
@@ -276,7 +278,7 @@ class TestEstimate:
     @pytest.mark.parametrize("weights", [np.ones(2), np.array([0.3, 20.0])])
     def test_it_solves_the_stacked_weighted_rows(self, weights):
         samples = noisy(a_motion(400), NOISE, 2)
-        rows = MODEL.regressor(*samples.motion[1:]).dense(P) * np.sqrt(weights)[:, None]
+        rows = MODEL.regressor(samples.motion).dense(P) * np.sqrt(weights)[:, None]
         right = samples.torque * np.sqrt(weights)
         some = samples.usable
         expected, *_ = np.linalg.lstsq(rows[some], right[some], rcond=None)

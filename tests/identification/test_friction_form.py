@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from identification.estimators.friction_drift import drift_of_factors
 from identification.estimators.friction_form import (
     FORMS,
     FormUncertainty,
@@ -20,7 +21,6 @@ from identification.factor.factor import Factor
 from identification.model.friction import ASYMMETRIC, QUADRATIC, STRIBECK, FrictionLaw
 from identification.model.robot import RobotModel
 from identification.validation.facts.form import FORM
-from identification.validation.residuals import drift_of_factors
 from tests.identification.test_verdict import finding_of, judged
 from tests.identification.two_link import MODEL, NOISE, URDF, P, a_motion, as_samples, truth
 
@@ -41,7 +41,7 @@ def stribeck(share, speed, motion=MOTION):
 def recorded(added=0.0, seed=0, motion=MOTION, noise=NOISE):
     """Samples of the planted arm with a torque (m, 2) that no parameter has."""
     random = np.random.default_rng(seed)
-    torque = MODEL.torque(truth(), *motion[1:]) + added
+    torque = MODEL.torque(truth(), motion) + added
     return as_samples(MODEL, motion, torque + noise * random.standard_normal(torque.shape))
 
 
@@ -177,7 +177,7 @@ class TestDrift:
         motion = MOTION
         level = np.linspace(0.05, -0.05, len(motion.time))[:, None]
         friction = np.where(MODEL.friction_columns, truth(), 0.0)
-        added = self.CHANGE / -0.1 * level * MODEL.torque(friction, *motion[1:])
+        added = self.CHANGE / -0.1 * level * MODEL.torque(friction, motion)
         samples = recorded(added, noise=0.1 * NOISE)
         edges = np.linspace(0, len(motion.time), parts + 1).astype(int)
         factors = [Factor.by_time(MODEL, samples.between(a, b)) for a, b in pairwise(edges)]

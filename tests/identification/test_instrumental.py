@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -37,8 +39,13 @@ def executed(seed, *, position_noise=0.0, correlation=0.02, noise=1.0):
     """Return the plan followed within 2 %, with noisy encoders and a 40 Hz smoother."""
     rng = np.random.default_rng(seed)
     beside = four_sines(TIME, seed=13 + seed, size=0.02)
-    true = Motion(TIME, *(a + b for a, b in zip(PLAN[1:4], beside[1:4], strict=True)))
-    torque = MODEL.torque(TRUTH, *true[1:]) + noise * two_link.coloured(
+    true = Motion(
+        TIME,
+        PLAN.position + beside.position,
+        PLAN.velocity + beside.velocity,
+        PLAN.acceleration + beside.acceleration,
+    )
+    torque = MODEL.torque(TRUTH, true) + noise * two_link.coloured(
         rng, len(TIME), STEP, correlation
     )
     if position_noise:
@@ -69,7 +76,7 @@ def dense(samples, plan=PLAN):
     """Return Z and W (m, n, p) and y (m, n), zero in unusable rows."""
     rows = samples.usable & MODEL.moving(plan.velocity)
     p = MODEL.n_parameters
-    z, w = (MODEL.regressor(*motion[1:]).dense(p) for motion in (plan, samples.motion))
+    z, w = (MODEL.regressor(motion).dense(p) for motion in (plan, samples.motion))
     return (
         np.where(rows[..., None], z, 0.0),
         np.where(rows[..., None], w, 0.0),
@@ -138,8 +145,8 @@ class TestInstrumentalEstimate:
         assert 0.90 <= np.mean(covered) <= 0.99
 
     def test_a_resting_instrument_determines_nothing(self):
-        still = PLAN._replace(
-            velocity=PLAN.velocity * [1.0, 0.0], acceleration=PLAN.acceleration * [1.0, 0.0]
+        still = replace(
+            PLAN, velocity=PLAN.velocity * [1.0, 0.0], acceleration=PLAN.acceleration * [1.0, 0.0]
         )
         _, result = fit(executed(1), still)
         assert {"f0_2", "f1_2"} <= set(result.estimate.undetermined)

@@ -1,5 +1,7 @@
 """Friction that grows with the torque that a gear transmits."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -27,7 +29,7 @@ def gravity_and_inertia(model, values, motion):
     rigid = values.copy()
     rigid[model.friction_part] = 0.0
     rigid[[name.endswith("m") for name in model.parameter_names]] = 0.0
-    return model.torque(rigid, *motion[1:])
+    return model.torque(rigid, motion)
 
 
 def weighted_fit(samples):
@@ -49,9 +51,9 @@ class TestLaw:
             URDF, friction=FrictionLaw(third=None), joint_friction={MODEL.joint_names[1]: LAW}
         )
         motion = a_motion()
-        torque = model.torque(np.append(truth(), 0.06), *motion[1:])
+        torque = model.torque(np.append(truth(), 0.06), motion)
         assert model.parameter_names[-1] == "fl_2"
-        both = LOADED.torque(np.append(truth(), [0.0, 0.06]), *motion[1:])
+        both = LOADED.torque(np.append(truth(), [0.0, 0.06]), motion)
         np.testing.assert_allclose(torque, both, rtol=1e-12, atol=1e-10)
 
 
@@ -59,16 +61,16 @@ class TestTorque:
     def test_it_is_a_share_of_the_rigid_torque_against_the_motion(self):
         motion = a_motion()
         rigid = gravity_and_inertia(MODEL, truth(), motion)
-        added = LOADED.torque(VALUES, *motion[1:]) - MODEL.torque(truth(), *motion[1:])
+        added = LOADED.torque(VALUES, motion) - MODEL.torque(truth(), motion)
         expected = SHARES * np.sign(motion.velocity) * np.abs(rigid)
         np.testing.assert_allclose(added, expected, rtol=1e-9, atol=1e-9)
 
     def test_it_follows_the_presliding_state(self):
         model = LOADED.with_friction(presliding=1e-3)
         motion = a_motion()
-        z = model.friction.direction(*motion[:3])
-        torque = model.torque(VALUES, *motion[1:4], z)
-        without = MODEL.torque(truth(), *motion[1:4], z)
+        z = model.friction.direction(motion)
+        torque = model.torque(VALUES, replace(motion, direction=z))
+        without = MODEL.torque(truth(), replace(motion, direction=z))
         rigid = gravity_and_inertia(MODEL, truth(), motion)
         np.testing.assert_allclose(torque - without, SHARES * z * np.abs(rigid), atol=1e-9)
 
@@ -79,8 +81,8 @@ class TestTorque:
         model = RobotModel.from_urdf(URDF, friction=LAW, payload=payload, elements=[spring, ripple])
         motion = a_motion()
         values = np.concatenate([VALUES, [7.0, 8.0]])
-        expected = gravity_and_inertia(MODEL, truth(), motion) + model.load_torque(*motion[1:4])
-        torque = model.gear_torque(values, *motion[1:4])
+        expected = gravity_and_inertia(MODEL, truth(), motion) + model.load_torque(motion)
+        torque = model.gear_torque(values, motion)
         np.testing.assert_allclose(torque, expected, rtol=1e-9, atol=1e-9)
 
     def test_coupled_motors_have_no_such_term(self):
@@ -141,7 +143,7 @@ class TestPlannedMotions:
         fast = LOADED.friction.moving(motion.velocity).all(axis=1)
         motion = motion.rows(fast)
         gram = Objective(LOADED).information(motion)
-        columns = LOADED.regressor(*motion[1:]).dense(LOADED.n_parameters)
+        columns = LOADED.regressor(motion).dense(LOADED.n_parameters)
         expected = np.einsum("mjp,mjq->pq", columns, columns)
         np.testing.assert_allclose(gram, expected, rtol=1e-9, atol=1e-9)
         assert np.isfinite([*Objective(LOADED).measures(motion).values()]).all()

@@ -32,6 +32,7 @@ from identification.model.elements import (
 )
 from identification.model.friction import FrictionLaw, JointFriction, dissipation, presliding_state
 from identification.model.kinematics import FROM_PINOCCHIO, chain_from_urdf
+from identification.model.motion import Motion
 from identification.model.pseudo_inertia import (
     AS_GIVEN,
     ASSUMED,
@@ -58,18 +59,18 @@ from tests.identification.two_link import URDF as TWO_LINK
 TILTED = (2.0, -3.0, -9.0)
 
 
-def inverse_dynamics(urdf, gravity, q, qd, qdd):
+def inverse_dynamics(urdf, gravity, motion):
     """Return pinocchio's torques of the rigid bodies."""
     model = pin.buildModelFromXML(urdf)
     model.gravity.linear = np.array(gravity)
     data = model.createData()
-    torque = np.empty(q.shape)
-    for sample in range(len(q)):
+    torque = np.empty(motion.position.shape)
+    for sample, (q, qd, qdd) in enumerate(motion.states()):
         configuration = []
-        for joint, angle in zip(list(model.joints)[1:], q[sample], strict=True):
+        for joint, angle in zip(list(model.joints)[1:], q, strict=True):
             # pinocchio writes a continuous joint as a point on the circle
             configuration += [np.cos(angle), np.sin(angle)] if joint.nq == 2 else [angle]
-        torque[sample] = pin.rnea(model, data, np.array(configuration), qd[sample], qdd[sample])
+        torque[sample] = pin.rnea(model, data, np.array(configuration), qd, qdd)
     return torque
 
 
@@ -117,9 +118,10 @@ class TestRobotModel:
         friction = [f0, f1, f2, fo] if law.offset else [f0, f1, f2]
         values = np.concatenate([model.base.grouping @ standard.reshape(-1), *friction])
 
-        expected = inverse_dynamics(urdf, gravity, q, qd, qdd)
+        motion = Motion.of_states(q, qd, qdd)
+        expected = inverse_dynamics(urdf, gravity, motion)
         expected += rotors * qdd + f0 * np.sign(qd) + f1 * qd + f2 * qd**3 + fo
-        assert np.abs(model.torque(values, q, qd, qdd) - expected).max() < 1e-10
+        assert np.abs(model.torque(values, motion) - expected).max() < 1e-10
 
     def test_inertia_of_the_joints_is_pinocchios_plus_rotors(self):
         robot = pin.buildModelFromXML(urdf_text())
@@ -171,12 +173,12 @@ class TestRobotModel:
         model = RobotModel.from_urdf(urdf_text())
         good = np.zeros((5, 6))
         short = np.zeros((4, 6))
-        with pytest.raises(ShapeError, match=r"qd has shape \(4, 6\), expected \(5, 6\)"):
-            model.regressor(good, short, good)
-        with pytest.raises(ShapeError, match=r"q has shape \(6,\), expected \(m, 6\)"):
-            model.regressor(good[0], good, good)
+        with pytest.raises(ShapeError, match=r"velocity has shape \(4, 6\), expected \(5, 6\)"):
+            model.regressor(Motion.of_states(good, short, good))
+        with pytest.raises(ShapeError, match=r"position has shape \(6,\), expected \(m, 6\)"):
+            model.regressor(Motion.of_states(good[0], good, good))
         with pytest.raises(ShapeError, match=r"values has shape \(57,\), expected \(58,\)"):
-            model.torque(np.zeros(57), good, good, good)
+            model.torque(np.zeros(57), Motion.at_rest(good))
 
 
 PAIRS = ((0, 1), (1, 3))
@@ -229,8 +231,9 @@ class TestLockedJoints:
         all_q[:, free] = q
         all_qd[:, free] = qd
         all_qdd[:, free] = qdd
-        expected = whole.torque(values(whole), all_q, all_qd, all_qdd)[:, free]
-        np.testing.assert_allclose(model.torque(values(model), q, qd, qdd), expected, atol=1e-9)
+        expected = whole.torque(values(whole), Motion.of_states(all_q, all_qd, all_qdd))[:, free]
+        motion = Motion.of_states(q, qd, qdd)
+        np.testing.assert_allclose(model.torque(values(model), motion), expected, atol=1e-9)
 
     def test_locked_links_are_merged_if_the_rest_is_inconsistent(self):
         urdf = panda()
@@ -516,7 +519,8 @@ class TestLawsOfJoints:
         friction = random.normal(size=len(model.friction.terms))
         values = np.concatenate([np.zeros(model.base.rank), friction])
         qd = random.choice([-2.0, -0.5, -0.1, -1e-3, 0.0, 1e-3, 0.1, 0.5, 2.0], (30, 6))
-        torque = model.torque(values, random.normal(size=(30, 6)), qd, random.normal(size=(30, 6)))
+        q, qdd = random.normal(size=(2, 30, 6))
+        torque = model.torque(values, Motion.of_states(q, qd, qdd))
         coefficients = [{} for _ in names]
         for name, value in zip(model.parameter_names[model.base.rank :], friction, strict=True):
             symbol, joint = name.split("_")
@@ -603,17 +607,17 @@ class TestPreslidingState:
 class TestDirectionOfFriction:
     def test_without_presliding_it_is_the_sign(self):
         motion = a_motion()
-        direction = MODEL.friction.direction(*motion[:3])
+        direction = MODEL.friction.direction(motion)
         np.testing.assert_array_equal(direction, np.sign(motion.velocity))
 
     def test_the_torque_uses_the_direction_of_a_motion(self):
         motion = a_motion()
-        half = motion._replace(direction=0.5 * np.sign(motion.velocity))
+        half = replace(motion, direction=0.5 * np.sign(motion.velocity))
         dry = np.zeros_like(truth())
         dry[MODEL.parameter_names.index("f0_1")] = 4.0
         dry[MODEL.parameter_names.index("f0_2")] = 2.0
         np.testing.assert_allclose(
-            MODEL.torque(dry, *half[1:]), 0.5 * MODEL.torque(dry, *motion[1:]), atol=1e-12
+            MODEL.torque(dry, half), 0.5 * MODEL.torque(dry, motion), atol=1e-12
         )
 
 
@@ -622,16 +626,12 @@ def coupled():
     return RobotModel.from_urdf(urdf_text(), coupling=Coupling(NS16_TURNS))
 
 
-def states(m=40):
-    return np.random.default_rng(4).uniform(-3.0, 3.0, (3, m, 6))
-
-
 class TestCoupling:
     """Motors that turn with several joints."""
 
     def test_rotors_and_motor_friction_act_through_it(self, coupled):
         """tau = K' J K qdd + sum of c_m' f_m(c_m qd), computed from K here."""
-        q, qd, qdd = states()
+        motion = some_states(40)
         inertia = np.random.default_rng(1).uniform(1e-4, 1e-3, 6)
         rotors = NS16_TURNS.T @ np.diag(inertia) @ NS16_TURNS
         standard = np.zeros(len(coupled.layout.names))
@@ -642,12 +642,12 @@ class TestCoupling:
         friction = np.zeros(len(coupled.friction.terms))
         friction[-4:] = 2.0, 3.0, 0.5, 0.7
         values = np.concatenate([coupled.base.grouping @ standard, friction])
-        expected = qdd @ rotors
+        expected = motion.acceleration @ rotors
         for motor, coulomb, viscous in ((4, 2.0, 0.5), (5, 3.0, 0.7)):
             c = NS16_TURNS[motor] / NS16_TURNS[motor, motor]
-            speed = qd @ c
+            speed = motion.velocity @ c
             expected += np.outer(coulomb * np.sign(speed) + viscous * speed, c)
-        np.testing.assert_allclose(coupled.torque(values, q, qd, qdd), expected, atol=1e-9)
+        np.testing.assert_allclose(coupled.torque(values, motion), expected, atol=1e-9)
 
     def test_rows_need_moving_motors(self, coupled):
         qd = np.ones((1, 6))
@@ -661,7 +661,7 @@ class TestCoupling:
             urdf_text(), coupling=Coupling(np.diag(np.diag(NS16_TURNS)))
         )
         assert with_gears.parameter_names == uncoupled.parameter_names
-        blocks = [model.regressor(*states()).blocks for model in (with_gears, uncoupled)]
+        blocks = [model.regressor(some_states(40)).blocks for model in (with_gears, uncoupled)]
         assert all(map(np.array_equal, *blocks))
 
     @pytest.mark.parametrize(
@@ -845,11 +845,11 @@ class TestElementModel:
         model = with_elements(SPRING, GAS)
         motion = two_link.a_motion()
         values = np.concatenate([two_link.truth(), [35.0, 0.8]])
-        expected = two_link.MODEL.torque(two_link.truth(), *motion[1:])
+        expected = two_link.MODEL.torque(two_link.truth(), motion)
         expected[:, 0] += 35.0 * (motion.position[:, 0] - 0.3)
         expected[:, 1] += 0.8 * replace(GAS, identified=False).known_torque(motion.position[:, 1])
-        np.testing.assert_allclose(model.torque(values, *motion[1:]), expected, atol=1e-9)
-        dense = model.regressor(*motion[1:]).dense(model.n_parameters) @ values
+        np.testing.assert_allclose(model.torque(values, motion), expected, atol=1e-9)
+        dense = model.regressor(motion).dense(model.n_parameters) @ values
         np.testing.assert_allclose(dense, expected, atol=1e-9)
         other = model.with_friction(coulomb=False)
         assert other.parameter_names[other.element_part] == model.elements.names
@@ -864,15 +864,15 @@ class TestElementModel:
         )
         values = np.concatenate([two_link.truth(), [0.0, 0.0, 0.3, 0.4]])
         angle = 20.0 * motion.position[:, 0] - 30.0 * motion.position[:, 1]
-        expected = two_link.MODEL.torque(two_link.truth(), *motion[1:])
+        expected = two_link.MODEL.torque(two_link.truth(), motion)
         expected[:, 1] += 0.5 * np.sin(2.0 * angle + np.arctan2(0.3, 0.4))
-        np.testing.assert_allclose(model.torque(values, *motion[1:]), expected, atol=1e-9)
+        np.testing.assert_allclose(model.torque(values, motion), expected, atol=1e-9)
 
     def test_known_elements_are_load(self):
         sprung_model = with_elements(replace(SPRING, identified=False))
         motion = two_link.a_motion(1.0)
         assert sprung_model.parameter_names == two_link.MODEL.parameter_names
-        load = sprung_model.load_torque(*motion[1:4])
+        load = sprung_model.load_torque(motion)
         np.testing.assert_allclose(load[:, 0], 40.0 * (motion.position[:, 0] - 0.3))
         assert not load[:, 1].any()
         assert sprung_model.has_load and not two_link.MODEL.has_load
@@ -923,13 +923,12 @@ class TestIdentifiedElements:
 
 
 def some_states(m, seed=3):
-    q, qd, qdd = np.random.default_rng(seed).uniform(-3.0, 3.0, (3, m, 6))
-    return q, qd, qdd
+    return Motion.of_states(*np.random.default_rng(seed).uniform(-3.0, 3.0, (3, m, 6)))
 
 
 class TestRegressor:
     def test_blocks_have_only_columns_that_act_on_the_joint(self, ns16):
-        regressor = ns16.regressor(*some_states(50))
+        regressor = ns16.regressor(some_states(50))
         both = zip(regressor.blocks, regressor.columns, strict=True)
         for number, (block, columns) in enumerate(both, start=1):
             names = [ns16.parameter_names[c] for c in columns]
@@ -944,37 +943,37 @@ class TestRegressor:
 
     @pytest.mark.parametrize("m", [0, 1, 2, 63, 65, CHUNK - 1, CHUNK, CHUNK + 1, 2 * CHUNK + 77])
     def test_samples_are_independent(self, ns16, m):
-        q, qd, qdd = some_states(m)
-        whole = ns16.regressor(q, qd, qdd)
+        motion = some_states(m)
+        whole = ns16.regressor(motion)
         assert [len(block) for block in whole.blocks] == [m] * 6
         for t in {0, m // 2, m - 1} if m else ():
-            alone = ns16.regressor(q[t : t + 1], qd[t : t + 1], qdd[t : t + 1])
+            alone = ns16.regressor(motion.rows(slice(t, t + 1)))
             for long, short in zip(whole.blocks, alone.blocks, strict=True):
                 assert np.allclose(long[t], short[0], rtol=1e-13, atol=1e-13)
 
     def test_threads_do_not_share_working_arrays(self, ns16):
         first = some_states(300, seed=1)
         second = some_states(300, seed=2)
-        alone = [np.concatenate([b.copy() for b in rows]) for _, rows in ns16.plan.chunks(*first)]
+        alone = [np.concatenate([b.copy() for b in rows]) for _, rows in ns16.plan.chunks(first)]
         together = []
-        for (_, rows), _ in zip(ns16.plan.chunks(*first), ns16.plan.chunks(*second), strict=True):
+        for (_, rows), _ in zip(ns16.plan.chunks(first), ns16.plan.chunks(second), strict=True):
             together.append(np.concatenate([b.copy() for b in rows]))
         assert np.array_equal(np.hstack(alone), np.hstack(together))
 
     @pytest.mark.parametrize("angle", [0.0, np.pi / 2, np.pi, -np.pi, 1e4])
     def test_it_is_continuous_at_all_angles(self, ns16, angle):
         # tan(q / 2), from which the rotation is computed, has a pole at pi
-        q, qd, qdd = some_states(3)
-        q[:] = angle
-        nearby = ns16.regressor(q + 1e-9, qd, qdd)
-        for at, near in zip(ns16.regressor(q, qd, qdd).blocks, nearby.blocks, strict=True):
+        motion = some_states(3)
+        motion.position[:] = angle
+        nearby = ns16.regressor(replace(motion, position=motion.position + 1e-9))
+        for at, near in zip(ns16.regressor(motion).blocks, nearby.blocks, strict=True):
             assert np.all(np.isfinite(at))
             assert np.allclose(at, near, atol=1e-6)
 
     def test_working_arrays_are_freed_with_the_model(self):
         """Without the cycle collector, which may run minutes later."""
         model = RobotModel.from_urdf(urdf_text())
-        model.regressor(*some_states(CHUNK))
+        model.regressor(some_states(CHUNK))
         plan = weakref.ref(model.plan)
         gc.disable()
         try:

@@ -12,6 +12,7 @@ from identification.estimators.payload import NAMES, PayloadError, identify_payl
 from identification.estimators.payload_problem import Run
 from identification.factor.columns import gain_factor
 from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
 from identification.model.payload import Load, Payload
 from identification.model.pseudo_inertia import inertial_parameters, margin
 from identification.model.robot import RobotModel
@@ -44,16 +45,15 @@ def pinocchio_torque(urdf, payload, joint, where):
             joint, pin.Inertia(payload.mass, np.array(payload.centre), tensor), where
         )
     data = model.createData()
-    q, qd, qdd = states(model.nv)
     rows = [
         pin.rnea(model, data, pin.integrate(model, pin.neutral(model), a), b, c)
-        for a, b, c in zip(q, qd, qdd, strict=True)
+        for a, b, c in states(model.nv).states()
     ]
     return np.array(rows)
 
 
 def states(n):
-    return np.random.default_rng(6).uniform(-2.0, 2.0, (3, 20, n))
+    return Motion.of_states(*np.random.default_rng(6).uniform(-2.0, 2.0, (3, 20, n)))
 
 
 class TestPayload:
@@ -73,7 +73,7 @@ class TestPayload:
         model = RobotModel.from_urdf(urdf, gravity=TILTED, payload=payload)
         expected = pinocchio_torque(urdf, payload, model.n_joints, where)
         expected -= pinocchio_torque(urdf, None, model.n_joints, where)
-        np.testing.assert_allclose(model.load_torque(*states(model.n_joints)), expected, atol=1e-9)
+        np.testing.assert_allclose(model.load_torque(states(model.n_joints)), expected, atol=1e-9)
 
     def test_it_does_not_change_the_parameters(self):
         bare = RobotModel.from_urdf(urdf_text())
@@ -81,9 +81,9 @@ class TestPayload:
         assert loaded.parameter_names == bare.parameter_names
         values = np.arange(1.0, bare.n_parameters + 1)
         np.testing.assert_array_equal(
-            loaded.torque(values, *states(6)), bare.torque(values, *states(6))
+            loaded.torque(values, states(6)), bare.torque(values, states(6))
         )
-        assert not bare.load_torque(*states(6)).any()
+        assert not bare.load_torque(states(6)).any()
 
     def test_an_unknown_frame_is_refused_with_the_known_ones(self):
         with pytest.raises(ModelError, match=r"'tool9' is not a link .* link_6"):
@@ -120,7 +120,7 @@ def recordings(loads, *, noise=NOISE, drift=0.0, pace=1.0, seed=0):
     for k, load in enumerate(loads):
         drifted = truth()
         drifted[-4:] *= 1.0 + drift * np.tile(rng.standard_normal(2), 2)
-        torque = MODEL.torque(drifted, *motion[1:])
+        torque = MODEL.torque(drifted, motion)
         if load is not None:
             torque += load_torque(MODEL, load, motion)
         torque += noise * rng.standard_normal(torque.shape)
@@ -217,7 +217,7 @@ class TestFrame:
         urdf = URDF.replace("</robot>", tool)
         model = RobotModel.from_urdf(urdf, friction=FrictionLaw(third=None))
         motion = a_motion()
-        bare = model.torque(truth(), *motion[1:])
+        bare = model.torque(truth(), motion)
         loaded = bare + load_torque(model, replace(LOAD, frame="tool"), motion)
         runs = [
             Run.of("run", model, as_samples(model, motion, torque), "tool", loaded=kind)
@@ -243,7 +243,7 @@ LIFT_AND_TURN = robot(
 
 
 def load_torque(model, payload, motion):
-    return Load(model.chain, model.gravity, payload).torque(*motion[1:4])
+    return Load(model.chain, model.gravity, payload).torque(motion)
 
 
 def factors_of(
@@ -255,7 +255,7 @@ def factors_of(
     motion = four_sines(TIME, n=model.n_joints) if motion is None else motion
     samples = as_samples(model, motion, np.zeros_like(motion.position))
     rng = np.random.default_rng(seed)
-    torque = model.torque(truth() if values is None else values, *motion[1:])
+    torque = model.torque(truth() if values is None else values, motion)
     factors = []
     for payload in (None, load):
         joint = torque if payload is None else torque + load_torque(model, payload, motion)

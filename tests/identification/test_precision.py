@@ -109,8 +109,8 @@ def test_a_load_is_weighed_beside_unknown_offsets() -> None:
     model = problem.objective.model
     (planned,) = problem.genome.motions(random_genes(problem)[None])
     motion = midpoints(planned, 1e-2)
-    direction = friction_of_excitation(model).direction(*motion[:3])
-    rows = model.regressor(*motion[1:4], direction).dense(model.n_parameters)
+    direction = friction_of_excitation(model).direction(motion)
+    rows = model.regressor(replace(motion, direction=direction)).dense(model.n_parameters)
     m, n, p = rows.shape
     beside = np.tile(np.eye(n), (m, 1))
     whole = np.column_stack([rows.reshape(m * n, p), beside])

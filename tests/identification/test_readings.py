@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import Recording, RobotModel
+from identification.model.motion import Motion
 from identification.signals.samples import Preprocessing, prepare
 from identification.validation.reading_changes import Change
 from identification.validation.readings import Step, find_readings
@@ -50,9 +51,9 @@ def motion(factors: tuple[float, ...] = (1.0, 1.0, 1.0)) -> tuple[Floats, Floats
     values = np.zeros(robot.n_parameters)
     bodies = np.repeat(factors, robot.layout.width) * robot.nominal
     values[: robot.base.rank] = robot.base.grouping @ bodies
-    torque = robot.torque(values, q, v, a) + 0.4 * np.sign(v) + 0.2 * v
+    torque = robot.torque(values, Motion.of_states(q, v, a)) + 0.4 * np.sign(v) + 0.2 * v
     torque += rng.normal(0.0, 0.02, v.shape)
-    return q, torque, robot.torque(values, q, np.zeros_like(q), np.zeros_like(q))
+    return q, torque, robot.torque(values, Motion.at_rest(q))
 
 
 KNEE = np.array([0.0, 1.0, 0.0])

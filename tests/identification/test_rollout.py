@@ -193,8 +193,8 @@ def test_dry_friction_at_rest_is_no_torque_that_moves() -> None:
     motion = four_sines(time)
     velocity = motion.velocity.copy()
     velocity[:, 1] = 0.0
-    motion = motion._replace(velocity=velocity)
-    predicted = MODEL.torque(arm.values, *motion[1:])
+    motion = replace(motion, velocity=velocity)
+    predicted = MODEL.torque(arm.values, motion)
     for added, left in ((2.5, 0.0), (-2.5, 0.0), (7.0, 2.0), (-7.0, -2.0)):
         samples = as_samples(MODEL, motion, predicted + added)
         residual = driving_residual(MODEL, samples, arm.values)

@@ -98,7 +98,7 @@ class TestElimination:
         rows = []
         torque = []
         for run in runs:
-            dense = ARM.regressor(*run.motion[1:]).dense(ARM.n_parameters)
+            dense = ARM.regressor(run.motion).dense(ARM.n_parameters)
             rows.append(np.where(run.usable[..., None], dense, 0.0))
             torque.append(np.where(run.usable, run.torque, 0.0))
         scale = np.sqrt(weights)
@@ -158,7 +158,7 @@ class TestElimination:
 
     def test_undetermined_parameters_are_removed_first(self):
         motion = three_sines(1)
-        held = Motion(motion.time, *(part * [1.0, 0.0] for part in motion[1:4]))
+        held = motion.converted(lambda states: states * [1.0, 0.0])
         training = Factor.by_time(ARM, simulated(ARM, TRUTH, held, ARM_NOISE, 3))
         result = eliminate(ARM, training, training)
         full = estimate(ARM, training)
@@ -231,9 +231,9 @@ def a_recording(
 ):
     """Simulate a motion with noise on torque and position, through a Butterworth low-pass."""
     motion = a_motion(duration) if motion is None else motion
-    direction = model.friction.direction(*motion[:3])
+    sliding = replace(motion, direction=model.friction.direction(motion))
     rng = np.random.default_rng(seed)
-    torque = model.torque(truth() if values is None else values, *motion[1:4], direction)
+    torque = model.torque(truth() if values is None else values, sliding)
     position = motion.position + 1e-6 * rng.standard_normal(torque.shape)
     torque += noise * rng.standard_normal(torque.shape)
     if shape is not None:

@@ -257,12 +257,12 @@ class TestTrueTimes:
         even = 1e-3 * np.arange(4000)
         stamps = even + rng.uniform(0.0, 3e-4, 4000)
         true = even if is_even else stamps
-        position, velocity, _ = motion(true)
+        exact = one_sine(true)
         gap = np.isin(np.arange(4000), [3990])  # few samples behind it tell nothing
         recording = Recording(
             time=stamps,
-            position=position + 1e-6 * rng.standard_normal(position.shape),
-            velocity=velocity if with_velocity else None,
+            position=exact.position + 1e-6 * rng.standard_normal(exact.position.shape),
+            velocity=exact.velocity if with_velocity else None,
             joint_names=("a", "b"),
             gap_before=gap,
         )
@@ -460,17 +460,13 @@ TRUTH = truth()
 RESOLUTION = 2e-6  # rad, of the encoders
 
 
-def motion(time):
-    return one_sine(time)[1:4]
-
-
 def smooth_recording(*, noise=0.0, delay=0.0):
     time = np.arange(6000) * 1e-3
     rng = np.random.default_rng(8)
-    torque = MODEL.torque(TRUTH, *motion(time - delay))
+    torque = MODEL.torque(TRUTH, one_sine(time - delay))
     return Recording(
         time=time,
-        position=np.round(motion(time)[0] / RESOLUTION) * RESOLUTION,
+        position=np.round(one_sine(time).position / RESOLUTION) * RESOLUTION,
         joint_names=MODEL.joint_names,
         torque=torque + noise * rng.standard_normal(torque.shape),
     )
@@ -490,7 +486,9 @@ class TestNoise:
         """Not the jitter of the clock."""
         rng = np.random.default_rng(seed)
         time = np.arange(5000) * 1e-3 + jitter * rng.uniform(-1.0, 1.0, 5000)
-        values = motion(time)[0] + max(sigma, 0.03 * jitter) * rng.standard_normal((5000, 2))
+        values = one_sine(time).position + max(sigma, 0.03 * jitter) * rng.standard_normal(
+            (5000, 2)
+        )
         variance = difference_variance(time, values)
         np.testing.assert_allclose(np.sqrt(variance), max(sigma, 0.03 * jitter), rtol=0.1)
 
@@ -514,9 +512,10 @@ class TestSamples:
     def test_smoothed_motion_is_accurate_in_usable_rows(self):
         recording = smooth_recording()
         samples = prepare(recording, MODEL, noise_variance=QUANTISATION)
-        for smoothed, exact in zip(samples.motion[1:4], motion(recording.time), strict=True):
-            error = (smoothed - exact)[samples.usable.all(axis=1)]
-            assert np.sqrt(np.mean(error**2)) < 2e-3 * np.std(exact)
+        exact = one_sine(recording.time).columns()
+        for name in ("position", "velocity", "acceleration"):
+            error = (samples.motion.columns()[name] - exact[name])[samples.usable.all(axis=1)]
+            assert np.sqrt(np.mean(error**2)) < 2e-3 * np.std(exact[name])
 
     def test_derivatives_do_not_cross_a_gap(self):
         whole = smooth_recording()
@@ -532,12 +531,12 @@ class TestSamples:
             gap_before=gap,
         )
         samples = prepare(gapped, MODEL, noise_variance=QUANTISATION)
-        exact = [part[keep] for part in motion(whole.time)]
+        exact = one_sine(whole.time).rows(keep)
         rows = samples.usable.all(axis=1)
         assert not samples.usable[1995:2005].any()
-        assert np.abs(samples.motion.velocity - exact[1])[rows].max() < 0.02
+        assert np.abs(samples.motion.velocity - exact.velocity)[rows].max() < 0.02
         unflagged = prepare(replace(gapped, gap_before=None), MODEL, noise_variance=QUANTISATION)
-        assert np.abs(unflagged.motion.velocity - exact[1])[1995:2005].max() > 1.0
+        assert np.abs(unflagged.motion.velocity - exact.velocity)[1995:2005].max() > 1.0
 
     @pytest.mark.parametrize("delay", [0.004, -0.0025])
     def test_a_known_torque_delay_is_compensated(self, delay):
@@ -575,21 +574,21 @@ class TestSamples:
         recording = smooth_recording(noise=0.5)
         options = Preprocessing(smooth_torque=True)
         samples = prepare(recording, MODEL, noise_variance=QUANTISATION, options=options)
-        exact = MODEL.torque(TRUTH, *motion(recording.time))
+        exact = MODEL.torque(TRUTH, one_sine(recording.time))
         rows = samples.usable.all(axis=1)
         noise = np.std((samples.torque - exact)[rows], axis=0)
         assert (noise < 0.15).all()
 
     def test_measured_velocities_are_used(self):
         recording = smooth_recording()
-        exact = motion(recording.time)
+        exact = one_sine(recording.time)
         rows = recording.time < 3.0  # and a segment too short to smooth
         gaps = np.isin(np.arange(6000), [3000, 3002])
-        recording = replace(recording, velocity=exact[1] + 0.1, gap_before=gaps)
+        recording = replace(recording, velocity=exact.velocity + 0.1, gap_before=gaps)
         options = Preprocessing(velocity="measured")
         smoothed = prepare(recording, MODEL, noise_variance=QUANTISATION, options=options).motion
         inner = np.flatnonzero(rows)[9:-9]
-        np.testing.assert_allclose(smoothed.velocity[inner], exact[1][inner] + 0.1, atol=0.01)
+        np.testing.assert_allclose(smoothed.velocity[inner], exact.velocity[inner] + 0.1, atol=0.01)
         assert not smoothed.velocity[3000:3002].any()
 
     def test_invalid_recordings_and_bandwidths_raise(self):

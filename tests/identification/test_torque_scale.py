@@ -30,7 +30,7 @@ LOAD = Payload(4.0, (0.2, 0.0, 0.1), (0.02, 0.0, 0.0, 0.03, 0.0, 0.04))
 def torque():
     rng = np.random.default_rng(1)
     motion = a_motion()
-    clean = MODEL.torque(truth(), *motion[1:])
+    clean = MODEL.torque(truth(), motion)
     return motion, clean + 0.5 * rng.standard_normal(clean.shape)
 
 
@@ -145,8 +145,8 @@ class TestPayload:
     def weighed(self, scales, std):
         """Weigh the load with noise-free torques of wrong scale."""
         motion = four_sines(np.arange(2000) * 5e-3)
-        bare = MODEL.torque(truth(), *motion[1:])
-        carried = bare + Load(MODEL.chain, MODEL.gravity, LOAD).torque(*motion[1:4])
+        bare = MODEL.torque(truth(), motion)
+        carried = bare + Load(MODEL.chain, MODEL.gravity, LOAD).torque(motion)
         noise = np.random.default_rng(3).standard_normal((2, *bare.shape))
         runs = [
             Run.of(

@@ -71,8 +71,8 @@ torques = arrays(np.float64, (20, 2), elements=st.floats(-100, 100, width=32))
 def samples_with(error, *, origin=0.0, time=None, rows=slice(None)):
     """Return rows of a motion with the torque of unit parameters plus an error (m, 2)."""
     time = (np.arange(len(error)) * 2e-3 if time is None else time)[rows]
-    motion = one_sine(time)._replace(time=time + origin)
-    torque = MODEL.torque(np.ones(MODEL.n_parameters), *motion[1:]) + error[rows]
+    motion = replace(one_sine(time), time=time + origin)
+    torque = MODEL.torque(np.ones(MODEL.n_parameters), motion) + error[rows]
     return as_samples(MODEL, motion, torque, origin=origin)
 
 
@@ -117,7 +117,7 @@ class TestPredictionError:
         """Measured without limit, compensated up to a tenth."""
         values = np.ones(MODEL.n_parameters)
         motion = samples_with(np.zeros((5000, 2))).motion
-        friction = MODEL.torque(np.where(MODEL.friction_columns, values, 0.0), *motion[1:])
+        friction = MODEL.torque(np.where(MODEL.friction_columns, values, 0.0), motion)
         other = 0.2 * np.sin(2.0 * np.pi * 1.3 * motion.time)[:, None] * np.array([1.0, 0.0])
         warm = samples_with(np.array([0.05, -0.08]) * friction + other)
         left, change, apart = slow_error(MODEL, values, warm, 10.0)
@@ -287,7 +287,7 @@ def a_run(seed, disturbance=None, *, duration=12.0, noise=RESIDUAL_NOISE):
     amplitude = rng.uniform(0.3, 0.9, (3, 2))
     rate = rng.uniform(0.7, 3.0, (3, 2))
     motion = sine_motion(time, amplitude, rate, rng.uniform(0.0, 6.0, (3, 2)))
-    torque = MODEL.torque(VALUES, *motion[1:])
+    torque = MODEL.torque(VALUES, motion)
     torque = torque + noise * unit_noise(rng, torque.shape)
     if disturbance is not None:
         torque = torque + disturbance(motion, seed)
@@ -427,7 +427,7 @@ class TestResidualChecks:
         def cooling(motion, seed):
             # Five fitted recordings: from +4 % to -4 % of the second joint's friction.
             change = 0.04 - 0.02 * seed
-            return np.asarray(change * MODEL.torque(friction, *motion[1:]) * np.array([0.0, 1.0]))
+            return np.asarray(change * MODEL.torque(friction, motion) * np.array([0.0, 1.0]))
 
         drift = patterns_of(cooling, noise=0.1).drift
         assert drift is not None and len(drift.share) == 15
@@ -580,8 +580,7 @@ class TestConsistencyCheck:
         torque = np.where(run.usable, run.torque, 0.0)
         both = check.consistent.estimate.values, check.consistent.unconstrained.values
         errors = [
-            torque - np.where(run.usable, MODEL.torque(values, *run.motion[1:]), 0.0)
-            for values in both
+            torque - np.where(run.usable, MODEL.torque(values, run.motion), 0.0) for values in both
         ]
         ours, free = (np.linalg.norm(error) / np.linalg.norm(torque) for error in errors)
         assert check.cost == pytest.approx(ours - free, rel=1e-6)
@@ -735,7 +734,7 @@ class TestStepsOfTheLog:
 def arm_with(measured, seed=0, duration=20.0):
     """Samples of the planted arm with another torque (motion, torque) -> (m, 2), and noise."""
     motion = four_sines(np.arange(0.0, duration, 0.005), seed=seed)
-    torque = MODEL.torque(truth(), *motion[1:])
+    torque = MODEL.torque(truth(), motion)
     torque = measured(motion, torque) + gaussian(np.random.default_rng(seed), motion)
     return as_samples(MODEL, motion, torque)
 
@@ -748,7 +747,7 @@ def with_friction(factor):
     friction = np.where(MODEL.friction_columns, truth(), 0.0)
 
     def measured(motion, torque):
-        return torque + (factor - 1.0) * MODEL.torque(friction, *motion[1:])
+        return torque + (factor - 1.0) * MODEL.torque(friction, motion)
 
     return measured
 
@@ -870,7 +869,7 @@ def runs_of(model, values, seed):
     friction = [{"f0": 3.0, "f1": 2.0, "fo": 0.2}.get(t.symbol, 0.3) for t in model.friction.terms]
     truth = np.concatenate([model.base.grouping @ values, friction])
     motions = [sines(model.n_joints, 10 * seed + number) for number in range(2)]
-    noise = [0.02 * model.torque(truth, *motion[1:]).std(axis=0) for motion in motions]
+    noise = [0.02 * model.torque(truth, motion).std(axis=0) for motion in motions]
     return [
         simulated(model, truth, *motion_and_noise, seed)
         for motion_and_noise in zip(motions, noise, strict=True)

@@ -13,7 +13,6 @@ from identification.estimators.least_squares import estimate_repetitions
 from identification.estimators.prior import body_prior
 from identification.factor.estimate import Estimate, estimate
 from identification.factor.factor import Factor
-from identification.model.motion import Motion
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.text import percentage
@@ -85,12 +84,12 @@ def a_motion(seed, *, duration=8.0, step=0.01):
 def executed(model, truth, motion, seed, assumed, other):
     """Return the samples of a PC that assumes another drive train than the arm has."""
     (real, constant) = drive()
-    torque = model.torque(truth, *motion[1:])
+    torque = model.torque(truth, motion)
     torque = torque + other(motion, torque)
     current = np.linalg.solve(real.T, torque.T).T / constant
     current += CURRENT_NOISE * np.random.default_rng(seed).standard_normal(current.shape)
     seen = np.linalg.solve(assumed[0], real).T
-    motion = Motion(motion.time, *(part @ seen for part in motion[1:4]))
+    motion = motion.converted(lambda states: states @ seen)
     return as_samples(model, motion, (current * assumed[1]) @ assumed[0])
 
 
@@ -194,7 +193,7 @@ class TestUnseenMotion:
         carrying = RobotModel.from_urdf(urdf_text(), payload=Payload(mass, (0.0, 0.09, 0.12)))
 
         def load(motion, _):
-            return carrying.load_torque(*motion[1:4])
+            return carrying.load_torque(motion)
 
         verdict, evidence = campaign(unseen_disturbance=load)
         assert not verdict.good
@@ -691,7 +690,7 @@ SLOW = 0.2  # rad/s; rows near a reversal are left out
 def recorded(seed, load=None):
     """Return a motion with the paper's arm, a load (m,) [kg] on its flange, and noise."""
     motion = a_motion(seed, duration=10.0, step=8e-3)
-    torque = MODEL.torque(ns16_values(MODEL), *motion[1:])
+    torque = MODEL.torque(ns16_values(MODEL), motion)
     if load is not None:
         torque = torque + load[:, None] * of_one_kilogram(motion)
     rng = np.random.default_rng(seed + 1000)
@@ -706,7 +705,7 @@ def of_one_kilogram(motion):
     body = pin.Inertia.FromSphere(1.0, 0.05)
     loaded.inertias[6] += body.se3Action(pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.1])))
     data = bare.createData(), loaded.createData()
-    rows = zip(*motion[1:4], strict=True)
+    rows = motion.states()
     return np.array(
         [pin.rnea(loaded, data[1], *row) - pin.rnea(bare, data[0], *row) for row in rows]
     )
@@ -749,7 +748,7 @@ def turned(values):
 
 def moved(samples, change, *, torque=True):
     """Return samples with another motion, and with another torque by default."""
-    motion = Motion(samples.motion.time, *(change(channel) for channel in samples.motion[1:4]))
+    motion = samples.motion.kinematics().converted(change)
     if not torque:
         return replace(samples, motion=motion)
     usable = np.abs(change(samples.usable.astype(np.float64))) > 0.0
@@ -894,10 +893,10 @@ class TestPrintedSizes:
     def test_what_the_motion_leaves_open_has_no_size(self):
         """A torque that is friction alone, of a joint that moves alone."""
         motion = a_motion(1, duration=10.0, step=8e-3)
-        for array in motion[1:4]:
+        for array in (motion.position, motion.velocity, motion.acceleration):
             array[:, :5] = 0.0
         motion.position[:, :5] = 0.3
-        torque = MODEL.torque(ns16_values(MODEL), *motion[1:])
+        torque = MODEL.torque(ns16_values(MODEL), motion)
         usable = np.zeros(torque.shape, dtype=np.bool_)
         usable[:, 5] = True
         samples = as_samples(MODEL, motion, torque, usable=usable)
@@ -918,7 +917,7 @@ class TestErrorsWithoutCause:
         motion.position[:, 4] = 0.3
         motion.velocity[:, 4] = 0.0
         motion.acceleration[:, 4] = 0.0
-        torque = MODEL.torque(ns16_values(MODEL), *motion[1:])
+        torque = MODEL.torque(ns16_values(MODEL), motion)
         torque += (
             NOISE * torque.std(axis=0) * np.random.default_rng(3).standard_normal(torque.shape)
         )
@@ -932,7 +931,7 @@ class TestErrorsWithoutCause:
         samples = recorded(seed)
         rigid = np.where(MODEL.friction_columns, 0.0, ns16_values(MODEL))
         direction = np.sign(samples.motion.velocity)
-        load = np.abs(MODEL.torque(rigid, *samples.motion[1:4], direction))
+        load = np.abs(MODEL.torque(rigid, replace(samples.motion, direction=direction)))
         (cause,) = causes([replace(samples, torque=samples.torque + 0.2 * load * direction)])
         assert cause.fault.kind == "load friction"
         assert cause.size == pytest.approx(0.2, abs=0.03)

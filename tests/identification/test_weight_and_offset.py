@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from identification import FrictionLaw, RobotModel
+from identification.model.motion import Motion
 
 LAW = FrictionLaw(offset=True, third=None)
 DOWN = (0.0, 0.0, -9.81)
@@ -37,14 +38,15 @@ def test_every_mass_rotor_and_offset_has_its_parameters() -> None:
     lift = model()
     rng = np.random.default_rng(0)
     q, qd, qdd = rng.normal(size=(3, 200, 2))
-    columns = np.array([lift.torque(row, q, qd, qdd)[:, 0] for row in np.eye(lift.n_parameters)])
+    motion = Motion.of_states(q, qd, qdd)
+    columns = np.array([lift.torque(row, motion)[:, 0] for row in np.eye(lift.n_parameters)])
     of_joint = columns[np.abs(columns).max(axis=1) > 0.0].T
     assert np.linalg.matrix_rank(of_joint) == of_joint.shape[1]
     force = 7.0 * (qdd[:, 0] + 9.81) + 0.8 * qdd[:, 0] + 30.0  # mass, rotor, offset
     values = np.zeros(lift.n_parameters)
     values[lift.parameter_names.index("m1")] = 7.8
     values[lift.parameter_names.index("fo_1")] = 30.0 - 9.81 * 0.8
-    assert lift.torque(values, q, qd, qdd)[:, 0] == pytest.approx(force)
+    assert lift.torque(values, motion)[:, 0] == pytest.approx(force)
 
 
 @pytest.mark.parametrize(

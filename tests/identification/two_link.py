@@ -55,7 +55,7 @@ def truth():
 
 def simulated(model, values, motion, noise=0.0, seed=0, **changes):
     """Samples of an arm with these parameters, with white noise of each joint [N·m]."""
-    torque = model.torque(values, *motion[1:])
+    torque = model.torque(values, motion)
     torque += noise * np.random.default_rng(seed).standard_normal(torque.shape)
     return as_samples(model, motion, torque, **changes)
 
@@ -81,7 +81,7 @@ def a_motion(duration=10.0, step=0.005):
 
 def recording(error, motion):
     """What the planted arm's torques were in a motion, with an error (m, 2) [N·m]."""
-    torque = MODEL.torque(truth(), *motion[1:]) + error
+    torque = MODEL.torque(truth(), motion) + error
     return as_samples(MODEL, motion, torque, origin=float(motion.time[0]))
 
 

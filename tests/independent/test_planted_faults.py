@@ -24,10 +24,9 @@ from benchmarks.coverage import (
     logged,
 )
 from benchmarks.joint_log import JointLog
-from hil.identify import identify_archives
-from hil.identify.run import Identification
-from hil.importers import IMPORTED_LAW, Robot
-from hil.progress import Silent
+from hil.base.progress import Silent
+from hil.importers.robot import IMPORTED_LAW, Robot
+from hil.pipeline.run import Identification, identify_archives
 from identification.validation.finding import Finding
 
 GAIN = 1.1

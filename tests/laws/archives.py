@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import open_archive
-from hil.errors import ArchiveError
+from hil.base.errors import ArchiveError
 from tests.laws.second_reader import Archived
 
 

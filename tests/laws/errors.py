@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Final
 
-from hil.errors import HilError
+from hil.base.errors import HilError
 
 ALLOWED: Final = frozenset(
     (

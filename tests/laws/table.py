@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from hil.errors import HilError
+from hil.base.errors import HilError
 from tests.disk import readers
 from tests.endurance import piece
 from tests.laws.archives import gap_free, not_truncated, nothing_lost, readable

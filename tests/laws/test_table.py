@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 import pytest
 
-from hil.errors import OutputError
+from hil.base.errors import OutputError
 from tests.laws.evidence import ArchiveFile, Evidence, Rest
 from tests.laws.manifests import Entry
 from tests.laws.second_reader import Archived, cycle_layout

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from drivers.exchange.event_log import NO_ARCHIVE
 from drivers.states import State
 from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
+from hil.base.errors import ArchiveError
 from hil.campaign import Campaign
-from hil.errors import ArchiveError
 from sim_fixtures import Phase
 from tests.laws.archives import as_exchanged, in_one_archive
 from tests.laws.arm import IN_OPEN_MODE, closed, stands

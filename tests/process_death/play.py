@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers.transports.simulated import SimulatedTransport
+from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, Stop, VirtualLink
+from hil.campaign.identified import identify_campaign
 from hil.campaign.plan import design
 from hil.cell import Cell
-from hil.identify import identify_campaign
-from hil.identify.options import FIXED
-from hil.progress import Silent
-from hil.simulation import simulated_controller
+from hil.control.simulation import simulated_controller
+from hil.pipeline.options import FIXED
 from identification import Estimate
 from tests.faults import Strikes
 from tests.hil.fast_cell import fast_cell

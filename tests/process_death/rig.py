@@ -31,11 +31,11 @@ from drivers import record
 from drivers.exchange.control import SharedState
 from drivers.record import RingReader, cycle_dtype
 from drivers.states import State
+from hil.base.errors import HilError
+from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, stop_on_interrupt
 from hil.cell import Cell
-from hil.demo_link import LOOPBACK
-from hil.errors import HilError
-from hil.progress import Silent
+from hil.control.simulator_process import LOOPBACK
 from tests.faults import StrikeKind, Strikes, Trigger, Victim
 from tests.hil.loopback import on_loopback
 from tests.laws.manifests import Entry, manifest_of

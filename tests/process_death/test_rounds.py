@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from drivers.record import cycle_dtype
+from hil.base.progress import Silent
 from hil.campaign.plan import design
-from hil.progress import Silent
 from sim_fixtures import Phase
 from tests.faults import Moment, StrikeKind, Victim, parse_strikes
 from tests.hil.fast_cell import fast_cell

@@ -21,7 +21,7 @@ from drivers.packets import (
     is_init,
     next_number,
 )
-from hil.own_moves import InterpolatedMoves
+from hil.control.own_moves import InterpolatedMoves
 from sim_fixtures import (
     ControllerSettings,
     Phase,

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 
-from hil.progress import reporter
+from hil.base.progress import reporter
 from tests.arguments import at_least_one, parser_of, whole_number
 from tests.faults import GRAMMAR
 from tests.simulate.many import played, stage_folder

@@ -11,12 +11,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.campaign.motions import require_runnable
+from hil.base.errors import HilError
 from hil.campaign.plan import CampaignPlan, PlannedMotion
+from hil.campaign.planned_motions import require_runnable
 from hil.cell import Cell
-from hil.errors import HilError
-from hil.motion_checks import MotionChecks
-from hil.simulation import controller_settings
+from hil.control.motion_checks import MotionChecks
+from hil.control.simulation import controller_settings
 from identification.excitation import RESCORE_PERIOD, Excitation, Objective
 from planner import FourierSeries, PiecewiseCubic, PlanningError, plan_in_child
 from sim_fixtures import ControllerSettings

@@ -17,13 +17,15 @@ from drivers.exchange.loop import exchange
 from drivers.record import cycle_dtype
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveOutcome, ArchiveSpec, open_archive
-from hil.campaign import VirtualLink, virtual_link
-from hil.campaign.errors import MotionFailedError, RepetitionsRejectedError
-from hil.campaign.motions import START_TOLERANCE
-from hil.campaign.operator import Stop
+from hil.base.errors import ControllerError
+from hil.campaign import VirtualLink
+from hil.campaign.errors import RepetitionsRejectedError
 from hil.cell import Cell
-from hil.errors import ControllerError
-from hil.simulation import simulated_controller
+from hil.control import virtual_link
+from hil.control.errors import MotionFailedError
+from hil.control.motion_watch import Stop
+from hil.control.motions import START_TOLERANCE
+from hil.control.simulation import simulated_controller
 from planner import Move, TrajectoryPlayer, plan_moves
 from sim_fixtures import Phase, SimulatedController
 from tests import messages

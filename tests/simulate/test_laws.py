@@ -15,8 +15,8 @@ import pytest
 from scipy.stats import norm
 
 from drivers.events import MotionEnded, RepliesLost
-from hil.campaign.errors import MotionFailedError
-from hil.errors import ControllerError
+from hil.base.errors import ControllerError
+from hil.control.errors import MotionFailedError
 from tests.drivers import oracle
 from tests.faults import parse_script
 from tests.hil.mcap_bytes import chunks

@@ -23,24 +23,23 @@ from drivers import State
 from drivers.errors import Check
 from drivers.events import MotionEnded
 from hil.archive import writer
-from hil.campaign import Campaign, VirtualLink, link, operator_control
+from hil.base.errors import HilError
+from hil.base.files import write_atomically
+from hil.base.progress import Silent
+from hil.campaign import Campaign, VirtualLink
 from hil.campaign import folder as campaign_folder
 from hil.campaign.dry_run import DryRunRecord
-from hil.campaign.errors import (
-    MotionFailedError,
-    MotionRefusedError,
-    RepetitionsRejectedError,
-)
+from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.folder import CampaignFolder
-from hil.campaign.operator import OperatorRequest, RunStatus, Stop
+from hil.campaign.operator import RunStatus
 from hil.campaign.run import RunResult
-from hil.errors import HilError
-from hil.files import write_atomically
-from hil.identify.options import FIXED
-from hil.identify.prepared import prepare_sources
-from hil.identify.sources import gather_sources
-from hil.progress import Silent
-from hil.simulation import simulated_controller
+from hil.control import link, operator_control
+from hil.control.errors import MotionFailedError, MotionRefusedError
+from hil.control.motion_watch import OperatorRequest, Stop
+from hil.control.simulation import simulated_controller
+from hil.pipeline.options import FIXED
+from hil.pipeline.prepared import prepare_sources
+from hil.pipeline.sources import gather_sources
 from identification import IdentificationError
 from identification.estimators.least_squares import estimate_repetitions
 from planner import TrajectoryPlayer

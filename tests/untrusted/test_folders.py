@@ -26,6 +26,9 @@ from typer.testing import CliRunner
 from hil.archive import ArchiveHeader, Samples, open_archive, write_samples
 from hil.archive.check import check_archive
 from hil.archive.container import MAGIC
+from hil.base.errors import ArchiveError, HilError, InputError
+from hil.base.files import write_atomically, write_files
+from hil.base.safe_input import parse_toml, read_text
 from hil.campaign import Campaign, CampaignFolderError
 from hil.campaign.dry_run import Acceptance, DryRunRecord
 from hil.campaign.folder import LOCK, CampaignFolder
@@ -36,15 +39,12 @@ from hil.campaign.warmup import FrictionMeter, WarmUpRecord
 from hil.cell import Cell
 from hil.cli import app
 from hil.cli.plan import read_via_points
-from hil.errors import ArchiveError, HilError, InputError
-from hil.files import write_atomically, write_files
 from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.bags import bag_files, open_bag
 from hil.importers.column_map import Format
 from hil.importers.table import Table
-from hil.outcome import SERIES, _load_series, rewrite_report
-from hil.reading import parse_toml, read_text
-from hil.results import Results
+from hil.report.output_files import SERIES, _load_series, rewrite_report
+from hil.results.results import Results
 from hil.study.results import StudyResults
 from identification import IdentificationError
 from identification.excitation import Journal
@@ -329,7 +329,7 @@ def test_series_of_a_report_are_numbers_of_limited_size(
     )  # fmt: skip
     loaded = SimpleNamespace(joint_names=["a", "b"])
     monkeypatch.setattr(Results, "load", lambda _: loaded)
-    monkeypatch.setattr("hil.outcome._LARGEST", 1 << 22)
+    monkeypatch.setattr("hil.report.output_files._LARGEST", 1 << 22)
     for data in bombs:
         (folder / SERIES).write_bytes(data)
         with pytest.raises(InputError, match="does not contain the series of a report"):

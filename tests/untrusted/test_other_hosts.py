@@ -17,7 +17,7 @@ import pytest
 
 from drivers import CyclicPacket, InitPacket
 from hil.archive import ArchiveOutcome, open_archive
-from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
+from hil.control.simulator_process import LOOPBACK, SimulatorProcess, free_port
 from tests.hil.fast_cell import fast_cell
 
 pytestmark = pytest.mark.safety

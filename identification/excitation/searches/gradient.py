@@ -18,12 +18,11 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.excitation.searches.population import Scores
 from identification.excitation.searches.tangent import Linearisation
 
-Array = NDArray[np.float64]
 Fitness = Callable[[Scores], Array]
 
 _BOX: Final = 0.1  # first half width of the box, as a fraction of each gene's range

@@ -18,12 +18,10 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any, BinaryIO, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.excitation.errors import JournalError
 from identification.excitation.searches.population import Scores
-
-Array = NDArray[np.float64]
 
 # Packages whose release may change the numbers of a search.
 _DISTRIBUTIONS: Final = ("hil", "numpy", "scipy", "pymoo", "cma", "ruckig", "pin", "coal")

@@ -15,10 +15,9 @@ from typing import Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.excitation.genomes import Genome, ViaPointGenome
 from planner import FourierSeries, PiecewiseCubic, PlannerError
-
-Array = NDArray[np.float64]
 
 _REACH: Final = 2  # points before and after one that the motion changes with it
 _ROUNDING: Final = 1e-9  # of the duration, relative

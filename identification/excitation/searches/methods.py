@@ -6,11 +6,10 @@ from collections.abc import Callable, Mapping
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.excitation.criteria import OF_PAPER, fitness_eq7
 
-Array = NDArray[np.float64]
 Method = Literal["a", "b", "balanced", "front", "gradient"]
 
 

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from identification.arrays import Array
 from identification.excitation.constraints import SAMPLE_PERIOD, Constraints, midpoints, sampled
 from identification.excitation.criteria import (
     CRITERIA,
@@ -31,8 +32,6 @@ from identification.excitation.searches.tangent import (
 from identification.excitation.violation import KINDS, Violation, excess_by_kind
 from planner import PlannerCrashed, PlannerError, PlanningTimedOut
 from planner.worker import WorkerProcess, chunks_of, load, map_in_children, pack
-
-Array = NDArray[np.float64]
 
 _MEASURES: Final = len(CRITERIA)
 

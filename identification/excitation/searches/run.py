@@ -9,8 +9,8 @@ from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.excitation.criteria import OF_PAPER, SENSE, Criteria, columns
 from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation
@@ -30,7 +30,6 @@ from identification.excitation.searches.population import (
 )
 from identification.excitation.violation import KINDS, NoFeasibleMotionError
 
-Array = NDArray[np.float64]
 Phase = Literal["sample", "search", "gradient", "polish"]
 Fitness = Callable[[Scores], Array]
 

@@ -15,6 +15,7 @@ from typing import Final, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.excitation.collision import CollisionChecker
 from identification.excitation.constraints import Constraints, CurrentModel, midpoints, sampled
 from identification.excitation.criteria import Objective
@@ -22,8 +23,6 @@ from identification.excitation.genomes import Genome, ViaPointGenome
 from identification.excitation.searches.local_change import Change, PlannedMoves
 from identification.model.motion import Motion
 from planner import PlannerError
-
-Array = NDArray[np.float64]
 
 
 class Problem(Protocol):
@@ -144,7 +143,7 @@ def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent
         raise motion
     middles = midpoints(motion, min(_SAMPLE_PERIOD, motion.duration / _FEWEST_SAMPLES))
     time = middles.time
-    states = np.array(middles[1:4])
+    states = _states(middles)
     constraints = problem.constraints
     n = states.shape[2]
     steps = _steps(states)
@@ -284,7 +283,7 @@ def _loads(currents: CurrentModel, motion: Motion) -> Iterator[Margin]:
     if len(sample) == 0:
         return
     samples, row = np.unique(sample, return_inverse=True)
-    chosen = np.array(motion[1:4])[:, samples]
+    chosen = _states(motion.rows(samples))
     slope = np.zeros((len(sample), 3, chosen.shape[2]))
     reversing = _near_reversal(currents, chosen[1])
     for kind, joint, above, below, gap in _neighbours(chosen, _steps(chosen)):
@@ -340,6 +339,11 @@ def _distances(checker: CollisionChecker, time: Array, states: Array) -> Iterato
             slope[0] = (distance[:n] - distance[n:]) / (2.0 * _POSITION_STEP)
             left = here - checker.required[index] - _SPARE
             yield Margin(float(time[nearest]), states[:, nearest], slope, left)
+
+
+def _states(motion: Motion) -> Array:
+    """Return position, velocity and acceleration (3, m, n)."""
+    return np.array([motion.position, motion.velocity, motion.acceleration])
 
 
 def _motion(states: Array, period: float = 1.0) -> Motion:

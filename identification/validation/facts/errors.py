@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.text import percentage
 from identification.validation.consistency import ELEMENTS
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Mask, Naming, Thresholds, little_torque
-
-Array = NDArray[np.float64]
 
 UNEXPLAINED: Final = "unexplained error"
 """Name of the check whether any fault explains the error."""

@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, assert_never
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.text import percentage
 from identification.validation.causes import Cause
 from identification.validation.evidence import Evidence
 from identification.validation.facts.scale import SignFacts
 from identification.validation.faults import Kind
 from identification.validation.finding import Finding, Mask, Naming, Thresholds
-
-Array = NDArray[np.float64]
 
 MOUNTING_STEP: Final = (
     "state how the arm is mounted: `--gravity X Y Z` where a log is read with its URDF, or gravity"

@@ -6,15 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
+from identification.arrays import Array
 from identification.estimators.friction_form import UNCERTAIN
 from identification.text import percentage
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Mask, Naming, Thresholds
-
-Array = NDArray[np.float64]
 
 FORM: Final = "form of friction"
 """Name of the check whether a friction law lacks a term."""

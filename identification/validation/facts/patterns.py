@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.text import percentage
 from identification.validation.evidence import Evidence
 from identification.validation.facts.sameness import WARMER
 from identification.validation.finding import Finding, Mask, Naming, Thresholds
 from identification.validation.residuals import Profile, ResidualChecks, Ripple
-
-Array = NDArray[np.float64]
 
 
 def _notable(checks: ResidualChecks, pattern: Profile | Ripple, limits: Thresholds) -> Mask:

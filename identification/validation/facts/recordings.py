@@ -6,14 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from identification.arrays import Array
 from identification.text import percentage
 from identification.validation.evidence import SIGMAS, Evidence
 from identification.validation.finding import Finding, Mask, Naming, Thresholds, joined
-
-Array = NDArray[np.float64]
 
 _JUMPS_SHOWN: Final = 3
 

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.text import percentage
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Mask, Naming, Thresholds
-
-Array = NDArray[np.float64]
 
 _INERTIA_OFF: Final = 1.2  # ratio of inertias; data sheets are accurate to 10 %
 

@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.text import percentage
 from identification.validation.changes import ChangeKind
 from identification.validation.evidence import Evidence
 from identification.validation.facts.faults import GravityFacts
 from identification.validation.finding import Finding, Mask, Naming, Thresholds
 from identification.validation.prediction import FRICTION_CHANGE
-
-Array = NDArray[np.float64]
 
 WARMER: Final = "warm the arm up by moving it before recording"
 """What to do against friction that changes."""

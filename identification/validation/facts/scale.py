@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from identification.arrays import Array
 from identification.validation.consistency import ELEMENTS
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Mask, Naming
-
-Array = NDArray[np.float64]
 
 # Beyond this ratio the unit is wrong, or motor torques are in place of joint torques (gear ratios
 # are 30 to 200); descriptions in use are closer.

@@ -15,11 +15,11 @@ from drivers import InitPacket
 from drivers.record import cycle_dtype
 from hil.archive import Archive, ArchiveWriter, Samples, open_archive, write_samples
 from hil.archive.check import check_archive, read_overview
+from hil.archive.recordings import recording_of
 from hil.archive.repair import repair
-from hil.errors import ArchiveError, ArchiveWriteError, InputError
+from hil.base.errors import ArchiveError, ArchiveWriteError, InputError
 from hil.new import cell_of_urdf, from_archive
 from hil.plots.archive_view import view_of
-from hil.recordings import recording_of
 from tests.fuzz.mutate_mcap import mutate_mcap
 from tests.fuzz.targets import Target, place_of
 from tests.hil.fast_cell import CELL, URDF

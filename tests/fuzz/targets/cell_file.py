@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hil.base.errors import HilError, InputError
 from hil.cell import Cell, CellError
-from hil.errors import HilError, InputError
 from tests.fuzz.draw import mutate_text
 from tests.fuzz.targets import Target, place_of
 from tests.hil.fast_cell import CELL, URDF

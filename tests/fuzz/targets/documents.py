@@ -8,6 +8,7 @@ from contextlib import suppress
 from functools import lru_cache, partial
 from pathlib import Path
 
+from hil.base.errors import CampaignFolderError, InputError
 from hil.campaign.dry_run import DryRunRecord
 from hil.campaign.errors import NotRehearsedError
 from hil.campaign.folder import CampaignFolder
@@ -16,8 +17,7 @@ from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.warmup import WarmUpRecord
 from hil.design.result import DesignResult, _seal
 from hil.design.settings import load_settings, preset_text
-from hil.errors import CampaignFolderError, InputError
-from hil.results import Results
+from hil.results.results import Results
 from tests.fuzz.draw import mutate_text
 from tests.fuzz.targets import Target, place_of
 from tests.hil.fast_cell import fast_campaign, fast_cell

@@ -9,14 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.errors import InputError
-from hil.importers import Robot
+from hil.base.errors import InputError
+from hil.importers.robot import Robot
 from hil.new import cell_of_urdf
 from identification.errors import ModelError
 from identification.excitation import Workspace
 from identification.excitation.collision import CollisionChecker
 from identification.excitation.errors import CollisionModelError
 from identification.model.kinematics import chain_from_urdf
+from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from tests.fuzz.draw import mutate_text
 from tests.fuzz.targets import Target, place_of
@@ -101,8 +102,9 @@ def model_of(text: str) -> bool:
     except ModelError:
         model = None
     if model is not None:
-        motion = np.linspace(-1.0, 1.0, 3 * n).reshape(3, n)
-        assert np.isfinite(model.regressor(motion, motion, motion).dense(model.n_parameters)).all()
+        states = np.linspace(-1.0, 1.0, 3 * n).reshape(3, n)
+        motion = Motion.of_states(states, states, states)
+        assert np.isfinite(model.regressor(motion).dense(model.n_parameters)).all()
     with suppress(CollisionModelError, ModelError):
         CollisionChecker(text, Workspace(floor=0.0))
     return model is not None

@@ -26,8 +26,8 @@ from hil.archive import repair as repairing
 from hil.archive.check import check_archive
 from hil.archive.container import encode
 from hil.archive.repair import Repair, repair
+from hil.base.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
 from hil.cli import app
-from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
 from tests.hil import mcap_bytes
 from tests.hil.archive.conftest import FIRST, NAME, Written, write
 from tests.hil.mcap_bytes import Content, chunks

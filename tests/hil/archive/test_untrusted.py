@@ -26,9 +26,9 @@ from hil.archive.check import check_archive, read_overview
 from hil.archive.container import Record
 from hil.archive.header import ArchiveHeader, HeaderError
 from hil.archive.repair import repair
+from hil.base.errors import ArchiveError
 from hil.cli import app
-from hil.errors import ArchiveError
-from hil.identify.sources import cell_of, gather_sources
+from hil.pipeline.sources import cell_of, gather_sources
 from tests.fuzz.mutate_mcap import Record as FileRecord
 from tests.fuzz.mutate_mcap import body_of, entries_of, join_file, split_file, split_records
 from tests.hil import mcap_bytes

@@ -16,12 +16,10 @@ from hil.campaign import (
     VirtualLink,
 )
 from hil.campaign.dry_run import DryRunRecord
-from hil.campaign.operator import OperatorRequest, RunStatus
+from hil.campaign.operator import RunStatus
 from hil.campaign.run import RunResult
-from hil.simulation import (
-    simulated_controller,
-    simulated_link,
-)
+from hil.control.motion_watch import OperatorRequest
+from hil.control.simulation import simulated_controller, simulated_link
 from tests.hil.fast_cell import set_points
 
 Array = NDArray[np.float64]

@@ -13,14 +13,14 @@ import pytest
 from hil.archive import open_archive
 from hil.archive.check import check_archive
 from hil.archive.repair import amend_outcome
+from hil.base.progress import Silent
 from hil.batch.cache import CacheLocation
 from hil.batch.discovery import discover
 from hil.campaign import (
     Campaign,
     quality,
 )
-from hil.identify.sources import gather_sources
-from hil.progress import Silent
+from hil.pipeline.sources import gather_sources
 from tests.hil.batch_work import Here
 from tests.hil.campaign_runs.rig import Make, Operator, kinds, slowing
 from tests.messages import NOT_IN_CAMPAIGN, NOT_IN_MANIFEST

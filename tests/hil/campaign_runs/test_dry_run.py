@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hil.base.errors import InputError, OperatorStopError
 from hil.campaign import (
     Campaign,
     CampaignFolderError,
@@ -17,11 +18,8 @@ from hil.campaign.errors import (
     AgainstGravityError,
     DryRunError,
 )
-from hil.campaign.operator import Stop
-from hil.errors import InputError, OperatorStopError
-from hil.simulation import (
-    simulated_link,
-)
+from hil.control.motion_watch import Stop
+from hil.control.simulation import simulated_link
 from tests.hil.campaign_runs.rig import Make, Operator, Real, kinds, peak_speed
 from tests.hil.fast_cell import mirrored, pass_rehearsal
 from tests.messages import AGAINST_GRAVITY, DRY_RUN_NOT_DONE

@@ -7,15 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import hil.files
-from hil.campaign.errors import (
-    MotionFailedError,
-)
-from hil.campaign.operator import OperatorRequest, RunStatus, Stop
-from hil.errors import OutputError
-from hil.simulation import (
-    simulated_link,
-)
+import hil.base.files
+from hil.base.errors import OutputError
+from hil.campaign.operator import RunStatus
+from hil.control.errors import MotionFailedError
+from hil.control.motion_watch import OperatorRequest, Stop
+from hil.control.simulation import simulated_link
 from tests.hil.campaign_runs.rig import Make, Operator, kinds
 
 pytestmark = pytest.mark.safety
@@ -61,14 +58,14 @@ def test_the_time_left_is_right_and_counts_down(
 def test_a_full_disk_is_named(make: Make, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     drift = 1e-9 if name == "warmup.json" else 0.0
     campaign = make(warmup_drift=drift, warmup_least=3, warmup_most=3)
-    write = hil.files._write_through
+    write = hil.base.files._write_through
 
     def full(path: Path, content: str | bytes) -> None:
         if path.name.startswith(name):
             raise OSError(28, "No space left on device")
         write(path, content)
 
-    monkeypatch.setattr(hil.files, "_write_through", full)
+    monkeypatch.setattr(hil.base.files, "_write_through", full)
     with pytest.raises(OutputError, match=rf"{name} cannot be written \(No space left"):
         campaign.run(accept_dry_run=True)
     monkeypatch.undo()

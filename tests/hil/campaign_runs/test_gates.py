@@ -11,6 +11,8 @@ import pytest
 
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import open_archive
+from hil.base.errors import ControllerError, HilError
+from hil.base.progress import Silent
 from hil.campaign import (
     Campaign,
     CampaignFolderError,
@@ -18,20 +20,15 @@ from hil.campaign import (
     NotRehearsedError,
     VirtualLink,
 )
-from hil.campaign.connection import active_checks
 from hil.campaign.dry_run import DryRunRecord
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
-from hil.campaign.operator import Stop
 from hil.campaign.rehearsal import Rehearsal
-from hil.errors import ControllerError, HilError
-from hil.motion_checks import MotionChecks
-from hil.move import plan_move, send
-from hil.progress import Silent
-from hil.simulation import (
-    simulated_controller,
-    simulated_link,
-)
+from hil.control.connection import active_checks
+from hil.control.motion_checks import MotionChecks
+from hil.control.motion_watch import Stop
+from hil.control.move import plan_move, send
+from hil.control.simulation import simulated_controller, simulated_link
 from tests.hil.campaign_runs.rig import Make, Real
 from tests.hil.fast_cell import pass_rehearsal
 from tests.messages import ANOTHER_CELL_OR_PLAN

@@ -19,14 +19,11 @@ from hil.campaign import (
 from hil.campaign.errors import (
     RepetitionsRejectedError,
 )
-from hil.campaign.operator import OperatorRequest
 from hil.campaign.quality import FIELDS, Executed, RepetitionCheck
 from hil.campaign.run import RunResult
-from hil.identify.sources import gather_sources
-from hil.simulation import (
-    controller_settings,
-    simulated_controller,
-)
+from hil.control.motion_watch import OperatorRequest
+from hil.control.simulation import controller_settings, simulated_controller
+from hil.pipeline.sources import gather_sources
 from sim_fixtures.faults import parse_fault, split_faults
 from tests import messages
 from tests.hil.campaign_runs.rig import (

@@ -11,15 +11,13 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
+from hil.base.errors import HilError, OperatorStopError
 from hil.campaign import (
     Campaign,
 )
-from hil.campaign.errors import (
-    MotionFailedError,
-)
 from hil.cli import app
-from hil.errors import HilError, OperatorStopError
-from hil.results import Results
+from hil.control.errors import MotionFailedError
+from hil.results.results import Results
 from tests.hil.fast_cell import mirrored, pass_rehearsal
 from tests.hil.screen_rig import on_terminal
 from tests.messages import AGAINST_GRAVITY

@@ -22,11 +22,8 @@ from hil.campaign.warmup import (
     WarmUpRecord,
     change_per_motion,
 )
-from hil.motion_checks import MotionChecks
-from hil.simulation import (
-    planted_truth,
-    simulated_link,
-)
+from hil.control.motion_checks import MotionChecks
+from hil.control.simulation import planted_truth, simulated_link
 from tests.hil.campaign_runs.rig import Array, Make, Operator, kinds, slowing
 from tests.hil.fast_cell import fast_cell
 

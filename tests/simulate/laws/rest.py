@@ -14,8 +14,8 @@ import numpy as np
 
 from drivers.events import MotionEnded
 from drivers.states import State
-from hil.campaign.errors import MotionFailedError
-from hil.errors import ControllerError, HilError
+from hil.base.errors import ControllerError, HilError
+from hil.control.errors import MotionFailedError
 from sim_fixtures import Phase
 from tests.faults import DISTURBS_THE_ARM, kind_of
 from tests.laws.arm import closed, stands

@@ -1,0 +1,1 @@
+"""What every floor uses and nothing of a robot: errors, files, text, progress, threads."""

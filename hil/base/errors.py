@@ -1,0 +1,174 @@
+"""Errors of the `hil` package.
+
+```
+HilError                   exit status 1
+├── UnsafeError            3: a motion was refused before anything was sent
+│   ├── MotionRefusedError      limits, current, collision, or too long
+│   ├── NoExcitationError       every motion of a design would be refused
+│   ├── NotRehearsedError       the plan did not pass its rehearsal
+│   ├── DryRunError             the slow dry run of the plan was not accepted
+│   └── MountingError           a payload has to be mounted or removed, and nobody confirms it
+├── ExecutionError         4: a motion did not begin, or ended otherwise than planned
+│   ├── ControllerError         the controller or the link was not ready, or failed
+│   └── MotionFailedError       stopped, refused by this PC, or lost; with its archive
+├── RepetitionsRejectedError   5: a motion failed its quality check repeatedly
+├── OperatorStopError         130: stopped by the operator
+├── OutputError            1: results cannot be written: disk full, no permission
+└── InputError             2: invalid input of the user: file, field, problem, remedy
+                           (1 on the command line for errors of a disk: `DISK_REFUSES`)
+    ├── ArchiveError       an archive that cannot be read or written
+    │   ├── NotAnArchiveError       another format, empty, or truncated in its header
+    │   ├── ArchiveVersionError     written by a newer version of the archive profile
+    │   └── ArchiveWriteError       the file cannot be created or written
+    ├── CellError          the cell file
+    ├── SettingsError      the settings of a design
+    ├── CampaignFolderError     the campaign folder
+    └── SourceError        a foreign recording (CSV, rosbag2) that cannot be imported
+```
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterable, Mapping
+from os import PathLike
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, ClassVar, Final, Self
+
+from hil.base.terminal_text import printable
+
+DISK_REFUSES: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EFBIG})
+"""Numbers of an OSError that are not caused by input: disk full, over quota, failed."""
+
+
+class HilError(Exception):
+    """Base class of the errors of `hil`; the message is for the operator.
+
+    `exit_code` is that of the command line; `figures` are JSON data about the work done before.
+    """
+
+    exit_code: ClassVar[int] = 1
+    figures: Mapping[str, object] = MappingProxyType({})
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return the parts of a pickle: the constructors have other arguments than the message."""
+        return _restored, (type(self), self.args, vars(self))
+
+    def beside(self, figures: Mapping[str, object]) -> Self:
+        """Return this error with figures."""
+        self.figures = dict(figures)
+        return self
+
+
+def _restored(kind: type[HilError], args: tuple[Any, ...], state: dict[str, Any]) -> HilError:
+    error = kind.__new__(kind)
+    error.args = args
+    vars(error).update(state)
+    return error
+
+
+class InputError(HilError):
+    """Invalid input of the user: file (or None), field in it, problem with the value, remedy."""
+
+    exit_code: ClassVar[int] = 2
+
+    def __init__(
+        self,
+        path: str | PathLike[str] | None,
+        problem: str,
+        *,
+        field: str = "",
+        remedy: str = "",
+    ) -> None:
+        self.path = None if path is None else Path(path)
+        self.field = field
+        self.problem = problem
+        self.remedy = remedy
+        shown = path if isinstance(path, str) and "://" in path else self.path  # a URL as it is
+        place = [printable(str(part), keep="") for part in (shown, field) if part]
+        sentence = ": ".join([*place, problem])
+        super().__init__(f"{sentence}; {remedy}" if remedy else sentence)
+
+
+class ArchiveError(InputError):
+    """An archive that cannot be read or written."""
+
+
+class NotAnArchiveError(ArchiveError):
+    """A file that is not an archive of `hil`, or is truncated in its header."""
+
+
+class ArchiveVersionError(ArchiveError):
+    """An archive of an unknown profile version."""
+
+
+class ArchiveWriteError(ArchiveError):
+    """An archive that cannot be created or written."""
+
+
+class CampaignFolderError(InputError):
+    """A campaign folder that cannot be used."""
+
+    def __init__(self, folder: Path, problem: str, remedy: str) -> None:
+        super().__init__(folder, problem, remedy=remedy)
+
+
+class SourceError(InputError):
+    """A foreign recording that cannot be imported."""
+
+
+class UnrecordedJointError(SourceError):
+    """A foreign recording without a joint of its robot.
+
+    Attributes:
+        count: how many joints were recorded.
+        joints: those that the recording names, as in the URDF.
+        channels: names of the channels, which may say a side of the robot.
+    """
+
+    count = 0
+    joints: tuple[str, ...] = ()
+    channels: tuple[str, ...] = ()
+
+    def of(
+        self, count: int, joints: Iterable[str] = (), channels: Iterable[str] = ()
+    ) -> UnrecordedJointError:
+        """Return this error with what was recorded."""
+        self.count = count
+        self.joints = tuple(joints)
+        self.channels = tuple(channels)
+        return self
+
+
+class OutputError(HilError):
+    """A folder that cannot be written to; nothing in it was changed."""
+
+    def __init__(self, path: Path, problem: str) -> None:
+        self.path = path
+        self.problem = problem
+        super().__init__(
+            f"{path}: {problem}; nothing there was changed: make room, or use another folder"
+        )
+
+
+class UnsafeError(HilError):
+    """A motion that was refused before anything was sent."""
+
+    exit_code: ClassVar[int] = 3
+
+
+class OperatorStopError(HilError):
+    """Stopped by the operator; everything recorded is archived."""
+
+    exit_code: ClassVar[int] = 130
+
+
+class ExecutionError(HilError):
+    """A motion did not begin, or ended otherwise than planned, whoever ended it."""
+
+    exit_code: ClassVar[int] = 4
+
+
+class ControllerError(ExecutionError):
+    """The controller, or the link to it, was not ready or failed."""

@@ -1,0 +1,36 @@
+"""Identification of a campaign: the estimate from its archives, with its conduct."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from hil.base.progress import Reporter
+from hil.base.threads import one_thread
+from hil.pipeline.identify_folder import identify_recorded
+from hil.pipeline.options import Options
+from hil.pipeline.run import Identification
+
+from .folder import CampaignFolder
+from .status import conduct_of
+
+
+@one_thread()
+def identify_campaign(
+    root: Path, reporter: Reporter, options: Options = Options(), *, predict: Sequence[Path] = ()
+) -> Identification:
+    """Identify from the complete archives of a campaign folder; `predict` adds held-out archives.
+
+    Raises:
+        InputError: the folder has no complete excitation.
+    """
+    return with_conduct(identify_recorded(root, reporter, options, predict=predict), root)
+
+
+def with_conduct(identification: Identification, root: Path) -> Identification:
+    """Return an identification of a campaign folder with the conduct of the campaign."""
+    conduct = conduct_of(CampaignFolder(root))
+    return replace(
+        identification, results=identification.results.model_copy(update={"conduct": conduct})
+    )

@@ -1,0 +1,241 @@
+"""The simulated arm of a rehearsal, close to the nominal one, with faults of its link.
+
+Masses, inertias, rotors and friction are varied within `SPREAD` of their nominal values. A cell
+without `[simulation]` gets one from `[nominal]` and the defaults below.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import pinocchio
+from numpy.typing import NDArray
+
+from drivers.open_mode import MAX_TARGET_JUMP
+from drivers.transports.simulated import Delay, Duplicate, Fault, Lose, SimulatedTransport
+from hil.cell import Cell
+from hil.control.simulation import (
+    controller_settings,
+    planted_values,
+    simulated_controller,
+    simulated_provenance,
+)
+from hil.control.virtual_link import VirtualLink
+from identification.text import percentage
+from sim_fixtures import ServoSettings, UnmodelledEffects
+
+Array = NDArray[np.float64]
+
+SPREAD: Final = 0.1  # Largest relative deviation of the simulated parameters from the nominal ones
+NOISE_SHARE: Final = 0.005  # Noise of the current, rms, as a share of the weakest motor's limit
+RESOLUTION_SHARE: Final = 0.001  # Resolution of the target current, as a share of the same limit
+FAULT_EVERY: Final = 3.0  # Mean time between two faults of the link, s
+LOOP_CYCLES: Final = 0.5
+"""Mean delay of a target current, cycles: it acts over the cycle before the packet."""
+RESONANCE: Final = 500.0
+"""Resonance of a main axis, rotor against link, rad/s, where the cell has no elasticity."""
+FASTEST: Final = 800.0
+"""Highest resonance in any posture, rad/s: the simulated arm has steps of 0.5 ms."""
+POSTURES: Final = 60  # Postures in which the resonances are computed
+MAIN_AXES: Final = 3
+SLOWEST_LOOP: Final = 0.002
+"""Slowest current loop, s; a slower one makes the simulated arm oscillate."""
+_HORIZON: Final = 4.0
+"""Period of link faults as a multiple of the motions' duration: moves take time, too."""
+
+
+@dataclass(frozen=True, eq=False)
+class Twin:
+    """A simulated arm for a rehearsal.
+
+    Attributes:
+        cell: with a simulated controller; its `[simulation]` has the varied parameters.
+        truth: simulated parameters (p,) in the order of the model.
+        assumed: assumed properties, in sentences.
+        seed: of the variation.
+    """
+
+    cell: Cell
+    truth: Array
+    assumed: tuple[str, ...]
+    seed: int
+
+    @classmethod
+    def of(cls, cell: Cell, *, seed: int, repetitions: int) -> Twin:
+        """Return an arm with random parameters for a cell."""
+        rng = np.random.default_rng(seed)
+        planted = _varied(cell, rng)
+        settings, assumed = _simulation(cell, planted, seed)
+        twin = cell.with_values(
+            {
+                **{f"simulation.{key}": value for key, value in settings.items()},
+                "controller.transport": "simulated",
+                "campaign.repetitions": min(repetitions, cell.campaign.repetitions),
+            }
+        )
+        if (sentence := too_far_without_a_packet(twin)) is not None:
+            assumed.append(sentence)
+        return cls(twin, planted_values(twin), tuple(assumed), seed)
+
+    def link(self, seconds: float, *, effects: bool) -> VirtualLink:
+        """Return a link in virtual time to the arm, with random faults."""
+        table = self.cell.controller
+        # The current loop has the delay of `[controller] current_delay_cycles`.
+        lag = (LOOP_CYCLES - table.current_delay_cycles) * self.cell.period
+        settings = replace(
+            controller_settings(self.cell, effects=effects),
+            servo=ServoSettings(current_lag=float(np.clip(lag, 0.0, SLOWEST_LOOP))),
+            # `[controller] max_gap` missed packets in a row end no motion.
+            missed_replies=table.max_gap + 1,
+            while_silent="continue",
+        )
+        controller = simulated_controller(
+            self.cell, settings=settings, effects=effects, seed=self.seed
+        )
+        faults = link_faults(self.cell, _HORIZON * seconds, self.seed)
+        return VirtualLink.over(
+            SimulatedTransport(controller, faults), self.cell, finish=controller.finish
+        )
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        """Metadata of a rehearsal's archive, with the simulated parameters."""
+        planted = dict(zip(self.cell.model.parameter_names, self.truth.tolist(), strict=True))
+        return {
+            **simulated_provenance(self.cell, effects=False),
+            "rehearsal": "yes",
+            "planted": json.dumps(planted),
+        }
+
+
+def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
+    """Return single packets doubled, late or, where a motion survives it, lost within `seconds`."""
+    rng = np.random.default_rng([seed, 7])
+    cycles = round(seconds / cell.period)
+    count = max(1, round(seconds / FAULT_EVERY))
+    survived = cell.controller.max_gap > 0 and too_far_without_a_packet(cell) is None
+    kinds = ["delay", "duplicate", *(["lose"] if survived else [])]
+    faults: list[Fault] = []
+    # Not in the packets of the start.
+    for cycle in sorted(rng.integers(1000, max(1001, cycles), count).tolist()):
+        match kinds[rng.integers(len(kinds))]:
+            case "delay":
+                faults.append(Delay(cycle, cycles=float(rng.uniform(0.1, 0.8))))
+            case "duplicate":
+                faults.append(Duplicate(cycle))
+            case _:
+                faults.append(Lose(cycle))
+    return tuple(faults)
+
+
+def too_far_without_a_packet(cell: Cell) -> str | None:
+    """Return why a lost packet ends a motion at full speed; None where the motion survives it.
+
+    A controller that extrapolates is then one step ahead of the set-point sent last.
+    """
+    if not cell.controller.max_gap:
+        return None
+    share = MAX_TARGET_JUMP * np.array(cell.drive_table.following_error)
+    speeds = np.diag(cell.joint_limits.velocity)
+    turns = cell.drive_train.motor_revolutions_per_cycle(speeds, cell.period)
+    steps = np.abs(turns).sum(axis=0)
+    motor = int(np.argmax(steps / share))
+    if steps[motor] <= share[motor]:
+        return None
+    return (
+        f"no packet is lost: at full speed the motor of {cell.joint_names[motor]} turns by "
+        f"{steps[motor]:.2g} revolutions in a cycle of {cell.controller.cycle_ms} ms; the guard "
+        f"allows {share[motor]:.2g} ({percentage(MAX_TARGET_JUMP)} of following_error in "
+        "[drive_train]), so "
+        "that a packet lost at that speed ends the motion on the real arm; a shorter cycle or a "
+        "lower velocity_deg in [limits] avoids this"
+    )
+
+
+def _varied(cell: Cell, rng: np.random.Generator) -> dict[str, list[float]]:
+    """Return inertias, rotors and friction varied about those of the URDF and `[nominal]`."""
+    nominal = cell.nominal
+    n = len(cell.joint_names)
+
+    def varied(values: list[float]) -> list[float]:
+        factors = 1.0 + SPREAD * rng.uniform(-1.0, 1.0, n)
+        return (np.array(values) * factors).tolist()  # type: ignore[no-any-return]
+
+    return {
+        "inertia_scale": varied([1.0] * n),
+        "rotor_inertia": varied(nominal.rotor_inertia),
+        "coulomb": varied(nominal.coulomb),
+        "viscous": varied(nominal.viscous),
+        "third": varied(nominal.third or [0.0] * n),
+    }
+
+
+def _simulation(
+    cell: Cell, planted: dict[str, list[float]], seed: int
+) -> tuple[dict[str, Any], list[str]]:
+    """Return `[simulation]` of the simulated arm, and what in it is assumed."""
+    table: dict[str, Any] = {**planted, "seed": seed}
+    assumed = []
+    given = cell.file.simulation
+    if given is None:
+        weakest = min(cell.drive_table.current_limit)
+        table["initial_deg"] = cell.campaign.home_deg
+        table["current_noise"] = NOISE_SHARE * weakest
+        table["current_resolution"] = RESOLUTION_SHARE * weakest
+        assumed.append(
+            f"the current has a noise of {table['current_noise']:.3g} A rms and a resolution of "
+            f"{table['current_resolution']:.3g} A ({percentage(NOISE_SHARE, 1)} and "
+            f"{percentage(RESOLUTION_SHARE, 1)} of the weakest motor's limit)"
+        )
+    if given is None or not (
+        given.torque_ripple or given.friction_drift or any(given.elasticity) or given.delay
+    ):
+        effects = _ordinary_effects(cell, np.array(planted["rotor_inertia"]))
+        table |= asdict(effects) | {"elasticity": list(effects.elasticity)}
+        assumed.append(
+            "effects that the model leaves out have default sizes: torque ripple of "
+            f"{percentage(effects.torque_ripple)} of the Coulomb torque, friction that falls by "
+            f"{percentage(effects.friction_drift)}, springs in the main axes, "
+            f"{1e3 * effects.delay:g} ms "
+            "of delay"
+        )
+    unknown = [key for key in ("rotor_inertia", "coulomb", "viscous") if not any(planted[key])]
+    if unknown:
+        assumed.append(f"[nominal] has only zeros for {', '.join(unknown)}: so has the arm")
+    return table, assumed
+
+
+def _ordinary_effects(cell: Cell, rotors: Array) -> UnmodelledEffects:
+    """Return effects of default sizes, with springs that suit the arm.
+
+    No resonance exceeds `FASTEST` in any of `POSTURES` random postures. Where axes are almost
+    parallel, the effective inertia beyond a spring is much below that of its link.
+    """
+    n = len(rotors)
+    limits = cell.joint_limits
+    model = pinocchio.buildModelFromXML(cell.urdf)
+    data = model.createData()
+
+    def inertia(posture: Array) -> Array:
+        upper = np.triu(pinocchio.crba(model, data, posture))
+        return np.asarray(upper + np.triu(upper, 1).T)
+
+    links = inertia(cell.home).diagonal()
+    reduced = rotors * links / np.maximum(rotors + links, np.finfo(np.float64).tiny)
+    soft = (np.arange(n) < MAIN_AXES) & (reduced > 0.0)
+    compliance = np.zeros(n)
+    compliance[soft] = 1.0 / (reduced[soft] * RESONANCE**2)
+    root = 1.0 / np.sqrt(compliance[soft])
+    fastest = 0.0
+    shares = np.random.default_rng(0).random((POSTURES, n))
+    for posture in [cell.home, *(limits.lower + shares * (limits.upper - limits.lower))]:
+        if soft.any():
+            whole = inertia(posture) + np.diag(np.where(soft, 0.0, rotors))
+            mobility = np.linalg.inv(whole)[np.ix_(soft, soft)] + np.diag(1.0 / rotors[soft])
+            frequency = float(np.linalg.eigvalsh(root[:, None] * mobility * root)[-1])
+            fastest = max(fastest, frequency)
+    compliance *= max(1.0, float(np.sqrt(fastest)) / FASTEST) ** 2
+    return replace(UnmodelledEffects.default_sizes(n), elasticity=tuple(compliance.tolist()))

@@ -1,0 +1,1 @@
+"""Changes of an arm between campaigns, and their page."""

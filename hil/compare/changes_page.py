@@ -1,0 +1,14 @@
+"""Page of a comparison of campaigns."""
+
+from __future__ import annotations
+
+from hil.base.version import software
+from hil.compare.comparison import FALSE_ALARMS, LEAST, MIN_REPETITIONS, Comparison
+from hil.report.rendering import environment, page_bytes
+
+
+def comparison_page(comparison: Comparison) -> bytes:
+    """Return the comparison as one HTML file; the same input gives the same bytes."""
+    rules = {"alarms": FALSE_ALARMS, "least": LEAST, "repetitions": MIN_REPETITIONS}
+    template = environment().get_template("changes.html.j2")
+    return page_bytes(template.render(found=comparison, rules=rules, software=software()))

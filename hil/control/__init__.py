@@ -1,0 +1,1 @@
+"""The link to a controller, real or simulated; single motions and recordings over it."""

@@ -1,0 +1,217 @@
+"""State of a controller by its events, and the limits that count with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.events import (
+    InitReceived,
+    LinkLost,
+    MotionEnded,
+    MotionStarted,
+    PacketRejected,
+    Refused,
+)
+from drivers.exchange.event_log import EventsLost, ExchangeEvent
+from drivers.guard import Guard
+from drivers.init_check import float32_text, is_narrower
+from drivers.packets import InitPacket
+from drivers.states import State
+from hil.archive import ArchiveSpec
+from hil.base.errors import ControllerError
+from hil.base.terminal_text import plural
+from hil.cell import Cell
+from hil.control.errors import refusal_text
+from hil.control.motion_checks import MotionChecks
+from hil.control.motion_watch import REFUSED
+
+Array = NDArray[np.float64]
+
+START_TIMEOUT: Final = 60.0  # s within which an accepted motion must have started
+OFF_TIMEOUT: Final = 2.0  # s with the drive off after which an accepted motion is dropped
+_WITHOUT_DRIVE: Final = (State.SYNC, State.INIT, State.DRIVE_OFF, State.FAULTED, State.ENDED)
+
+
+@dataclass(eq=False)
+class Connection:
+    """State of the controller since the link was opened, and of the motion requested last.
+
+    Attributes:
+        inits: init packets so far.
+        unusable: why the arm cannot be moved, None if it can.
+        differences: figures in which it differs from the cell.
+        lost: the last loss of the link since an archive was opened.
+        not_understood: number and cause of packets without a reply; "" for none.
+        no_reply: the cause alone.
+        refused: the last refusal since a motion was requested.
+        started: whether the motion has sent anything, or may have.
+        ended: the end of the motion, if its event came.
+        report: receives a line for each refusal at once.
+        cell: of the link, for these lines.
+    """
+
+    init: InitPacket | None = None
+    inits: int = 0
+    unusable: str | None = None
+    differences: tuple[str, ...] = ()
+    lost: LinkLost | None = None
+    not_understood: str = ""
+    no_reply: str = ""
+    refused: Refused | None = None
+    started: bool = False
+    ended: MotionEnded | None = None
+    report: Callable[[str], object] = str
+    cell: Cell | None = None
+    _rejected: int = 0
+
+    def update(self, event: ExchangeEvent) -> None:
+        """Update the state with an event."""
+        match event:
+            case InitReceived():
+                self.init = event.init
+                self.unusable = event.unusable
+                self.differences = event.differences
+                self.inits += 1
+            case Refused():
+                self.refused = event
+                self._report(event)
+            case LinkLost():
+                self.lost = event
+            case MotionStarted() | EventsLost():
+                self.started = True
+            case MotionEnded():
+                self.ended = event
+            case PacketRejected() if event.reason:
+                self._rejected += event.count
+                packets = plural(self._rejected, "packet")
+                self.no_reply = event.reason
+                self.not_understood = f"{packets} came and got no reply: {event.reason}"
+
+    def reset_motion(self) -> None:
+        """Forget the last motion: another one is about to be requested."""
+        self.ended = None
+        self.refused = None
+        self.started = False
+
+    def require_usable(self) -> None:
+        """Raise ControllerError if the controller is not the cell's."""
+        if self.unusable is not None:
+            remedy = "; correct the cell file, or the controller" if self.differences else ""
+            raise ControllerError(f"the controller cannot be used: {self.unusable}{remedy}")
+
+    def _report(self, event: Refused) -> None:
+        text = str(event.error) if self.cell is None else refusal_text(self.cell, event.error)
+        self.report(f"{REFUSED}: {text}; {event.error.remedy}")
+
+
+class StartTimeout:
+    """Detects that a motion accepted at `now` [s of any monotonic clock] will not start."""
+
+    def __init__(self, now: float) -> None:
+        self._requested = self._drive_on = now
+
+    def no_start(self, state: State, now: float) -> str | None:
+        """Return why a motion that has not started will not start; None while it may."""
+        if state not in _WITHOUT_DRIVE:
+            self._drive_on = now
+        if now - self._drive_on > OFF_TIMEOUT:
+            event = "a refusal came" if state is State.FAULTED else "the drive went off"
+            return f"{event} before the motion began"
+        if now - self._requested > START_TIMEOUT:
+            return f"the motion did not begin within {START_TIMEOUT:g} s ({state.name})"
+        return None
+
+
+def waiting_text(state: State, received: str) -> str:
+    """Return what keeps a controller from moving, with a remedy; "" while it is getting ready.
+
+    `received` is what came from a controller without a session.
+    """
+    match state:
+        case State.SYNC:
+            return f"{received}; start its Open program"
+        case State.DRIVE_OFF | State.FAULTED:
+            return "its drive is off; switch it on"
+        case State.ENDED:
+            return "it has ended its session; start its Open program again"
+        case _:
+            return ""
+
+
+def not_ready(state: State, waited: float) -> ControllerError:
+    """Return the error of a controller that was not ready for a motion after `waited` s."""
+    after = f"within {waited:.3g} s"
+    restart = "restart the program on the controller"
+    match state:
+        case State.SYNC:
+            problem = (
+                f"did not begin a session {after} (state SYNC): it is silent, or still in one that "
+                f"began before this program; {restart} and try again"
+            )
+        case State.ENDED:
+            problem = f"ended the session {after} before its drive was on; {restart} and try again"
+        case _:
+            problem = f"did not reach drive-on {after} (state {state.name}); switch the drive on"
+            problem += " and try again"
+    return ControllerError(f"the controller {problem}")
+
+
+def described(spec: ArchiveSpec, connection: Connection) -> ArchiveSpec:
+    """Return the archive with the init packet."""
+    if connection.init is None:
+        return spec
+    packet = {"init_packet.bin": connection.init.encode()}
+    return replace(spec, attachments={**spec.attachments, **packet})
+
+
+def active_guard(cell: Cell, init: InitPacket | None) -> Guard:
+    """Return a guard with the narrower limits of the cell and the controller."""
+    guard = Guard(cell.guard_limits, cell.period)
+    if init is not None:
+        current = np.fmin(_stated(cell, init, "current_limit"), cell.drive_train.current_limit)
+        guard.narrow(_stated(cell, init, "following_error"), current)
+    return guard
+
+
+def active_checks(
+    cell: Cell, connection: Connection, checks: MotionChecks | None = None
+) -> MotionChecks:
+    """Return checks with the narrower current limits of cell and controller.
+
+    `checks` itself is returned where both are the cell's.
+    """
+    checks = MotionChecks.of(cell) if checks is None else checks
+    if connection.init is None:
+        return checks
+    return checks.within(_stated(cell, connection.init, "current_limit"))
+
+
+Limit = Literal["current_limit", "following_error"]
+
+
+def narrower_limits(cell: Cell, connection: Connection, limit: Limit) -> tuple[str, ...]:
+    """Return a sentence for each limit of the controller that is below the cell's.
+
+    No model predicts the following error of a servo: motions cannot be checked against it.
+    """
+    if connection.init is None:
+        return ()
+    stated = _stated(cell, connection.init, limit)
+    cell_limit = getattr(cell.drive_table, limit)
+    unit = "A" if limit == "current_limit" else "motor revolutions"
+    return tuple(
+        f"{cell.joint_names[joint]}: {float32_text(stated[joint])} {unit} in the controller, "
+        f"{cell_limit[joint]:.9g} in the cell file"
+        for joint in np.flatnonzero(is_narrower(stated, np.array(cell_limit)))
+    )
+
+
+def _stated(cell: Cell, init: InitPacket, limit: Limit) -> Array:
+    """Return a limit of the cell's arm in an init packet (n,), NaN where it has none."""
+    values = getattr(init, limit)[cell.controller.arm - 1, : len(cell.joint_names)]
+    return np.asarray(values, dtype=np.float64)

@@ -1,0 +1,135 @@
+"""Recording of motions that the controller's own program executes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hil.archive import CONTROLLER_PROGRAM, ArchiveName, ArchiveSpec
+from hil.base.errors import InputError
+from hil.base.files import make_folder
+from hil.base.version import software
+from hil.cell import Cell
+
+if TYPE_CHECKING:
+    from hil.archive.recorder import Recorded
+    from hil.control.link import MotionLink, Watch
+    from hil.control.motion_watch import Stop
+
+KINDS = ("excitation", "validation", "standstill")
+
+
+def record(
+    link: MotionLink,
+    cell: Cell,
+    path: Path,
+    *,
+    kind: str,
+    stop: Stop,
+    duration: float | None = None,
+    wait: float | None = None,
+    watch: Watch = lambda _: None,
+    durable: bool = True,
+) -> Recorded:
+    """Record the session of the controller from its first cycle, without requesting any motion.
+
+    The kind is one of `KINDS`. `stop` ends the recording, as do the end of the session and the
+    `duration` [s] of the controller's time. `wait` limits the time for the controller to start [s].
+    With `durable` each flush waits for the disk.
+
+    Raises:
+        ControllerError: the controller did not start in time, or does not match the cell.
+        OperatorStopError: stopped before it started.
+        ArchiveWriteError: the archive cannot be written.
+    """
+    metadata = {"motion": CONTROLLER_PROGRAM, **kind_entry(path, kind), **origin_of(cell)}
+    spec = archive_spec(cell, path, metadata, durable=durable)
+    return link.record(spec, stop, duration=duration, wait=wait, watch=watch)
+
+
+def archive_spec(
+    cell: Cell,
+    path: Path,
+    metadata: Mapping[str, str],
+    plan: Mapping[str, Any] | None = None,
+    *,
+    durable: bool,
+) -> ArchiveSpec:
+    """Return the specification of an archive with cell, URDF, drive train and plan attached.
+
+    A motion of the controller's own program has no plan. The name of the cell is added to the
+    metadata. With `durable` each flush waits for the disk.
+    """
+    attachments = {
+        "cell.toml": cell.text.encode(),
+        "robot.urdf": cell.urdf.encode(),
+        "drive_train.json": cell.drive_table.model_dump_json().encode(),
+    }
+    if plan is not None:
+        attachments["plan.json"] = json.dumps(plan).encode()
+    return ArchiveSpec(
+        path,
+        joint_names=cell.joint_names,
+        period=cell.period,
+        metadata={"cell": cell.name, **metadata},
+        attachments=attachments,
+        durable=durable,
+    )
+
+
+def archive_path(output: Path, kind: str) -> Path:
+    """Return `output` if it ends in .mcap, else the next file name in that folder.
+
+    Raises:
+        InputError: the file exists, or the folder cannot be created.
+    """
+    if output.suffix == ".mcap":
+        if output.exists():
+            raise InputError(output, "exists already", remedy="archives are never overwritten")
+        name = ArchiveName.parse(output)
+        if name is not None and name.kind != kind:
+            problem = f"is the name of a {name.kind}"
+            raise InputError(output, problem, remedy=f"add --kind {name.kind}")
+        make_folder(output.parent)
+        return output
+    make_folder(output)
+    index = 0
+    while list(output.glob(f"{kind}_{index:03d}_a*.mcap")):
+        index += 1
+    return output / ArchiveName(kind, index)
+
+
+def kind_entry(path: Path, kind: str) -> dict[str, str]:
+    """Return the kind as metadata, {} if the file name contains it."""
+    return {} if ArchiveName.parse(path) is not None else {"kind": kind}
+
+
+def origin_of(
+    cell: Cell, *, only_simulated: bool | None = None, virtual: bool | None = None
+) -> dict[str, str]:
+    """Return origin, date (none in virtual time) and software of a recording as metadata.
+
+    Whether only a simulated arm can move and whether time is virtual follow from the cell's link
+    by default.
+    """
+    if only_simulated is None:
+        only_simulated = cell.only_simulated
+    if virtual is None:
+        virtual = cell.controller.transport == "simulated"
+    return {
+        "simulated": "yes" if only_simulated else "no",
+        **({} if virtual else {"recorded_at": _now()}),
+        **{f"software.{name}": version for name, version in software().items()},
+    }
+
+
+def with_present_date(metadata: Mapping[str, str]) -> dict[str, str]:
+    """Return the metadata with the present date, if it has a date."""
+    return {**metadata, **({"recorded_at": _now()} if "recorded_at" in metadata else {})}
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

@@ -1,0 +1,1 @@
+"""Files of an identified arm for simulators, read back."""

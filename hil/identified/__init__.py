@@ -1,0 +1,1 @@
+"""From recordings of any kind to an identified arm in memory, and from there to its files."""

@@ -1,0 +1,1 @@
+"""A payload weighed by recordings without and with it."""

@@ -1,0 +1,1 @@
+"""Identification: archives to samples, estimate, evidence, verdict and results."""

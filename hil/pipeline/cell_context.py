@@ -1,0 +1,413 @@
+"""Facts about cell and recordings that an estimate and its verdict need beside the model."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.archive import open_archive
+from hil.cell import Cell
+from hil.cell.nominal import nominal_of
+from hil.cell.text import urdf_limits
+from identification.estimators.torque_channel import torque_noiseless_above
+from identification.estimators.torque_scale import DATA_SHEET, described
+from identification.factor.estimate import Estimate
+from identification.model.friction import TERMS, FrictionLaw
+from identification.selection.inner_prediction import FRICTION_AT_SPEED, LOAD, LOW_PASS, REVERSAL
+from identification.signals.masks import SATURATED
+from identification.signals.recording import UNWRAPPED, Recording
+from identification.signals.samples import Samples
+from identification.text import percentage
+from identification.validation.evidence import CellContext
+from identification.validation.finding import Finding, Thresholds, joined
+from identification.validation.nominal_scale import InertiaRatio, inertia_ratio, nominal_scale
+from identification.validation.position_jumps import PositionJump, position_steps
+from identification.validation.prediction import PredictionError, pooled_error
+from identification.validation.residuals import folded_noise
+from planner.arrays import numbers
+
+from .prepared import Prepared
+from .sources import Source, Sources
+
+Array = NDArray[np.float64]
+
+_POSTURES = 500
+_TIME_TOLERANCE = 1e-6  # s
+
+
+def controller_error(
+    cell: Cell, sources: Sequence[Source], samples: Sequence[Samples]
+) -> PredictionError | None:
+    """Return the torque error of the controller's model; None if an archive lacks its current."""
+    if cell.file.drive_train is None:
+        return None
+    errors = []
+    for source, prepared in zip(sources, samples, strict=True):
+        current = _column_at(source, "model_current", prepared.motion.time)
+        if current is None:
+            return None
+        torque = cell.drive_train.joint_torque(current)
+        errors.append(PredictionError.between(prepared.torque, torque, prepared.usable))
+    return pooled_error(errors) if errors else None
+
+
+def controller_inertia(
+    cell: Cell, estimate: Estimate, sources: Sequence[Source]
+) -> InertiaRatio | None:
+    """Return the controller's diagonal inertia over the identified one; None if not sent."""
+    if cell.file.drive_train is None or estimate.undetermined:
+        return None
+    received = []
+    for source in sources:
+        recording = source.recording
+        few = slice(None, None, max(1, recording.n_samples // _POSTURES))
+        inertia = _column_at(source, "diagonal_inertia", recording.time[few])
+        if inertia is not None:
+            received.append((recording.position[few], inertia))
+    if not received:
+        return None
+    positions, inertia = map(np.concatenate, zip(*received, strict=True))
+    return inertia_ratio(cell.model, estimate.values, positions, inertia)
+
+
+def _column_at(source: Source, field: str, time: Array) -> Array | None:
+    """Return a channel (m, n) of a complete archive at some times; None if absent or zero."""
+    if source.context is not None:
+        return None  # a part
+    archive = open_archive(source.path, fields=("cycle", field))
+    column = archive.columns.get(field)
+    cycle = archive.columns.get("cycle")
+    if column is None or cycle is None or archive.period is None:
+        return None
+    if not np.isfinite(column).all() or not np.any(column):
+        return None
+    at = (cycle - cycle[0]) * archive.period
+    rows = np.clip(np.searchsorted(at, time - _TIME_TOLERANCE), 0, len(at) - 1)
+    if np.abs(at[rows] - time).max() > _TIME_TOLERANCE:
+        return None
+    return np.asarray(column[rows])
+
+
+# Position changes below this share of a joint's range are floating-point rounding.
+_ROUNDING: Final = 1e-9
+_STEP_QUANTILE: Final = 0.01  # of the changes between samples: one step of a coarse encoder
+_GRID: Final = 0.05  # distance from a multiple of the step, in steps
+_MAX_ROUNDING: Final = 0.02  # of accelerations, as a share
+_EXACT: Final = 1e-4  # relative error below the resolution of any sensor
+_FEW: Final = 3  # recordings that show the noise of the torque
+_MOST: Final = 0.5  # of the squared residual
+_FAST: Final = 2.0  # a low-pass above this multiple of the motion's bandwidth has no effect
+
+
+def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
+    """Collect the facts about the cell and the recordings that a verdict needs."""
+    cell = prepared.sources.cell
+    sources = prepared.sources
+    recorded = sources.training if sources.in_sample else (*sources.training, *sources.held_out)
+    driven = cell.file.drive_train is not None
+    saturated = prepared.masked.get(SATURATED)
+    nominal = nominal_of(cell)
+    steps = [position_steps(source.recording, source.name) for source in recorded]
+    return CellContext(
+        torque_limit=torque_limits(cell),
+        saturated=None if saturated is None else saturated / max(prepared.rows, 1),
+        motor_from_joint=cell.drive_train.motor_from_joint if driven else None,
+        controller=controller_error(cell, sources.held_out, prepared.held_out),
+        nominal_scale=None
+        if nominal is None
+        else nominal_scale(
+            cell.model,
+            nominal.values,
+            prepared.training,
+            rotors_known=nominal.rotors_known,
+            share=nominal.share,
+        ),
+        jumps=tuple(jump for source_steps in steps for jump in source_steps.jumps),
+        controller_inertia=controller_inertia(
+            cell, estimate, (*sources.training, *sources.held_out)
+        ),
+        delays=prepared.delays,
+        assumed_delay=prepared.assumed_delay,
+        corrections=(
+            *_clock(prepared),
+            *_log([jump for source_steps in steps for jump in source_steps.logged]),
+            *_wrapped(recorded),
+            *_torque_channel(prepared),
+            *_friction_law(prepared),
+            *_resolution(prepared),
+            *_sampling_rate(prepared, estimate),
+        ),
+        added_friction=_added_friction(prepared),
+        scale_std=torque_scale_of(sources).std,
+    )
+
+
+def _condition(check: str, text: str, advice: str) -> Finding:
+    return Finding(check, "doubtful", text, advice, "condition")
+
+
+def _clock(prepared: Prepared) -> Iterator[Finding]:
+    retimed = [source for source in prepared.sources.training if source.retimed]
+    if retimed:
+        text = f"{joined([source.name for source in retimed])}: {'; '.join(retimed[0].clock)}"
+        yield _condition("clock", text, "log the controller's time with each sample")
+
+
+def _log(steps: Sequence[PositionJump]) -> Iterator[Finding]:
+    """Yield a finding about samples that the log repeats or has late."""
+    if steps:
+        counts = Counter((step.recording, step.joint) for step in steps)
+        each = joined([f"{joint} {count} in {name}" for (name, joint), count in counts.items()])
+        first = min(steps, key=lambda step: step.time)
+        yield _condition(
+            "clock",
+            f"the log repeats position samples, has them late or lacks rows: {each} (first:"
+            f" {first.joint} after {first.time:.3f} s of {first.recording}); the arm moved on",
+            "log every sample of the controller once, with the controller's time",
+        )
+
+
+def _wrapped(sources: Sequence[Source]) -> Iterator[Finding]:
+    """Yield a finding about angles that were unwrapped."""
+    joints = {source.name: source.recording.provenance.get(UNWRAPPED) for source in sources}
+    each = [f"{names} of {name}" for name, names in joints.items() if names]
+    if each:
+        text = f"angles that wrap at a whole turn were unwrapped: {joined(each)}"
+        yield Finding("wrapped angles", "information", text, "", "condition")
+
+
+def _added_friction(prepared: Prepared) -> tuple[str, ...]:
+    """Return the symbols of friction terms that inner prediction chose and nobody stated."""
+    chosen = prepared.settings.friction
+    if not any(choice.name == FRICTION_AT_SPEED for choice in prepared.settings.choices):
+        return ()
+    stated = prepared.sources.cell.stated.robot.friction
+    added = [
+        term.symbol
+        for term in TERMS
+        if (option := term.option) in chosen
+        and chosen[option] not in (None, "none", 0.0, False)
+        and getattr(stated, option) in (None, "none", 0.0, False)
+    ]
+    return tuple(dict.fromkeys(added))
+
+
+def _friction_law(prepared: Prepared) -> Iterator[Finding]:
+    """Yield a finding if inner prediction chose another friction law than the archives state."""
+    names = (FRICTION_AT_SPEED, LOAD, REVERSAL)
+    if not any(choice.chosen for choice in prepared.settings.choices if choice.name in names):
+        return
+    cell = prepared.sources.cell
+    law = cell.model.friction.laws[0]
+    table = cell.stated.robot.friction
+    stated = law.changed({term.option: getattr(table, term.option) for term in TERMS})
+    text = (
+        f"the friction law is {law.summary()[0]}, chosen by inner prediction; the recordings state"
+        f" {stated.summary()[0]}"
+    )
+    removed = [term.label.lower() for term in stated.terms if term not in law.terms]
+    if law.tanh is not None and law.coulomb:
+        removed = [label for label in removed if label != "coulomb"]  # it reverses smoothly
+    if removed:
+        yield _condition(
+            "friction law",
+            f"{text}, which predicts parts of the fitted motion worse",
+            f"keep it with `hil identify --friction {_option(stated)}` if it is known",
+        )
+    else:
+        yield Finding("friction law", "information", text, "", "condition")
+
+
+def _option(law: FrictionLaw) -> str:
+    """Return the terms of a law as an entry of `--friction`."""
+    return ",".join(
+        f"{term.label.lower()}={term.speed:g}" if term.speed_symbol else term.label.lower()
+        for term in law.terms
+    )
+
+
+def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
+    """Yield findings about a delay or low-pass of the torque chosen by inner prediction."""
+    chosen = [choice.name for choice in prepared.settings.choices if choice.chosen]
+    how = prepared.settings.preprocessing
+    if prepared.delays is None and how.torque_delay != prepared.settings.stated_delay:
+        yield _condition(
+            "delay",
+            f"the torque lags the position by {1e3 * how.torque_delay:.3g} ms (chosen by inner"
+            " prediction); this was compensated",
+            "state it (`hil identify --delay SECONDS`), or correct it in the recording program",
+        )
+    width = how.torque_bandwidth
+    advice = "record the torque unfiltered, or state its low-pass with --torque-bandwidth"
+    if LOW_PASS in chosen and width is not None:
+        yield _condition(
+            "torque bandwidth",
+            f"the recorded torque is probably filtered by a low-pass of {width:.3g} Hz"
+            f" ({how.torque_shape}); the model is filtered in the same way",
+            advice,
+        )
+        return
+    exact = any(choice.errors[choice.chosen] < _EXACT for choice in prepared.settings.choices)
+    if exact or REVERSAL in chosen:
+        return  # computed for this motion, or it would not be predicted to rounding
+    above = torque_noiseless_above(prepared.sources.training[0].recording)
+    if above is not None and width is None and above < _FAST * how.rigid_bandwidth:
+        yield _condition(
+            "torque bandwidth",
+            f"the recorded torque has no noise above {above:.2g} Hz: it was filtered by a low-pass"
+            " or computed",
+            advice,
+        )
+
+
+def _resolution(prepared: Prepared) -> Iterator[Finding]:
+    """Yield findings if the resolution of the positions is too low.
+
+    For their accelerations: rounding to a step q is white noise of variance q²/12; after smoothing
+    with a bandwidth B it contributes q²/12 (2 / rate) (2 pi)^4 B^5 / 5 to the variance of the
+    acceleration. For friction at rest: it reverses over the presliding displacement, and a larger
+    step of a resting joint makes its direction one of rounding.
+    """
+    names = prepared.sources.cell.joint_names
+    model = prepared.sources.cell.model
+    coarse = dict[str, float]()
+    reversing = dict[str, float]()
+    for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
+        recording = source.recording
+        interval = float(np.median(np.diff(recording.time)))
+        resting = np.any(samples.usable & ~model.moving(samples.motion.velocity), axis=0)
+        for j, name in enumerate(names):
+            step = grid_step(recording.position[:, j])
+            if step is None:
+                continue
+            width = min(samples.position_bandwidth[j], 0.5 / interval)
+            noise = step**2 / 12.0 * 2.0 * interval * (2.0 * np.pi) ** 4 * width**5 / 5.0
+            if np.sqrt(noise) > _MAX_ROUNDING * samples.motion.acceleration[:, j].std():
+                coarse[name] = max(step, coarse.get(name, 0.0))
+            law = model.friction.laws[j]
+            if law.coulomb and resting[j] and 0.0 < (law.presliding or 0.0) < step:
+                reversing[name] = max(step, reversing.get(name, 0.0))
+    if coarse:
+        yield _condition(
+            "resolution",
+            f"the positions have a coarse resolution [rad or m]: {_steps(coarse)}; more than"
+            f" {percentage(_MAX_ROUNDING)} of the accelerations is rounding error",
+            "record positions with more digits, or identify with a lower --bandwidth",
+        )
+    elif reversing:
+        presliding = max(law.presliding or 0.0 for law in model.friction.laws)
+        yield _condition(
+            "resolution",
+            f"the positions have a coarse resolution [rad or m]: {_steps(reversing)}; friction"
+            f" reverses over {presliding:.2g}, so that its direction at rest is that of rounding",
+            "record positions with more digits, or leave slow rows out"
+            " (`hil identify --exclude-rows slow`)",
+        )
+
+
+def _steps(steps: Mapping[str, float]) -> str:
+    return joined([f"{name} {step:.2g}" for name, step in steps.items()])
+
+
+def _sampling_rate(prepared: Prepared, estimate: Estimate) -> Iterator[Finding]:
+    """Yield a finding if most of a large error is noise that sampling folds into the motion's."""
+    how = prepared.settings.preprocessing
+    if how.torque_bandwidth is not None:
+        return
+    few = prepared.training[:_FEW]
+    model = prepared.sources.cell.model
+    noise = folded_noise(model, estimate.values, few, how.rigid_bandwidth)
+    if noise.share > _MOST and noise.error > Thresholds().unexplained:
+        rate = 1.0 / float(np.median(np.diff(few[0].motion.time)))
+        yield _condition(
+            "sampling rate",
+            f"at {rate:.3g} Hz the torque has noise up to half this rate; sampling folds it to"
+            f" below {how.rigid_bandwidth:g} Hz, where it is {percentage(noise.share)} of the"
+            " squared residual",
+            "log at a higher rate, or filter the torque below half the rate before it is sampled",
+        )
+
+
+def grid_step(position: Array) -> float | None:
+    """Return the step of the grid that the positions (m,) of a joint lie on, None without one."""
+    moves = np.abs(np.diff(position))
+    moves = moves[moves > _ROUNDING * np.ptp(position)]
+    if not moves.size:
+        return None
+    step = float(np.quantile(moves, _STEP_QUANTILE))
+    # Of positions without a grid, a tenth is that near to multiples of any step by chance.
+    off = np.abs(moves / step - np.rint(moves / step))
+    return step if np.mean(off < _GRID) > 0.5 else None
+
+
+def torque_limits(cell: Cell) -> Array | None:
+    """Return the maximum torque of each joint (n,) [N·m or N], NaN if unknown; None without any."""
+    if cell.file.drive_train is not None:
+        drives = cell.drive_train
+        gear = np.abs(np.diag(drives.motor_from_joint))
+        return np.asarray(gear * drives.torque_constant * drives.current_limit)
+    effort = urdf_limits(cell.urdf, cell.joint_names).effort
+    limits = np.where(np.isfinite(effort), effort, np.nan)
+    return None if np.isnan(limits).all() else limits
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueScale:
+    """Uncertainty of the scale of torques, common to all recordings of an arm."""
+
+    std: Array  #: relative standard deviation of each joint (n,)
+    of: str  #: what has it: "torque constants", or "the scale of the recorded torques"
+    source: str  #: where it is from
+
+    @property
+    def message(self) -> str:
+        """What is assumed, such as "assuming torque constants to 3 %"."""
+        if not self.std.any():
+            return f"assuming exact torques ({self.source})"
+        return f"assuming {described(self.std, self.of)} (standard deviation; {self.source})"
+
+
+def torque_scale_of(sources: Sources) -> TorqueScale:
+    """Return the uncertainty of the torques of the fitted recordings."""
+    recordings = [source.recording for source in sources.training]
+    return torque_scale(sources.cell, recordings, simulated=sources.header.only_simulated)
+
+
+def torque_scale(cell: Cell, recordings: Sequence[Recording], *, simulated: bool) -> TorqueScale:
+    """Return the uncertainty of the torques of recordings, of the worst where they differ.
+
+    That of the column map comes first, then that of the cell. The torques of a simulated arm
+    (`simulated`: only one can have moved) are exact: its currents are made with the torque
+    constants of the cell. A controller's own currents and imported ones have torque constants of a
+    data sheet unless something else is stated, and joint torque sensors are no better
+    (`identification.estimators.torque_scale.DATA_SHEET`).
+    """
+    n = len(cell.joint_names)
+    drives = cell.file.drive_train
+    with_currents = any(recording.motor_current is not None for recording in recordings)
+    of = "torque constants" if with_currents else "the scale of the recorded torques"
+    mapped = [recording.provenance.get("torque_uncertainty") for recording in recordings]
+    in_cell = cell.file.robot.torque_uncertainty
+    table = "[robot]"
+    if drives is not None and drives.torque_uncertainty is not None:
+        in_cell = drives.torque_uncertainty
+        table = "[drive_train]"
+    if in_cell is not None:
+        base = np.broadcast_to(np.asarray(in_cell, dtype=np.float64), n)
+        source = f"torque_uncertainty of {table} in the cell file"
+    elif simulated:
+        base = np.zeros(n)
+        source = "a simulated arm"
+    else:
+        base = np.full(n, DATA_SHEET)
+        source = "of a data sheet, as no torque_uncertainty is stated"
+    if any(entry is not None for entry in mapped):
+        stds = [base if text is None else numbers(json.loads(text), 1) for text in mapped]
+        return TorqueScale(np.max(stds, axis=0), of, "torque_uncertainty of the column map")
+    return TorqueScale(np.array(base), of, source)

@@ -1,0 +1,133 @@
+"""Torque constants from archives, some of them recorded with a known payload."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.archive import open_archive
+from hil.base.errors import ArchiveError, InputError
+from hil.base.progress import Reporter
+from hil.cell import Cell
+from identification.estimators.gains import MOST_BLOCKS, Gains, identify_gains
+from identification.factor.blocks import FINE_BLOCK
+from identification.factor.columns import gain_factor
+from identification.factor.factor import Factor
+from identification.model.payload import Payload
+from identification.model.robot import RobotModel
+from identification.selection.settings import Settings
+from identification.signals.recording import RecordingError
+
+from .options import FIXED
+from .prepared import motor_from_joint, samples_of, stated_settings
+from .sources import Source, aligned, cell_of, source_of
+
+
+@dataclass(frozen=True, eq=False)
+class GainsFound:
+    """Identified torque constants."""
+
+    gains: Gains
+    loads: dict[str, Payload | None]  #: payload by archive name (by path if names are not unique)
+    motor_side: bool  #: whether gear ratios are known; otherwise gains include them
+
+
+def find_gains(
+    archives: Sequence[Path],
+    loaded: Mapping[Path, Payload],
+    reporter: Reporter,
+    *,
+    delay: float | Literal["stated"] | None = "stated",
+) -> GainsFound:
+    """Identify the torque constant of every motor.
+
+    Archives are `loaded` if they have another payload than that of their cell. Currents lag
+    positions by `delay` [s]; "stated" uses the cell's.
+
+    Raises:
+        InputError: an archive cannot be used, or not with the others; no archive has a payload.
+        IdentificationError: no usable row.
+    """
+    carried: list[Payload | None] = []
+    sources: list[Source] = []
+    cells: list[Cell] = []
+    lags: list[Settings] = []
+    loads: dict[str, Payload | None] = {}
+    first: Cell | None = None
+    names = [path.name for path in (*archives, *loaded)]
+    with reporter.task("reading recordings", len(names)) as task:
+        for path in (*archives, *loaded):
+            archive = open_archive(path)
+            cell = cell_of(archive)
+            source = source_of(archive, cell)
+            current = source.recording.motor_current
+            if current is None:
+                problem = "holds no motor currents"
+                remedy = "import them as motor_current"
+                raise ArchiveError(path, problem, remedy=remedy)
+            source_turns = motor_from_joint(source.recording)
+            if cell.file.drive_train is not None:
+                source_turns = np.asarray(cell.drive_train.motor_from_joint)
+            if first is None:
+                first = cell
+                turns = source_turns
+                model = replace(cell.model, payload=None)
+            # One robot with one drive train; only the payload may differ.
+            same = cell.urdf == first.urdf and np.array_equal(turns, source_turns)
+            if not same or cell.model.parameter_names != model.parameter_names:
+                problem = f"has another robot, friction law or drive train than {first.path}"
+                remedy = "identify the gains of each robot separately"
+                raise ArchiveError(path, problem, remedy=remedy)
+            # A recorded torque may have been computed with other gains.
+            without = replace(source.recording, torque=np.zeros_like(current))
+            load = loaded.get(path, cell.model.payload)
+            loads[path.name if names.count(path.name) == 1 else str(path)] = load
+            carried.append(load)
+            lags.append(stated_settings(cell, replace(FIXED, delay=delay)))
+            sources.append(replace(source, recording=without))
+            cells.append(cell)
+            task.advance(1, path.name)
+    assert first is not None, "the command line asks for an archive"
+    _require_load(loads.values())
+    recorded = list(zip(sources, cells, lags, carried, strict=True))
+    gains = identify_gains(model, _reduced(recorded, model, turns, reporter))
+    return GainsFound(gains, loads, not np.array_equal(turns, np.eye(len(turns))))
+
+
+def _reduced(
+    recorded: Sequence[tuple[Source, Cell, Settings, Payload | None]],
+    model: RobotModel,
+    turns: NDArray[np.float64],
+    reporter: Reporter,
+) -> list[Factor]:
+    """Return the factor of each recording, in equal blocks of time."""
+    # Repetitions of a motion begin together: errors of the model repeat at equal times.
+    together, _ = aligned(tuple(source for source, *_ in recorded))
+    longest = max(source.recording.time[-1] - source.recording.time[0] for source in together)
+    block = max(FINE_BLOCK, float(longest) / MOST_BLOCKS)
+    factors: list[Factor] = []
+    with reporter.task("reducing recordings", len(together)) as task:
+        for source, (_, cell, settings, load) in zip(together, recorded, strict=True):
+            try:
+                samples = samples_of(source, cell, settings, model)
+            except RecordingError as error:
+                raise ArchiveError(source.path, str(error), remedy="leave it out") from error
+            current = source.recording.motor_current
+            assert current is not None, "checked above"
+            factors.append(
+                gain_factor(model, samples, current, payload=load, transmission=turns, block=block)
+            )
+            task.advance(1, source.name)
+    return factors
+
+
+def _require_load(loads: Iterable[Payload | None]) -> None:
+    if not any(load is not None and load.parameters.any() for load in loads):
+        problem = "without a known payload, gains and inertias are only known up to a factor"
+        remedy = "add a recording with a known load: --loaded ARCHIVE --mass KG"
+        raise InputError(None, problem, field="--loaded", remedy=remedy)

@@ -1,0 +1,70 @@
+"""Identification of archives by the folder they stand in: a campaign, or any other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from hil.archive.recorded_campaign import RecordedCampaign
+from hil.base.errors import InputError
+from hil.base.progress import Reporter
+from hil.base.threads import one_thread
+from hil.pipeline.options import Options
+from hil.pipeline.run import Identification, identify_archives
+
+
+@one_thread()
+def identify_paths(
+    paths: Sequence[Path],
+    reporter: Reporter,
+    options: Options = Options(),
+    *,
+    predict: Sequence[Path] = (),
+) -> Identification:
+    """Identify from a campaign folder, a folder of archives, or archives.
+
+    Raises:
+        InputError: the folder contains neither, or is not the only path.
+    """
+    folder = next((path for path in paths if path.is_dir()), None)
+    if folder is None:
+        return identify_archives(paths, reporter, options, predict=predict)
+    if len(paths) > 1:
+        raise InputError(
+            folder, "is a folder among files", remedy="give one campaign folder, or files only"
+        )
+    if RecordedCampaign(folder).sealed:
+        return identify_recorded(folder, reporter, options, predict=predict)
+    archives = sorted(folder.glob("*.mcap"))  # of `hil record`
+    if not archives:
+        remedy = "give a campaign folder (`hil design -o`), or archives (*.mcap)"
+        raise InputError(folder, "contains neither a campaign nor archives", remedy=remedy)
+    return identify_archives(archives, reporter, options, predict=predict)
+
+
+@one_thread()
+def identify_recorded(
+    root: Path, reporter: Reporter, options: Options = Options(), *, predict: Sequence[Path] = ()
+) -> Identification:
+    """Identify from the complete archives of a campaign folder; `predict` adds held-out archives.
+
+    How the campaign was conducted is added by :func:`hil.campaign.identified.with_conduct`.
+
+    Raises:
+        InputError: the folder has no complete excitation.
+    """
+    campaign = RecordedCampaign(root)
+    kinds = ("excitation", "validation")
+    paths = [path for kind in kinds for path in campaign.completed(kind)]
+    if not paths:
+        problem = "its manifest.json has no completed excitation with an intact archive"
+        remedy = "run the campaign, or give the archives instead of the folder"
+        raise InputError(root, problem, remedy=remedy)
+    return identify_archives(
+        [*paths, *campaign.completed("standstill")],
+        reporter,
+        options,
+        predict=predict,
+        name=root.resolve().name,
+        warnings=campaign.damaged(),
+    )

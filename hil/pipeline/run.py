@@ -1,0 +1,95 @@
+"""Identification: archives to samples, estimate, evidence, verdict and results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from hil.base.progress import Reporter
+from hil.base.threads import one_thread
+from hil.cell import Cell
+from hil.results.results import Results
+from hil.results.series import ReportSeries
+from identification.estimators.least_squares import RepeatedEstimate
+from identification.selection.essential import Elimination
+from identification.validation.consistency import ConsistencyCheck
+from identification.validation.verdict import Verdict
+
+from .estimating import Estimation, estimate_with, with_transmitted_load
+from .figure_series import report_series
+from .options import Options
+from .prepared import Prepared, prepare_sources
+from .sources import gather_sources, payload_warnings
+from .summary import summary
+from .validation import Validation, validate
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """An identification with everything it was computed from."""
+
+    paths: tuple[Path, ...]  #: of the archives
+    prepared: Prepared
+    estimation: Estimation
+    validation: Validation
+    results: Results  #: content of `results.json`
+
+    @property
+    def cell(self) -> Cell:
+        """The cell of the archives."""
+        return self.prepared.sources.cell
+
+    @property
+    def estimate(self) -> RepeatedEstimate:
+        """Pooled and per repetition."""
+        return self.estimation.result
+
+    @property
+    def consistency(self) -> ConsistencyCheck | str:
+        """Consistent parameters, or the reason why there are none."""
+        return self.validation.consistency
+
+    @property
+    def essential(self) -> Elimination | str:
+        """Essential parameters, or the reason why there are none."""
+        return self.validation.essential
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the model may be used."""
+        return self.validation.verdict
+
+    @cached_property
+    def series(self) -> ReportSeries:
+        """Data of the report's figures."""
+        return report_series(self.prepared, self.estimate)
+
+
+@one_thread()
+def identify_archives(
+    paths: Sequence[Path],
+    reporter: Reporter,
+    options: Options = Options(),
+    *,
+    predict: Sequence[Path] = (),
+    name: str = "",
+    warnings: Sequence[str] = (),
+) -> Identification:
+    """Identify from archives; their kind decides what is fitted, `predict` is held out.
+
+    Archives are read as recordings (`gather_sources`), which become samples (`prepare_sources`),
+    factors and an estimate (`estimate_with`), evidence and a verdict (`validate`), and results.
+
+    Raises:
+        InputError: the archives cannot be used, not together, or not by the chosen estimator.
+    """
+    sources = gather_sources(paths, options.split, predict, in_sample=options.in_sample)
+    prepared = with_transmitted_load(prepare_sources(sources, options, reporter))
+    estimation = estimate_with(prepared, options, reporter)
+    validation = validate(prepared, estimation, reporter)
+    warnings = (*warnings, *payload_warnings(prepared.sources.cell))
+    prepared = prepared.warned(*warnings, *estimation.warnings, *validation.warnings)
+    results = summary(name or paths[0].stem, prepared, estimation, validation)
+    return Identification((*paths, *predict), prepared, estimation, validation, results)

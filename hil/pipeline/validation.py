@@ -1,0 +1,133 @@
+"""Validation of an estimate: what speaks for it and against it, and the verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from hil.base.progress import Reporter
+from hil.cell.nominal import Nominal, nominal_of
+from identification import Factor, IdentificationError
+from identification.selection.essential import Elimination, choose_essential
+from identification.validation.calibration import Calibration, TorqueMeans, calibrate
+from identification.validation.consistency import ConsistencyCheck, check_consistency
+from identification.validation.evidence import Evidence, gather
+from identification.validation.fault_scores import ScorePrior
+from identification.validation.verdict import Verdict, judge
+
+from .cell_context import cell_context_of
+from .estimating import Estimation
+from .prepared import Prepared
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """Evidence on an estimate, and the verdict."""
+
+    consistency: ConsistencyCheck | str  #: consistent parameters, or the reason why there are none
+    essential: Elimination | str  #: essential parameters, or the reason why there are none
+    #: coverage of the intervals of held-out torque; None if too little or nothing was held out
+    calibration: Calibration | None
+    nominal: Nominal | None  #: nominal model
+    evidence: Evidence
+    verdict: Verdict
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What makes no model bad."""
+        return tuple(_warnings(self.consistency, self.essential))
+
+
+def validate(prepared: Prepared, estimation: Estimation, reporter: Reporter) -> Validation:
+    """Gather the evidence on an estimate, and judge it."""
+    sources = prepared.sources
+    result = estimation.result
+    model = sources.cell.model
+    nominal = nominal_of(sources.cell)
+    posterior = estimation.posterior
+    with reporter.task("validating", 3) as task:
+        unseen = sum(estimation.held_out, Factor.zero(model))
+        consistency = _consistency(estimation, unseen, in_sample=sources.in_sample)
+        task.advance(1, "essential parameters")
+        essential = _essential(prepared, estimation)
+        task.advance(1, "verdict")
+        evidence = gather(
+            model,
+            result,
+            prepared.training,
+            prepared.held_out,
+            same_motion=sources.same_motion,
+            nominal=None if nominal is None else nominal.values,
+            context=cell_context_of(prepared, result.pooled),
+            in_sample=sources.in_sample,
+            names=[source.name for source in sources.training],
+            unseen=unseen,
+            consistency=None if isinstance(consistency, str) else consistency,
+            prior=ScorePrior(posterior.prior.belief.gaussian, posterior.design_effect),
+        )
+        evidence = replace(evidence, form=estimation.form)
+        verdict = judge(model.joint_names, evidence, tested_on=sources.tested_on)
+        task.advance(1)
+    calibration = _calibration(prepared, estimation)
+    return Validation(consistency, essential, calibration, nominal, evidence, verdict)
+
+
+def _warnings(consistency: ConsistencyCheck | str, essential: Elimination | str) -> Iterator[str]:
+    if isinstance(consistency, str):
+        yield f"no physically consistent parameters were found: {consistency}"
+    elif consistency.costly and not consistency.impossible:  # which is a finding
+        yield consistency.sentence
+    if isinstance(essential, str):
+        yield f"no essential parameters: {essential}"
+
+
+def _consistency(
+    estimation: Estimation, unseen: Factor, *, in_sample: bool
+) -> ConsistencyCheck | str:
+    """Compare the posteriors with and without possible bodies, or return why that failed."""
+    posterior = estimation.posterior
+    training = estimation.result.factor
+    try:
+        return check_consistency(
+            posterior.model,
+            training,
+            unseen,
+            posterior.free(training).estimate,
+            weights=posterior.weights(training),
+            prior=posterior.prior,
+            design_effect=posterior.design_effect,
+            in_sample=in_sample,
+        )
+    except IdentificationError as error:
+        return str(error)
+
+
+def _essential(prepared: Prepared, estimation: Estimation) -> Elimination | str:
+    """Choose the essential parameters, or return why there are none."""
+    if prepared.sources.in_sample:
+        return "they are chosen on held-out data, and there is none"
+    model = prepared.sources.cell.model
+    try:
+        return choose_essential(model, estimation.result.factor, estimation.held_out)
+    except IdentificationError as error:
+        return str(error)
+
+
+def _calibration(prepared: Prepared, estimation: Estimation) -> Calibration | None:
+    """Check the intervals of held-out torque."""
+    if prepared.sources.in_sample:
+        return None
+    model = prepared.sources.cell.model
+    result = estimation.result
+    try:
+        calibration = calibrate(
+            result.pooled,
+            result.factor,
+            TorqueMeans.of(model, prepared.training),
+            TorqueMeans.of(model, prepared.held_out),
+            estimation.refit,
+        )
+    except IdentificationError:
+        return None
+    return None if math.isnan(calibration.inside) else calibration

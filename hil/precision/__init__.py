@@ -1,0 +1,1 @@
+"""Precision that is required of a design, and what it promises."""

@@ -1,0 +1,141 @@
+"""What a motion that was not run yet will leave uncertain, by the contributions of an interval.
+
+`hil identify` counts the same (`hil.pipeline.estimating`): the error of the torque, an uncertain
+delay, and elastic gears, each by the function that counts it of recordings. The scale of the
+torques, which only absolute intervals have, is added by :mod:`hil.precision.forecast`. Only
+recordings show that a friction law lacks a term, or that friction drifts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.cell import Cell
+from hil.pipeline.prepared import stated_delay, with_stated_delay
+from identification.distributions import student_limit
+from identification.estimators.covariance import SHORTEST_BLOCK
+from identification.estimators.delay import DelayEstimate, predicted_rate
+from identification.estimators.elasticity import (
+    elastic_torque,
+    expected_compliance,
+    expected_square,
+    open_compliance,
+)
+from identification.factor.blocks import FINE_BLOCK
+from identification.model.motion import Motion
+from identification.signals.samples import Preprocessing, Samples
+
+Array = NDArray[np.float64]
+
+_FEWEST_BLOCKS: Final = 2
+
+
+class Variances(NamedTuple):
+    """Variances of k quantities, by contribution."""
+
+    rows: Array  #: of the torque's error, with prior and earlier recordings (k,)
+    delay: Array  #: of the torque's uncertain delay (k,)
+    gears: Array  #: of elastic gears (k,)
+
+    @property
+    def total(self) -> Array:
+        """Their sum (k,)."""
+        return np.asarray(self.rows + self.delay + self.gears)
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedRows:
+    """Sums over a motion of an arm with parameters (p,): of regressor, rate and elastic torque."""
+
+    cell: Cell
+    grams: Array  #: integrals of the products of the columns of each joint (n, q, q), q = p + 1 + n
+    duration: float  #: of the motion [s]
+    rigid: bool  #: whether the gears are known to be rigid, as those of a simulated arm
+
+    @classmethod
+    def of(cls, cell: Cell, motion: Motion, values: Array, *, rigid: bool) -> Self:
+        """Return the sums over a sampled motion."""
+        model = cell.model
+        n = model.n_joints
+        torque = model.torque(values, motion)
+        samples = Samples(
+            motion=motion,
+            torque=torque,
+            usable=np.asarray(model.moving(motion.velocity)),
+            segments=(slice(0, len(motion.time)),),
+            origin=0.0,
+            position_bandwidth=np.full(n, Preprocessing().rigid_bandwidth),
+        ).with_friction_direction(model)
+        rate = predicted_rate(samples, torque)
+        elastic = np.zeros((*torque.shape, n))
+        if cell.file.drive_train is not None:
+            compliance = expected_compliance(model, samples, values)
+            elastic = elastic_torque(model, samples, values, compliance)
+        p = model.n_parameters
+        step = float(motion.time[1] - motion.time[0])
+        grams = np.zeros((n, p + 1 + n, p + 1 + n))
+        for joint, (block, used) in enumerate(zip(*samples.regressor(model), strict=True)):
+            table = np.zeros((len(torque), p + 1 + n))
+            table[:, used] = block
+            table[:, p] = rate[:, joint]
+            table[:, p + 1 :] = elastic[:, joint]
+            some = table[samples.usable[:, joint]]
+            grams[joint] = step * some.T @ some
+        return cls(cell, grams, step * len(torque), rigid)
+
+    def variances(
+        self, directions: Array, prior: Array, density: Array, motions: float = 1.0
+    ) -> Variances:
+        """Return what so many such motions leave of the variances of functions (k, p).
+
+        Args:
+            directions: linear functions of the parameters (k, p).
+            prior: information of prior and earlier recordings (p, p).
+            density: of the torque error of each joint at low frequencies (n,) [(N m)² s].
+            motions: number of different motions of this kind.
+        """
+        p = directions.shape[1]
+        total = motions * np.tensordot(1.0 / density, self.grams, axes=1)
+        information = prior + total[:p, :p]
+        size = 1.0 / np.sqrt(np.diag(information))
+        inverse = np.linalg.inv(information * size[:, None] * size) * size[:, None] * size
+        rows = np.einsum("kp,pq,kq->k", directions, inverse, directions)
+        moved = inverse @ total[:p, p]
+        left = float(total[p, p] - total[:p, p] @ moved)
+        delay = self._delay_variance(1.0 / np.sqrt(left) if left > 0.0 else np.inf)
+        moved_by_gears, covariance = open_compliance(
+            inverse, total[:p, p + 1 :], total[p + 1 :, p + 1 :]
+        )
+        gears = directions @ moved_by_gears
+        square = expected_square(covariance, rigid=self.rigid)
+        return Variances(
+            rows,
+            delay * (directions @ moved) ** 2,
+            np.einsum("kn,nm,km->k", gears, square, gears),
+        )
+
+    def interval_factor(self, motions: float = 1.0) -> float:
+        """Return the standard deviations in half a 95 % interval, by the blocks of time."""
+        count = motions * self.duration / (SHORTEST_BLOCK * FINE_BLOCK)
+        return float(student_limit(0.025, max(_FEWEST_BLOCKS, count) - 1.0))
+
+    def _delay_variance(self, std: float) -> float:
+        """Return the variance of the delay [s²], estimated with a standard deviation [s]."""
+        stated = stated_delay(self.cell)
+        cycle = self.cell.period if self.cell.file.controller is not None else 0.0
+        estimate = DelayEstimate(
+            delay=stated,
+            std=std,
+            assumed=stated,
+            cycle=cycle,
+            interval_factor=self.interval_factor(),
+            reason=None if np.isfinite(std) else "the motion does not show it",
+            significant=False,
+        )
+        if self.cell.file.controller is None:
+            return estimate.variance
+        return with_stated_delay(estimate, stated).variance

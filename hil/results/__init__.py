@@ -1,0 +1,1 @@
+"""What the files of results contain: identification, rollout, and series of the figures."""

@@ -1,0 +1,1 @@
+"""Held-out motions simulated forward, by torque or on an identified servo."""

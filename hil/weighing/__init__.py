@@ -1,0 +1,1 @@
+"""A payload weighed by a campaign: its motion without and with it."""

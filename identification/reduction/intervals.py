@@ -1,0 +1,110 @@
+"""Intervals of an estimate: with the errors that the scatter of its residuals does not show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from identification.arrays import Array
+from identification.estimators.delay import with_uncertain_delay
+from identification.estimators.elasticity import with_elastic_gears
+from identification.estimators.friction_drift import drift_of_factors
+from identification.estimators.friction_form import (
+    FormUncertainty,
+    form_uncertainty,
+    with_drift,
+    with_uncertain_form,
+)
+from identification.estimators.torque_scale import with_torque_scale
+from identification.factor.estimate import Estimate, inverse_variance
+from identification.factor.factor import Factor
+from identification.factor.normal_equations import solve
+from identification.model.robot import RobotModel
+from identification.reduction.posterior import Posterior
+from identification.reduction.reduction import Reduction
+
+
+class Widened(NamedTuple):
+    """An estimate whose intervals allow for what its model lacks."""
+
+    estimate: Estimate
+    form: FormUncertainty | None  #: of the friction law; None if it was not examined
+
+
+def delayed(
+    estimate: Estimate, total: Reduction, variance: float, precision: Array | None
+) -> Estimate:
+    """Return the estimate with the error of the delay in its intervals.
+
+    Args:
+        estimate: of p parameters.
+        total: sums of the fitted rows.
+        variance: mean square error of the delay [s²].
+        precision: information (p, p) of a prior in addition to the rows.
+    """
+    if not variance or total.rates is None:
+        return estimate
+    return with_uncertain_delay(estimate, total.factor, total.rates, variance, precision)
+
+
+def widened(
+    estimate: Estimate,
+    total: Reduction,
+    posterior: Posterior,
+    precision: Array | None,
+    torque_scale: Array,
+    recordings: Sequence[Factor],
+) -> Widened:
+    """Return the estimate with elastic gears and an uncertain friction law in its intervals.
+
+    Its change by the scale of the torques is added to it, not to the intervals.
+
+    Args:
+        estimate: of p parameters and n joints.
+        total: sums of the fitted rows.
+        posterior: of the arm.
+        precision: information (p, p) of the prior, if the estimate has one.
+        torque_scale: relative standard deviation of each joint's torque (n,).
+        recordings: factors of the recordings in order, whose friction may drift.
+    """
+    model = posterior.model
+    factor = total.factor
+    # The scores of a stronger prior, or of possible bodies, are not zero.
+    believed = None if precision is None else posterior.believed(factor)
+    result = _with_scale(estimate, factor, precision, torque_scale)
+    form = None
+    if total.unmodelled is not None:
+        effect = posterior.design_effect
+        if total.unmodelled.elastic is not None:
+            torque = total.unmodelled.elastic
+            result = with_elastic_gears(
+                result, factor, torque, effect, precision, believed, total.times
+            )
+        own = estimate if believed is None else replace(estimate, values=believed)
+        form = form_uncertainty(model, own, factor, total.unmodelled.forms, precision)
+        result = with_uncertain_form(result, form)
+    return Widened(_with_drift(model, result, recordings), form)
+
+
+def _with_scale(
+    estimate: Estimate, factor: Factor, precision: Array | None, std: Array
+) -> Estimate:
+    if not std.any():
+        return estimate
+    weights = inverse_variance(estimate.noise_std**2)
+    equations = factor.weighted(weights)
+    if precision is not None:
+        equations = equations._replace(A=equations.A + precision)
+    return with_torque_scale(estimate, factor, weights, solve(equations).inverse, std)
+
+
+def _with_drift(model: RobotModel, estimate: Estimate, recordings: Sequence[Factor]) -> Estimate:
+    """Return the estimate with the significant drift of friction in its intervals."""
+    drift = drift_of_factors(model, estimate.values, recordings)
+    if drift is None:
+        return estimate
+    change = np.where(drift.significant, np.nan_to_num(drift.change), 0.0)
+    return with_drift(model, estimate, change)

@@ -1,0 +1,46 @@
+"""What a room of `hil` loads: who reads a file waits for no estimator and no search.
+
+The floors themselves are a contract of import-linter in `pyproject.toml`.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import hil
+
+ROOT = Path(hil.__file__).parent
+ESTIMATION = ("estimators", "excitation", "export", "factor", "rollout", "selection", "validation")
+"""Packages of `identification` above its model and its signals."""
+PIPELINE = ("control", "design", "look", "pipeline", "report", "results")
+IMPORTERS = sorted(path.stem for path in (ROOT / "importers").glob("[a-z]*.py"))
+
+
+def loaded_by(*modules: str) -> set[str]:
+    """Return the modules that a new process has loaded after some imports."""
+    code = f"import sys, {', '.join(modules)}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+@pytest.mark.parametrize(
+    "modules",
+    [
+        pytest.param(["hil.cell"], id="the cell file"),
+        pytest.param(["hil.importers.table"], id="a text table"),
+        pytest.param([f"hil.importers.{name}" for name in IMPORTERS], id="any log or bag"),
+    ],
+)
+def test_reading_a_file_loads_neither_estimators_nor_searches(modules: list[str]) -> None:
+    above = {f"identification.{name}" for name in ESTIMATION} | {f"hil.{name}" for name in PIPELINE}
+    loaded = loaded_by(*modules)
+    assert loaded >= {*modules}
+    assert not above & loaded
+
+
+def test_identification_knows_nothing_of_hil() -> None:
+    assert not {name for name in loaded_by("identification.api") if name.startswith("hil")}
