@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from hil.cli import app
-from hil.importers import Robot
 from hil.importers import messages as import_messages
 from hil.importers.conclusions import Certainty
 from hil.importers.recording import ImportOptions
+from hil.importers.robot import Robot
 from hil.look import Look, Row, look_at
 from hil.look import messages as look_messages
 from hil.look.readings import Channels, NextBest
