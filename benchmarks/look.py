@@ -24,9 +24,11 @@ from benchmarks import parser_of, show
 from benchmarks.arms import urdf as arm_urdf
 from hil.archive import open_archive
 from hil.base.errors import HilError
+from hil.importers.conclusions import Certainty
 from hil.importers.recording import ImportOptions, RobotOf, import_recording
 from hil.importers.robot import Robot
 from hil.look import Look, look_at
+from hil.look.messages import choice_text, row_text
 from hil.pipeline.sources import cell_of, source_of
 from identification.estimators.prior import body_prior, fit_posterior
 from identification.factor.factor import Factor
@@ -246,10 +248,12 @@ def _says(text: str, phrase: str) -> bool:
 def _said(look: Look, aspect: str) -> list[str]:
     """Return what a look says of an aspect, all readings of a doubt included."""
     rows = [
-        f"{row.reading} ({row.certainty})" for row in look.rows if row.aspect in aspect.split(", ")
+        f"{row_text(row).reading} ({row.certainty})"
+        for row in look.rows
+        if row.aspect in aspect.split(", ")
     ]
     return rows + [
-        choice.reading
+        choice_text(choice)
         for choices in look.questions
         for choice in choices
         if choice.aspect == aspect
@@ -260,12 +264,12 @@ def _wrong(look: Look, planted: Planted) -> str:
     """Return the aspects of which a sure row says something else than what is there."""
     wrong = []
     for row in look.rows:
-        if row.certainty != "sure" or row.aspect not in _EXPECTED:
+        if row.certainty is not Certainty.CERTAIN or row.aspect not in _EXPECTED:
             continue
         right = [_EXPECTED[row.aspect]]
         if row.aspect in planted.aspect and planted.meaning != "as it is":
             right = [*planted.words, *(right if row.aspect == "angle unit" else ())]
-        if not any(_says(row.reading, word) for word in right):
+        if not any(_says(row_text(row).reading, word) for word in right):
             wrong.append(row.aspect)
     return ", ".join(wrong)
 

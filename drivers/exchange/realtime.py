@@ -9,7 +9,7 @@ import resource
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 CPU_LATENCY: Final = Path("/dev/cpu_dma_latency")
 """Open with value 0 it excludes the slow idle states of the processors."""
@@ -41,13 +41,15 @@ class RealTimeSettings:
 class RealTimeReport:
     """Granted settings; `scheduling` is "SCHED_FIFO" with its priority, or "ordinary".
 
-    `refused` has one sentence per refusal, with its remedy.
+    `refused` has one sentence per refusal, with its remedy; `memory_in_use_locked` says that only
+    memory in use at the start is locked, as the limit is finite.
     """
 
     scheduling: str
     memory_locked: bool
     cpu_awake: bool
     refused: tuple[str, ...] = ()
+    memory_in_use_locked: bool = False
 
 
 def enter(settings: RealTimeSettings) -> RealTimeReport:
@@ -59,11 +61,14 @@ def enter(settings: RealTimeSettings) -> RealTimeReport:
     gc.collect()
     gc.freeze()
     gc.disable()
-    locked = settings.lock_memory and _lock_memory(refused)
+    locked = _lock_memory(refused) if settings.lock_memory else "nothing"
     awake = settings.hold_cpu_awake and _hold_cpu_awake(refused)
     if settings.cpu is not None:
         _pin(settings.cpu, refused)
-    return RealTimeReport(_schedule(settings.priority, refused), locked, awake, tuple(refused))
+    scheduling = _schedule(settings.priority, refused)
+    return RealTimeReport(
+        scheduling, locked == "all", awake, tuple(refused), memory_in_use_locked=locked == "in use"
+    )
 
 
 def _schedule(priority: int, refused: list[str]) -> str:
@@ -83,7 +88,8 @@ def _schedule(priority: int, refused: list[str]) -> str:
     return "ordinary"
 
 
-def _lock_memory(refused: list[str]) -> bool:
+def _lock_memory(refused: list[str]) -> Literal["all", "in use", "nothing"]:
+    """Lock the memory of this process, and return which of it."""
     remedy = (
         f"permit it with the line '@realtime - memlock unlimited' in {LIMITS_FILE}, join that "
         "group and log in again"
@@ -101,13 +107,13 @@ def _lock_memory(refused: list[str]) -> bool:
     flags = _MCL_CURRENT if finite else _MCL_CURRENT | _MCL_FUTURE
     if libc.mlockall(flags) != 0:
         refused.append(f"locking memory was refused ({os.strerror(ctypes.get_errno())}); {remedy}")
-        return False
+        return "nothing"
     if finite:
         refused.append(f"only memory in use now is locked (the limit is {hard} bytes); {remedy}")
-        return False
+        return "in use"
     reserve = bytearray(_HEAP)
     del reserve
-    return True
+    return "all"
 
 
 def _hold_cpu_awake(refused: list[str]) -> bool:

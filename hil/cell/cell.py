@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from drivers.drive_train import DriveTrain
 from drivers.errors import DriverError
 from drivers.guard import GuardLimits
-from drivers.transports.base import TransportSpec
+from drivers.transports.base import TransportError, TransportSpec
 from hil.base.safe_input import parse_toml, read_text, remedy_for_missing
 from hil.base.terminal_text import typed
 from identification.model.robot import RobotModel
@@ -253,10 +253,10 @@ class Cell:
             raise self.error("controller.transport", table.transport, problem, remedy)
         try:
             spec.check(table.mode)
-        except (DriverError, ValueError) as error:
-            problem, _, remedy = str(error).rpartition("; ")
+        except TransportError as error:
             field = f"controller.{table.transport}"
-            raise self.error(field, None, problem or remedy, remedy) from error
+            problem = f"{error.link}: {error.reason}"
+            raise self.error(field, None, problem, error.remedy) from error
         return spec
 
     @property

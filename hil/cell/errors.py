@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple, get_args
 from pydantic import BaseModel, ValidationError
 
 from hil.base.errors import InputError
+from hil.cell.field_error import FieldError
 
 
 class CellError(InputError):
@@ -44,7 +45,12 @@ def first_error(
     if kind == "extra_forbidden":
         remedy = f"valid fields: {', '.join(place.siblings)}"
         return CellError(path, place.name, value, "is not a field", remedy)
-    problem, _, remedy = detail["msg"].removeprefix("Value error, ").partition("; ")
+    cause = detail.get("ctx", {}).get("error")
+    problem = str(cause or detail["msg"])
+    remedy = ""
+    if isinstance(cause, FieldError):
+        problem = cause.problem
+        remedy = cause.remedy
     problem = problem[0].lower() + problem[1:]
     remedy = remedy or (f"it must be {place.description}" if place.description else "")
     remedy = remedy or f"see {documentation}"

@@ -23,6 +23,7 @@ from pydantic import (
 from drivers.transports.base import TransportSpec
 from drivers.transports.udp import UdpSpec
 from hil.base.safe_input import parse_port
+from hil.cell.field_error import FieldError
 
 # Strict: TOML has types, so "yes" and "3" are errors.
 Number = Annotated[FiniteFloat, Field(strict=True)]
@@ -38,10 +39,8 @@ Point = tuple[Number, Number, Number]
 def _turning(ratios: list[float]) -> list[float]:
     for joint, ratio in enumerate(ratios, 1):
         if ratio == 0:
-            raise ValueError(
-                f"gear_ratio of joint {joint} is 0; "
-                "give signed motor revolutions per joint revolution"
-            )
+            problem = f"gear_ratio of joint {joint} is 0"
+            raise FieldError(problem, "give signed motor revolutions per joint revolution")
     return ratios
 
 
@@ -325,10 +324,8 @@ class LimitsTable(Table):
     def _ordered(self) -> LimitsTable:
         for joint, (low, high) in enumerate(zip(self.lower_deg, self.upper_deg, strict=False), 1):
             if low >= high:
-                raise ValueError(
-                    f"joint {joint}: lower_deg {low:g} is not below upper_deg {high:g}; "
-                    "correct one of them"
-                )
+                problem = f"joint {joint}: lower_deg {low:g} is not below upper_deg {high:g}"
+                raise FieldError(problem, "correct one of them")
         return self
 
 
@@ -392,7 +389,7 @@ class CanTable(Table):
     def _has_fd(cls, profile: object) -> object:
         if profile == "classic":
             remedy = 'write profile = "fd" if the adapter has CAN FD, else transport = "udp"'
-            raise ValueError(f"{_NO_CLASSIC}; {remedy}")
+            raise FieldError(_NO_CLASSIC, remedy)
         return profile
 
 
@@ -422,9 +419,8 @@ class ControllerTable(Table):
     @model_validator(mode="after")
     def _adapter_named(self) -> ControllerTable:
         if self.transport == "can" and self.can is None:
-            raise ValueError(
-                'transport = "can" needs a table [controller.can]; add it, or write "udp"'
-            )
+            problem = 'transport = "can" needs a table [controller.can]'
+            raise FieldError(problem, 'add it, or write "udp"')
         return self
 
 
@@ -435,7 +431,7 @@ class LinkType:
     Attributes:
         spec: settings of the link from `[controller]` and the number of axes.
         parse: fields of `[controller]` from an address of `hil simulate`; None if it is none, and
-            ValueError with problem and remedy for one that is not supported any more.
+            FieldError for one that is not supported any more.
         form: what such an address is, and how it is written with an example.
         controller: module whose `open_controller_link(spec, mode)` opens the controller's end; a
             name, because `sim_fixtures` is slow to load.
@@ -471,7 +467,7 @@ def _can_address(text: str) -> dict[str, Any] | None:
     channel, _, profile = address.rpartition(":") if ":" in address else (address, "", "fd")
     if profile == "classic":
         remedy = "leave :classic out if the adapter has CAN FD, else use --udp"
-        raise ValueError(f"{_NO_CLASSIC}; {remedy}")
+        raise FieldError(_NO_CLASSIC, remedy)
     if not (interface and channel) or profile != "fd":
         return None
     return {"can": {"interface": interface, "channel": channel}}

@@ -10,7 +10,6 @@ from typing import Annotated
 
 import typer
 
-from hil.archive import open_archive
 from hil.base.errors import InputError
 from hil.base.files import write_output
 from hil.base.progress import say
@@ -32,7 +31,8 @@ from hil.importers.bag_map import BagMap
 from hil.importers.channels import CHANNEL_NAMES
 from hil.importers.column_map import ready_map, ready_maps
 from hil.importers.dh import convention_of
-from hil.importers.recording import ImportOptions, import_bag, import_recording
+from hil.importers.messages import sentence
+from hil.importers.recording import ImportedRecording, ImportOptions, import_bag, import_recording
 from hil.importers.robot import STANDARD_GRAVITY, Robot, Use
 from hil.importers.rosbag2 import Clock, Effort
 from hil.pipeline.options import friction_from
@@ -324,7 +324,7 @@ def rosbag2(
         use=kind,
         force=force,
     )
-    _print(recording.archive, recording.lines, json=json)
+    _print(recording, json=json)
 
 
 @with_options(Described, "arm")
@@ -372,7 +372,7 @@ def log(
     proposed = reading.columns is None and recording.text is not None
     if proposed:
         write_output(recording.archive.with_suffix(".map.toml"), recording.text or "")
-    _print(recording.archive, recording.lines, json=json)
+    _print(recording, json=json)
     if proposed and not json:
         say(f"wrote {recording.archive.with_suffix('.map.toml')}")
 
@@ -402,18 +402,18 @@ def maps(
             say(f"{map_name:<18} {purpose}")
 
 
-def _print(path: Path, concluded: Sequence[str] = (), *, json: bool) -> None:
-    """Print what was concluded of the channels, and the findings in the new archive."""
-    findings = open_archive(path).header.findings
-    lines = [*concluded, *findings.lines]
+def _print(recording: ImportedRecording, *, json: bool) -> None:
+    """Print what was concluded of the channels, and what was found in the samples."""
+    found = [*map(sentence, recording.concluded), *map(sentence, recording.examined.found)]
+    warnings = [*map(sentence, recording.examined.warnings)]
     if json:
-        print_json({"archive": str(path), "found": lines, "warnings": findings.warnings})
+        print_json({"archive": str(recording.archive), "found": found, "warnings": warnings})
         return
-    for line in lines:
+    for line in found:
         say(line)
-    for warning in findings.warnings:
+    for warning in warnings:
         typer.secho(printable(f"warning: {warning}"), fg=typer.colors.YELLOW)
-    say(f"wrote {path}")
+    say(f"wrote {recording.archive}")
 
 
 def _names(renamed: list[str]) -> dict[str, str]:

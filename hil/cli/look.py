@@ -14,8 +14,17 @@ from hil.base.progress import say
 from hil.base.terminal_text import printable
 from hil.cli.arguments import JsonOption, print_json, with_options
 from hil.cli.imports import Described, Reading
-from hil.look import Choice, Group, Look, Row, fit_alike, look_at
+from hil.importers.conclusions import Certainty
+from hil.look import Choice, Group, Look, Row, look_at
 from hil.look.maps import with_entries
+from hil.look.messages import (
+    as_json,
+    choice_text,
+    fit_alike,
+    gravity_option,
+    row_text,
+    setting_text,
+)
 from identification.text import percentage
 
 IN_DOUBT = 2
@@ -47,7 +56,7 @@ def look(
     result = look_at(recording, arm.robot if arm.is_given else None, reading.options)
     asks = sys.stdin.isatty() and sys.stdout.isatty() and not json
     if json:
-        print_json(result.as_json())
+        print_json(as_json(result))
     else:
         _print(result)
     text = result.map_text
@@ -57,7 +66,7 @@ def look(
         if chosen is None:
             is_open = True
         elif text is not None and chosen.entries:
-            text = with_entries(text, dict(chosen.entries))
+            text = with_entries(text, chosen.entries)
     if output is not None and text is None:
         say(f"note: {output} is not written: a bag has no columns to map", err=True)
     if output is not None and text is not None:
@@ -80,10 +89,11 @@ def _print(result: Look) -> None:
         typer.echo(f"\n{choices[0].aspect}: {doubt}; choose one line for the map:")
         for number, choice in enumerate(choices, 1):
             error = "" if choice.error is None else f" (error {percentage(choice.error, 2)})"
-            typer.echo(printable(f"  {number}  {choice.line or choice.reading}"))
-            typer.echo(printable(f"     {choice.reading}{error}"))
-    for option in result.options:
-        say(f"for `hil identify`: {option}")
+            reading = choice_text(choice)
+            typer.echo(printable(f"  {number}  {setting_text(choice.setting) or reading}"))
+            typer.echo(printable(f"     {reading}{error}"))
+    if result.gravity is not None:
+        say(f"for `hil identify`: {gravity_option(result.gravity)}")
 
 
 def _ask(choices: Sequence[Choice]) -> Choice | None:
@@ -98,10 +108,11 @@ def table(rows: Sequence[Row]) -> list[str]:
     width = max((len(row.aspect) for row in rows), default=0)
     lines = []
     for row in rows:
-        lines.append(f"{row.aspect.ljust(width)}  {row.certainty.ljust(6)}  {row.reading}")
-        lines.append(f"{' ' * width}          {row.reason}")
-        if row.decide and row.certainty != "sure":
-            lines.append(f"{' ' * width}          to decide: {row.decide}")
+        text = row_text(row)
+        lines.append(f"{row.aspect.ljust(width)}  {row.certainty.ljust(6)}  {text.reading}")
+        lines.append(f"{' ' * width}          {text.reason}")
+        if text.decide and row.certainty is not Certainty.CERTAIN:
+            lines.append(f"{' ' * width}          to decide: {text.decide}")
     return lines
 
 

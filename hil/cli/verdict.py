@@ -98,11 +98,10 @@ def sentences(results: Results, *, quiet: bool = False) -> list[str]:
     judgement = results.judgement
     if quiet:
         return [f"note: {warning}" for warning in results.verdict.warnings]
-    findings = {finding.words for finding in judgement.findings}
     lines = [
         f"{_LEVELS[finding.level]}: {finding.words}" for finding in reversed(judgement.worst_first)
     ]
-    lines += [f"note: {warning}" for warning in results.verdict.warnings if warning not in findings]
+    lines += [f"note: {remark}" for remark in results.remarks]
     return lines + [f"next: {step}" for step in judgement.next_steps]
 
 

@@ -47,6 +47,7 @@ class Connection:
         differences: figures in which it differs from the cell.
         lost: the last loss of the link since an archive was opened.
         not_understood: number and cause of packets without a reply; "" for none.
+        no_reply: the cause alone.
         refused: the last refusal since a motion was requested.
         started: whether the motion has sent anything, or may have.
         ended: the end of the motion, if its event came.
@@ -60,6 +61,7 @@ class Connection:
     differences: tuple[str, ...] = ()
     lost: LinkLost | None = None
     not_understood: str = ""
+    no_reply: str = ""
     refused: Refused | None = None
     started: bool = False
     ended: MotionEnded | None = None
@@ -87,6 +89,7 @@ class Connection:
             case PacketRejected() if event.reason:
                 self._rejected += event.count
                 packets = plural(self._rejected, "packet")
+                self.no_reply = event.reason
                 self.not_understood = f"{packets} came and got no reply: {event.reason}"
 
     def reset_motion(self) -> None:

@@ -7,7 +7,6 @@ that of `hil.control.live_link` in real time.
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -52,7 +51,6 @@ WAIT_REPORTED: Final = 2.0  # s after which a controller that is not ready is re
 READY: Final = frozenset((State.CLOSED, State.OPENING, State.OPEN))
 """States with the drive on. A controller may open its axes at once: they are held where they are
 until a motion is requested."""
-_COUNT: Final = re.compile(r"\d+ packets?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +94,7 @@ class MotionLink:
         self.cycles = 0
         self.connection = Connection(cell=cell)
         self._inits = 0  # until the controller was connected
-        self._reported = ""
+        self._reported: tuple[State, str] | None = None
         self._ended_before = 0
         self._position: Array | None = None
 
@@ -160,9 +158,8 @@ class MotionLink:
 
     def _report_waiting(self, state: State, timeout: float) -> None:
         """Report once why no motion can begin yet, and what the operator does about it."""
-        reason = self._waiting() if state is State.SYNC else ""
-        text = waiting_text(state, reason)
-        reported = _COUNT.sub("", text)  # a count that grows is no other reason
+        text = waiting_text(state, self._waiting() if state is State.SYNC else "")
+        reported = state, self.connection.no_reply  # packets that are more are no other reason
         if text and reported != self._reported:
             self._reported = reported
             self.connection.report(f"waiting up to {timeout:g} s for the controller: {text}")

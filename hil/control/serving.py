@@ -17,6 +17,7 @@ from typing import Final
 from drivers.errors import DriverError
 from drivers.transports.base import TransportError
 from hil.base.errors import ControllerError, InputError
+from hil.cell.field_error import FieldError
 from hil.cell.schema import LINKS, ControllerTable
 from sim_fixtures import ControllerSettings, Phase, SimulatedController, serve
 from sim_fixtures.settings import PlantDiverged
@@ -48,9 +49,9 @@ def open_controller_link(
         raise InputError(None, f"{option} {text!r} names no transport", remedy=remedy)
     try:
         fields = kind.parse(address)
-    except ValueError as error:
-        problem, _, remedy = str(error).partition("; ")
-        raise InputError(None, f"{option} {text!r}: {problem}", remedy=remedy) from error
+    except FieldError as error:
+        problem = f"{option} {text!r}: {error.problem}"
+        raise InputError(None, problem, remedy=error.remedy) from error
     if fields is None:
         noun, form = kind.form
         raise InputError(None, f"{option} {text!r} is not {noun}", remedy=f"write {form}")

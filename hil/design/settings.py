@@ -16,6 +16,7 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 from hil.base.errors import InputError
 from hil.base.safe_input import parse_toml, read_text
 from hil.cell.errors import first_error
+from hil.cell.field_error import FieldError
 from hil.cell.schema import Choice, NonNegative, Number, Positive, Table, Whole, field
 from identification.excitation import METHODS, Method
 
@@ -75,10 +76,8 @@ class SearchTable(Table):
     @model_validator(mode="after")
     def _weights_share(self) -> SearchTable:
         if abs(sum(self.weights) - 1.0) > 1e-9:
-            raise ValueError(
-                f"weights {list(self.weights)} add up to {sum(self.weights):g}; they must add up "
-                "to 1, e.g. [0.7, 0.3]"
-            )
+            problem = f"weights {list(self.weights)} add up to {sum(self.weights):g}"
+            raise FieldError(problem, "they must add up to 1, e.g. [0.7, 0.3]")
         return self
 
 
@@ -119,15 +118,11 @@ class SineTable(Table):
     @model_validator(mode="after")
     def _ramps_fit(self) -> SineTable:
         if 0.0 < self.ramp < SHORTEST_RAMP:
-            raise ValueError(
-                f"a ramp of {self.ramp:g} s is too short; make it {SHORTEST_RAMP:g} s or longer, "
-                "or 0 for none"
-            )
+            problem = f"a ramp of {self.ramp:g} s is too short"
+            raise FieldError(problem, f"make it {SHORTEST_RAMP:g} s or longer, or 0 for none")
         if 2.0 * self.ramp > self.length:
-            raise ValueError(
-                f"two ramps of {self.ramp:g} s are longer than the motion, {self.length:g} s; make "
-                "the ramp shorter, or the motion longer"
-            )
+            problem = f"two ramps of {self.ramp:g} s are longer than the motion, {self.length:g} s"
+            raise FieldError(problem, "make the ramp shorter, or the motion longer")
         return self
 
 
@@ -149,10 +144,9 @@ class ConstraintTable(Table):
     @model_validator(mode="after")
     def _durations_ordered(self) -> ConstraintTable:
         if self.min_duration > self.max_duration:
-            raise ValueError(
-                f"min_duration = {self.min_duration:g} s is longer than max_duration = "
-                f"{self.max_duration:g} s; make it shorter"
-            )
+            longest = f"max_duration = {self.max_duration:g} s"
+            problem = f"min_duration = {self.min_duration:g} s is longer than {longest}"
+            raise FieldError(problem, "make it shorter")
         return self
 
 
@@ -194,24 +188,27 @@ class DesignSettings(Table):
     def _one_motion(self) -> DesignSettings:
         if (self.via_points is None) == (self.sines is None):
             given = "neither" if self.via_points is None else "both"
-            raise ValueError(f"has {given} of [via_points] and [sines]; give one of the two")
+            problem = f"has {given} of [via_points] and [sines]"
+            raise FieldError(problem, "give one of the two")
         if self.sines is not None and self.search.gradient > 0:
-            raise ValueError(
-                f"[search] gradient = {self.search.gradient} improves [via_points], not [sines]; "
-                "make it 0"
-            )
+            gradient = self.search.gradient
+            problem = f"[search] gradient = {gradient} improves [via_points], not [sines]"
+            raise FieldError(problem, "make it 0")
         if self.objective.precision and self.search.gradient == 0:
-            raise ValueError(
+            problem = (
                 "[objective] precision is reached by steps along the gradient, and [search] "
-                "gradient is 0; choose the method gradient, or make it 100 with [via_points]"
+                "gradient is 0"
             )
+            remedy = "choose the method gradient, or make it 100 with [via_points]"
+            raise FieldError(problem, remedy)
         asked = self.constraints
         length = None if self.sines is None else self.sines.length
         if length is not None and not asked.min_duration <= length <= asked.max_duration:
-            raise ValueError(
+            problem = (
                 f"[sines] length = {length:g} s is not between [constraints] min_duration = "
-                f"{asked.min_duration:g} s and max_duration = {asked.max_duration:g} s; change one"
+                f"{asked.min_duration:g} s and max_duration = {asked.max_duration:g} s"
             )
+            raise FieldError(problem, "change one")
         return self
 
     def replaced(self, **changes: Any) -> DesignSettings:

@@ -123,7 +123,7 @@ def memory_lock(given: RealTimeReport, limit: int) -> DoctorCheck:
     remedy = _limit_lines("memlock", "unlimited")
     if given.memory_locked:
         return DoctorCheck(name, Status.OK, f"given ({limited})")
-    if any(sentence.startswith("only memory") for sentence in given.refused):
+    if given.memory_in_use_locked:
         return DoctorCheck(
             name, Status.WARN, f"only what is in use at the start; {limited}", remedy
         )

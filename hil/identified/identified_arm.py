@@ -26,6 +26,7 @@ from hil.base.threads import one_thread
 from hil.export.model_files import pinocchio_of
 from hil.identified.annotate import annotate as write_annotated
 from hil.identified.staging import Staging, staged
+from hil.importers.messages import sentence
 from hil.importers.recording import ImportOptions, RobotOf, is_archive
 from hil.importers.robot import Robot
 from hil.pipeline.identify_folder import identify_paths
@@ -322,9 +323,9 @@ def _require_archives(paths: Sequence[Path]) -> None:
 
 def _channels(staging: Staging) -> tuple[str, ...]:
     return tuple(
-        f"{staging.sources[archive].name}: {line}"
+        f"{staging.sources[archive].name}: {sentence(conclusion)}"
         for archive, recording in staging.recordings.items()
-        for line in recording.lines
+        for conclusion in recording.concluded
     )
 
 

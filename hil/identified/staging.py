@@ -13,10 +13,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
-from hil.archive import open_archive
 from hil.base.errors import InputError
 from hil.base.files import convert_write_errors, replace_file, write_output
 from hil.base.progress import Reporter
+from hil.importers.messages import sentence
 from hil.importers.recording import (
     ImportedRecording,
     ImportOptions,
@@ -134,10 +134,7 @@ def _free(folder: Path, recording: Path) -> Path:
 
 def _report(recording: ImportedRecording, source: Path, reporter: Reporter) -> None:
     """Report what was concluded, then what the import found."""
-    findings = open_archive(recording.archive, fields=()).header.findings
-    for line in recording.lines:
-        reporter.say(f"{source.name}: {line}")
-    for line in findings.lines:
-        reporter.say(f"{source.name}: {line}")
-    for warning in findings.warnings:
-        reporter.say(f"{source.name}: warning: {warning}")
+    for conclusion in (*recording.concluded, *recording.examined.found):
+        reporter.say(f"{source.name}: {sentence(conclusion)}")
+    for warning in recording.examined.warnings:
+        reporter.say(f"{source.name}: warning: {sentence(warning)}")

@@ -18,6 +18,7 @@ from hil.base.errors import SourceError
 from hil.base.safe_input import open_file
 from hil.importers import mcap_messages
 from hil.importers.column_map import Column
+from hil.importers.conclusions import LeftOut
 from hil.importers.document_messages import ENCODINGS, columns_of_trees, trees
 from hil.importers.matlab import NUMBERS, lost_bytes, mat_array, mat_shapes, script_matrices
 from hil.importers.ros_messages import MessageError, columns_of, decoded, typestore_of
@@ -61,7 +62,7 @@ class ArrayFile:
         self.names = tuple(self._stored)
         self._loaded: dict[str, NDArray[Any]] = {}
 
-    notes: tuple[str, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
 
     def has(self, name: str) -> bool:
         """Return whether an array has this name."""

@@ -17,6 +17,7 @@ from hil.base.errors import SourceError
 from hil.base.safe_input import parse_toml, path_exists, read_text, remedy_for_missing
 from hil.cell.arms import Links
 from hil.cell.errors import first_error
+from hil.cell.field_error import FieldError
 from hil.importers.units import PER_CENT, UNITS, names_of_units
 
 KINEMATIC: Final = ("position", "velocity", "commanded_position")
@@ -194,7 +195,8 @@ class ColumnMap(_Table):
         for name, quantity in self.quantities().items():
             if quantity.unit not in (None, *UNITS[name]):
                 units = names_of_units(name)
-                raise ValueError(f"{quantity.unit!r} is not a unit of {name}; use {units}")
+                problem = f"{quantity.unit!r} is not a unit of {name}"
+                raise FieldError(problem, f"use {units}")
             if quantity.unit == PER_CENT and quantity.rated is None:
                 raise ValueError(f"{name} is in per cent: give {name}.rated, the value of 100 %")
             if quantity.side == "motor" and name != "motor_current" and not self.drive.geared:
@@ -202,18 +204,18 @@ class ColumnMap(_Table):
             if quantity.files is not None and (quantity.file or quantity.joints_along):
                 raise ValueError(f"{name} has files, so it has neither file nor joints_along")
             if isinstance(quantity.files, str) and "{}" not in quantity.files:
-                raise ValueError(
-                    f"{name}.files has no {{}} for the joint's number; "
-                    'write it there, as in "q_{}.txt"'
-                )
+                problem = f"{name}.files has no {{}} for the joint's number"
+                raise FieldError(problem, 'write it there, as in "q_{}.txt"')
             if quantity.coupled and name not in KINEMATIC:
-                raise ValueError(f"{name} has no coupled angles; give {KINEMATIC[0]}.coupled")
+                remedy = f"give {KINEMATIC[0]}.coupled"
+                raise FieldError(f"{name} has no coupled angles", remedy)
             if any(joint == other for joint, other, _ in quantity.coupled):
-                raise ValueError(f"{name}.coupled is of two joints each; use {name}.scale")
+                raise FieldError(f"{name}.coupled is of two joints each", f"use {name}.scale")
             if 0.0 in np.atleast_1d(quantity.scale):
                 raise ValueError(f"{name}.scale is 0, which removes the recorded values")
         if any(motor == joint for motor, joint, _ in self.drive.coupling):
-            raise ValueError("drive.coupling is between a motor and another joint; use gear_ratio")
+            problem = "drive.coupling is between a motor and another joint"
+            raise FieldError(problem, "use gear_ratio")
         if self.drive.motor_from_joint and (self.drive.gear_ratio or self.drive.coupling):
             raise ValueError("give either drive.motor_from_joint or gear_ratio and coupling")
         return self

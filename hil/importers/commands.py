@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 
 from hil.base.errors import SourceError
 from hil.importers.bags import Bag, BagMessage
+from hil.importers.conclusions import Conclusion, DifferentCommands, KnownCommands, NotCommands
 from hil.importers.mcap_messages import Topic
+from hil.importers.messages import sentence
 from hil.importers.ros_messages import CONTROLLER_STATE, JOINT_STATE
 from identification.signals.recording import GAP_STEPS
 
@@ -77,7 +79,7 @@ class Commands(NamedTuple):
     values: Array | None  #: (m, n) [rad or m], NaN where nothing was commanded
     topic: str = ""
     reading: str = ""  #: what the messages are
-    notes: tuple[str, ...] = ()  #: what was left out, and why
+    concluded: tuple[Conclusion, ...] = ()  #: what was left out, and why
 
 
 class _NotCommandsError(Exception):
@@ -122,7 +124,7 @@ def commanded_positions(
     """
     if chosen == NO_COMMAND:
         return Commands(None)
-    notes = []
+    concluded: list[NotCommands] = []
     groups = _candidates(bag.topics, states)
     if chosen is not None:
         groups = [[chosen]]
@@ -132,14 +134,15 @@ def commanded_positions(
             try:
                 commands.append(_commands_of(bag, topic, measured))
             except _NotCommandsError as error:
-                notes.append(f"{topic}: {error}: not used as commanded positions")
+                concluded.append(NotCommands(topic, str(error)))
         if not commands and chosen is not None:
             others = ", ".join(name for names in _candidates(bag.topics, states) for name in names)
             remedy = f"name another one ({others}), or none: --command-topic {NO_COMMAND}"
-            raise SourceError(bag.files[0], notes[-1], field="--command-topic", remedy=remedy)
+            problem = sentence(concluded[-1])
+            raise SourceError(bag.files[0], problem, field="--command-topic", remedy=remedy)
         if commands:
-            return _only(commands, notes)
-    return Commands(None, notes=tuple(notes))
+            return _only(commands, concluded)
+    return Commands(None, concluded=tuple(concluded))
 
 
 def _candidates(topics: Mapping[str, Topic], states: str) -> list[list[str]]:
@@ -160,16 +163,15 @@ def topics_of_kind(topics: Mapping[str, Topic], kind: str) -> list[str]:
     return [name for name, topic in topics.items() if topic.is_ros and topic.kind in kinds]
 
 
-def _only(commands: Sequence[Commands], notes: Sequence[str]) -> Commands:
+def _only(commands: Sequence[Commands], concluded: Sequence[Conclusion]) -> Commands:
     """Return the commands of the topic that has most, if the others say the same."""
     most = max(commands, key=lambda command: np.isfinite(_array(command)).sum())
     for other in commands:
         apart = np.abs(_array(other) - _array(most))
         if np.nanmax(apart, initial=0.0) > _ALIKE:
-            text = f"{most.topic} and {other.topic} carry different commands"
-            remedy = f"choose one: --command-topic {most.topic} or {other.topic}"
-            return Commands(None, notes=(*notes, f"{text}: neither is used; {remedy}"))
-    return most._replace(notes=(*notes, *most.notes))
+            different = DifferentCommands((most.topic, other.topic))
+            return Commands(None, concluded=(*concluded, different))
+    return most._replace(concluded=(*concluded, *most.concluded))
 
 
 def _array(command: Commands) -> Array:
@@ -204,12 +206,10 @@ def _commands_of(bag: Bag, topic: str, measured: Measured) -> Commands:
             f"it does not follow the positions of {measured.joints[joint]} ({wrong[joint]:.3g} rad"
             f" or m apart, which move by {size[joint]:.3g})"
         )
-    notes = []
-    if not known.all():
-        notes.append(
-            f"commanded_position: known at {np.count_nonzero(known)} of {len(known)} samples"
-        )
-    return Commands(values, topic, reading, tuple(notes))
+    if known.all():
+        return Commands(values, topic, reading)
+    partly = KnownCommands(int(np.count_nonzero(known)), len(known))
+    return Commands(values, topic, reading, (partly,))
 
 
 def _of_states(messages: Iterable[BagMessage], measured: Measured) -> tuple[Array, str]:

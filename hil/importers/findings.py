@@ -8,15 +8,38 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from hil.archive import Findings, Samples
+from hil.archive import Samples
 from hil.base.errors import SourceError
 from hil.cell.text import UrdfLimits, urdf_limits
+from hil.importers.conclusions import (
+    Conclusion,
+    ConstantPositions,
+    Examined,
+    FastJoint,
+    JointRange,
+    LargeTorque,
+    LittleMotion,
+    LockedJoints,
+    NoTorque,
+    OutsideLimits,
+    RecordedClock,
+    SameStamp,
+    ScaledVelocity,
+    TooFewSamples,
+    TorqueSize,
+    UnrelatedVelocity,
+    UnusualRate,
+    VelocityOrder,
+    Within,
+    ZeroTorque,
+)
+from hil.importers.messages import problem_of, remedy_of
 from hil.importers.publishers import APART, alternating_samples
 from hil.importers.stamps import FASTEST, SLOWEST
 from identification.model.motion import Motion
@@ -49,7 +72,7 @@ def examine(
     locked: Mapping[str, float] | None = None,
     nominal: NominalTorque | None = None,
     held_joints: Collection[str] = (),
-) -> Findings:
+) -> Examined:
     """Return the findings on samples of the joint side, in SI units.
 
     `locked` are positions [rad or m] of joints that are not in the model, by name; `nominal` is the
@@ -59,16 +82,14 @@ def examine(
     limits = urdf_limits(urdf, joint_names)
     turning = _turning(urdf, joint_names)
     position = in_turns(samples.position, limits, turning)
-    held = [f"{name} at {place:.4g}" for name, place in (locked or {}).items()]
-    lines = [f"locked, rad or m: {', '.join(held)}"] if held else []
+    held = (LockedJoints(locked),) if locked else ()
     if len(time) < 2:
-        return Findings(lines=(f"{len(time)} samples", *lines), warnings=())
+        return Examined((TooFewSamples(len(time)), *held), ())
     base = time_base(time)
-    lines = [f"time: {'; '.join(base.describe())}", *lines]
-    lines += map(_range, joint_names, position.T, turning, limits.lower, limits.upper)
-    warnings = []
+    ranges = map(_range, joint_names, position.T, turning, limits.lower, limits.upper)
+    warnings: list[Conclusion] = []
     if not SLOWEST <= base.rate <= FASTEST:
-        warnings += [f"{base.rate:.3g} samples per second are unusual: check the unit of the time"]
+        warnings += [UnusualRate(base.rate)]
     several = _of_one_stamp(time, position) or alternating_samples(position)
     warnings += [several] if several else []
     warnings += _positions(time, position, joint_names, limits, turning, has_speed=not several)
@@ -79,10 +100,10 @@ def examine(
     if is_plausible:
         warnings += _torque_size(samples, joint_names, limits.effort, nominal)
     warnings += _constant(position, joint_names, held_joints)
-    return Findings(lines=tuple(lines), warnings=tuple(warnings))
+    return Examined((RecordedClock(base), *held, *ranges), tuple(warnings))
 
 
-def _constant(position: Array, names: Sequence[str], held: Collection[str]) -> Iterator[str]:
+def _constant(position: Array, names: Sequence[str], held: Collection[str]) -> Iterator[Conclusion]:
     """Yield a warning if joints have one reading throughout while others move."""
     ranges = np.ptp(position, axis=0)
     if np.all(ranges <= STUCK_MOVEMENT):
@@ -90,10 +111,7 @@ def _constant(position: Array, names: Sequence[str], held: Collection[str]) -> I
     constant = [name for name, size in zip(names, ranges, strict=True) if size == 0.0]
     constant = [name for name in constant if name not in held]
     if constant:
-        yield (
-            f"the position of {', '.join(constant)} is the same in all {len(position)} samples: "
-            "it is assumed to stand still; if it moved, its encoder or its column is wrong"
-        )
+        yield ConstantPositions(tuple(constant), len(position))
 
 
 def _turning(urdf: str, names: Sequence[str]) -> NDArray[np.bool_]:
@@ -101,15 +119,11 @@ def _turning(urdf: str, names: Sequence[str]) -> NDArray[np.bool_]:
     return np.array([kinds[name] != "prismatic" for name in names])
 
 
-def _range(name: str, position: Array, turns: bool, lower: float, upper: float) -> str:
+def _range(name: str, position: Array, turns: bool, lower: float, upper: float) -> JointRange:
+    limits = (float(lower), float(upper)) if np.isfinite(lower) else None
     low = float(position.min())
     high = float(position.max())
-    text = f"{name}: {low:.3f} .. {high:.3f} {'rad' if turns else 'm'}"
-    if turns:
-        text += f" ({math.degrees(low):.0f} .. {math.degrees(high):.0f} deg)"
-    if np.isfinite(lower):
-        text += f", limits of the URDF {lower:.3f} .. {upper:.3f}"
-    return text
+    return JointRange(name, low, high, turns=bool(turns), limits=limits)
 
 
 def _fits(position: Array, limits: UrdfLimits) -> NDArray[np.bool_]:
@@ -155,18 +169,10 @@ def in_turns(position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]) ->
     return np.where(fits & usual, continued + turns, continued)
 
 
-class _Outside(NamedTuple):
-    """Positions that leave the limits of the URDF."""
-
-    rows: NDArray[np.bool_]  #: (m,) those with a joint outside
-    problem: str
-    remedy: str
-
-
 def _outside(
     position: Array, names: Sequence[str], limits: UrdfLimits, turning: NDArray[np.bool_]
-) -> _Outside | None:
-    """Return which positions leave the limits of the URDF, and which reading would not."""
+) -> OutsideLimits | None:
+    """Return how positions leave the limits of the URDF, and how they would not."""
     radians = in_turns(np.where(turning, np.radians(position), position), limits, turning)
     position = in_turns(position, limits, turning)
     fits = _fits(position, limits)
@@ -176,40 +182,23 @@ def _outside(
         return None
     low = position.min(axis=0)
     high = position.max(axis=0)
-    ranges = ", ".join(f"{names[j]}: {low[j]:.3g} .. {high[j]:.3g}" for j in beyond)
+    ranges = {names[j]: (float(low[j]), float(high[j])) for j in beyond}
     outside = (position < limits.lower - _TOLERANCE) | (position > limits.upper + _TOLERANCE)
-    rows = np.asarray(outside.any(axis=1))
-    share = (
-        "every row leaves" if rows.all() else f"{_percent(float(rows.mean()))} of the rows leave"
-    )
-    problem = f"as mapped, {share} the limits of the URDF ({ranges})"
+    fraction = float(outside.any(axis=1).mean())
     farthest = 3.0 * np.maximum(-limits.lower, limits.upper)
     far = (np.maximum(-low, high) > farthest)[beyond].any()
     columns = scipy.optimize.linear_sum_assignment(~fits + 1e-6 * (1.0 - np.eye(len(names))))[1]
-    check = "check unit, sign and zero in the column map"
     if far and np.diag(_fits(radians, limits)).all():
-        entry = '[position] unit = "deg" in the column map'
-        remedy = f"as degrees read as radians, none would: write {entry}"
-    elif fits[joints, columns].all():
-        order = ", ".join(names[int(j)] for j in np.argsort(columns))
-        remedy = (
-            f"with the columns those of {order}, none would: check the order of the joints, or "
-            f"{check}"
-        )
-    else:
-        remedy = check
-    return _Outside(rows, problem, remedy)
+        return OutsideLimits(fraction, ranges, Within.DEGREES)
+    if fits[joints, columns].all():
+        order = tuple(names[int(j)] for j in np.argsort(columns))
+        return OutsideLimits(fraction, ranges, Within.ORDER, order)
+    return OutsideLimits(fraction, ranges, Within.NOTHING)
 
 
-def _percent(share: float) -> str:
-    """Return a share below 1 that does not read as all."""
-    return f"{min(100.0 * share, 99.9):.3g} %"
-
-
-def outside_limits(position: Array, names: Sequence[str], urdf: str) -> tuple[str, str] | None:
-    """Return how positions (m, n) leave the limits of the URDF and what would not; None if not."""
-    outside = _outside(position, names, urdf_limits(urdf, names), _turning(urdf, names))
-    return None if outside is None else (outside.problem, outside.remedy)
+def outside_limits(position: Array, names: Sequence[str], urdf: str) -> OutsideLimits | None:
+    """Return how positions (m, n) leave the limits of the URDF; None if they do not."""
+    return _outside(position, names, urdf_limits(urdf, names), _turning(urdf, names))
 
 
 def check_positions(position: Array, names: Sequence[str], urdf: str, path: Path) -> None:
@@ -218,10 +207,10 @@ def check_positions(position: Array, names: Sequence[str], urdf: str, path: Path
     Raises:
         SourceError: none is.
     """
-    outside = _outside(position, names, urdf_limits(urdf, names), _turning(urdf, names))
-    if outside is not None and outside.rows.all():
-        remedy = f"{outside.remedy}; if the limits are wrong: --outside-limits"
-        raise SourceError(path, outside.problem, field="position", remedy=remedy)
+    outside = outside_limits(position, names, urdf)
+    if outside is not None and outside.fraction == 1.0:
+        remedy = f"{remedy_of(outside)}; if the limits are wrong: --outside-limits"
+        raise SourceError(path, problem_of(outside), field="position", remedy=remedy)
 
 
 def are_degrees(position: Array, converted: Array, names: Sequence[str], urdf: str) -> bool:
@@ -262,22 +251,19 @@ def _positions(
     turning: NDArray[np.bool_],
     *,
     has_speed: bool,
-) -> Iterator[str]:
+) -> Iterator[Conclusion]:
     """Yield warnings where positions or speeds are outside the limits of the URDF.
 
     Positions of several sources have no speed of the arm.
     """
     outside = _outside(position, names, limits, turning)
     if outside is not None:
-        yield f"{outside.problem}; {outside.remedy}"
+        yield outside
     low = position.min(axis=0)
     high = position.max(axis=0)
     travel = float((high - low).max())
     if travel < _LEAST_TRAVEL:
-        yield (
-            f"no joint moves further than {travel:.2g} rad or m ({math.degrees(travel):.2g} if "
-            "these were degrees): check the unit of the positions"
-        )
+        yield LittleMotion(travel)
     stride = max(1, len(time) // 2000)  # longer steps, in which noise is negligible
     steps = np.diff(time[::stride])[:, None]
     moved = np.abs(np.diff(position[::stride], axis=0))[steps[:, 0] > 0.0]
@@ -286,31 +272,22 @@ def _positions(
     usual = np.quantile(moved / steps[steps[:, 0] > 0.0], 0.9, axis=0)
     for name, speed, limit in zip(names, usual, limits.velocity, strict=True):
         if speed > _TOO_FAST * limit:
-            yield (
-                f"{name} would move at {speed:.3g} rad/s (or m/s), its limit in the URDF is "
-                f"{limit:.3g}: check the units of position (degrees?) and time (milliseconds?)"
-            )
+            yield FastJoint(name, float(speed), float(limit))
 
 
-def _of_one_stamp(time: Array, position: Array) -> str:
-    """Return how far apart positions (m, n) of one stamp are, "" if they are near."""
+def _of_one_stamp(time: Array, position: Array) -> SameStamp | None:
+    """Return how far apart positions (m, n) of one stamp are, None if they are near."""
     starts = np.flatnonzero(np.diff(time, prepend=time[0] - 1.0))
     highest = np.maximum.reduceat(position, starts)
     lowest = np.minimum.reduceat(position, starts)
     apart = (highest - lowest).max(axis=1)
     count = np.count_nonzero(apart > APART)
-    if not count:
-        return ""
-    return (
-        f"samples with the same time stamp are up to {apart.max():.3g} rad or m apart ({count} such"
-        " stamps): two sources write this log, or its clock stood still or is much coarser than its"
-        " samples"
-    )
+    return SameStamp(float(apart.max()), int(count)) if count else None
 
 
 def _velocities(
     time: Array, position: Array, velocity: Array, names: Sequence[str]
-) -> Iterator[str]:
+) -> Iterator[Conclusion]:
     """Yield warnings where velocities are not the slopes of the positions."""
     moving = [joint for joint in range(len(names)) if np.ptp(position[:, joint]) >= _LEAST_TRAVEL]
     if not moving:
@@ -324,26 +301,16 @@ def _velocities(
             order = list(names)
             for joint, column in zip(moving, columns, strict=True):
                 order[moving[column]] = names[joint]
-            yield (
-                "the velocities are in another order than the positions: as mapped they deviate "
-                f"from the slopes by {_missed(itself):.0f} %, as those of {', '.join(order)} by "
-                f"{_missed(best):.0f} %: name the columns of both in the same order"
-            )
+            yield VelocityOrder(tuple(order), _missed(itself), _missed(best))
             return
-    off = []
+    off = {}
     for k, joint in enumerate(moving):
         if itself[k] < _CORRELATED:
-            yield (
-                f"the velocity of {names[joint]} does not follow its position (correlation "
-                f"{itself[k]:.2f}): check the order of the joints"
-            )
+            yield UnrelatedVelocity(names[joint], float(itself[k]))
         elif abs(factor[k] - 1.0) > _SCALE_TOLERANCE:
-            off.append(f"{factor[k]:.4g} for {names[joint]}")
+            off[names[joint]] = float(factor[k])
     if off:
-        yield (
-            f"the velocity is the slope of the position times {', '.join(off)}: check units, signs "
-            "and gears of both, and the unit of the time"
-        )
+        yield ScaledVelocity(off)
 
 
 def _missed(correlation: Array) -> float:
@@ -373,27 +340,21 @@ def against_position(time: Array, position: Array, velocity: Array) -> tuple[Arr
     return factor, correlation
 
 
-def _torques(samples: Samples, names: Sequence[str], limits: Array) -> Iterator[str]:
+def _torques(samples: Samples, names: Sequence[str], limits: Array) -> Iterator[Conclusion]:
     if samples.torque is None and samples.motor_current is None:
-        use = "nothing can be identified from it"
-        if samples.commanded_position is not None:
-            use = "bodies cannot be identified, servo and friction can (`hil rollout --polish`)"
-        yield f"the log has neither torque nor motor current: {use}"
+        yield NoTorque(is_commanded=samples.commanded_position is not None)
     if samples.torque is None:
         return
     for name, largest, limit in zip(names, np.abs(samples.torque).max(axis=0), limits, strict=True):
         if largest == 0.0:
-            yield f"the torque of {name} is zero throughout"
+            yield ZeroTorque(name)
         elif largest > _TOO_FAST * limit:
-            yield (
-                f"the torque of {name} reaches {largest:.3g}, its limit in the URDF is "
-                f"{limit:.3g} N·m (or N): check its unit and side (motor or joint)"
-            )
+            yield LargeTorque(name, float(largest), float(limit))
 
 
 def _torque_size(
     samples: Samples, names: Sequence[str], limits: Array, nominal: NominalTorque | None
-) -> Iterator[str]:
+) -> Iterator[Conclusion]:
     """Yield a warning where torques have another order of magnitude than the arm needs.
 
     Compared are root mean squares with those of the nominal inertias over the same motion, without
@@ -402,33 +363,23 @@ def _torque_size(
     if samples.torque is None or not samples.torque.any():
         return
     expected = None if nominal is None else _nominal_rms(samples, nominal)
-    if expected is not None and expected.any():
+    by_masses = expected is not None and bool(expected.any())
+    if expected is not None and by_masses:
         compared = expected >= _SIGNIFICANT * expected.max()
         rms = np.sqrt(np.mean(np.square(samples.torque), axis=0))
         ratio = rms[compared] / expected[compared]
-        reference = "those of the URDF's masses"
         lowest = _OTHER_UNIT
     else:
         compared = np.isfinite(limits)
         if not compared.any():
             return
         ratio = np.abs(samples.torque).max(axis=0)[compared] / limits[compared]
-        reference = "the effort limits of the URDF"
         lowest = _THOUSAND / _TOO_FAST
-    listing = ", ".join(
-        f"{name}: {value:.2g}" for name, value in zip(_those(names, compared), ratio, strict=True)
-    )
+    ratios = dict(zip(_those(names, compared), ratio.tolist(), strict=True))
     if ratio.max() < 1.0 / lowest:
-        yield (
-            f"the torques are too small for this arm: measured over {reference} {listing}; check "
-            "their unit (N·m read as mN·m would be 1000 times too small) and side (motor or joint)"
-        )
+        yield TorqueSize(ratios, by_masses, too_large=False)
     elif ratio.min() > _OTHER_UNIT:
-        yield (
-            f"the torques are too large for this arm: measured over {reference} {listing}; check "
-            "their unit (mN·m read as N·m would be 1000 times too large), side (motor or joint) "
-            "and the masses of the URDF"
-        )
+        yield TorqueSize(ratios, by_masses, too_large=True)
 
 
 def _those(names: Sequence[str], which: NDArray[np.bool_]) -> list[str]:

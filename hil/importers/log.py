@@ -17,13 +17,23 @@ from hil.archive import Samples
 from hil.base.errors import SourceError, UnrecordedJointError
 from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.column_map import HOLE, KINEMATIC, ColumnMap, Quantity, TimeColumn
+from hil.importers.conclusions import (
+    ConcludedUnit,
+    Conclusion,
+    JointOrder,
+    LeftOut,
+    MappedUnit,
+    MissingNumbers,
+    Omitted,
+    StatedUnit,
+)
 from hil.importers.findings import are_degrees, has_degrees_per_second
 from hil.importers.publishers import second_publisher
-from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
+from hil.importers.robot import NOT_RECORDED, RecordingContent, Robot, Use
 from hil.importers.row_names import row_names
 from hil.importers.stamps import YEAR, concluded_unit, sorted_neighbours, without_wraps
 from hil.importers.table import Table
-from hil.importers.units import PER_CENT, TIMES, UNITS, unit_of
+from hil.importers.units import PER_CENT, TIMES, UNITS, kind_named, unit_of
 
 Array = NDArray[np.float64]
 
@@ -58,6 +68,22 @@ def import_log(
             does not fit the robot.
         ArchiveWriteError: the archive exists or cannot be written.
     """
+    content = read_log(source, robot=robot, columns=columns, coupled=coupled)
+    content.write(
+        output, held_joints=held_joints, use=use, force=force, outside_limits=outside_limits
+    )
+    return Path(output)
+
+
+def read_log(
+    source: str | PathLike[str], *, robot: Robot, columns: ColumnMap, coupled: bool = True
+) -> RecordingContent:
+    """Read a log; see :func:`import_log`.
+
+    Raises:
+        SourceError: a file cannot be read, a column is missing, a cell is not a number, or the map
+            does not fit the robot.
+    """
     log = _Log(Path(source), columns, robot)
     with np.errstate(over="ignore", invalid="ignore"):  # such numbers are refused later
         values = {name: log.read(name) for name in columns.quantities()}
@@ -76,19 +102,15 @@ def import_log(
     if (uncertainty := columns.drive.torque_uncertainty) is not None:
         each = np.broadcast_to(uncertainty, len(log.joints))[log.order]
         metadata["torque_uncertainty"] = json.dumps(each.tolist())
-    return write_imported(
-        output,
+    left_out = (omitted for file in log.files.values() for omitted in file.left_out)
+    return RecordingContent(
         samples,
-        source=[*log.files],
-        robot=robot,
+        robot,
+        source=tuple(log.files),
         metadata=metadata,
-        held_joints=held_joints,
+        concluded=(*log.concluded, *left_out),
         period=None if columns.sample_rate is None else 1.0 / columns.sample_rate,
-        use=use,
         clock=clock.path,
-        notes=[*log.notes, *(note for file in log.files.values() for note in file.notes)],
-        force=force,
-        outside_limits=outside_limits,
     )
 
 
@@ -110,7 +132,7 @@ class _Log:
         joints: of the log, in its order.
         order: the log's column of each joint of the robot.
         matrix: motor angles per joint angle (k, k), in the log's order.
-        notes: what was concluded, where neither map nor file states it.
+        concluded: where neither map nor file states it.
     """
 
     def __init__(self, path: Path, columns: ColumnMap, robot: Robot) -> None:
@@ -118,7 +140,7 @@ class _Log:
         self._folder = path if path.is_dir() else path.parent
         self._map = columns
         self.files: dict[Path, Table | ArrayFile] = {}
-        self.notes: list[str] = []
+        self.concluded: list[Conclusion] = []
         self.joints = columns.joints or self._row_names(robot.joint_names)
         self.order = self._joint_order(robot)
         self.matrix = self._motor_from_joint()
@@ -158,11 +180,9 @@ class _Log:
             if not others:
                 return 1.0
         if mapped is not None and others:
-            self.notes.append(
-                f"{name}: the map says {mapped}, the file {others[0]}; used: {mapped}"
-            )
+            self.concluded.append(MappedUnit(kind_named(name), mapped, str(others[0])))
         elif mapped is None:
-            self.notes.append(f"{name}: in {others[0]}, as the file states")
+            self.concluded.append(StatedUnit(kind_named(name), str(others[0])))
         units = [mapped or unit or next(iter(UNITS[name])) for unit in stated]
         if PER_CENT in units and quantity.rated is None:
             problem = "is in per cent of a rated value that the map does not state"
@@ -216,7 +236,7 @@ class _Log:
             return stated
         unit = concluded_unit(file.times(time.column, TIMES["s"], time.array))
         if unit != "s":
-            self.notes.append(f"time: no unit is stated; read as {unit}, which gives a usual rate")
+            self.concluded.append(ConcludedUnit("time", unit))
         return unit
 
     def _within_archive(
@@ -225,7 +245,7 @@ class _Log:
         """Return times [ns] as stamps that an archive can hold, wraps continued."""
         zeros = next((row for row, time in enumerate(times) if time), 0)
         if zeros and abs(times[zeros] or 0) > YEAR:
-            self.notes.append(f"left out: rows at the start with the time 0 ({zeros})")
+            self.concluded.append(LeftOut(Omitted.ZERO_TIMES, zeros))
             valid = valid & (np.arange(len(times)) >= zeros)
         base = times[int(np.argmax(valid))] or 0
         # Differences are taken before numbers of any size become 64-bit ones.
@@ -237,8 +257,8 @@ class _Log:
             self._raise_span(max(map(abs, shifted)), path)
         stamp = np.array(shifted, np.int64)
         continued = without_wraps(stamp[valid])
-        if continued.note is not None:
-            self.notes.append(f"time: {continued.note}")
+        if continued.wrapped is not None:
+            self.concluded.append(continued.wrapped)
         low = base + int(continued.stamp.min())
         high = base + int(continued.stamp.max())
         origin = 0 if low >= 0 and high < _LATEST else low
@@ -269,10 +289,8 @@ class _Log:
             remedy = "check the columns of the map, delimiter and decimal mark ([format])"
             raise SourceError(self.path, problem, remedy=remedy)
         if dropped.size:
-            self.notes.append(
-                f"left out: rows in which a number is missing ({len(dropped)} of {len(complete)}, "
-                f"the first after {dropped[0]} rows)"
-            )
+            missing = MissingNumbers(len(dropped), len(complete), int(dropped[0]))
+            self.concluded.append(missing)
         return np.asarray(complete)
 
     def samples(
@@ -285,16 +303,16 @@ class _Log:
         """Return the complete rows (m,) on the joint side, sorted, of the first publisher."""
         rows = np.flatnonzero(complete)
         swapped = sorted_neighbours(clock.stamp[rows], "row")
-        if swapped.note is not None:
-            self.notes.append(f"time: {swapped.note}")
+        if swapped.swapped is not None:
+            self.concluded.append(swapped.swapped)
         rows = rows[swapped.order]
         stamp = clock.stamp[rows]
         joint = self.in_concluded_units(
             stamp, {name: array[rows] for name, array in values.items()}, robot
         )
         silent = second_publisher(joint["position"], "row")
-        if silent.note is not None:
-            self.notes.append(silent.note)
+        if silent.publisher is not None:
+            self.concluded.append(silent.publisher)
             stamp = stamp[~silent.rows]
             joint = {name: array[~silent.rows] for name, array in joint.items()}
         return Samples(stamp, **joint)
@@ -322,19 +340,13 @@ class _Log:
             if are_degrees(joint["position"], converted["position"], names, robot.urdf):
                 joint = converted
                 values = degrees
-                self.notes.append(
-                    "position: no unit is stated; read as degrees, within the limits of the URDF, "
-                    "which radians leave by far"
-                )
+                self.concluded.append(ConcludedUnit("position", "deg"))
         if "velocity" in self._unstated and len(stamp) > 1:
             time = (stamp - stamp[0]) * 1e-9
             if has_degrees_per_second(time, joint["position"], joint["velocity"]):
                 degrees = {**values, "velocity": values["velocity"] * degree}
                 joint = _joint_side(degrees, self._map, self)
-                self.notes.append(
-                    "velocity: no unit is stated; read as degrees per second, the slope of the "
-                    "positions"
-                )
+                self.concluded.append(ConcludedUnit("velocity", "deg/s"))
         return joint
 
     def _numbers(self, name: str, quantity: Quantity) -> tuple[Array, list[str | None]]:
@@ -488,7 +500,7 @@ class _Log:
         names = row_names(file.texts, joints) if isinstance(file, Table) else None
         if names is None or names.joints in ((), joints):
             return joints
-        self.notes.append(names.message)
+        self.concluded.append(JointOrder(names.joints))
         return names.joints
 
     def _joint_order(self, robot: Robot) -> list[int]:

@@ -18,10 +18,18 @@ from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
 from hil.importers.channels import CHANNEL_NAMES, Channel, channels_of, kind_of
 from hil.importers.column_map import ColumnMap, Format, ready_map, ready_maps
+from hil.importers.conclusions import (
+    ChannelMeaning,
+    Conclusion,
+    JointOrder,
+    NameBasis,
+    UnitBasis,
+    UnusedChannels,
+)
 from hil.importers.name_words import is_measured, kind_by_words, kinds_said, words_of
 from hil.importers.robot import Robot
-from hil.importers.row_names import RowNames, row_names
-from hil.importers.units import UNITS, Kind, unit_of, without_unit
+from hil.importers.row_names import row_names
+from hil.importers.units import Kind, kind_named, unit_of, without_unit
 
 _NUMBER: Final = re.compile(r"\d{1,2}(?=\D*$)")
 _JOINT_KINDS: Final[tuple[Kind, ...]] = (
@@ -42,12 +50,12 @@ class Proposal:
     Attributes:
         text: the map, TOML.
         columns: the same, parsed.
-        lines: one for each group of channels: names, quantity, unit and the reason.
+        concluded: the meaning of each group of channels, and which are not used.
     """
 
     text: str
     columns: ColumnMap
-    lines: tuple[str, ...]
+    concluded: tuple[Conclusion, ...]
 
     @property
     def has_torque(self) -> bool:
@@ -66,7 +74,7 @@ class _Group:
         size: numbers in a sample.
         unit: that the log states for the first, None without one.
         by_joint: whether the names are those of joints of the URDF.
-        by_words: how the quantity is said, where no whole name does; "" where one does.
+        by_words: how words in names say the quantity; None where a whole name does.
     """
 
     pattern: str
@@ -75,7 +83,7 @@ class _Group:
     size: int
     unit: str | None
     by_joint: bool = False
-    by_words: str = ""
+    by_words: NameBasis | None = None
 
     @property
     def label(self) -> str:
@@ -229,16 +237,16 @@ def _of_ready_map(name: str, joints: Sequence[str]) -> Proposal:
     if joints:
         text = f"{to_text({'joints': list(joints)})}\n{text}"
         columns = columns.model_copy(update={"joints": tuple(joints)})
-    reason = f"as in the ready map {name}"
-    lines = [
-        f"{quantity.columns}: {kind}, {quantity.unit}, {reason}"
-        for kind, quantity in columns.quantities().items()
-    ]
+    basis = NameBasis.READY_MAP, UnitBasis.MAP
+    named = {kind: (str(each.columns), each.unit) for kind, each in columns.quantities().items()}
     if columns.time is not None:
-        lines.insert(0, f"{columns.time.column}: time, {columns.time.unit}, {reason}")
-    if joints:
-        lines.append(RowNames(0, tuple(joints)).message)
-    return Proposal(text, columns, tuple(lines))
+        named = {"time": (str(columns.time.column), columns.time.unit), **named}
+    meanings = [
+        ChannelMeaning(channels, kind_named(kind), basis[0], unit, basis[1], name)
+        for kind, (channels, unit) in named.items()
+    ]
+    order = (JointOrder(tuple(joints)),) if joints else ()
+    return Proposal(text, columns, (*meanings, *order))
 
 
 class _Search:
@@ -261,7 +269,7 @@ class _Search:
         self._groups = groups
         self._chosen = chosen
         self._rate = sample_rate
-        self._lines: list[str] = []
+        self._concluded: list[Conclusion] = []
         self._used: set[str] = set()
 
     def proposal(self, form: Format | None) -> Proposal:
@@ -281,7 +289,7 @@ class _Search:
             self._refuse_missing(missing)
         others = [group.label for group in self._groups if not self._is_used(group)]
         if others and not self._nameless:
-            self._lines.append(f"not used: {', '.join(others[:_MOST_NAMED])}")
+            self._concluded.append(UnusedChannels(tuple(others[:_MOST_NAMED])))
         table: dict[str, object] = {kind: {"columns": names} for kind, names in columns.items()}
         if self._rate is not None:
             table = {"sample_rate": self._rate, **table}
@@ -291,18 +299,19 @@ class _Search:
             table["time"] = {"column": time if isinstance(time, str) else time[0], **parts}
         if self._recorded:
             table = {"joints": list(self._recorded), **table}
-            self._lines.append(RowNames(0, tuple(self._recorded)).message)
+            self._concluded.append(JointOrder(tuple(self._recorded)))
         if form is not None:
             table["format"] = form.model_dump(exclude_defaults=True)
         comment = "Proposed by hil from the names and units of the channels"
         text = to_text(table, {"": comment})
-        return Proposal(text, ColumnMap.model_validate(parse_toml(text)), tuple(self._lines))
+        return Proposal(text, ColumnMap.model_validate(parse_toml(text)), tuple(self._concluded))
 
     def _channels(self, kind: Kind) -> _Columns | None:
         """Return the channels of a quantity; None if the log has none."""
         if kind in self._chosen:
             names = self._chosen[kind]
-            self._lines.append(f"{names}: {kind}, as given with --columns")
+            given = NameBasis.OPTION, UnitBasis.OPTION
+            self._concluded.append(ChannelMeaning(names, kind, given[0], None, given[1]))
             self._used.update([names, *map(str.strip, names.split(","))])
             return self._given(names)
         groups = self._groups_of(kind)
@@ -322,7 +331,7 @@ class _Search:
         elif group.size != len(self._columns_of) or not set(self._joints) <= set(self._columns_of):
             self._refuse_count(kind, group)
         self._used.update([group.pattern, *group.names])
-        self._lines.append(f"{group.label}: {self._reason(kind, group)}")
+        self._concluded.append(self._meaning(kind, group))
         return group.columns(self._columns_of)
 
     def _groups_of(self, kind: Kind) -> list[_Group]:
@@ -349,7 +358,7 @@ class _Search:
     def _by_words(self, kind: Kind, groups: Sequence[_Group]) -> list[_Group]:
         """Return the groups whose names say a quantity by a word in them."""
         said = [g for g in groups if kind_by_words(g.pattern) == kind]
-        said = [replace(g, by_words="by a word in the name") for g in said]
+        said = [replace(g, by_words=NameBasis.WORD) for g in said]
         if kind == "time":
             return [g for g in said if g.size == 1]
         count = len(self._columns_of)
@@ -359,8 +368,8 @@ class _Search:
         if exact or several or len(single) != count:
             return exact or several
         names = tuple(g.names[0] for g in single)
-        how = "by a word in the names, joints in the order of the log"
-        return [_Group(",".join(names), kind, names, count, single[0].unit, by_words=how)]
+        by_words = NameBasis.WORDS
+        return [_Group(",".join(names), kind, names, count, single[0].unit, by_words=by_words)]
 
     def _is_used(self, group: _Group) -> bool:
         return group.pattern in self._used or self._used.issuperset(group.names)
@@ -378,21 +387,17 @@ class _Search:
         return all(group.pattern in ("{}", "0") for group in self._groups)
 
     @staticmethod
-    def _reason(kind: Kind, group: _Group) -> str:
-        """Return quantity, unit and why."""
-        if group.unit is not None:
-            unit = f"{group.unit} as the log states"
-        else:
-            unit = "no unit stated"
-            if kind in ("torque", "motor_current"):
-                unit += f", read as {next(iter(UNITS[kind]))}"
-            else:
-                unit += ", concluded from the numbers"
-        where = "by the URDF's joint in the name" if group.by_joint else "by the name"
+    def _meaning(kind: Kind, group: _Group) -> ChannelMeaning:
+        """Return quantity and unit, and from what."""
+        unit_basis = UnitBasis.LOG
+        if group.unit is None:
+            by_custom = kind in ("torque", "motor_current")
+            unit_basis = UnitBasis.CUSTOM if by_custom else UnitBasis.NUMBERS
+        basis = NameBasis.JOINT if group.by_joint else NameBasis.NAME
         if group.unit is not None and kind_of(group.names[0])[0] is None and not group.by_joint:
-            where = "by the unit"
-        where = group.by_words or where
-        return f"{kind}, {where}; {unit}"
+            basis = NameBasis.UNIT
+        basis = group.by_words or basis
+        return ChannelMeaning(group.label, kind, basis, group.unit, unit_basis)
 
     def _refuse_several(self, kind: Kind, groups: Sequence[_Group]) -> NoReturn:
         names = [name for group in groups for name in (group.pattern, *group.names)]
@@ -456,7 +461,7 @@ class _Search:
         ]
         listing = ", ".join(group.label for group in self._groups[:_MOST_NAMED])
         examples = [
-            f"{kind} ({', '.join(CHANNEL_NAMES[_kind(kind)][:3])}, ...)" for kind in missing
+            f"{kind} ({', '.join(CHANNEL_NAMES[kind_named(kind)][:3])}, ...)" for kind in missing
         ]
         problem = f"no channel is named as {' or '.join(examples)}; its channels are {listing}"
         stated = kinds_of_file(self._log)
@@ -521,7 +526,3 @@ def _likely(kind: str, groups: Sequence[_Group]) -> str:
 
 def _named(kind: str) -> str:
     return kind.replace("_", " ")
-
-
-def _kind(name: str) -> Kind:
-    return next(kind for kind in CHANNEL_NAMES if kind == name)

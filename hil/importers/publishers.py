@@ -7,6 +7,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.importers.conclusions import Alternation, Sample, SecondPublisher
+
 Array = NDArray[np.float64]
 
 APART: Final = 0.1
@@ -17,25 +19,22 @@ _RETURNS: Final = 0.25  # of a step to another sequence, which the step back lea
 _LEAST_SHARE: Final = 0.02  # of the samples, beyond single spikes
 
 
-class SecondPublisher(NamedTuple):
+class Silent(NamedTuple):
     """Samples with one and the same pose between others that move."""
 
     rows: NDArray[np.bool_]  #: (m,)
-    note: str | None  #: what was left out, None if there are none
+    publisher: SecondPublisher | None  #: None if there are none
 
 
-def second_publisher(position: Array, sample: str) -> SecondPublisher:
-    """Find those of positions (m, n) [rad or m]; in words each is a `sample`, such as "message"."""
+def second_publisher(position: Array, sample: Sample) -> Silent:
+    """Find those of positions (m, n) [rad or m]."""
     rows = _of_one_pose(position)
     if not rows.any():
-        return SecondPublisher(rows, None)
+        return Silent(rows, None)
     pose = position[np.argmax(rows)]
-    where = ", ".join(f"{angle:.3g}" for angle in pose) if pose.any() else "0"
-    note = (
-        f"{np.count_nonzero(rows)} of {len(position)} {sample}s have {where} for all positions "
-        "between others that do not: those of a second publisher, left out"
-    )
-    return SecondPublisher(rows, note)
+    where = tuple(pose.tolist()) if pose.any() else ()
+    count = int(np.count_nonzero(rows))
+    return Silent(rows, SecondPublisher(count, len(position), where, sample))
 
 
 def _of_one_pose(position: Array) -> NDArray[np.bool_]:
@@ -56,19 +55,15 @@ def _of_one_pose(position: Array) -> NDArray[np.bool_]:
     return none if np.abs(others - pose).max(axis=1).min() < APART else np.asarray(silent)
 
 
-def alternating_samples(position: Array) -> str:
-    """Return how far apart two sequences are that positions (m, n) go to and fro between, or ""."""
+def alternating_samples(position: Array) -> Alternation | None:
+    """Return how far apart two sequences are that positions (m, n) go to and fro between."""
     steps = np.abs(np.diff(position, axis=0)).max(axis=1)
     if len(steps) < 2:
-        return ""
+        return None
     there_and_back = np.minimum(steps[:-1], steps[1:])
     left = np.abs(position[2:] - position[:-2]).max(axis=1)
     alternate = (there_and_back > APART) & (left < _RETURNS * there_and_back)
     count = np.count_nonzero(alternate)
     if count <= max(2 * STALLED, _LEAST_SHARE * len(position)):
-        return ""
-    return (
-        f"samples go to and fro between two sequences up to {there_and_back[alternate].max():.3g} "
-        f"rad or m apart ({count} samples): two sources write these joints, one of them other or "
-        "older samples; record one of them"
-    )
+        return None
+    return Alternation(float(there_and_back[alternate].max()), int(count))

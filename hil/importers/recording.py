@@ -17,10 +17,19 @@ from hil.importers.bag_map import BagMap
 from hil.importers.bags import open_bag
 from hil.importers.channels import channels_of
 from hil.importers.column_map import ColumnMap, map_text
-from hil.importers.log import import_log
+from hil.importers.conclusions import (
+    ChannelMeaning,
+    Conclusion,
+    Examined,
+    FixedFingers,
+    NameBasis,
+    RecordedArm,
+    UnitBasis,
+)
+from hil.importers.log import read_log
 from hil.importers.proposal import proposed_map
 from hil.importers.robot import Robot, Use
-from hil.importers.rosbag2 import Effort, import_rosbag2, joint_state_topics, recorded_joints
+from hil.importers.rosbag2 import Effort, joint_state_topics, read_rosbag2, recorded_joints
 from hil.importers.units import UNITS, Kind
 
 _BAGS: Final = (".db3", ".bag", ".mcap", ".zstd", ".zst")
@@ -61,12 +70,15 @@ class ImportedRecording:
         archive: that was written.
         map_text: the column map, TOML; None for joint states of a bag, which need none.
         bag: how those were read; None for a log.
-        lines: one for each group of channels that was concluded: name, quantity, unit, reason.
+        concluded: the meaning of each group of channels, what was fixed for it, and what the motion
+            and the torque say, in this order.
+        examined: what was found in its samples, and warnings.
     """
 
     archive: Path
     map_text: str | None
-    lines: tuple[str, ...]
+    concluded: tuple[Conclusion, ...]
+    examined: Examined
     bag: BagMap | None = None
 
     @property
@@ -165,7 +177,7 @@ def _of_recorded_joints(
         return read(robots)
     except UnrecordedJointError as error:
         imported = _of_fewer_joints(read, robots, error)
-    return replace(imported, lines=(*imported.lines, *robots.lines))
+    return replace(imported, concluded=(*imported.concluded, *robots.concluded))
 
 
 def _of_fewer_joints(
@@ -187,7 +199,7 @@ class _OfRecordedJoints:
     """Robots of which joints that were not recorded are fixed, after a refused import.
 
     Attributes:
-        lines: what was fixed.
+        concluded: what was fixed.
     """
 
     def __init__(self, robot_of: RobotOf, source: Path) -> None:
@@ -195,7 +207,7 @@ class _OfRecordedJoints:
         self._source = source
         self._steps: list[Callable[[Robot], Robot]] = []
         self._robot: Robot | None = None
-        self.lines: tuple[str, ...] = ()
+        self.concluded: tuple[Conclusion, ...] = ()
 
     def __call__(self, recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
         robot = self._robot_of(recorded)
@@ -217,21 +229,15 @@ class _OfRecordedJoints:
         fixed = [name for name in robot.joint_names if name not in gripping.joint_names]
         if fixed and error.count <= len(gripping.joint_names):
             self._steps.append(lambda robot: robot.without_gripper(error.joints))
-            names = ", ".join(fixed)
-            places = ", ".join(f"{gripping.locked[name]:.3g}" for name in fixed)
-            line = f"{names}: fixed, at {places} (rad or m), as of an unrecorded gripper"
-            self.lines = (*self.lines, line)
+            fingers = FixedFingers({name: gripping.locked[name] for name in fixed})
+            self.concluded = (*self.concluded, fingers)
             return True
         arm = self._arm(robot, error)
         if arm is None:
             return False
         self._steps.append(lambda robot: robot.between(arm.links))
-        reason = "names" if error.joints else "number"
-        line = (
-            f"arm: {arm}, between {arm.links}, by the {reason} of the recorded joints; all others "
-            "are fixed"
-        )
-        self.lines = (*self.lines, line)
+        recorded = RecordedArm(str(arm), arm.links, by_names=bool(error.joints))
+        self.concluded = (*self.concluded, recorded)
         return True
 
     def _arm(self, robot: Robot, error: UnrecordedJointError) -> Arm | None:
@@ -284,7 +290,7 @@ def _imported(
     if options.columns is None and has_joint_states(source) and not _read_as_log(source, options):
         bag = _bag_map(options)
         return _import_bag(source, output, robot_of, bag, options, held_joints, use, force=force)
-    lines: tuple[str, ...] = ()
+    concluded: tuple[Conclusion, ...] = ()
     if options.columns is not None:
         robot = robot_of(partial(_joints_of_map, options.columns))
         columns = ColumnMap.load(options.columns)
@@ -301,19 +307,15 @@ def _imported(
         )
         columns = proposal.columns
         text = proposal.text
-        lines = proposal.lines
-    import_log(
-        source,
+        concluded = proposal.concluded
+    examined = read_log(source, robot=robot, columns=columns, coupled=coupled).write(
         output,
-        robot=robot,
-        columns=columns,
         held_joints=held_joints,
         use=use,
-        coupled=coupled,
         force=force,
         outside_limits=options.outside_limits,
     )
-    return ImportedRecording(output, with_arm(text, robot.links), lines)
+    return ImportedRecording(output, with_arm(text, robot.links), concluded, examined)
 
 
 def _bag_map(options: ImportOptions) -> BagMap:
@@ -348,15 +350,17 @@ def _import_bag(
     names = stated.rename
     robot = robot_of(lambda: recorded_joints(source, topic, names))
     robot = _arm_of_map(robot, stated.arm, options.columns)
-    import_rosbag2(
+    content = read_rosbag2(
         source,
-        output,
         robot=robot,
         topic=topic,
         effort=stated.effort,
         clock=stated.clock,
         joint_names=names,
         command_topic=stated.command_topic,
+    )
+    examined = content.write(
+        output,
         held_joints=held_joints,
         use=use,
         force=force,
@@ -366,17 +370,20 @@ def _import_bag(
     keys = ("topic", "clock", "effort", "command_topic")
     read = {key: entries[key] for key in keys if key in entries}
     bag = BagMap.model_validate({**read, "rename": dict(names), "arm": robot.links})
-    lines = tuple(
-        f"{channel.name}: {kind}, {next(iter(UNITS[kind]))}, by the field of the joint states; "
-        "joints by their names"
+    basis = NameBasis.MESSAGE, UnitBasis.MESSAGE
+    concluded = tuple(
+        ChannelMeaning(channel.name, kind, basis[0], next(iter(UNITS[kind])), basis[1])
         for channel in channels_of(source)
         if channel.name.rpartition("/")[0] == entries["topic"]
         and (kind := _content(channel.kind, stated.effort)) is not None
     )
     if "command_topic" in entries:
-        line = f"{entries['command_topic']}: commanded_position, rad or m, {entries['command']}"
-        lines = (*lines, line)
-    return ImportedRecording(output, None, lines, bag)
+        topic = str(entries["command_topic"])
+        commands = NameBasis.COMMANDS, UnitBasis.MESSAGE
+        how = str(entries["command"])
+        meaning = ChannelMeaning(topic, "commanded_position", commands[0], None, commands[1], how)
+        concluded = (*concluded, meaning)
+    return ImportedRecording(output, None, concluded, examined, bag)
 
 
 def _content(kind: Kind | None, effort: Effort) -> Kind | None:

@@ -14,7 +14,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Findings, Samples, write_samples
+from hil.archive import Samples, write_samples
 from hil.base.errors import ArchiveWriteError, SourceError
 from hil.base.files import file_digest, make_folder, replace_file
 from hil.base.safe_input import path_exists, read_input
@@ -24,12 +24,14 @@ from hil.cell.arms import Links, joints_outside
 from hil.cell.gripper import gripper_joints
 from hil.cell.nominal import nominal_of
 from hil.cell.text import urdf_limits, with_values
+from hil.importers.conclusions import Conclusion, Examined
 from hil.importers.dh import Convention, urdf_of_dh
 from hil.importers.findings import (
     NominalTorque,
     check_positions,
     examine,
 )
+from hil.importers.messages import as_findings
 from hil.importers.stamps import check_clock
 from identification.errors import ModelError
 from identification.model.friction import FrictionLaw
@@ -265,79 +267,91 @@ def _require_joints(held_joints: Sequence[str], robot: Robot, source: Path) -> N
         raise SourceError(source, problem, field="held joints", remedy=remedy)
 
 
-def write_imported(
-    output: str | PathLike[str],
-    samples: Samples,
-    *,
-    source: Sequence[Path],
-    robot: Robot,
-    metadata: Mapping[str, str],
-    held_joints: Sequence[str] = (),
-    period: float | None = None,
-    use: Use = "excitation",
-    clock: Path | None = None,
-    notes: Sequence[str] = (),
-    clock_remedy: str | None = None,
-    force: bool = False,
-    outside_limits: bool = False,
-) -> Path:
-    """Write samples of the joint side in SI units, joints in the robot's order, as an archive.
+@dataclass(frozen=True, eq=False)
+class RecordingContent:
+    """A recording of another program, read and not yet written as an archive.
 
-    Findings on their plausibility (:mod:`hil.importers.findings`) are stored in its metadata.
-    `period` is the sampling step [s] of a recording at a fixed rate, `clock` the file that the
-    stamps come from, by default the first `source`; `clock_remedy` replaces the remedies for an
-    invalid clock of a log. `notes` are further lines of the findings. With `force` an existing
-    archive is replaced once the new one is complete; `outside_limits` accepts positions of which no
-    row is within the limits of the URDF.
-
-    Raises:
-        SourceError: no sample, a value that is not finite or above 1e12, an invalid clock, or no
-            row within the limits of the URDF.
-        ArchiveWriteError: the archive exists or cannot be written.
+    Attributes:
+        samples: of the joint side in SI units, joints in the robot's order.
+        source: the files that it was read from.
+        metadata: further entries of the archive.
+        concluded: what was concluded and left out.
+        period: sampling step [s] of a recording at a fixed rate.
+        clock: the file that the stamps come from, by default the first `source`.
+        clock_remedy: in place of the remedies for an invalid clock of a log.
     """
-    output = Path(output)
-    _require_writable(output, source, force=force)
-    _check(samples, source[0], robot.joint_names)
-    check_clock(samples.stamp, clock or source[0], clock_remedy)
-    if not outside_limits:
-        check_positions(samples.position, robot.joint_names, robot.urdf, source[0])
-    _require_joints(held_joints, robot, source[0])
-    findings = _findings(samples, robot, held_joints, notes)
-    entries = {
-        **metadata,
-        "source": json.dumps([path.name for path in source]),
-        "source_sha256": json.dumps([file_digest(path) for path in source]),
-        "held_joints": json.dumps(list(held_joints)),
-        "use": use,
-        "findings": json.dumps(findings.model_dump()),
-    }
 
-    make_folder(output.parent)
-    with _replaced(output) if force else nullcontext(output) as path:
-        write_samples(
-            path,
-            samples,
-            joint_names=robot.joint_names,
-            metadata=entries,
-            attachments=robot.attachments(),
-            period=period,
+    samples: Samples
+    robot: Robot
+    source: tuple[Path, ...]
+    metadata: Mapping[str, str]
+    concluded: tuple[Conclusion, ...] = ()
+    period: float | None = None
+    clock: Path | None = None
+    clock_remedy: str | None = None
+
+    def write(
+        self,
+        output: str | PathLike[str],
+        *,
+        held_joints: Sequence[str] = (),
+        use: Use = "excitation",
+        force: bool = False,
+        outside_limits: bool = False,
+    ) -> Examined:
+        """Write the recording as an archive, and return what was found in it.
+
+        The archive has the same in words. With `force` an existing archive is replaced once the new
+        one is complete; `outside_limits` accepts positions of which no row is within the limits of
+        the URDF.
+
+        Raises:
+            SourceError: no sample, a value that is not finite or above 1e12, an invalid clock, or
+                no row within the limits of the URDF.
+            ArchiveWriteError: the archive exists or cannot be written.
+        """
+        output = Path(output)
+        samples = self.samples
+        source = self.source
+        robot = self.robot
+        _require_writable(output, source, force=force)
+        _check(samples, source[0], robot.joint_names)
+        check_clock(samples.stamp, self.clock or source[0], self.clock_remedy)
+        if not outside_limits:
+            check_positions(samples.position, robot.joint_names, robot.urdf, source[0])
+        _require_joints(held_joints, robot, source[0])
+        found = self._examined(held_joints)
+        entries = {
+            **self.metadata,
+            "source": json.dumps([path.name for path in source]),
+            "source_sha256": json.dumps([file_digest(path) for path in source]),
+            "held_joints": json.dumps(list(held_joints)),
+            "use": use,
+            "findings": json.dumps(as_findings(found).model_dump()),
+        }
+        make_folder(output.parent)
+        with _replaced(output) if force else nullcontext(output) as path:
+            write_samples(
+                path,
+                samples,
+                joint_names=robot.joint_names,
+                metadata=entries,
+                attachments=robot.attachments(),
+                period=self.period,
+            )
+        return found
+
+    def _examined(self, held_joints: Sequence[str]) -> Examined:
+        """Return the findings of an import, what was concluded first."""
+        found = examine(
+            self.samples,
+            self.robot.joint_names,
+            self.robot.urdf,
+            locked=self.robot.locked,
+            nominal=self.robot.nominal_torque(),
+            held_joints=held_joints,
         )
-    return output
-
-
-def _findings(
-    samples: Samples, robot: Robot, held_joints: Sequence[str], notes: Sequence[str]
-) -> Findings:
-    """Return the findings of an import, `notes` first."""
-    findings = examine(
-        samples,
-        robot.joint_names,
-        robot.urdf,
-        locked=robot.locked,
-        nominal=robot.nominal_torque(),
-        held_joints=held_joints,
-    )
-    return Findings(lines=(*notes, *findings.lines), warnings=findings.warnings)
+        return Examined((*self.concluded, *found.found), found.warnings)
 
 
 @contextmanager

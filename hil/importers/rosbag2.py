@@ -22,9 +22,16 @@ from hil.importers.commands import (
     measured_topics,
     topics_of_kind,
 )
+from hil.importers.conclusions import (
+    Conclusion,
+    LeftOut,
+    MergedMessages,
+    Omitted,
+    PartialVelocity,
+)
 from hil.importers.mcap_messages import Topic
 from hil.importers.publishers import APART, STALLED, second_publisher
-from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
+from hil.importers.robot import NOT_RECORDED, RecordingContent, Robot, Use
 from hil.importers.ros_messages import CONTROLLER_STATE, JOINT_STATE
 from hil.importers.stamps import leading_zeros, sorted_neighbours
 
@@ -72,6 +79,36 @@ def import_rosbag2(
         SourceError: no bag, no such topic, a joint that was not recorded, a value not finite.
         ArchiveWriteError: the archive exists or cannot be written.
     """
+    content = read_rosbag2(
+        source,
+        robot=robot,
+        topic=topic,
+        effort=effort,
+        clock=clock,
+        joint_names=joint_names,
+        command_topic=command_topic,
+    )
+    content.write(
+        output, held_joints=held_joints, use=use, force=force, outside_limits=outside_limits
+    )
+    return Path(output)
+
+
+def read_rosbag2(
+    source: str | PathLike[str],
+    *,
+    robot: Robot,
+    topic: str | None = None,
+    effort: Effort = "torque",
+    clock: Clock = "auto",
+    joint_names: Mapping[str, str] | None = None,
+    command_topic: str | None = None,
+) -> RecordingContent:
+    """Read the joint states of a bag; see :func:`import_rosbag2`.
+
+    Raises:
+        SourceError: no bag, no such topic, a joint that was not recorded, a value not finite.
+    """
     with open_bag(Path(source)) as bag:
         chosen = _choose(bag, topic)
         states = _States(bag.files[0], robot.joint_names, joint_names or {}, effort, clock)
@@ -84,18 +121,13 @@ def import_rosbag2(
     metadata = {"importer": "rosbag2", "topic": chosen, "effort": effort, "clock": states.clock}
     if commands.values is not None:
         metadata |= {"command_topic": commands.topic, "command": commands.reading}
-    return write_imported(
-        output,
+    return RecordingContent(
         samples,
-        source=files,
-        robot=robot,
+        robot,
+        source=tuple(files),
         metadata=metadata,
-        held_joints=held_joints,
-        use=use,
-        notes=[*states.notes, *commands.notes],
+        concluded=(*states.concluded, *commands.concluded),
         clock_remedy=_BAG_CLOCK if states.clock == "header" else "record again",
-        force=force,
-        outside_limits=outside_limits,
     )
 
 
@@ -172,7 +204,7 @@ class _States:
 
     Attributes:
         clock: whose stamps are used, ``header`` or ``bag``.
-        notes: what was left out, sorted or merged.
+        concluded: what was left out, sorted or merged.
     """
 
     def __init__(
@@ -192,7 +224,7 @@ class _States:
         self._orders: dict[tuple[str, ...], list[int]] = {}  # places of the joints in a message
         self._recorded: dict[str, None] = {}  # names as in the bag
         self.clock: Literal["header", "bag"] = "header"
-        self.notes: list[str] = []
+        self.concluded: list[Conclusion] = []
 
     def add(self, message: BagMessage) -> None:
         """Add a message.
@@ -279,7 +311,7 @@ class _States:
         if whole:
             others = sum(len(part.numbers) for part in parts) - len(whole[0].numbers)
             if others:
-                self.notes.append(f"left out: messages with some of the joints only ({others})")
+                self.concluded.append(LeftOut(Omitted.SOME_JOINTS, others))
             return whole
         for joint in self._joints:
             holders = [part for part in parts if joint in part.joints]
@@ -300,15 +332,15 @@ class _States:
         zeros = leading_zeros(stamp)
         if zeros:
             keep[:zeros] = False
-            self.notes.append(f"left out: messages at the start without a stamp ({zeros})")
+            self.concluded.append(LeftOut(Omitted.NO_STAMPS, zeros))
         silent = second_publisher(values["position"], "message")
-        if silent.note is not None:
+        if silent.publisher is not None:
             keep &= ~silent.rows
-            self.notes.append(silent.note)
+            self.concluded.append(silent.publisher)
         order = np.flatnonzero(keep)
         swapped = sorted_neighbours(stamp[order], "message")
-        if swapped.note is not None:
-            self.notes.append(swapped.note)
+        if swapped.swapped is not None:
+            self.concluded.append(swapped.swapped)
         order = order[swapped.order]
         values = {name: array[order] for name, array in values.items()}
         self._check_repeats(stamp[order], received[order], numbers[order], values["position"])
@@ -330,13 +362,14 @@ class _States:
                 problem = f"only {len(array)} of {count} messages have it"
                 raise SourceError(self._source, problem, field=name, remedy="record it throughout")
             if absent.any():
-                joints = ", ".join(np.array(part.joints)[absent])
-                problem = f"joint {joints} has none in any message, the others have it"
-                remedy = "record it; --effort ignore imports the motion alone"
+                joints = tuple(np.array(part.joints)[absent].tolist())
                 if name == "effort":
+                    listing = ", ".join(joints)
+                    problem = f"joint {listing} has none in any message, the others have it"
+                    remedy = "record it; --effort ignore imports the motion alone"
                     raise SourceError(self._source, problem, field=name, remedy=remedy)
                 if name == "velocity":
-                    self.notes.append(f"velocity: {problem}: left out for all")
+                    self.concluded.append(PartialVelocity(joints))
                     continue
             values[name] = array
         if "position" not in values:
@@ -389,14 +422,16 @@ class _States:
         columns = [joint for part in parts for joint in part.joints]
         order = [columns.index(joint) for joint in self._joints]
         missing = [
-            f"{name} of {', '.join(part.joints)}"
+            (name, part.joints)
             for part, samples in zip(parts, joined, strict=True)
             for name in {name for other in joined for name in other.values} - set(samples.values)
         ]
         if missing:
-            problem = f"{missing[0]} was not recorded, that of the other joints was"
+            name, without = missing[0]
+            listing = ", ".join(without)
+            problem = f"{name} of {listing} was not recorded, that of the other joints was"
             remedy = f"record it; {_AT_REST}; --effort ignore imports the motion alone"
-            raise SourceError(self._source, problem, field=missing[0].split()[0], remedy=remedy)
+            raise SourceError(self._source, problem, field=name, remedy=remedy)
         stamp = first.stamp
         for samples in joined[1:]:
             stamp = stamp[(stamp >= samples.stamp[0]) & (stamp <= samples.stamp[-1])]
@@ -407,8 +442,8 @@ class _States:
             problem = f"{kinds} come in messages of their own, {apart or 'not at the same time'}"
             remedy = f"record them in one message; {_AT_REST}"
             raise SourceError(self._source, problem, field="joints", remedy=remedy)
-        how = "with the same stamps" if exact else "interpolated to the stamps of the first"
-        self.notes.append(f"merged from messages of their own, {how}: {kinds}")
+        groups = tuple(tuple(part.joints) for part in parts)
+        self.concluded.append(MergedMessages(groups, same_stamps=bool(exact)))
         values = {
             name: np.column_stack(
                 [

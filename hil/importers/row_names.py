@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 _BEFORE_NAMES: Final = 3  # columns of a joint state: seconds, nanoseconds, frame
-ORDER: Final = "joints in the order of the names in the rows"
-"""What is said of them, before their names."""
 
 
 class RowNames(NamedTuple):
@@ -15,11 +13,6 @@ class RowNames(NamedTuple):
 
     place: int  #: of the first among the columns
     joints: tuple[str, ...]
-
-    @property
-    def message(self) -> str:
-        """What is said of them."""
-        return f"{ORDER}: {', '.join(self.joints)}"
 
     def columns_of_messages(self, width: int) -> dict[str, str]:
         """Return the columns of joint states without a header, as of `ros2 topic echo --csv`.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.base.errors import SourceError
+from hil.importers.conclusions import CounterContinued, Sample, SortedSamples
 from hil.importers.units import TIMES
 
 Stamps = NDArray[np.int64]
@@ -55,7 +56,7 @@ class Continued(NamedTuple):
     """Stamps of a counter without its wraps."""
 
     stamp: Stamps
-    note: str | None  #: what wrapped, None if nothing did
+    wrapped: CounterContinued | None  #: None if nothing did
 
 
 def without_wraps(stamp: Stamps) -> Continued:
@@ -76,8 +77,7 @@ def without_wraps(stamp: Stamps) -> Continued:
             continue
         if ((continued > 0) & (continued <= _MOST_STEPS * usual)).all():
             passed = np.concatenate([[0], np.cumsum(np.where(backward, wrap, 0))])
-            times = f"{int(backward.sum())} times" if backward.sum() > 1 else "once"
-            return Continued(stamp + passed, f"{name} wrapped {times} and was continued")
+            return Continued(stamp + passed, CounterContinued(name, int(backward.sum())))
     return Continued(stamp, None)
 
 
@@ -91,14 +91,14 @@ class Sorted(NamedTuple):
     """The order of samples by stamp."""
 
     order: NDArray[np.intp]
-    note: str | None  #: how many had changed places, None if none had
+    swapped: SortedSamples | None  #: None if none had changed places
 
 
-def sorted_neighbours(stamp: Stamps, sample: str) -> Sorted:
+def sorted_neighbours(stamp: Stamps, sample: Sample) -> Sorted:
     """Return the order of samples by stamp (m,) [ns] where a few neighbours changed places.
 
     A clock that was set back stays as it is, to be refused: there a sample is older than many
-    before it. In words it is a `sample`, such as "message".
+    before it.
     """
     unchanged = np.arange(len(stamp))
     backward = int(np.count_nonzero(np.diff(stamp) < 0))
@@ -108,8 +108,7 @@ def sorted_neighbours(stamp: Stamps, sample: str) -> Sorted:
     farthest = int(np.abs(order - unchanged).max())
     if farthest > 2 or backward > max(1.0, _SWAPPED * len(stamp)):
         return Sorted(unchanged, None)
-    count = f"{backward} {sample}s" if backward > 1 else f"one {sample}"
-    return Sorted(order, f"{count} that came before an older one: sorted by stamp")
+    return Sorted(order, SortedSamples(backward, sample))
 
 
 def check_clock(stamp: Stamps, path: Path, remedy: str | None = None) -> None:

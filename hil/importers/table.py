@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hil.base.errors import SourceError
 from hil.importers.column_map import HOLE, Column, Format
+from hil.importers.conclusions import LeftOut, Omitted
 from hil.importers.date_stamps import nanoseconds_of_dates
 from hil.importers.dialect import (
     FORTRAN,
@@ -69,7 +70,7 @@ class Table:
     numbered: Sequence[int]  #: line numbers in the file, from 1
     dialect: Dialect
     gaps: bool  #: whether rows may lack numbers
-    notes: tuple[str, ...] = ()  #: what was left out
+    left_out: tuple[LeftOut, ...] = ()
 
     @classmethod
     def read(cls, path: Path, form: Format) -> Table:
@@ -100,11 +101,11 @@ class Table:
         if not names and form.header is None and comments:
             commented = dialect.cells(comments[-1].lstrip().lstrip("#%/"))
             names = tuple(commented) if len(commented) == width > 1 else ()
-        notes = (f"left out: lines that repeat the header ({repeated})",) if repeated else ()
+        left_out = (LeftOut(Omitted.HEADERS, repeated),) if repeated else ()
         numbers = [number for number, _ in rows]
         lines = [line for _, line in rows]
         gaps = form.missing == "drop"
-        return cls(path, names, units, width, lines, numbers, dialect, gaps, notes)
+        return cls(path, names, units, width, lines, numbers, dialect, gaps, left_out)
 
     def unit(self, column: Column) -> str | None:
         """Return the unit that the file states for a column: below its name, or in brackets."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 Kind = Literal["time", "position", "velocity", "torque", "motor_current", "commanded_position"]
 
@@ -61,6 +61,11 @@ _BY_SPELLING: Final = {
 }
 _BRACKETED: Final = re.compile(r"(.*?)[\s_]*(?:\[([^\[\]]*)\]|\(([^()]*)\))")
 _SUFFIXES: Final = ("deg", "rad", "mrad", "rpm", "Nm", "ms", "us", "ns", "sec", "mA")
+
+
+def kind_named(name: str) -> Kind:
+    """Return the quantity of this name."""
+    return next(kind for kind in get_args(Kind) if kind == name)
 
 
 def names_of_units(kind: str) -> str:

@@ -12,15 +12,18 @@ from hil.archive import open_archive
 from hil.base.errors import SourceError
 from hil.base.terminal_text import typed
 from hil.cell import Cell
+from hil.importers.conclusions import Certainty
 from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, import_recording
 from hil.importers.robot import Robot, Use
+from hil.look.messages import choice_text, fit_alike, sentences, setting_text
 from hil.look.other_arm import Contradictions
-from hil.look.result import Choice, Look, Row, fit_alike
+from hil.look.readings import DoubtfulArm, ExplainedTorque, GravityOption
+from hil.look.result import ChangedReading, Choice, Look, Row
 from hil.look.run import SETTINGS, look_at_joints, mountings
 from hil.pipeline.sources import cell_of, source_of
 from identification.errors import IdentificationError
 from identification.estimators.torque_channel import possible_low_passes
-from identification.signals.samples import Preprocessing, Samples, prepare
+from identification.signals.samples import Samples, prepare
 from identification.text import percentage
 from identification.validation.reading_scores import Score, compare, score_of
 from identification.validation.readings import SURE
@@ -69,7 +72,7 @@ def concluded(
         contradictions = Contradictions.of(cell, cell.model, samples, score, score.overall)
         return _of_this_arm(imported, source, contradictions)
     if score.overall > _SUSPECT and (explained := _explained(imported.archive)):
-        imported = replace(imported, lines=(*imported.lines, explained.line))
+        imported = replace(imported, concluded=(*imported.concluded, explained.how))
         error = explained.score.overall
         contradictions = Contradictions.of(cell, cell.model, samples, explained.score, error)
         return _of_this_arm(imported, source, contradictions)
@@ -83,7 +86,7 @@ def concluded(
         imported = _of_this_arm(imported, source, contradictions)
     if look.questions:
         raise undecided(source, look.questions[0], contradictions)
-    if look.map_text != imported.map_text or look.options:
+    if look.map_text != imported.map_text or look.gravity is not None:
         again = _again(imported, source, robot_of, look, use)
         if (few := _few_rows(again.archive)) is not None:
             cell, samples, score = few
@@ -108,10 +111,10 @@ def _few_rows(archive: Path) -> tuple[Cell, Samples, Score] | None:
 
 
 class _Explained(NamedTuple):
-    """Score of a torque through a low-pass or with heavy rotors, and both in words."""
+    """Score of a torque through a low-pass or with heavy rotors."""
 
     score: Score
-    line: str
+    how: ExplainedTorque
 
 
 def _explained(archive: Path) -> _Explained | None:
@@ -133,19 +136,11 @@ def _explained(archive: Path) -> _Explained | None:
             for wide_rotors in (False, True) if how is not SETTINGS else (True,):
                 score = score_of(model, samples, wide_rotors=wide_rotors)
                 if 0.0 < score.overall < least and not score.driven.any():
-                    return _Explained(score, _described(how, wide_rotors=wide_rotors))
+                    found = ExplainedTorque(how.torque_bandwidth, heavy_rotors=wide_rotors)
+                    return _Explained(score, found)
     except (IdentificationError, ValueError):
         pass  # the identification says what is wrong
     return None
-
-
-def _described(how: Preprocessing, *, wide_rotors: bool) -> str:
-    width = how.torque_bandwidth
-    parts = (
-        f"low-passed at {width:.2g} Hz" if width else "",
-        "with rotors heavier than the links" if wide_rotors else "",
-    )
-    return f"torque: follows the arm of the URDF, {', '.join(filter(None, parts))}"
 
 
 def _hangs_otherwise(cell: Cell, samples: Samples, score: Score) -> bool:
@@ -167,27 +162,18 @@ def _of_this_arm(
     Raises:
         SourceError: more than two independent findings contradict it.
     """
-    sentences = contradictions.sentences
+    found = contradictions.found
     if not contradictions.is_doubtful:
         return imported
-    if len(sentences) > _WARNED:
-        problem = f"is not of the arm of the URDF: {'; '.join(sentences)}"
+    if len(found) > _WARNED:
+        problem = f"is not of the arm of the URDF: {sentences(found)}"
         raise SourceError(source, problem, field="--urdf", remedy=_REMEDY)
-    warning = f"warning: the URDF may be that of another arm: {'; '.join(sentences)}"
-    return replace(imported, lines=(*imported.lines, warning))
+    return replace(imported, concluded=(*imported.concluded, DoubtfulArm(found)))
 
 
 def _changed(look: Look) -> list[Row]:
-    """Return the rows of what is sure to be other than recorded."""
-    aspects = ("order", "signs", "angle unit", "zero", "coupling", "gravity", "mounting")
-    return [
-        row
-        for row in look.rows
-        if row.aspect in aspects
-        and row.certainty == "sure"
-        and not row.reason.startswith("next")
-        and "friction takes energy" not in row.reason
-    ]
+    """Return the rows of what is certain to be other than recorded."""
+    return [row for row in look.rows if row.is_changed and row.certainty is Certainty.CERTAIN]
 
 
 def _again(
@@ -197,7 +183,7 @@ def _again(
     assert look.map_text is not None
     column_map = imported.archive.with_suffix(".found.toml")
     column_map.write_text(look.map_text, encoding="utf-8")
-    gravity = _gravity(look)
+    gravity = look.gravity
 
     def robot(recorded: object) -> Robot:
         described = robot_of(recorded)  # type: ignore[arg-type]
@@ -207,13 +193,7 @@ def _again(
         source, imported.archive, robot, ImportOptions(column_map), use=use, force=True
     )
     column_map.unlink()
-    lines = [f"{row.aspect}: {row.reading}, concluded; {row.reason}" for row in _changed(look)]
-    return replace(again, lines=(*imported.lines, *lines))
-
-
-def _gravity(look: Look) -> tuple[float, ...] | None:
-    option_words = " ".join(look.options).split()
-    return tuple(float(word) for word in option_words[1:4]) if option_words else None
+    return replace(again, concluded=(*imported.concluded, *map(ChangedReading, _changed(look))))
 
 
 def undecided(
@@ -224,10 +204,11 @@ def undecided(
         f" (error {percentage(choice.error, 1)})" if choice.error else "" for choice in choices
     ]
     readings = " or ".join(
-        choice.reading + error for choice, error in zip(choices, errors, strict=True)
+        choice_text(choice) + error for choice, error in zip(choices, errors, strict=True)
     )
-    options = [choice.line for choice in choices if choice.line.startswith("--")]
-    lines = [choice.line for choice in choices if choice.line and choice.line not in options]
+    settings = [choice.setting for choice in choices if choice.setting is not None]
+    options = [setting_text(each) for each in settings if isinstance(each, GravityOption)]
+    lines = [setting_text(each) for each in settings if not isinstance(each, GravityOption)]
     steps = []
     if options:
         steps.append(f"state {' or '.join(options)}")
@@ -240,8 +221,8 @@ def undecided(
     remedy = "; or ".join(steps) or "name joint, unit and sign of each column in a map (--map)"
     problem = f"{fit_alike(choices)}: {readings}"
     if contradictions.is_doubtful:
-        said = "; ".join(contradictions.sentences)
-        problem = f"may not be of the arm of the URDF: {said}; and {problem}"
+        found = sentences(contradictions.found)
+        problem = f"may not be of the arm of the URDF: {found}; and {problem}"
         return SourceError(source, problem, field="--urdf", remedy=f"{_REMEDY}; or {remedy}")
     if choices[0].aspect in _OF_AXES:
         remedy += "; if none of these is so, give the URDF of this arm"

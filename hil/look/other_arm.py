@@ -16,12 +16,24 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.cell.text import urdf_limits
+from hil.importers.conclusions import Certainty
 from hil.importers.findings import limit_excess, whole_turns
 from hil.look.physics import Size, mounted
+from hil.look.readings import (
+    BeyondEffort,
+    BeyondMasses,
+    BeyondRange,
+    BeyondSpeed,
+    Contradiction,
+    Fact,
+    OtherAxes,
+    OtherLengths,
+    Step,
+    UnexplainedTorque,
+)
 from hil.look.result import Row
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.text import percentage
 from identification.validation.reading_scores import Comparison, Score, compare, score_of
 from identification.validation.readings import EXPLAINED, SEPARATE, SURE
 
@@ -41,18 +53,18 @@ _SHORTER: Final = 0.5  # error ratio that such a channel does not have
 
 @dataclass(frozen=True)
 class Contradictions:
-    """What contradicts the arm, one sentence of each kind; "" for none.
+    """What contradicts the arm, one thing of each kind; None for nothing.
 
     The kinds are independent: another zero of a joint changes its motion alone, another unit of
     the torque the size alone. One cause of this sort does not explain two of them. A torque that
     is too small is no contradiction: it may be of the motor side, as the positions may.
     """
 
-    motion: str
-    size: str
-    lengths: str
-    torque: str
-    axes: str
+    motion: BeyondRange | BeyondSpeed | None = None
+    size: BeyondEffort | BeyondMasses | None = None
+    lengths: OtherLengths | None = None
+    torque: UnexplainedTorque | None = None
+    axes: OtherAxes | None = None
     #: whether a joint is farther beyond its range than zeros are off, or masses explain no torque
     #: of this size
     is_far: bool = False
@@ -81,58 +93,57 @@ class Contradictions:
         excess = limit_excess(low + turns_aside, high + turns_aside, limits)
         speed = _largest(samples.motion.velocity) / limits.velocity
         effort = _largest(samples.torque) / limits.effort
-        motion = size = torque = ""
+        motion: BeyondRange | BeyondSpeed | None = None
+        size: BeyondEffort | BeyondMasses | None = None
         if excess.max() > _BEYOND:
             joint = int(excess.argmax())
-            far = f"{np.degrees(excess[joint]):.0f}°" if turns[joint] else f"{excess[joint]:.2g} m"
-            motion = f"{names[joint]} moves {far} beyond its range"
+            motion = BeyondRange(names[joint], float(excess[joint]), turns=bool(turns[joint]))
         elif speed.max() > _OVER:
             joint = int(speed.argmax())
-            motion = f"{names[joint]} moves at {speed[joint]:.3g} times its largest speed"
+            motion = BeyondSpeed(names[joint], float(speed[joint]))
         expected = Size.of(cell, model, samples)
         factor = expected.factor or 1.0
         # A factor of 1000 is another unit, which a look names.
         if effort.max() > _OVER and not expected.is_thousand:
             joint = int(effort.argmax())
-            size = f"the torque of {names[joint]} reaches {effort[joint]:.3g} times its limit"
+            size = BeyondEffort(names[joint], float(effort[joint]))
         elif expected.is_off and factor > 1.0 and not expected.is_thousand:
-            size = f"the torque is {factor:.2g} times that of {expected.basis}"
+            size = BeyondMasses(factor, expected.by_masses)
         lengths = _other_lengths(cell, model, samples, score, expected)
-        if error > _UNEXPLAINED and not lengths:
-            torque = f"{percentage(error)} of the torque stays unexplained, whatever the masses"
-        several = len(changed) > 1
-        axes = f"the torque follows it with other {' and '.join(changed)} only" if several else ""
-        is_larger = expected.by_masses and size.endswith(expected.basis)
+        is_open = error > _UNEXPLAINED and lengths is None
+        torque = UnexplainedTorque(error) if is_open else None
+        axes = OtherAxes(tuple(changed)) if len(changed) > 1 else None
+        is_larger = isinstance(size, BeyondMasses) and size.by_masses
         is_far = is_larger or bool(np.any(excess > np.where(turns, _FAR, np.inf)))
         return cls(motion, size, lengths, torque, axes, is_far=is_far)
 
     @property
-    def sentences(self) -> tuple[str, ...]:
+    def found(self) -> tuple[Contradiction, ...]:
         """The contradictions there are."""
-        parts = (self.motion, self.size, self.lengths, self.torque, self.axes)
-        return tuple(filter(None, parts))
+        kinds = (self.motion, self.size, self.lengths, self.torque, self.axes)
+        return tuple(each for each in kinds if each is not None)
 
     @property
     def row(self) -> Row:
         """What a look says of a doubtful arm."""
-        reading = "may be another than that of the URDF"
-        return Row("arm", reading, "open", "; ".join(self.sentences), "give the URDF of this arm")
+        step = Step.GIVE_URDF_OF_THIS_ARM
+        return Row("arm", Fact.OTHER_ARM, Certainty.UNDETERMINED, self.found, step)
 
     @property
     def is_doubtful(self) -> bool:
         """Whether the arm may be another one, by a finding that is enough or by two."""
-        return self.is_far or bool(self.lengths) or len(self.sentences) > 1
+        return self.is_far or self.lengths is not None or len(self.found) > 1
 
 
 def _other_lengths(
     cell: Cell, model: RobotModel, samples: Samples, score: Score, size: Size
-) -> str:
+) -> OtherLengths | None:
     """Return which lengths of the links the torque fits better than those of the URDF.
 
     Longer links have more weight: that a torque by masses is larger as well is evidence of them.
     """
     if not np.any(model.gravity):
-        return ""
+        return None
     gravity = model.gravity
     trials = {factor: _with_lengths(cell, gravity, samples, score, factor) for factor in _LENGTHS}
     best = min(trials, key=lambda factor: trials[factor][1].ratio)
@@ -143,13 +154,10 @@ def _other_lengths(
     least = 1.0 if best > 1.0 else _SHORTER
     agrees = size.by_masses and 1.0 < best < (size.factor or 0.0)
     if error > EXPLAINED or against.sigmas > -(SEPARATE if agrees else SURE):
-        return ""
+        return None
     if against.ratio > least:
-        return ""
-    return (
-        f"the torque fits links {best:.2g} times as long (error {percentage(error)}, with those "
-        f"of the URDF {percentage(score.overall)})"
-    )
+        return None
+    return OtherLengths(best, error, score.overall)
 
 
 def _with_lengths(

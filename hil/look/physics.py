@@ -6,15 +6,52 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.cell.nominal import nominal_of
+from hil.importers.conclusions import Certainty
 from hil.look.maps import entries_of
-from hil.look.result import Certainty, Choice, Group, Row
+from hil.look.readings import (
+    AngleUnit,
+    ArmChange,
+    Basis,
+    Changes,
+    ColumnOrder,
+    Decider,
+    DelayInterval,
+    DelayProblem,
+    Either,
+    ErrorAsRead,
+    ErrorRatio,
+    Evidence,
+    Fact,
+    FilterShape,
+    GravityOption,
+    LastBody,
+    LowPassedTorque,
+    MapEntries,
+    MotorCurrents,
+    MotorTorque,
+    Mounting,
+    NearestZero,
+    NextBest,
+    Reading,
+    Setting,
+    SizeRatio,
+    StatedPayload,
+    StillUnexplained,
+    TorqueDelay,
+    TorqueUnit,
+    UnseenFriction,
+    UnseenZeros,
+    Vector,
+)
+from hil.look.readings import Step as Decide
+from hil.look.result import Aspect, Choice, Group, Row
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.prior import LEARNED, body_prior, fit_posterior
 from identification.factor.factor import Factor
@@ -23,10 +60,9 @@ from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples
-from identification.text import percentage
 from identification.validation.faults import COUPLED
 from identification.validation.nominal_scale import nominal_scale
-from identification.validation.reading_changes import Axes, Change, Meaning
+from identification.validation.reading_changes import IN_ORDER, Axes, Change, Meaning
 from identification.validation.readings import EXPLAINED, SEPARATE, Readings, Step
 
 Array = NDArray[np.float64]
@@ -41,7 +77,7 @@ MOUNTINGS: Final = {
     "upright": (0.0, 0.0, -9.81),
 }
 """Gravity in the base frame by mounting [m/s²]; "" for a torque without gravity."""
-_ASPECTS: Final[Mapping[Meaning, str]] = {
+_ASPECTS: Final[Mapping[Meaning, Aspect]] = {
     "torque sign": "signs",
     "position sign": "signs",
     "axis sign": "signs",
@@ -96,11 +132,6 @@ class Size:
         scales = np.abs(scale[np.isfinite(scale)])
         positive = scales[scales > 0.0]
         return cls(float(np.median(positive)) if len(positive) else None, by_masses=True)
-
-    @property
-    def basis(self) -> str:
-        """What is expected by."""
-        return "the URDF's masses" if self.by_masses else "the masses of arms of its reach"
 
     @property
     def is_off(self) -> bool:
@@ -174,193 +205,165 @@ class Finding:
         ]
         error = self.readings.score.overall
         if error > EXPLAINED:
-            rows = [_no_longer_sure(row, error) for row in rows]
-        rows.append(
-            Row("as read", f"torque predicted to {100.0 * error:.2g} % from other parts", "sure",
-                "with free parameters, before a fit of the friction law")
-        )  # fmt: skip
+            rows = [_no_longer_certain(row, error) for row in rows]
+        as_read = ErrorAsRead(error)
+        rows.append(Row("as read", as_read, Certainty.CERTAIN, (Basis.FREE_PARAMETERS,)))
         return rows
 
     def steps(self, *meanings: Meaning) -> list[Step]:
         """Return the changes of some meanings."""
         return [step for step in self.readings.steps if step.change.meaning in meanings]
 
-    def names(self, change: Change) -> str:
-        """Return the names of the joints of a change."""
-        if len(change.joints) == self.cell.model.n_joints:
-            return "all joints"
-        return ", ".join(self.cell.joint_names[joint] for joint in change.joints)
+    def _of_arm(self, change: Change) -> ArmChange:
+        return ArmChange(change, self.cell.joint_names)
 
-    def _row_of(self, aspect: str, steps: list[Step], text: str, decide: str) -> Row:
+    def _changes(self, steps: Sequence[Step]) -> Changes:
+        return Changes(tuple(self._of_arm(step.change) for step in steps))
+
+    def _changed(
+        self, aspect: Aspect, steps: list[Step], reading: Reading, decider: Decider
+    ) -> Row:
+        """Return the row of an aspect that is other than recorded, and how certain that is."""
         ratio = float(np.prod([step.ratio for step in steps]))
         sigmas = min(step.sigmas for step in steps)
-        certainty: Certainty = "sure" if all(step.sure for step in steps) else "open"
+        certainty = Certainty.UNDETERMINED
+        if all(step.sure for step in steps):
+            certainty = Certainty.CERTAIN
         nearest = self.readings.nearest
         rivals = [nearest[step.change.meaning] for step in steps if step.change.meaning in nearest]
         if any(rival[1].sigmas < SEPARATE and _repeats(rival[0], steps) for rival in rivals):
-            certainty = "open"
-        reason = f"error {ratio:.2f} times that as recorded ({-sigmas:.0f} standard errors)"
+            certainty = Certainty.UNDETERMINED
+        evidence: Evidence = ErrorRatio(ratio, sigmas)
         if all(step.by_friction for step in steps):
-            reason = "friction would drive the joint otherwise"
-        return Row(aspect, text, certainty, reason, decide)
+            evidence = Basis.DRIVING_FRICTION
+        return Row(aspect, reading, certainty, (evidence,), decider, is_changed=True)
 
-    def _unchanged(self, aspect: str, reading: str, *meanings: Meaning, decide: str = "") -> Row:
-        """Return the row of an aspect that is as recorded, and how sure that is."""
+    def _unchanged(
+        self, aspect: Aspect, reading: Fact, *meanings: Meaning, decider: Decider | None = None
+    ) -> Row:
+        """Return the row of an aspect that is as recorded, and how certain that is."""
         nearest = self.readings.nearest
         rivals = [nearest[meaning] for meaning in meanings if meaning in nearest]
         if not rivals:
-            return Row(aspect, reading, "likely", "not examined", decide)
+            return Row(aspect, reading, Certainty.LIKELY, (Basis.NOT_EXAMINED,), decider)
         change, against = min(rivals, key=lambda rival: rival[1].sigmas)
-        reason = f"next best: {self.described(change)}, error {against.ratio:.2f} times"
+        next_best = NextBest(self._of_arm(change), against.ratio)
         if against.sigmas > SEPARATE:
-            return Row(aspect, reading, "sure", reason)
+            return Row(aspect, reading, Certainty.CERTAIN, (next_best,))
         if against.sigmas < _HALF * SEPARATE or against.ratio < _ALIKE:
-            both = f"{reading}, or {self.described(change)}"
-            return Row(aspect, both, "open", reason, decide)
-        return Row(aspect, reading, "likely", reason, decide)
-
-    def described(self, change: Change) -> str:
-        """Return a change in words."""
-        texts: Mapping[Meaning, str] = {
-            "torque sign": "torque negated",
-            "position sign": "position negated",
-            "axis sign": "position and torque negated",
-            "torque order": "torques exchanged",
-            "position order": "positions exchanged",
-            "joint order": "joints exchanged",
-            "degrees": "degrees",
-            "radians": "radians",
-            "no gravity": "without gravity",
-            "mounting": f"mounted {change.name}",
-            "angle sum": "plus",
-            "angle difference": "less",
-            "zero": f"zero moved by {np.degrees(change.size):.0f} deg",
-        }
-        if change.meaning in COUPLED:
-            joint, other = (self.cell.joint_names[place] for place in change.joints)
-            return f"the angle of {joint} is recorded {texts[change.meaning]} that of {other}"
-        text = texts[change.meaning]
-        if len(change.joints) > 2 and change.order:
-            names = self.cell.joint_names
-            pairs = zip(change.joints, change.order, strict=True)
-            listing = ", ".join(f"{names[joint]} in place of {names[at]}" for joint, at in pairs)
-            return f"{text.removesuffix(' exchanged')} in another order: {listing}"
-        return f"{text}: {self.names(change)}" if change.joints else text
+            both = Either(reading, next_best.change)
+            return Row(aspect, both, Certainty.UNDETERMINED, (next_best,), decider)
+        return Row(aspect, reading, Certainty.LIKELY, (next_best,), decider)
 
     def _order(self) -> Row:
-        steps = self.steps("torque order", "position order", "joint order")
+        steps = self.steps(*IN_ORDER)
         if not steps:
-            return self._unchanged("order", "joints in the order of the URDF", "torque order",
-                              "position order", "joint order",
-                              decide="move the joints one by one")  # fmt: skip
-        kinds = sorted({step.change.meaning for step in steps})
+            decider = Decide.MOVE_EACH_JOINT
+            return self._unchanged("order", Fact.ORDER_OF_URDF, *IN_ORDER, decider=decider)
+        kinds = {step.change.meaning for step in steps}
         names = np.array(self.cell.joint_names)
-        texts = []
-        if "torque order" in kinds or "joint order" in kinds:
-            listing = ", ".join(names[np.argsort(self.axes.torque_order)])
-            texts.append(f"torque columns are of {listing}")
-        if "position order" in kinds or "joint order" in kinds:
-            listing = ", ".join(names[np.argsort(self.axes.position_order)])
-            texts.append(f"position columns are of {listing}")
-        return self._row_of("order", steps, "; ".join(texts), "name the joint of each column")
+        torque = position = None
+        if kinds & {"torque order", "joint order"}:
+            torque = tuple(names[np.argsort(self.axes.torque_order)].tolist())
+        if kinds & {"position order", "joint order"}:
+            position = tuple(names[np.argsort(self.axes.position_order)].tolist())
+        return self._changed("order", steps, ColumnOrder(torque, position), Decide.NAME_JOINTS)
 
     def _signs(self) -> Row:
         steps = self.steps("torque sign", "position sign", "axis sign")
+        decider = Decide.PUSH_A_JOINT
         if steps:
-            text = "; ".join(self.described(step.change) for step in steps)
-            return self._row_of("signs", steps, text, "push one joint by hand and see its torque")
+            return self._changed("signs", steps, self._changes(steps), decider)
         friction = self.readings.score.friction
         share = self.readings.score.share
         dissipates = (friction > SEPARATE) & (share > 0.0)
+        reading = Fact.SIGNS_OF_URDF
         if dissipates.all():
-            return Row(
-                "signs", "as the URDF's axes", "sure", "friction takes energy in every joint"
-            )
-        row = self._unchanged("signs", "as the URDF's axes", "torque sign", "position sign",
-                         decide="push one joint by hand and see its torque")  # fmt: skip
-        unsure = ", ".join(
-            name for name, sure in zip(self.cell.joint_names, dissipates, strict=True) if not sure
+            return Row("signs", reading, Certainty.CERTAIN, (Basis.DISSIPATION,))
+        row = self._unchanged("signs", reading, "torque sign", "position sign", decider=decider)
+        unseen = tuple(
+            name for name, seen in zip(self.cell.joint_names, dissipates, strict=True) if not seen
         )
-        return Row(row.aspect, row.reading, row.certainty,
-                   f"{row.reason}; friction is not seen in {unsure}", row.decide)  # fmt: skip
+        return replace(row, evidence=(*row.evidence, UnseenFriction(unseen)))
 
     def _unit(self) -> Row:
         steps = self.steps("degrees", "radians")
         if steps:
-            unit = "deg" if self.axes.factor < 1.0 else "rad"
-            return self._row_of("angle unit", steps, f"in {unit}", f'[position] unit = "{unit}"')
-        return self._unchanged("angle unit", "unit as read", "degrees", "radians")
+            unit: Literal["deg", "rad"] = "deg" if self.axes.factor < 1.0 else "rad"
+            entry = MapEntries((("position.unit", unit),))
+            return self._changed("angle unit", steps, AngleUnit(unit), entry)
+        return self._unchanged("angle unit", Fact.UNIT_AS_READ, "degrees", "radians")
 
     def _zero(self) -> Row:
         steps = self.steps("zero")
-        decide = "compare a posture with the URDF's (viewer)"
-        unseen = [self.cell.joint_names[joint] for joint in self.readings.unseen_zeros]
+        decider = Decide.COMPARE_A_POSTURE
+        unseen = tuple(self.cell.joint_names[joint] for joint in self.readings.unseen_zeros)
         if steps:
-            text = "; ".join(self.described(step.change) for step in steps)
-            return self._row_of("zero", steps, text, decide)
-        row = self._unchanged("zero", "as the URDF", "zero", decide=decide)
+            return self._changed("zero", steps, self._changes(steps), decider)
+        row = self._unchanged("zero", Fact.ZERO_OF_URDF, "zero", decider=decider)
         if not unseen:
             return row
-        text = f"as the URDF where the torque shows it; not shown: {', '.join(unseen)}"
         change, against = self.readings.nearest["zero"]
-        reason = f"{self.described(change)}: error {against.ratio:.2f} times"
-        return Row("zero", text, "open", reason, decide)
+        nearest = NearestZero(self._of_arm(change), against.ratio)
+        return Row("zero", UnseenZeros(unseen), Certainty.UNDETERMINED, (nearest,), decider)
 
     def _coupling(self) -> Row:
         steps = self.steps(*COUPLED)
-        decide = "turn one joint alone and see which angles change"
+        decider = Decide.TURN_ONE_JOINT
         if steps:
-            text = "; ".join(self.described(step.change) for step in steps)
-            return self._row_of("coupling", steps, text, decide)
-        return self._unchanged("coupling", "no angle contains another's", *COUPLED, decide=decide)
+            return self._changed("coupling", steps, self._changes(steps), decider)
+        return self._unchanged("coupling", Fact.UNCOUPLED, *COUPLED, decider=decider)
 
     def _gravity(self) -> Row:
         steps = self.steps("no gravity")
         if steps:
-            return self._row_of("gravity", steps, "torque without gravity", "--gravity 0 0 0")
-        decide = "hold the arm still, stretched out, and see the torque"
-        return self._unchanged("gravity", "torque with gravity", "no gravity", decide=decide)
+            option = GravityOption((0.0, 0.0, 0.0))
+            return self._changed("gravity", steps, Fact.WITHOUT_GRAVITY, option)
+        decider = Decide.HOLD_STILL
+        return self._unchanged("gravity", Fact.WITH_GRAVITY, "no gravity", decider=decider)
 
     def _mounting(self) -> Row:
         steps = self.steps("mounting")
+        decider = Decide.STATE_GRAVITY
         if steps:
-            return self._row_of("mounting", steps, steps[-1].change.name, "state --gravity X Y Z")
-        return self._unchanged("mounting", "as stated, else upright", "mounting",
-                          decide="state --gravity X Y Z")  # fmt: skip
+            return self._changed("mounting", steps, Mounting(steps[-1].change.name), decider)
+        return self._unchanged("mounting", Fact.STATED_MOUNTING, "mounting", decider=decider)
 
     def _size(self) -> Row:
         factor = self.size.factor
         if factor is None:
-            reason = "no masses in the URDF and little weight: size not tested"
-            decide = "state gear ratios or torque constants ([drive] of a map) if not"
-            return Row("side", "joint side", "likely", reason, decide)
-        reason = f"measured over expected by {self.size.basis}: {factor:.2g}"
+            untested = (Basis.SIZE_UNTESTED,)
+            decider = Decide.STATE_DRIVE
+            return Row("side", Fact.JOINT_SIDE, Certainty.LIKELY, untested, decider)
+        evidence = (SizeRatio(factor, self.size.by_masses),)
         if not self.size.is_off:
-            certainty: Certainty = "sure" if self.size.by_masses else "likely"
-            return Row("side", "joint side, a torque", certainty, reason)
+            certainty = Certainty.CERTAIN if self.size.by_masses else Certainty.LIKELY
+            return Row("side", Fact.JOINT_TORQUE, certainty, evidence)
         if self.size.is_thousand:
-            unit = "mN.m" if factor > 1.0 else "kN.m"
-            return Row("side", f"torque in {unit}", "likely", reason, f'[torque] unit = "{unit}"')
+            unit: Literal["mN.m", "kN.m"] = "mN.m" if factor > 1.0 else "kN.m"
+            entry = MapEntries((("torque.unit", unit),))
+            return Row("side", TorqueUnit(unit), Certainty.LIKELY, evidence, entry)
         if factor > 1.0:
-            return Row("side", "larger than the arm needs", "open", reason, "check the unit")
-        return Row("side", "motor side (before the gears), or a current", "open", reason,
-                   "ask for the unit of the channel")  # fmt: skip
+            reading = Fact.LARGE_TORQUE
+            return Row("side", reading, Certainty.UNDETERMINED, evidence, Decide.CHECK_UNIT)
+        reading = Fact.MOTOR_SIDE
+        return Row("side", reading, Certainty.UNDETERMINED, evidence, Decide.ASK_FOR_UNIT)
 
     def _payload(self, groups: Sequence[Group]) -> Row:
         payload = self.cell.file.robot.payload
         if payload is not None:
-            return Row("payload", f"{payload.mass:g} kg as stated", "sure", "by the cell")
-        decide = "record with and without it (`hil payload`)"
+            stated = StatedPayload(payload.mass)
+            return Row("payload", stated, Certainty.CERTAIN, (Basis.CELL,))
+        decider = Decide.RECORD_PAYLOAD
         last = next((group for group in reversed(groups) if group.quantity == "body"), None)
         if last is None or not last.identifiable:
-            reason = "the motion determines no parameter of the last body"
-            return Row("payload", "none stated; not determined", "open", reason, decide)
+            none = (Basis.LAST_BODY_UNDETERMINED,)
+            reading = Fact.PAYLOAD_UNDETERMINED
+            return Row("payload", reading, Certainty.UNDETERMINED, none, decider)
         total = last.identifiable + last.weak + last.missing
-        reason = (
-            f"the motion determines {last.identifiable} of the {total} parameters of the body of"
-            f" {last.body}, with all that it carried"
-        )
-        return Row("payload", "none stated; part of the last body", "likely", reason, decide)
+        evidence = (LastBody(last.identifiable, total, last.body),)
+        reading = Fact.PAYLOAD_IN_LAST_BODY
+        return Row("payload", reading, Certainty.LIKELY, evidence, decider)
 
     def questions(self) -> tuple[tuple[Choice, ...], ...]:
         """Return the readings that fit alike, the best of each meaning."""
@@ -384,29 +387,17 @@ class Finding:
         entries: Mapping[str, Any] = {}
         if self.map_text is not None:
             entries = entries_of(axes, self.map_text, self.source, self.cell.joint_names)
-        line = "; ".join(
-            f"[{key.rpartition('.')[0]}] {key.rpartition('.')[2]} = {_toml(value)}"
-            if "." in key
-            else f"{key} = {_toml(value)}"
-            for key, value in entries.items()
-        )
-        if not line and change.meaning in ("no gravity", "mounting"):
+        setting: Setting | None = MapEntries(tuple(entries.items())) if entries else None
+        if setting is None and change.meaning in ("no gravity", "mounting"):
             gravity = (0.0, 0.0, 0.0) if change.meaning == "no gravity" else MOUNTINGS[change.name]
-            line = f"--gravity {' '.join(f'{part:g}' for part in gravity)}"
-        aspect = _ASPECTS[change.meaning]
-        return Choice(aspect, self.described(change), error, line, tuple(entries.items()))
+            setting = GravityOption(gravity)
+        return Choice(_ASPECTS[change.meaning], self._of_arm(change), error, setting)
 
     def _sides(self) -> tuple[Choice, ...]:
         ratio = 1.0 / (self.size.factor or 1.0)
         count = self.cell.model.n_joints
-        each = ", ".join([f"{ratio:.0f}"] * count)
-        return (
-            Choice("side", "torque of the motors", None,
-                   f'[torque] side = "motor"; [drive] gear_ratio = [{each}] (about; the maker\'s)'),
-            Choice("side", "motor current", None,
-                   f"[motor_current] in place of [torque]; [drive] torque_constant = [{each}] "
-                   "(about, N·m/A with gears)"),
-        )  # fmt: skip
+        settings = (MotorTorque(ratio, count), MotorCurrents(ratio, count))
+        return tuple(Choice("side", None, None, setting) for setting in settings)
 
     def entries(self) -> dict[str, Any]:
         """Return the entries of the map for the sure conclusions."""
@@ -419,76 +410,71 @@ class Finding:
             entries["torque.unit"] = "mN.m" if (self.size.factor or 1.0) > 1.0 else "kN.m"
         return entries
 
-    def options(self) -> tuple[str, ...]:
-        """Return the options for `hil identify` that the sure conclusions need."""
+    def gravity(self) -> Vector | None:
+        """Return the gravity that the sure conclusions need; None if it is as stated [m/s²]."""
         if any(step.sure for step in self.steps("no gravity")):
-            return ("--gravity 0 0 0",)
-        steps = [step for step in self.steps("mounting") if step.sure]
-        if not steps:
-            return ()
-        return (f"--gravity {' '.join(f'{part:g}' for part in self.readings.model.gravity)}",)
+            return (0.0, 0.0, 0.0)
+        if any(step.sure for step in self.steps("mounting")):
+            return tuple(self.readings.model.gravity.tolist())
+        return None
 
 
-def _no_longer_sure(row: Row, error: float) -> Row:
+def _no_longer_certain(row: Row, error: float) -> Row:
     """Return a row that rests on a torque which the arm does not explain."""
-    if row.certainty != "sure" or row.aspect == "payload":
+    if row.certainty is not Certainty.CERTAIN or row.aspect == "payload":
         return row
-    reason = f"{row.reason}; but {percentage(error)} of the torque stays unexplained"
-    return replace(row, certainty="likely", reason=reason)
+    evidence = (*row.evidence, StillUnexplained(error))
+    return replace(row, certainty=Certainty.LIKELY, evidence=evidence)
 
 
 def _repeats(change: Change, steps: list[Step]) -> bool:
     """Whether a change concerns the joints of steps that are orders."""
-    return change.meaning.endswith("order") and any(
+    return change.meaning in IN_ORDER and any(
         set(change.joints) & set(step.change.joints) for step in steps
     )
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, str):
-        return f'"{value}"'
-    if isinstance(value, list):
-        return f"[{', '.join(map(_toml, value))}]"
-    return f"{value:g}"
 
 
 def without_torque(recording: Recording) -> Row:
     """Return the row of a log without torque."""
     if recording.motor_current is None:
-        decide = "record it"
+        decider = Decide.RECORD_TORQUE
         if recording.commanded_position is not None:
-            decide = "import it: `hil rollout --polish` identifies servo and friction"
-        return Row("torque", "none, and no motor current", "sure", "by the channels", decide)
-    return Row("torque", "none; motor currents", "sure", "by name or unit",
-               "[drive] torque_constant of a map (N·m/A), or `hil torque-constants`")  # fmt: skip
+            decider = Decide.IMPORT_COMMANDS
+        return Row("torque", Fact.NO_TORQUE, Certainty.CERTAIN, (Basis.CHANNELS,), decider)
+    decider = Decide.STATE_TORQUE_CONSTANT
+    return Row("torque", Fact.MOTOR_CURRENT, Certainty.CERTAIN, (Basis.NAME_OR_UNIT,), decider)
 
 
 def channel_rows(delay: DelayEstimate | None, low_pass: Preprocessing | None) -> Iterator[Row]:
     """Yield delay and low-pass of the torque."""
-    if delay is None:
-        yield Row("delay", "not determined", "open", "no usable row")
-    elif delay.significant:
-        half = 1e3 * delay.half_interval
-        yield Row("delay", f"torque {1e3 * delay.delay:.0f} ms behind the position", "sure",
-                  f"± {half:.1g} ms", "--delay auto")  # fmt: skip
-    elif delay.determined:
-        yield Row(
-            "delay", "none", "sure", f"{1e3 * delay.delay:.1f} ± {1e3 * delay.half_interval:.1g} ms"
-        )
-    elif abs(delay.delay) > delay.half_interval:
-        side = "behind" if delay.delay > 0.0 else "before"
-        text = f"perhaps: torque {1e3 * abs(delay.delay):.0f} ms {side} the position"
-        reason = f"± {1e3 * delay.half_interval:.1g} ms; other parts are not predicted better"
-        yield Row("delay", text, "open", reason, "record faster motion")
-    else:
-        yield Row("delay", "none seen", "likely", str(delay.reason), "record faster motion")
+    yield _delay_row(delay)
     if low_pass is None or low_pass.torque_bandwidth is None:
-        yield Row("low-pass", "none in the torque", "likely", "none predicts it better")
+        none = (Basis.NO_FILTER_BETTER,)
+        yield Row("low-pass", Fact.NO_LOW_PASS, Certainty.LIKELY, none)
         return
-    kind = "causal" if low_pass.torque_shape.causal else "without phase"
-    yield Row("low-pass", f"torque low-passed at {low_pass.torque_bandwidth:.2g} Hz", "likely",
-              f"order {low_pass.torque_shape.order}, {kind}, fits better",
-              "ask for the filter of the channel")  # fmt: skip
+    reading = LowPassedTorque(low_pass.torque_bandwidth)
+    shape = FilterShape(low_pass.torque_shape.order, low_pass.torque_shape.causal)
+    yield Row("low-pass", reading, Certainty.LIKELY, (shape,), Decide.ASK_FOR_FILTER)
+
+
+def _delay_row(delay: DelayEstimate | None) -> Row:
+    if delay is None:
+        none = (Basis.NO_ROW,)
+        return Row("delay", Fact.DELAY_UNDETERMINED, Certainty.UNDETERMINED, none)
+    half = delay.half_interval
+    if delay.significant:
+        reading = TorqueDelay(delay.delay, confirmed=True)
+        evidence = DelayInterval(half)
+        return Row("delay", reading, Certainty.CERTAIN, (evidence,), Decide.ESTIMATE_DELAY)
+    if delay.determined:
+        about_zero = DelayInterval(half, delay.delay)
+        return Row("delay", Fact.NO_DELAY, Certainty.CERTAIN, (about_zero,))
+    if abs(delay.delay) > half:
+        reading = TorqueDelay(delay.delay, confirmed=False)
+        evidence = DelayInterval(half, unconfirmed=True)
+        return Row("delay", reading, Certainty.UNDETERMINED, (evidence,), Decide.RECORD_FASTER)
+    problem = DelayProblem(str(delay.reason))
+    return Row("delay", Fact.NO_DELAY_SEEN, Certainty.LIKELY, (problem,), Decide.RECORD_FASTER)
 
 
 def determined(readings: Readings) -> tuple[Group, ...]:

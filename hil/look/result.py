@@ -2,11 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
-Certainty = Literal["sure", "likely", "open"]
+from hil.importers.conclusions import Certainty, Conclusion
+from hil.look.readings import ArmChange, Decider, Evidence, MapEntries, Reading, Setting, Vector
+
+Aspect = Literal[
+    "time",
+    "joints",
+    "position",
+    "velocity",
+    "torque",
+    "motor current",
+    "commanded position",
+    "fixed",
+    "recorded arm",
+    "motion",
+    "wraps",
+    "positions",
+    "range",
+    "order",
+    "signs",
+    "angle unit",
+    "zero",
+    "coupling",
+    "gravity",
+    "mounting",
+    "side",
+    "payload",
+    "as read",
+    "delay",
+    "low-pass",
+    "arm",
+]
+"""What a row is about, as a person and a program read it."""
 
 
 @dataclass(frozen=True)
@@ -14,19 +44,20 @@ class Row:
     """What one aspect of a recording is.
 
     Attributes:
-        aspect: such as ``position`` or ``gravity``.
+        aspect: what it is about.
         reading: what it is.
-        certainty: ``sure``: nothing else fits; ``likely``: by names or custom; ``open``: the
-            recording does not say.
-        reason: why.
-        decide: what would decide it; empty if there is none.
+        certainty: how certain that is.
+        evidence: from what, most often one thing.
+        decider: what would decide it; None if there is nothing.
+        is_changed: whether the torque says that it is other than recorded.
     """
 
-    aspect: str
-    reading: str
+    aspect: Aspect
+    reading: Reading
     certainty: Certainty
-    reason: str
-    decide: str = ""
+    evidence: tuple[Evidence, ...]
+    decider: Decider | None = None
+    is_changed: bool = False
 
 
 @dataclass(frozen=True)
@@ -35,18 +66,21 @@ class Choice:
 
     Attributes:
         aspect: that of a row.
-        reading: what it would be.
+        reading: what it would be: a change, or, where the side is open, what its setting says.
         error: of the torque, predicted from other parts of the recording, as a share of it; None
             if the motion says nothing about it.
-        line: of a column map, or an option, that states it.
-        entries: of the map, by dotted key; empty if the line is no entry of a map.
+        setting: what states it; None if nothing does.
     """
 
-    aspect: str
-    reading: str
+    aspect: Aspect
+    reading: ArmChange | None
     error: float | None
-    line: str
-    entries: tuple[tuple[str, Any], ...] = ()
+    setting: Setting | None
+
+    @property
+    def entries(self) -> dict[str, Any]:
+        """The entries of the map that state it, by dotted key; empty if none do."""
+        return dict(self.setting.entries) if isinstance(self.setting, MapEntries) else {}
 
 
 @dataclass(frozen=True)
@@ -54,15 +88,10 @@ class Group:
     """How many parameters of a body or joint the recording determines."""
 
     body: str
-    quantity: str
+    quantity: Literal["body", "friction"]
     identifiable: int
     weak: int
     missing: int
-
-
-def fit_alike(choices: Sequence[Choice]) -> str:
-    """Return how many readings fit alike, in words."""
-    return f"{'two' if len(choices) == 2 else 'three'} readings fit alike"
 
 
 @dataclass(frozen=True)
@@ -75,7 +104,7 @@ class Look:
         questions: readings that fit alike, one tuple for each question.
         groups: parameters that the recording determines; empty without masses or geometry.
         map_text: the column map with the sure conclusions; None for a bag.
-        options: for `hil identify`, beside the map.
+        gravity: for `hil identify`, beside the map [m/s²]; None if it is as stated.
         error: of the torque as read, predicted from other parts of the recording, as a share of
             it; None without a torque or an arm.
     """
@@ -85,29 +114,12 @@ class Look:
     questions: tuple[tuple[Choice, ...], ...]
     groups: tuple[Group, ...]
     map_text: str | None
-    options: tuple[str, ...] = ()
+    gravity: Vector | None = None
     error: float | None = None
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the result for programs."""
-        questions = [
-            [
-                {
-                    "aspect": choice.aspect,
-                    "reading": choice.reading,
-                    "error": choice.error,
-                    "line": choice.line,
-                }
-                for choice in choices
-            ]
-            for choices in self.questions
-        ]
-        return {
-            "source": self.source,
-            "rows": [asdict(row) for row in self.rows],
-            "questions": questions,
-            "determines": [asdict(group) for group in self.groups],
-            "map": self.map_text,
-            "options": list(self.options),
-            "error": self.error,
-        }
+
+@dataclass(frozen=True)
+class ChangedReading(Conclusion):
+    """A row of a look of which an identification uses what it concludes."""
+
+    row: Row

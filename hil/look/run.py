@@ -13,12 +13,14 @@ import numpy as np
 from hil.archive import open_archive
 from hil.base.errors import SourceError
 from hil.cell import Cell
+from hil.importers.conclusions import Certainty, ChannelMeaning, UnitBasis
 from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, import_recording
 from hil.importers.required_signals import require_motion
 from hil.look import physics, signals
 from hil.look.maps import with_entries
 from hil.look.other_arm import Contradictions
-from hil.look.result import Group, Look, Row
+from hil.look.readings import Basis, Fact, Step
+from hil.look.result import Aspect, Group, Look, Row
 from hil.look.undescribed import undescribed_robot
 from hil.pipeline.sources import Source, cell_of, source_of
 from identification.errors import IdentificationError
@@ -48,14 +50,13 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
         imported = import_recording(source, archive, robot, lenient)
         require_motion(archive, source)
         opened = open_archive(archive)
-        notes = opened.header.findings.lines
         cell = cell_of(opened)
         try:
             recorded = source_of(opened, cell, to_fit=False)
             recorded.recording.checked(cell.joint_names)
         except (RecordingError, SourceError) as error:
             raise SourceError(source, str(error)) from error
-        rows = signals.rows(recorded.recording, imported.lines, notes, cell, given=robot_of)
+        rows = signals.rows(recorded.recording, imported, None if robot_of is None else cell)
         if robot_of is None:
             rows.append(_without_robot(recorded.recording))
             return Look(source.name, tuple(rows), (), (), imported.map_text)
@@ -65,14 +66,10 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
 def _without_robot(recording: Recording) -> Row:
     if recording.torque is None and recording.motor_current is None:
         return physics.without_torque(recording)
-    quantity = "torque" if recording.torque is not None else "motor current"
-    return Row(
-        quantity,
-        "side, gravity, signs and order of the joints not examined",
-        "open",
-        "a torque says them only together with the arm's geometry",
-        "add --urdf ARM.urdf",
-    )
+    quantity: Aspect = "torque" if recording.torque is not None else "motor current"
+    evidence = (Basis.NO_GEOMETRY,)
+    open_ = Certainty.UNDETERMINED
+    return Row(quantity, Fact.TORQUE_UNEXAMINED, open_, evidence, Step.GIVE_URDF)
 
 
 def _with_torque(
@@ -126,14 +123,18 @@ def _look_of(finding: physics.Finding, rows: Sequence[Row], groups: tuple[Group,
         finding.questions(),
         groups,
         text,
-        finding.options(),
+        finding.gravity(),
         finding.readings.score.overall,
     )
 
 
 def _readings(cell: Cell, recording: Recording, imported: ImportedRecording) -> Readings:
     samples = prepare(recording, cell.model, options=SETTINGS)
-    stated = any("position" in line and "no unit stated" not in line for line in imported.lines)
+    stated = any(
+        each.kind == "position" and each.unit_basis is not UnitBasis.NUMBERS
+        for each in imported.concluded
+        if isinstance(each, ChannelMeaning)
+    )
     return find_readings(
         cell.model,
         samples,

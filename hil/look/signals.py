@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -12,9 +11,38 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.importers.commands import COMMANDED
+from hil.importers.conclusions import (
+    Certainty,
+    ChannelMeaning,
+    ConcludedUnit,
+    Conclusion,
+    FixedFingers,
+    JointOrder,
+    NameBasis,
+    RecordedArm,
+    StatedUnit,
+    UnitBasis,
+)
 from hil.importers.findings import against_position, outside_limits
-from hil.importers.row_names import ORDER
-from hil.look.result import Certainty, Row
+from hil.importers.recording import ImportedRecording
+from hil.importers.units import Kind
+from hil.look.readings import (
+    Basis,
+    Channels,
+    Clock,
+    Correlation,
+    Fact,
+    LateVelocity,
+    NotSlopes,
+    SlopeFactors,
+    SlopeRatio,
+    SmoothPositions,
+    Step,
+    StillJoints,
+    Travel,
+    Wrapped,
+)
+from hil.look.result import Aspect, Row
 from identification.signals.clock import time_base
 from identification.signals.recording import STUCK_MOVEMENT, UNWRAPPED, Recording
 from identification.signals.smoothing import noiseless_above
@@ -26,66 +54,75 @@ _CLOSE: Final = 0.1  # relative deviation of their ratio
 _LONGEST_LAG: Final = 0.1  # s
 _CLEAR_LAG: Final = 1.5  # sampling steps
 _HIGHEST_CORRELATION: Final = 0.95
+_UNITS: Final = (ConcludedUnit, StatedUnit)
+_Unit = ConcludedUnit | StatedUnit
+_ASPECTS: Final[Mapping[Kind, Aspect]] = {
+    "position": "position",
+    "velocity": "velocity",
+    "torque": "torque",
+    "motor_current": "motor current",
+    "commanded_position": "commanded position",
+}
+_SLOPES: Final[Mapping[float, Fact]] = {
+    57.2958: Fact.SLOPE_IN_DEGREES,
+    math.radians(1.0): Fact.SLOPE_OF_DEGREES,
+    -1.0: Fact.NEGATED_SLOPE,
+    9.5493: Fact.SLOPE_IN_REVOLUTIONS,
+}
+"""What a velocity is whose factor to the slope of the position is this."""
 
 
-def rows(
-    recording: Recording,
-    lines: Sequence[str],
-    notes: Sequence[str],
-    cell: Cell,
-    *,
-    given: object,
-) -> list[Row]:
-    """Return the rows; `lines` say what the names of channels mean, `notes` what was concluded."""
-    table = [_time(recording, lines, notes)]
-    table += [_quantity(line, notes) for line in lines if not line.startswith(("not used", "t:"))]
-    table = [row for row in table if row.aspect != "time" or row is table[0]]
+def rows(recording: Recording, imported: ImportedRecording, arm: Cell | None) -> list[Row]:
+    """Return the rows; `arm` is that of the recording, None where nobody described it."""
+    concluded = imported.concluded
+    units = [each for each in imported.examined.found if isinstance(each, _UNITS)]
+    table = [_time(recording, concluded, units)]
+    table += [row for each in concluded if (row := _concluded(each, units)) is not None]
     if recording.velocity is not None:
         table.append(_velocity(recording))
-    table += [_rests(recording), _wraps(recording), _measured(recording, lines)]
-    if given is not None:
-        table.append(_range(recording, cell))
+    table += [_rests(recording), _wraps(recording), _measured(recording, concluded)]
+    if arm is not None:
+        table.append(_range(recording, arm))
     return table
 
 
-def _time(recording: Recording, lines: Sequence[str], notes: Sequence[str]) -> Row:
+def _time(recording: Recording, concluded: Sequence[Conclusion], units: Sequence[_Unit]) -> Row:
     base = time_base(recording.time, recording.gap_before)
-    text = "; ".join(base.describe())
-    stated = next((line for line in lines if ": time" in line), "")
-    concluded = next((note for note in notes if "time" in note and "read as" in note), "")
-    if concluded:
-        match = re.search(r"read as (\w+)", concluded)
-        unit = match[1] if match else "s"
-        return Row("time", f"{unit}; {text}", "likely", "that unit gives a usual rate",
-                   'state [time] unit = "..."')  # fmt: skip
-    if not stated and not any("joint states" in line for line in lines):
-        return Row("time", text, "sure", "at the rate that was given")
-    if "joint states" in " ".join(lines):
-        return Row("time", f"stamps of the messages; {text}", "sure", "by the message type")
-    match = re.search(r"; (\w+) as the log states|: time, (\w+), as in", stated)
-    unit = (match[1] or match[2]) if match else "s"
-    reason = "by the name and the unit that is stated" if match else "by the name; a usual rate"
-    return Row("time", f"{unit}; {text}", "sure", reason)
+    meanings = [each for each in concluded if isinstance(each, ChannelMeaning)]
+    stated = next((each for each in meanings if each.kind == "time"), None)
+    unit = next((each for each in units if each.kind == "time"), None)
+    if isinstance(unit, ConcludedUnit):
+        decider = Step.STATE_TIME_UNIT
+        return Row("time", Clock(base, unit.unit), unit.certainty, (Basis.USUAL_RATE,), decider)
+    if any(each.basis is NameBasis.MESSAGE for each in meanings):
+        clock = Clock(base, of_messages=True)
+        return Row("time", clock, Certainty.CERTAIN, (Basis.MESSAGE_TYPE,))
+    if stated is None:
+        return Row("time", Clock(base), Certainty.CERTAIN, (Basis.GIVEN_RATE,))
+    basis = Basis.NAME_AND_RATE if stated.unit is None else Basis.STATED_UNIT
+    return Row("time", Clock(base, stated.unit or "s"), Certainty.CERTAIN, (basis,))
 
 
-def _quantity(line: str, notes: Sequence[str]) -> Row:
-    """Return the row of a group of channels."""
-    channels, _, meaning = line.partition(": ")
-    kind, _, reason = meaning.partition(", ")
-    if channels == ORDER:
-        return Row("joints", meaning, "sure", "in the order of the names in the rows")
-    if not reason:
-        return Row("channels", channels, "likely", meaning)
-    concluded = next((note for note in notes if note.startswith(f"{kind}: ")), "")
-    certainty: Certainty = "sure" if "as the log states" in reason else "likely"
-    decide = ""
-    if kind in ("position", "velocity") and "no unit stated" in reason:
-        unit = "deg" if "degrees" in concluded else "rad"
-        unit += "/s" if kind == "velocity" else ""
-        reason = concluded.partition(": ")[2] or reason.partition(";")[0]
-        certainty = "sure" if concluded else "likely"
-        return Row(kind, f"{channels}: {unit}", certainty, reason, decide)
-    return Row(kind.replace("_", " "), channels, certainty, reason, decide)
+def _concluded(conclusion: Conclusion, units: Sequence[_Unit]) -> Row | None:
+    """Return the row of what was concluded of channels or joints; None if another row has it."""
+    if isinstance(conclusion, JointOrder):
+        return Row("joints", conclusion, Certainty.CERTAIN, (Basis.ROW_NAMES,))
+    if isinstance(conclusion, FixedFingers):
+        joints = Channels(", ".join(conclusion.positions))
+        return Row("fixed", joints, Certainty.LIKELY, (conclusion,))
+    if isinstance(conclusion, RecordedArm):
+        return Row("recorded arm", Channels(conclusion.arm), Certainty.LIKELY, (conclusion,))
+    if not isinstance(conclusion, ChannelMeaning) or conclusion.kind == "time":
+        return None
+    kind = conclusion.kind
+    if kind in ("position", "velocity") and conclusion.unit_basis is UnitBasis.NUMBERS:
+        unit = next((each for each in units if each.kind == kind), None)
+        usual = "rad" if kind == "position" else "rad/s"
+        reading = Channels(conclusion.channels, usual if unit is None else unit.unit)
+        certainty = Certainty.LIKELY if unit is None else unit.certainty
+        return Row(kind, reading, certainty, (unit or conclusion,))
+    reading = Channels(conclusion.channels)
+    return Row(_ASPECTS[kind], reading, conclusion.certainty, (conclusion,))
 
 
 def _velocity(recording: Recording) -> Row:
@@ -93,28 +130,28 @@ def _velocity(recording: Recording) -> Row:
     assert recording.velocity is not None
     moving = np.flatnonzero(np.ptp(recording.position, axis=0) > STUCK_MOVEMENT)
     if not moving.size:
-        return Row("velocity", "not examined", "open", "no joint moves")
+        open_ = Certainty.UNDETERMINED
+        return Row("velocity", Fact.NOT_EXAMINED, open_, (Basis.NO_MOTION,))
     factor, correlation = against_position(
         recording.time, recording.position[:, moving], recording.velocity[:, moving]
     )
     itself = np.diag(correlation)
     names = [recording.joint_names[joint] for joint in moving]
     if itself.min() < _FOLLOWS:
-        bad = ", ".join(name for name, r in zip(names, itself, strict=True) if r < _FOLLOWS)
-        decide = "check the order of the columns of both"
-        return Row("velocity", f"not the slope of the position: {bad}", "sure",
-                   f"correlation {itself.min():.2f}", decide)  # fmt: skip
+        bad = tuple(name for name, r in zip(names, itself, strict=True) if r < _FOLLOWS)
+        evidence = Correlation(float(itself.min()))
+        decider = Step.CHECK_COLUMNS
+        return Row("velocity", NotSlopes(bad), Certainty.CERTAIN, (evidence,), decider)
     if np.all(np.abs(factor - 1.0) < _CLOSE):
-        return Row("velocity", "slope of the position, same unit, sign and order", "sure",
-                   f"slope over velocity {1.0 / np.mean(factor):.3f}")  # fmt: skip
-    reasons = {57.2958: "deg/s beside rad", math.radians(1.0): "rad/s beside deg",
-               -1.0: "negated", 9.5493: "rev/min beside rad/s"}  # fmt: skip
+        ratio = SlopeRatio(float(1.0 / np.mean(factor)))
+        return Row("velocity", Fact.SLOPE, Certainty.CERTAIN, (ratio,))
     explanations = [
-        text for size, text in reasons.items() if np.all(np.abs(factor / size - 1.0) < _CLOSE)
+        fact for size, fact in _SLOPES.items() if np.all(np.abs(factor / size - 1.0) < _CLOSE)
     ]
-    figures = ", ".join(f"{name} {size:.4g}" for name, size in zip(names, factor, strict=True))
-    reading = explanations[0] if explanations else "times the slope of the position"
-    return Row("velocity", reading, "sure", figures, "state unit, sign or gears of both")
+    factors = SlopeFactors(dict(zip(names, factor.tolist(), strict=True)))
+    reading = explanations[0] if explanations else Fact.SCALED_SLOPE
+    decider = Step.STATE_UNIT_OR_GEARS
+    return Row("velocity", reading, Certainty.CERTAIN, (factors,), decider)
 
 
 def _rests(recording: Recording) -> Row:
@@ -125,42 +162,48 @@ def _rests(recording: Recording) -> Row:
         if size <= STUCK_MOVEMENT
     ]
     if not rests:
-        return Row("motion", "every joint moves", "sure", f"at least {travel.min():.2g} rad or m")
-    return Row("motion", f"never move: {', '.join(rests)}", "sure",
-               f"less than {STUCK_MOVEMENT:g} rad or m",
-               "record a motion of all joints, or fix these (--locked NAME)")  # fmt: skip
+        moved = Travel(float(travel.min()), at_least=True)
+        return Row("motion", Fact.EVERY_JOINT_MOVES, Certainty.CERTAIN, (moved,))
+    evidence = Travel(STUCK_MOVEMENT, at_least=False)
+    still = StillJoints(tuple(rests))
+    return Row("motion", still, Certainty.CERTAIN, (evidence,), Step.MOVE_ALL_OR_LOCK)
 
 
 def _wraps(recording: Recording) -> Row:
     wrapped = recording.provenance.get(UNWRAPPED)
     if wrapped is None:
-        return Row("wraps", "continuous, no wrap", "sure", "no step of a turn")
-    return Row("wraps", f"wrapped by a turn, continued: {wrapped}", "sure", "steps of a turn")
+        return Row("wraps", Fact.CONTINUOUS, Certainty.CERTAIN, (Basis.NO_TURN,))
+    return Row("wraps", Wrapped(wrapped), Certainty.CERTAIN, (Basis.TURNS,))
 
 
 def _range(recording: Recording, cell: Cell) -> Row:
     outside = outside_limits(recording.position, cell.joint_names, cell.urdf)
     if outside is None:
-        return Row("range", "within the limits of the URDF", "sure", "every row of every joint")
-    return Row("range", outside[0], "sure", "limits of the URDF", outside[1])
+        return Row("range", Fact.WITHIN_LIMITS, Certainty.CERTAIN, (Basis.EVERY_ROW,))
+    return Row("range", outside, Certainty.CERTAIN, (Basis.LIMITS,), outside)
 
 
-def _measured(recording: Recording, lines: Sequence[str]) -> Row:
+def _measured(recording: Recording, concluded: Sequence[Conclusion]) -> Row:
     """Return whether positions are measured, by their noise and the lag of the velocity."""
-    names = [line.partition(": ")[0] for line in lines if ": position" in line]
+    names = [
+        each.channels
+        for each in concluded
+        if isinstance(each, ChannelMeaning) and each.kind == "position"
+    ]
     if any(COMMANDED.search(name) for name in names):
-        return Row("positions", "commanded", "likely", "by the name",
-                   "record the measured ones if the controller has them")  # fmt: skip
+        decider = Step.RECORD_MEASURED_IF_ANY
+        return Row("positions", Fact.COMMANDED, Certainty.LIKELY, (Basis.NAME,), decider)
     quiet = noiseless_above(recording.time, recording.position, recording.segments())
     lag = velocity_lag(recording)
     if lag is not None and lag > 0.0:
-        return Row("positions", "commanded", "likely",
-                   f"the velocity comes {1e3 * lag:.0f} ms after their slope",
-                   "record the measured ones")  # fmt: skip
+        evidence = LateVelocity(lag)
+        decider = Step.RECORD_MEASURED
+        return Row("positions", Fact.COMMANDED, Certainty.LIKELY, (evidence,), decider)
     if quiet is None:
-        return Row("positions", "measured", "sure", "noise of an encoder at all frequencies")
-    return Row("positions", f"low-passed below {quiet:.2g} Hz, or commanded", "open",
-               "no noise above that frequency", "ask for the raw encoder positions")  # fmt: skip
+        return Row("positions", Fact.MEASURED, Certainty.CERTAIN, (Basis.ENCODER_NOISE,))
+    reading = SmoothPositions(quiet)
+    open_ = Certainty.UNDETERMINED
+    return Row("positions", reading, open_, (Basis.NO_NOISE,), Step.ASK_FOR_POSITIONS)
 
 
 def velocity_lag(recording: Recording) -> float | None:

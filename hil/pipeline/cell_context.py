@@ -78,8 +78,8 @@ def controller_inertia(
 
 def _column_at(source: Source, field: str, time: Array) -> Array | None:
     """Return a channel (m, n) of a complete archive at some times; None if absent or zero."""
-    if source.name != source.path.name:
-        return None
+    if source.context is not None:
+        return None  # a part
     archive = open_archive(source.path, fields=("cycle", field))
     column = archive.columns.get(field)
     cycle = archive.columns.get("cycle")

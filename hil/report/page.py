@@ -95,15 +95,11 @@ def report_bytes(
 
 def grouped_warnings(results: Results) -> dict[str, list[str]]:
     """Return the warnings of the verdict by what they are about, the most consequential first."""
-    checks = {finding.words: finding.check for finding in results.judgement.findings}
-    ranks = {finding.words: k for k, finding in enumerate(results.judgement.worst_first)}
     groups: dict[str, list[str]] = {title: [] for title in (_OF_MODEL, _OF_RECORDING)}
-    # Those that no check found are remarks about the sources, and last.
-    for warning in sorted(
-        results.verdict.warnings, key=lambda warning: ranks.get(warning, len(ranks))
-    ):
-        title = _OF_RECORDING if checks.get(warning) in _RECORDING_CHECKS else _OF_MODEL
-        groups[title].append(warning)
+    for finding in results.judgement.doubtful:
+        title = _OF_RECORDING if finding.check in _RECORDING_CHECKS else _OF_MODEL
+        groups[title].append(finding.words)
+    groups[_OF_MODEL] += results.remarks
     return groups if results.verdict.warnings else {}
 
 

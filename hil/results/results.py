@@ -151,6 +151,11 @@ class JudgementResult(Frozen):
 
         return sorted(self.findings, key=rank)
 
+    @property
+    def doubtful(self) -> list[Finding]:
+        """Findings that are warnings, the most consequential first."""
+        return [finding for finding in self.worst_first if finding.level == "doubtful"]
+
     def any_joint(self, figure: str) -> bool:
         """Whether a field of :class:`JointJudgement` is known for any joint."""
         return any(getattr(joint, figure) is not None for joint in self.joints)
@@ -507,6 +512,11 @@ class Results(Frozen):
     conduct: ConductResult | None = None  #: Null without a campaign folder
     occasion: OccasionResult | None = None  #: Null in files of earlier versions
     settings: SettingsResult | None = None  #: Likewise
+
+    @property
+    def remarks(self) -> list[str]:
+        """Warnings that no check found, about the recordings: they follow those of the verdict."""
+        return self.verdict.warnings[len(self.judgement.doubtful) :]
 
     @property
     def not_significant(self) -> list[str]:

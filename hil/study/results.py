@@ -473,5 +473,5 @@ def _outcome(row: Comparison) -> str:
     if row.verdict == "none":
         return f"no significant difference, {ratio_text}"
     saved = significant(100.0 * (1.0 - min(row.ratio, 1.0 / row.ratio)), 2)
-    slightly = "slightly " if row.verdict.startswith("slightly") else ""
+    slightly = "slightly " if row.verdict in ("slightly better", "slightly worse") else ""
     return f"{'B' if row.ratio < 1.0 else 'A'} is {slightly}better by {saved} %, {ratio_text}"

@@ -188,6 +188,7 @@ class PosteriorEstimate:
     origin: str  #: of the prior
     design_effect: float  #: rows of data that count as one
     shift: Array  #: way of the parameters (p,) from those by what is believed
+    scatter: str = ""  #: how the scatter of the data entered the covariance
 
     @property
     def ratio(self) -> Array:
@@ -315,20 +316,27 @@ def fit_posterior(
             values=values,
             covariance=base.estimate.covariance + np.outer(shift, shift),
             noise_std=factor.residual_rms(values),
-            method=base.estimate.method.replace(prior.believed.origin, prior.origin),
+            method=posterior_method(prior.origin, design_effect, base.scatter),
         )
         return replace(base, estimate=estimate, origin=prior.origin, shift=shift)
     spread = block_covariance(factor, weights, values, prior.information, design_effect)
     alone = factor.solve(weights)
     solution = Solution(values, spread.root, alone.condition, alone.determined)
-    method = f"posterior of the prior ({prior.origin}), {design_effect:.3g} rows count as one; "
-    estimate = estimate_of(model.units, factor, solution, weights, method + spread.description)
+    scatter = spread.description
+    method = posterior_method(prior.origin, design_effect, scatter)
+    estimate = estimate_of(model.units, factor, solution, weights, method)
     estimate = replace(
         estimate, covariance=spread.covariance, interval_factor=spread.interval_factor
     )
+    unmoved = np.zeros_like(prior.mean)
     return PosteriorEstimate(
-        estimate, prior.mean, prior.std, prior.origin, design_effect, np.zeros_like(prior.mean)
+        estimate, prior.mean, prior.std, prior.origin, design_effect, unmoved, scatter
     )
+
+
+def posterior_method(origin: str, design_effect: float, scatter: str) -> str:
+    """Return the description of an estimate from a prior; `scatter` is that of its covariance."""
+    return f"posterior of the prior ({origin}), {design_effect:.3g} rows count as one; {scatter}"
 
 
 @dataclass(frozen=True, eq=False)

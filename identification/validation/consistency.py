@@ -78,6 +78,11 @@ class ConsistencyCheck:
         return self.cost > overall or worse_axis
 
     @property
+    def is_balanced(self) -> bool:
+        """Whether one joint carries a weight that no body can, as a spring or balancer does."""
+        return bool(self.overloaded) and self.costly
+
+    @property
     def remedy(self) -> str:
         """What to check if no consistent parameters fit.
 
@@ -85,7 +90,7 @@ class ConsistencyCheck:
         coupling spoils several.
         """
         usual = "check signs, torque constants, coupling and URDF"
-        if not (self.overloaded and self.costly):
+        if not self.is_balanced:
             return usual
         return (
             f"describe {ELEMENTS} on {self.overloaded} as [[robot.elements]] of the cell file;"

@@ -273,7 +273,7 @@ class MadeUp(System):
 
 
 ALL = RealTimeReport("SCHED_FIFO 50", True, True)
-PARTLY = RealTimeReport("SCHED_FIFO 50", False, True, ("only memory in use now is locked (…)",))
+PARTLY = RealTimeReport("SCHED_FIFO 50", False, True, memory_in_use_locked=True)
 NOTHING = RealTimeReport("ordinary", False, False)
 CPU = "/sys/devices/system/cpu"
 C4G = "10.2.12.150"

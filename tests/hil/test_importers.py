@@ -42,6 +42,7 @@ from hil.importers.column_map import UNITS, ColumnMap, Format, ready_map, ready_
 from hil.importers.dh import Convention, urdf_of_dh
 from hil.importers.findings import examine
 from hil.importers.log import import_log
+from hil.importers.messages import sentence as worded
 from hil.importers.robot import Robot, _cell_text
 from hil.importers.stamps import check_clock
 from hil.importers.table import Table
@@ -905,7 +906,8 @@ def warnings(
     )
     robot = Robot.from_urdf(arm.urdf, recorded=arm.joint_names)
     nominal = robot.nominal_torque() if masses else None
-    return list(examine(samples, arm.joint_names, robot.urdf, nominal=nominal).warnings)
+    found = examine(samples, arm.joint_names, robot.urdf, nominal=nominal)
+    return list(map(worded, found.warnings))
 
 
 def factors(warning: str) -> dict[str, float]:
@@ -949,7 +951,7 @@ class TestWarnings:
 
         def findings(held_joints: Sequence[str] = ()) -> list[str]:
             result = examine(samples, arm.joint_names, robot.urdf, held_joints=held_joints)
-            return list(result.warnings)
+            return list(map(worded, result.warnings))
 
         (sentence,) = findings()
         assert sentence.startswith("the position of elbow_joint is the same in all")

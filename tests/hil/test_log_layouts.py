@@ -12,10 +12,13 @@ import pytest
 from hil.archive import open_archive
 from hil.base.errors import SourceError
 from hil.importers.channels import kind_of
+from hil.importers.conclusions import ChannelMeaning, JointOrder, UnusedChannels
+from hil.importers.messages import sentence
 from hil.importers.name_words import kind_by_words
 from hil.importers.recording import ImportedRecording, ImportOptions, import_recording
 from hil.importers.robot import Robot
 from hil.look import look_at
+from hil.look.messages import row_text
 from tests.hil.test_log_kinds import JOINTS, POSITION, SLOPE, TIME, TORQUE, URDF, Floats
 
 EPOCH = 1_700_000_000
@@ -241,9 +244,11 @@ def test_its_map_reads_it_again(tmp_path: Path, robot: Robot, layout: str) -> No
 
 def test_wanted_and_measured_in_german(tmp_path: Path, robot: Robot) -> None:
     path = of("Zeit [s]", "A{} Istwinkel [rad]", "A{} Sollwinkel [rad]", "A{} Moment [Nm]")
-    lines = imported(path(tmp_path / "log.csv"), robot).lines
-    assert any(line.startswith("A0 Istwinkel .. A2 Istwinkel: position") for line in lines)
-    assert any("not used: A0 Sollwinkel" in line for line in lines)
+    concluded = imported(path(tmp_path / "log.csv"), robot).concluded
+    channels = {each.kind: each.channels for each in concluded if isinstance(each, ChannelMeaning)}
+    assert channels["position"] == "A0 Istwinkel .. A2 Istwinkel"
+    (unused,) = [each for each in concluded if isinstance(each, UnusedChannels)]
+    assert unused.channels[0].startswith("A0 Sollwinkel")
 
 
 def test_a_row_for_each_joint(tmp_path: Path, robot: Robot) -> None:
@@ -296,13 +301,15 @@ class TestListsOfAnotherLength:
 
 def test_names_in_rows_are_said(tmp_path: Path, robot: Robot) -> None:
     recording = imported(echo_with_header(tmp_path / "log.csv"), robot)
-    assert "joints in the order of the names in the rows: ankle, hip, knee" in recording.lines
+    order = JointOrder(("ankle", "hip", "knee"))
+    assert order in recording.concluded
+    assert sentence(order) == "joints in the order of the names in the rows: ankle, hip, knee"
 
 
 def test_a_look_names_them(tmp_path: Path, robot: Robot) -> None:
     looked = look_at(echo_with_header(tmp_path / "log.csv"), lambda _: robot, ImportOptions())
-    (row,) = [row for row in looked.rows if "names in the rows" in row.reason]
-    assert (row.aspect, row.reading) == ("joints", "ankle, hip, knee")
+    (row,) = [row for row in looked.rows if row.aspect == "joints"]
+    assert row_text(row)[:2] == ("ankle, hip, knee", "in the order of the names in the rows")
 
 
 def test_a_ready_map_leaves_the_order_to_the_names(tmp_path: Path, robot: Robot) -> None:
@@ -344,4 +351,4 @@ def test_a_channel_without_numbers_of_joints_is_no_quantity(tmp_path: Path, robo
     names = ["t", "q{}", "tau{}", "belt_speed", "valve_position"]
     path = table(tmp_path / "log.csv", names, TIME, POSITION, TORQUE, TIME, TIME)
     recording = imported(path, robot)
-    assert "not used: belt_speed, valve_position" in recording.lines
+    assert UnusedChannels(("belt_speed", "valve_position")) in recording.concluded

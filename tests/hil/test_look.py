@@ -23,14 +23,26 @@ from hil.archive import open_archive
 from hil.base.errors import SourceError
 from hil.cli import app
 from hil.importers.column_map import ColumnMap
+from hil.importers.conclusions import Certainty
 from hil.importers.recording import ImportOptions, import_recording
 from hil.importers.robot import Robot
 from hil.look import Look, look_at
 from hil.look.conclusions import concluded, undecided
 from hil.look.maps import entries_of
+from hil.look.messages import row_text
 from hil.look.other_arm import Contradictions
 from hil.look.physics import channel_rows
-from hil.look.result import Choice
+from hil.look.readings import (
+    ArmChange,
+    BeyondRange,
+    DoubtfulArm,
+    Fact,
+    GravityOption,
+    MapEntries,
+    OtherLengths,
+    TorqueDelay,
+)
+from hil.look.result import Aspect, Choice
 from hil.look.run import SETTINGS
 from hil.pipeline.sources import cell_of, source_of
 from identification.estimators.delay import DelayEstimate
@@ -43,6 +55,8 @@ from tests.hil.test_importers_rosbag2 import STATE, bag, state, states
 from tests.hil.test_log_kinds import JOINTS, URDF
 
 Floats = NDArray[np.float64]
+UPRIGHT = ArmChange(Change("mounting", name="upright"), JOINTS)
+MOVED = ArmChange(Change("zero", (0,), 0.5), JOINTS)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +80,7 @@ def look(urdf: Path, log: Path, table: Mapping[str, Floats], **planted: Floats) 
 
 def reading(looked: Look, aspect: str) -> tuple[str, str]:
     row = next(row for row in looked.rows if row.aspect == aspect)
-    return row.reading, row.certainty
+    return row_text(row).reading, row.certainty
 
 
 def test_a_log_as_it_is(tmp_path: Path, urdf: Path, table: Mapping[str, Floats]) -> None:
@@ -167,11 +181,13 @@ def test_a_delay_that_other_parts_do_not_confirm_is_open() -> None:
         reason="95 % interval of ± 6 ms", significant=False,
     )  # fmt: skip
     row, _ = channel_rows(delay, None)
-    assert (row.reading, row.certainty) == ("perhaps: torque 30 ms behind the position", "open")
+    assert row.reading == TorqueDelay(0.03, confirmed=False)
+    assert row.certainty is Certainty.UNDETERMINED
+    assert row_text(row).reading == "perhaps: torque 30 ms behind the position"
     early, _ = channel_rows(replace(delay, delay=-0.03), None)
-    assert early.reading == "perhaps: torque 30 ms before the position"
+    assert row_text(early).reading == "perhaps: torque 30 ms before the position"
     unseen, _ = channel_rows(replace(delay, delay=0.005), None)
-    assert unseen.reading == "none seen"
+    assert unseen.reading is Fact.NO_DELAY_SEEN
 
 
 def test_degrees_are_concluded(tmp_path: Path, urdf: Path, table: Mapping[str, Floats]) -> None:
@@ -275,10 +291,10 @@ class TestConclusions:
 
     def test_a_refusal_names_options_and_lines_of_a_map(self) -> None:
         choices = (
-            Choice("mounting", "upright", 0.07, "--gravity 0 0 -9.81"),
-            Choice("zero", "zero moved", 0.07, "[position] offset = [0, 3]", (("a", 1),)),
+            Choice("mounting", UPRIGHT, 0.07, GravityOption((0.0, 0.0, -9.81))),
+            Choice("zero", MOVED, 0.07, MapEntries((("position.offset", [0.0, 3.0]),))),
         )
-        contradictions = Contradictions("", "", "", "", "")
+        contradictions = Contradictions()
         message = str(undecided(Path("my log.csv"), choices, contradictions))
         assert "state --gravity 0 0 -9.81; or write the map with `hil look 'my log.csv'" in message
         assert "-o map.toml`, add [position] offset = [0, 3], and give it with --map" in message
@@ -365,21 +381,22 @@ class TestOtherArm:
         motor = replace(samples.motion, position=100.0 * samples.motion.position)
         before_gears = replace(samples, motion=motor, torque=samples.torque / 100.0)
         score = score_of(cell.model, samples)
-        assert not Contradictions.of(cell, cell.model, samples, score, 0.0).sentences
-        (sentence,) = Contradictions.of(cell, cell.model, before_gears, score, 0.0).sentences
-        assert "beyond its range" in sentence
+        assert not Contradictions.of(cell, cell.model, samples, score, 0.0).found
+        (found,) = Contradictions.of(cell, cell.model, before_gears, score, 0.0).found
+        assert isinstance(found, BeyondRange)
 
-    @pytest.mark.parametrize(("length", "said"), [(0.25, "1.6"), (0.4, ""), (0.8, "0.5")])
+    @pytest.mark.parametrize(("length", "factor"), [(0.25, 1.6), (0.4, None), (0.8, 0.5)])
     def test_links_of_another_length(
-        self, tmp_path: Path, table: Mapping[str, Floats], length: float, said: str
+        self, tmp_path: Path, table: Mapping[str, Floats], length: float, factor: float | None
     ) -> None:
         """Masses are free: gravity and the coupling of the joints say how long the links are."""
         path = tmp_path / "a.csv"
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *table.values())
         text = URDF.replace("<origin xyz='0 0 0.4'/>", f"<origin xyz='0 0 {length}'/>")
         contradictions = self.contradictions(path, self.described(tmp_path / "x.urdf", text))
-        assert contradictions.is_doubtful == bool(said)
-        assert contradictions.lengths.startswith(f"the torque fits links {said}" if said else "")
+        assert contradictions.is_doubtful == (factor is not None)
+        lengths = contradictions.lengths
+        assert (None if lengths is None else lengths.factor) == pytest.approx(factor, abs=0.05)
 
     def test_a_look_says_it(self, tmp_path: Path, table: Mapping[str, Floats]) -> None:
         text = URDF.replace("<origin xyz='0 0 0.4'/>", "<origin xyz='0 0 0.25'/>")
@@ -402,21 +419,22 @@ class TestOtherArm:
             archive = tmp_path / f"{length}.mcap"
             imported = import_recording(source, archive, lambda _, arm=robot: arm, options)
             again = concluded(imported, source, lambda _, arm=robot: arm, options, "excitation")
-            assert any("another arm: the torque fits links" in x for x in again.lines) == warned
+            doubts = [each for each in again.concluded if isinstance(each, DoubtfulArm)]
+            assert [type(doubt.found[0]) for doubt in doubts] == [OtherLengths] * warned
 
     def test_a_doubtful_arm_is_said_before_readings_that_fit_alike(self, tmp_path: Path) -> None:
-        size = Contradictions("a moves 75° beyond its range", "", "", "", "", is_far=True)
-        choices = (Choice("zero", "zero moved", 0.13, "--gravity 0 0 0"),) * 2
+        size = Contradictions(BeyondRange("a", np.radians(75.0), turns=True), is_far=True)
+        choices = (Choice("zero", MOVED, 0.13, GravityOption((0.0, 0.0, 0.0))),) * 2
         refusal = undecided(tmp_path / "a.csv", choices, size)
         assert refusal.field == "--urdf"
         assert "may not be of the arm of the URDF: a moves 75°" in refusal.problem
         assert "two readings fit alike" in refusal.problem
 
     def test_readings_of_an_axis_that_are_not_so_are_another_arm(self, tmp_path: Path) -> None:
-        none = Contradictions("", "", "", "", "")
-        for aspect, said in (("zero", True), ("side", False)):
-            choices = (Choice(aspect, "as planted", 0.13, "--gravity 0 0 0"),) * 2
-            remedy = undecided(tmp_path / "a.csv", choices, none).remedy
+        aspects: tuple[tuple[Aspect, bool], ...] = (("zero", True), ("side", False))
+        for aspect, said in aspects:
+            choices = (Choice(aspect, MOVED, 0.13, GravityOption((0.0, 0.0, 0.0))),) * 2
+            remedy = undecided(tmp_path / "a.csv", choices, Contradictions()).remedy
             assert remedy is not None
             assert ("if none of these is so, give the URDF of this arm" in remedy) == said
 
@@ -436,7 +454,7 @@ class TestOtherArm:
         path = tmp_path / "a.csv"
         turned = {**table, "q": table["q"] + 2.0 * np.pi * np.array([0.0, 0.0, 1.0])}
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *turned.values())
-        assert not self.contradictions(path, urdf).sentences
+        assert not self.contradictions(path, urdf).found
 
     @pytest.mark.parametrize("change", ["narrow", "weak"])
     def test_one_of_them_alone_may_be_a_limit_that_is_wrong(
@@ -454,8 +472,9 @@ def test_payload_is_part_of_what_the_motion_determines(
     tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
 ) -> None:
     row = next(row for row in look(urdf, tmp_path / "a.csv", table).rows if row.aspect == "payload")
-    assert row.certainty == "likely"
-    assert re.search(r"determines \d+ of the \d+ parameters of the body of", row.reason)
+    assert row.certainty is Certainty.LIKELY
+    reason = row_text(row).reason
+    assert re.search(r"determines \d+ of the \d+ parameters of the body of", reason)
 
 
 def test_a_bag_has_no_columns_to_map(tmp_path: Path) -> None:

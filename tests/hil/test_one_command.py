@@ -23,7 +23,9 @@ from hil.base.errors import InputError, SourceError
 from hil.base.output_folder import SOURCES, folder_beside, sources_text
 from hil.cli import app
 from hil.importers.column_map import ColumnMap
+from hil.importers.conclusions import ChannelMeaning, NameBasis, UnitBasis, UnusedChannels
 from hil.importers.log import import_log
+from hil.importers.messages import sentence
 from hil.importers.proposal import proposed_map
 from hil.importers.recording import ImportOptions, import_recording
 from hil.importers.robot import Robot
@@ -67,7 +69,9 @@ class TestProposedMap:
                 "torque": {"columns": "tau{}"},
             }
         )
-        assert "tau1 .. tau3: torque, by the name; no unit stated, read as N.m" in proposal.lines
+        torque = ChannelMeaning("tau1 .. tau3", "torque", NameBasis.NAME, None, UnitBasis.CUSTOM)
+        assert torque in proposal.concluded
+        assert sentence(torque) == "tau1 .. tau3: torque, by the name; no unit stated, read as N.m"
 
     def test_its_text_is_the_map(self, tmp_path: Path, urdf: Path) -> None:
         path = log(tmp_path / "a.csv", ["t", "q{}", "tau{}"], TIME, POSITION, TORQUE)
@@ -80,9 +84,8 @@ class TestProposedMap:
         path = log(tmp_path / "a.csv", names, 1e3 * TIME, np.degrees(POSITION), TORQUE)
         robot = Robot.from_urdf(urdf)
         proposal = proposed_map(path, robot)
-        assert "axis1 (Nm) .. axis3 (Nm): torque, by the unit; N.m as the log states" in (
-            proposal.lines
-        )
+        torque = "axis1 (Nm) .. axis3 (Nm)", "torque", NameBasis.UNIT, "N.m", UnitBasis.LOG
+        assert ChannelMeaning(*torque) in proposal.concluded
         imported = import_recording(path, tmp_path / "a.mcap", lambda _: robot)
         columns = open_archive(imported.archive).columns
         assert np.allclose(columns["position"], POSITION, rtol=0.0, atol=1e-8)
@@ -120,7 +123,8 @@ class TestProposedMap:
         path = log(tmp_path / "a.csv", ["time", *names], TIME, *values)
         proposal = proposed_map(path, Robot.from_urdf(urdf))
         assert proposal.columns.position.columns == pattern.format(kind="pos", joint="{}")
-        assert any("by the URDF's joint in the name" in line for line in proposal.lines)
+        bases = [each.basis for each in proposal.concluded if isinstance(each, ChannelMeaning)]
+        assert NameBasis.JOINT in bases
         import_recording(path, tmp_path / "a.mcap", lambda _: Robot.from_urdf(urdf))
         columns = open_archive(tmp_path / "a.mcap").columns
         assert np.allclose(columns["torque"], TORQUE, rtol=0.0, atol=1e-7)
@@ -130,7 +134,8 @@ class TestProposedMap:
         path = log(tmp_path / "a.csv", names, 1e3 * TIME, np.degrees(POSITION), TORQUE)
         proposal = proposed_map(path, Robot.from_urdf(urdf))
         assert proposal.columns == ColumnMap.load("kuka_rsi")
-        assert "AIPos.A{}: position, deg, as in the ready map kuka_rsi" in proposal.lines
+        stated = "AIPos.A{}: position, deg, as in the ready map kuka_rsi"
+        assert stated in map(sentence, proposal.concluded)
 
     def test_arrays_are_found_and_others_listed(self, tmp_path: Path, urdf: Path) -> None:
         path = tmp_path / "a.npz"
@@ -138,7 +143,7 @@ class TestProposedMap:
         proposal = proposed_map(path, Robot.from_urdf(urdf))
         assert proposal.columns.torque is not None
         assert proposal.columns.torque.columns == "torques"
-        assert proposal.lines[-1] == "not used: target_positions"
+        assert proposal.concluded[-1] == UnusedChannels(("target_positions",))
 
     def test_arrays_with_the_time_beside_each(self, tmp_path: Path, urdf: Path) -> None:
         """As Simulink writes its structures with time."""
@@ -298,7 +303,8 @@ def test_a_bag_needs_no_map(tmp_path: Path, urdf: Path) -> None:
     bag(source, {"/joint_states": (STATE, WHOLE)})
     imported = import_recording(source, tmp_path / "a.mcap", lambda _: robot)
     import_rosbag2(source, tmp_path / "b.mcap", robot=robot)
-    assert imported.lines[2].startswith("/joint_states/effort: torque, N.m")
+    effort = "/joint_states/effort", "torque", NameBasis.MESSAGE, "N.m", UnitBasis.MESSAGE
+    assert imported.concluded[2] == ChannelMeaning(*effort)
     first, second = (open_archive(tmp_path / f"{name}.mcap").columns for name in "ab")
     assert all(np.array_equal(first[name], second[name]) for name in second)
 
@@ -455,9 +461,8 @@ class TestGripperThatWasNotRecorded:
         imported = import_recording(path, tmp_path / "a.mcap", lambda _: Robot.from_urdf(urdf))
         locked = cell_of(open_archive(imported.archive)).file.robot.locked
         assert locked == {"finger_joint": pytest.approx(0.03)}
-        assert (
-            "finger_joint: fixed, at 0.03 (rad or m), as of an unrecorded gripper" in imported.lines
-        )
+        said = "finger_joint: fixed, at 0.03 (rad or m), as of an unrecorded gripper"
+        assert said in map(sentence, imported.concluded)
 
     def test_the_map_reads_the_log_again(self, tmp_path: Path, urdf: Path) -> None:
         path = log(tmp_path / "a.csv", ["t", "q{}", "tau{}"], TIME, POSITION, TORQUE)

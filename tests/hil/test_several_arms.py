@@ -11,6 +11,7 @@ import pytest
 from hil.archive import open_archive
 from hil.base.errors import InputError, SourceError
 from hil.cell.arms import Links, arms_of, recorded_arms
+from hil.importers.messages import sentence
 from hil.importers.recording import ImportOptions, import_recording
 from hil.importers.robot import Robot
 from hil.look import look_at
@@ -98,7 +99,7 @@ class TestConcluded:
         assert (
             "arm: right_j1 .. right_j3, between torso_l1 and right_l3, by the names of the recorded"
             " joints; all others are fixed"
-        ) in imported.lines
+        ) in map(sentence, imported.concluded)
 
     def test_by_their_number(self, tmp_path: Path) -> None:
         urdf = robot_of_arms(tmp_path, ("arm", 3), ("head", 1))

@@ -698,9 +698,9 @@ class TestPossibleLowPasses:
         rows = []
         evaluate = RegressorPlan.evaluate
 
-        def counted(self, q, *others):
-            rows.append(len(q))
-            return evaluate(self, q, *others)
+        def counted(self, motion, *others):
+            rows.append(motion.n_samples)
+            return evaluate(self, motion, *others)
 
         monkeypatch.setattr(RegressorPlan, "evaluate", counted)
         recording = a_recording(noise=0.5 * NOISE, duration=20.0, shape=shape)

@@ -156,6 +156,8 @@ class PhysicalSignFacts:
     impossible: tuple[str, ...]
     doubtful: tuple[str, ...]
     added_friction: tuple[str, ...]  # friction that falls by a term that nobody stated
+    inconsistency: str = ""  # that no rigid bodies produce the predicted torque
+    is_balanced: bool = False  # whether a spring or a balancer would explain that
 
     @classmethod
     def of(cls, evidence: Evidence, signs: SignFacts) -> PhysicalSignFacts:
@@ -164,17 +166,19 @@ class PhysicalSignFacts:
         consistency = evidence.consistency
         if signs.all_opposite:
             return cls((), (), implausible.added)
-        impossible = list(implausible.impossible)
-        if consistency is not None and consistency.impossible:
-            # No rigid bodies produce the predicted torque.
-            impossible.append(f"{consistency.sentence}: {consistency.remedy}")
-        return cls(tuple(impossible), implausible.doubtful, implausible.added)
+        if consistency is None or not consistency.impossible:
+            return cls(*implausible)
+        inconsistency = f"{consistency.sentence}: {consistency.remedy}"
+        is_balanced = consistency.is_balanced
+        return cls(*implausible, inconsistency=inconsistency, is_balanced=is_balanced)
 
     def findings(self, _: Naming) -> Iterator[Finding]:
         """Yield each message."""
         for message in self.impossible:
-            step = _BALANCED if ELEMENTS in message else _SIGNS
-            yield Finding("physical signs", "wrong", message, step, "symptom")
+            yield Finding("physical signs", "wrong", message, _SIGNS, "symptom")
+        if self.inconsistency:
+            step = _BALANCED if self.is_balanced else _SIGNS
+            yield Finding("physical signs", "wrong", self.inconsistency, step, "symptom")
         step = "use the consistent estimate where the model must be physical (simulation, URDF)"
         for message in self.doubtful:
             yield Finding("physical signs", "doubtful", message, step)

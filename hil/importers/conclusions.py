@@ -1,0 +1,434 @@
+"""What an import concludes of a recording, as values; :mod:`hil.importers.messages` words them.
+
+Nothing reads the words back: what follows from a conclusion follows from its fields.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum, StrEnum, auto
+from typing import Literal
+
+from hil.cell.arms import Links
+from hil.importers.units import Kind
+from identification.signals.clock import TimeBase
+
+Sample = Literal["row", "message"]
+"""What one sample of a recording is called: a row of a log, a message of a bag."""
+
+
+class Certainty(StrEnum):
+    """How certain a conclusion is; the value is what a person and a program read."""
+
+    CERTAIN = "sure"  #: nothing else fits
+    LIKELY = "likely"  #: by names or custom
+    UNDETERMINED = "open"  #: the recording does not say
+
+
+class NameBasis(Enum):
+    """From what a channel has its quantity."""
+
+    NAME = auto()
+    JOINT = auto()  #: a name that contains that of a joint of the URDF
+    UNIT = auto()  #: the unit alone: the name says nothing
+    WORD = auto()  #: a word in the name
+    WORDS = auto()  #: a word in each of several names, one for each joint
+    READY_MAP = auto()
+    OPTION = auto()  #: ``--columns``
+    MESSAGE = auto()  #: the field of a message
+    COMMANDS = auto()  #: a topic of commands that the positions follow
+
+
+class UnitBasis(Enum):
+    """From what a channel has its unit."""
+
+    LOG = auto()  #: the log states it
+    MAP = auto()  #: a ready map states it
+    MESSAGE = auto()  #: the type of the message has it
+    CUSTOM = auto()  #: nothing states it: that of most logs
+    NUMBERS = auto()  #: nothing states it: concluded from the numbers
+    OPTION = auto()  #: the user named the channel
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """One thing that was concluded of a recording, or found in it."""
+
+
+@dataclass(frozen=True)
+class ChannelMeaning(Conclusion):
+    """The quantity of a group of channels.
+
+    Attributes:
+        channels: their name, or the first and the last.
+        unit: None where neither log nor map states one.
+        origin: of the ready map its name, of commands what their messages are.
+    """
+
+    channels: str
+    kind: Kind
+    basis: NameBasis
+    unit: str | None
+    unit_basis: UnitBasis
+    origin: str = ""
+
+    @property
+    def certainty(self) -> Certainty:
+        """Names are custom; a unit that the log states belongs to one quantity."""
+        return Certainty.CERTAIN if self.unit_basis is UnitBasis.LOG else Certainty.LIKELY
+
+    @property
+    def decided_by(self) -> str:
+        """The key of a column map that states otherwise."""
+        return f"{self.kind}.unit" if self.unit is None else f"{self.kind}.columns"
+
+
+@dataclass(frozen=True)
+class UnusedChannels(Conclusion):
+    """Channels of no quantity."""
+
+    channels: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class JointOrder(Conclusion):
+    """Joints that the rows of a log name, in their order."""
+
+    joints: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class FixedFingers(Conclusion):
+    """Joints of a gripper that was not recorded, and where they are held [rad or m]."""
+
+    positions: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class RecordedArm(Conclusion):
+    """The arm that was recorded, of several: its first and last joint.
+
+    Attributes:
+        by_names: whether the names of the recorded joints say so, else their number.
+    """
+
+    arm: str
+    links: Links
+    by_names: bool
+
+
+@dataclass(frozen=True)
+class MappedUnit(Conclusion):
+    """The unit of a map that differs from the one that the file states; the map's is used."""
+
+    kind: Kind
+    unit: str
+    stated: str
+
+
+@dataclass(frozen=True)
+class StatedUnit(Conclusion):
+    """The unit that the file states, where the map has none."""
+
+    kind: Kind
+    unit: str
+
+    @property
+    def certainty(self) -> Certainty:
+        """It is stated."""
+        return Certainty.CERTAIN
+
+
+@dataclass(frozen=True)
+class ConcludedUnit(Conclusion):
+    """The unit that the numbers have, where nothing states one.
+
+    Of a time it gives a usual rate; positions are within the limits of the URDF in it, which they
+    leave by far in radians; velocities are then the slopes of the positions.
+    """
+
+    kind: Kind
+    unit: str
+
+    @property
+    def certainty(self) -> Certainty:
+        """Two units of time may give usual rates; limits and slopes exclude all others."""
+        return Certainty.LIKELY if self.kind == "time" else Certainty.CERTAIN
+
+    @property
+    def decided_by(self) -> str:
+        """The key of a column map that states it."""
+        return f"{self.kind}.unit"
+
+
+class Omitted(Enum):
+    """What an import leaves out."""
+
+    ZERO_TIMES = auto()  #: rows before the clock was there
+    NO_STAMPS = auto()  #: the same of messages
+    HEADERS = auto()  #: lines of a header that was written again
+    SOME_JOINTS = auto()  #: messages with some of the joints only
+
+
+@dataclass(frozen=True)
+class LeftOut(Conclusion):
+    """Rows, lines or messages that were left out."""
+
+    what: Omitted
+    count: int
+
+
+@dataclass(frozen=True)
+class MissingNumbers(Conclusion):
+    """Rows that were left out, as a number is missing in them."""
+
+    count: int
+    total: int
+    before: int  #: rows before the first of them
+
+
+@dataclass(frozen=True)
+class CounterContinued(Conclusion):
+    """A clock of limited range that was continued where it began again."""
+
+    clock: str
+    times: int
+
+
+@dataclass(frozen=True)
+class SortedSamples(Conclusion):
+    """Samples that came before an older one, and were sorted."""
+
+    count: int
+    sample: Sample
+
+
+@dataclass(frozen=True)
+class SecondPublisher(Conclusion):
+    """Samples of one pose between others that move, left out; `pose` is empty where all are 0."""
+
+    count: int
+    total: int
+    pose: tuple[float, ...]  #: [rad or m]
+    sample: Sample
+
+
+@dataclass(frozen=True)
+class MergedMessages(Conclusion):
+    """Joints whose states come in messages of their own."""
+
+    groups: tuple[tuple[str, ...], ...]
+    same_stamps: bool  #: else interpolated to the stamps of the first
+
+
+@dataclass(frozen=True)
+class PartialVelocity(Conclusion):
+    """Joints without velocity, for which it was left out of all."""
+
+    joints: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class NotCommands(Conclusion):
+    """A topic of commands that was not used; `problem` is that of its messages."""
+
+    topic: str
+    problem: str
+
+
+@dataclass(frozen=True)
+class DifferentCommands(Conclusion):
+    """Two topics that command different positions, of which neither is used."""
+
+    topics: tuple[str, str]
+
+
+@dataclass(frozen=True)
+class KnownCommands(Conclusion):
+    """The share of the samples at which a command is known."""
+
+    count: int
+    total: int
+
+
+@dataclass(frozen=True)
+class TooFewSamples(Conclusion):
+    """A recording that is too short to be examined."""
+
+    count: int
+
+
+@dataclass(frozen=True)
+class LockedJoints(Conclusion):
+    """Joints that are no part of the model, and where they are held [rad or m]."""
+
+    positions: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class RecordedClock(Conclusion):
+    """The time base of a recording."""
+
+    base: TimeBase
+
+
+@dataclass(frozen=True)
+class JointRange(Conclusion):
+    """Range of the positions of a joint and its limits in the URDF [rad or m]."""
+
+    joint: str
+    low: float
+    high: float
+    turns: bool
+    limits: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class UnusualRate(Conclusion):
+    """A rate at which no robot is sampled [Hz]."""
+
+    rate: float
+
+
+@dataclass(frozen=True)
+class SameStamp(Conclusion):
+    """Samples of one stamp that are far apart [rad or m], and how many stamps have such."""
+
+    apart: float
+    count: int
+
+
+@dataclass(frozen=True)
+class Alternation(Conclusion):
+    """Samples that go to and fro between two sequences, and how far apart they are [rad or m]."""
+
+    apart: float
+    count: int
+
+
+class Within(Enum):
+    """How positions that leave the limits of the URDF would be within them."""
+
+    DEGREES = auto()  #: as degrees that are read as radians
+    ORDER = auto()  #: in another order of the joints
+    NOTHING = auto()
+
+
+@dataclass(frozen=True)
+class OutsideLimits(Conclusion):
+    """Positions that leave the limits of the URDF.
+
+    Attributes:
+        fraction: of the rows, 1 for all.
+        ranges: of the joints that leave them [rad or m].
+        within: how none would.
+        order: of the joints in that case.
+    """
+
+    fraction: float
+    ranges: Mapping[str, tuple[float, float]]
+    within: Within
+    order: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class LittleMotion(Conclusion):
+    """The farthest that any joint moves [rad or m]."""
+
+    travel: float
+
+
+@dataclass(frozen=True)
+class FastJoint(Conclusion):
+    """The speed of a joint, and its limit in the URDF [rad/s or m/s]."""
+
+    joint: str
+    speed: float
+    limit: float
+
+
+@dataclass(frozen=True)
+class VelocityOrder(Conclusion):
+    """Another order in which the velocities are the slopes of the positions.
+
+    `deviation` is that of the velocities as mapped [%], `least` that in this order.
+    """
+
+    order: tuple[str, ...]
+    deviation: float
+    least: float
+
+
+@dataclass(frozen=True)
+class UnrelatedVelocity(Conclusion):
+    """A velocity that does not follow the position of its joint."""
+
+    joint: str
+    correlation: float
+
+
+@dataclass(frozen=True)
+class ScaledVelocity(Conclusion):
+    """Velocities that are a multiple of the slope of their position."""
+
+    factors: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class NoTorque(Conclusion):
+    """A recording without torque and motor current."""
+
+    is_commanded: bool  #: whether it has commanded positions
+
+
+@dataclass(frozen=True)
+class ZeroTorque(Conclusion):
+    """A joint whose torque is zero throughout."""
+
+    joint: str
+
+
+@dataclass(frozen=True)
+class LargeTorque(Conclusion):
+    """The largest torque of a joint, and its limit in the URDF [N·m or N]."""
+
+    joint: str
+    torque: float
+    limit: float
+
+
+@dataclass(frozen=True)
+class TorqueSize(Conclusion):
+    """Torques of another order of magnitude than the arm needs.
+
+    Attributes:
+        ratios: of the measured torque, by joint.
+        by_masses: whether over that of the URDF's masses, else over its effort limits.
+        too_large: whether they are too large, else too small.
+    """
+
+    ratios: Mapping[str, float]
+    by_masses: bool
+    too_large: bool
+
+
+@dataclass(frozen=True)
+class ConstantPositions(Conclusion):
+    """Joints with one and the same position in all samples while others move."""
+
+    joints: tuple[str, ...]
+    samples: int
+
+
+@dataclass(frozen=True)
+class Examined:
+    """Results of the examination of an imported recording.
+
+    Attributes:
+        found: what was concluded and left out, then time base and ranges.
+        warnings: probable errors of the column map, or of the recording.
+    """
+
+    found: tuple[Conclusion, ...]
+    warnings: tuple[Conclusion, ...]

@@ -1,0 +1,421 @@
+"""Sentences about what an import concludes: the only place that makes them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import singledispatch
+from typing import Final
+
+from hil.archive import Findings
+from hil.importers.conclusions import (
+    Alternation,
+    ChannelMeaning,
+    ConcludedUnit,
+    Conclusion,
+    ConstantPositions,
+    CounterContinued,
+    DifferentCommands,
+    Examined,
+    FastJoint,
+    FixedFingers,
+    JointOrder,
+    JointRange,
+    KnownCommands,
+    LargeTorque,
+    LeftOut,
+    LittleMotion,
+    LockedJoints,
+    MappedUnit,
+    MergedMessages,
+    MissingNumbers,
+    NameBasis,
+    NotCommands,
+    NoTorque,
+    Omitted,
+    OutsideLimits,
+    PartialVelocity,
+    RecordedArm,
+    RecordedClock,
+    SameStamp,
+    ScaledVelocity,
+    SecondPublisher,
+    SortedSamples,
+    StatedUnit,
+    TooFewSamples,
+    TorqueSize,
+    UnitBasis,
+    UnrelatedVelocity,
+    UnusedChannels,
+    UnusualRate,
+    VelocityOrder,
+    Within,
+    ZeroTorque,
+)
+from hil.importers.units import UNITS
+
+_BASIS: Final[Mapping[NameBasis, str]] = {
+    NameBasis.NAME: "by the name",
+    NameBasis.JOINT: "by the URDF's joint in the name",
+    NameBasis.UNIT: "by the unit",
+    NameBasis.WORD: "by a word in the name",
+    NameBasis.WORDS: "by a word in the names, joints in the order of the log",
+    NameBasis.OPTION: "as given with --columns",
+    NameBasis.MESSAGE: "by the field of the joint states; joints by their names",
+}
+_OMITTED: Final[Mapping[Omitted, str]] = {
+    Omitted.ZERO_TIMES: "rows at the start with the time 0",
+    Omitted.NO_STAMPS: "messages at the start without a stamp",
+    Omitted.HEADERS: "lines that repeat the header",
+    Omitted.SOME_JOINTS: "messages with some of the joints only",
+}
+_MAP_CHECK: Final = "check unit, sign and zero in the column map"
+
+
+def sentence(conclusion: Conclusion) -> str:
+    """Return a conclusion in words, without full stop."""
+    return worded(conclusion)
+
+
+def as_findings(examined: Examined) -> Findings:
+    """Return what was found in words, as an archive has it."""
+    found = tuple(map(sentence, examined.found))
+    return Findings(lines=found, warnings=tuple(map(sentence, examined.warnings)))
+
+
+@singledispatch
+def worded(conclusion: Conclusion) -> str:
+    """Return the words of a type of conclusion; other rooms register theirs."""
+    raise NotImplementedError(type(conclusion).__name__)
+
+
+@worded.register
+def _(meaning: ChannelMeaning) -> str:
+    return f"{meaning.channels}: {meaning.kind}, {reason_of(meaning)}"
+
+
+def reason_of(meaning: ChannelMeaning) -> str:
+    """Return unit and reason of the meaning of channels."""
+    basis = meaning.basis
+    if basis is NameBasis.READY_MAP:
+        return f"{meaning.unit}, as in the ready map {meaning.origin}"
+    if basis is NameBasis.COMMANDS:
+        return f"rad or m, {meaning.origin}"
+    if basis is NameBasis.MESSAGE:
+        return f"{meaning.unit}, {_BASIS[basis]}"
+    if basis is NameBasis.OPTION:
+        return _BASIS[basis]
+    return f"{_BASIS[basis]}; {_unit_of(meaning)}"
+
+
+def basis_of(meaning: ChannelMeaning) -> str:
+    """Return from what channels have their quantity."""
+    return _BASIS[meaning.basis]
+
+
+def _unit_of(meaning: ChannelMeaning) -> str:
+    if meaning.unit_basis is UnitBasis.LOG:
+        return f"{meaning.unit} as the log states"
+    if meaning.unit_basis is UnitBasis.CUSTOM:
+        return f"no unit stated, read as {next(iter(UNITS[meaning.kind]))}"
+    return "no unit stated, concluded from the numbers"
+
+
+@worded.register
+def _(unused: UnusedChannels) -> str:
+    return f"not used: {', '.join(unused.channels)}"
+
+
+@worded.register
+def _(order: JointOrder) -> str:
+    return f"joints in the order of the names in the rows: {', '.join(order.joints)}"
+
+
+@worded.register
+def _(fixed: FixedFingers) -> str:
+    return f"{', '.join(fixed.positions)}: fixed, {places_of(fixed)}"
+
+
+def places_of(fixed: FixedFingers) -> str:
+    """Return where the joints of a gripper are fixed, and why."""
+    places = ", ".join(f"{place:.3g}" for place in fixed.positions.values())
+    return f"at {places} (rad or m), as of an unrecorded gripper"
+
+
+@worded.register
+def _(arm: RecordedArm) -> str:
+    return f"arm: {arm.arm}, {links_of(arm)}"
+
+
+def links_of(arm: RecordedArm) -> str:
+    """Return between which links the recorded arm lies, and by what."""
+    reason = "names" if arm.by_names else "number"
+    return f"between {arm.links}, by the {reason} of the recorded joints; all others are fixed"
+
+
+@worded.register
+def _(unit: MappedUnit) -> str:
+    return f"{unit.kind}: the map says {unit.unit}, the file {unit.stated}; used: {unit.unit}"
+
+
+@worded.register
+def _(unit: StatedUnit) -> str:
+    return f"{unit.kind}: {source_of(unit)}"
+
+
+@worded.register
+def _(unit: ConcludedUnit) -> str:
+    return f"{unit.kind}: {source_of(unit)}"
+
+
+def source_of(unit: StatedUnit | ConcludedUnit) -> str:
+    """Return from what a quantity has its unit."""
+    if isinstance(unit, StatedUnit):
+        return f"in {unit.unit}, as the file states"
+    none = "no unit is stated; read as"
+    if unit.kind == "time":
+        return f"{none} {unit.unit}, which gives a usual rate"
+    if unit.kind == "velocity":
+        return f"{none} degrees per second, the slope of the positions"
+    return f"{none} degrees, within the limits of the URDF, which radians leave by far"
+
+
+@worded.register
+def _(left_out: LeftOut) -> str:
+    return f"left out: {_OMITTED[left_out.what]} ({left_out.count})"
+
+
+@worded.register
+def _(missing: MissingNumbers) -> str:
+    return (
+        f"left out: rows in which a number is missing ({missing.count} of {missing.total}, "
+        f"the first after {missing.before} rows)"
+    )
+
+
+@worded.register
+def _(continued: CounterContinued) -> str:
+    times = f"{continued.times} times" if continued.times > 1 else "once"
+    return f"time: {continued.clock} wrapped {times} and was continued"
+
+
+@worded.register
+def _(swapped: SortedSamples) -> str:
+    many = swapped.count > 1
+    count = f"{swapped.count} {swapped.sample}s" if many else f"one {swapped.sample}"
+    of_log = "time: " if swapped.sample == "row" else ""
+    return f"{of_log}{count} that came before an older one: sorted by stamp"
+
+
+@worded.register
+def _(publisher: SecondPublisher) -> str:
+    where = ", ".join(f"{angle:.3g}" for angle in publisher.pose) or "0"
+    return (
+        f"{publisher.count} of {publisher.total} {publisher.sample}s have {where} for all positions"
+        " between others that do not: those of a second publisher, left out"
+    )
+
+
+@worded.register
+def _(merged: MergedMessages) -> str:
+    how = (
+        "with the same stamps" if merged.same_stamps else "interpolated to the stamps of the first"
+    )
+    kinds = " and ".join(f"({', '.join(joints)})" for joints in merged.groups)
+    return f"merged from messages of their own, {how}: {kinds}"
+
+
+@worded.register
+def _(velocity: PartialVelocity) -> str:
+    joints = ", ".join(velocity.joints)
+    problem = f"joint {joints} has none in any message, the others have it"
+    return f"velocity: {problem}: left out for all"
+
+
+@worded.register
+def _(commands: NotCommands) -> str:
+    return f"{commands.topic}: {commands.problem}: not used as commanded positions"
+
+
+@worded.register
+def _(different: DifferentCommands) -> str:
+    first, second = different.topics
+    remedy = f"choose one: --command-topic {first} or {second}"
+    return f"{first} and {second} carry different commands: neither is used; {remedy}"
+
+
+@worded.register
+def _(known: KnownCommands) -> str:
+    return f"commanded_position: known at {known.count} of {known.total} samples"
+
+
+@worded.register
+def _(few: TooFewSamples) -> str:
+    return f"{few.count} samples"
+
+
+@worded.register
+def _(locked: LockedJoints) -> str:
+    held = [f"{name} at {place:.4g}" for name, place in locked.positions.items()]
+    return f"locked, rad or m: {', '.join(held)}"
+
+
+@worded.register
+def _(clock: RecordedClock) -> str:
+    return f"time: {'; '.join(clock.base.describe())}"
+
+
+@worded.register
+def _(found: JointRange) -> str:
+    text = f"{found.joint}: {found.low:.3f} .. {found.high:.3f} {'rad' if found.turns else 'm'}"
+    if found.turns:
+        text += f" ({math.degrees(found.low):.0f} .. {math.degrees(found.high):.0f} deg)"
+    if found.limits is not None:
+        lower, upper = found.limits
+        text += f", limits of the URDF {lower:.3f} .. {upper:.3f}"
+    return text
+
+
+@worded.register
+def _(unusual: UnusualRate) -> str:
+    return f"{unusual.rate:.3g} samples per second are unusual: check the unit of the time"
+
+
+@worded.register
+def _(same: SameStamp) -> str:
+    return (
+        f"samples with the same time stamp are up to {same.apart:.3g} rad or m apart ({same.count}"
+        " such stamps): two sources write this log, or its clock stood still or is much coarser"
+        " than its samples"
+    )
+
+
+@worded.register
+def _(alternation: Alternation) -> str:
+    return (
+        f"samples go to and fro between two sequences up to {alternation.apart:.3g} "
+        f"rad or m apart ({alternation.count} samples): two sources write these joints, one of them"
+        " other or older samples; record one of them"
+    )
+
+
+@worded.register
+def _(outside: OutsideLimits) -> str:
+    return f"{problem_of(outside)}; {remedy_of(outside)}"
+
+
+def problem_of(outside: OutsideLimits) -> str:
+    """Return how positions leave the limits of the URDF."""
+    ranges = ", ".join(
+        f"{name}: {low:.3g} .. {high:.3g}" for name, (low, high) in outside.ranges.items()
+    )
+    some = f"{_percent(outside.fraction)} of the rows leave"
+    share = "every row leaves" if outside.fraction == 1.0 else some
+    return f"as mapped, {share} the limits of the URDF ({ranges})"
+
+
+def remedy_of(outside: OutsideLimits) -> str:
+    """Return what would keep positions within the limits of the URDF."""
+    if outside.within is Within.DEGREES:
+        entry = '[position] unit = "deg" in the column map'
+        return f"as degrees read as radians, none would: write {entry}"
+    if outside.within is Within.ORDER:
+        order = ", ".join(outside.order)
+        return (
+            f"with the columns those of {order}, none would: check the order of the joints, or "
+            f"{_MAP_CHECK}"
+        )
+    return _MAP_CHECK
+
+
+def _percent(share: float) -> str:
+    """Return a share below 1 that does not read as all."""
+    return f"{min(100.0 * share, 99.9):.3g} %"
+
+
+@worded.register
+def _(little: LittleMotion) -> str:
+    return (
+        f"no joint moves further than {little.travel:.2g} rad or m "
+        f"({math.degrees(little.travel):.2g} if these were degrees): check the unit of the"
+        " positions"
+    )
+
+
+@worded.register
+def _(fast: FastJoint) -> str:
+    return (
+        f"{fast.joint} would move at {fast.speed:.3g} rad/s (or m/s), its limit in the URDF is "
+        f"{fast.limit:.3g}: check the units of position (degrees?) and time (milliseconds?)"
+    )
+
+
+@worded.register
+def _(other: VelocityOrder) -> str:
+    return (
+        "the velocities are in another order than the positions: as mapped they deviate "
+        f"from the slopes by {other.deviation:.0f} %, as those of {', '.join(other.order)} by "
+        f"{other.least:.0f} %: name the columns of both in the same order"
+    )
+
+
+@worded.register
+def _(velocity: UnrelatedVelocity) -> str:
+    return (
+        f"the velocity of {velocity.joint} does not follow its position (correlation "
+        f"{velocity.correlation:.2f}): check the order of the joints"
+    )
+
+
+@worded.register
+def _(scaled: ScaledVelocity) -> str:
+    factors = ", ".join(f"{factor:.4g} for {name}" for name, factor in scaled.factors.items())
+    return (
+        f"the velocity is the slope of the position times {factors}: check units, signs "
+        "and gears of both, and the unit of the time"
+    )
+
+
+@worded.register
+def _(none: NoTorque) -> str:
+    use = "nothing can be identified from it"
+    if none.is_commanded:
+        use = "bodies cannot be identified, servo and friction can (`hil rollout --polish`)"
+    return f"the log has neither torque nor motor current: {use}"
+
+
+@worded.register
+def _(zero: ZeroTorque) -> str:
+    return f"the torque of {zero.joint} is zero throughout"
+
+
+@worded.register
+def _(large: LargeTorque) -> str:
+    return (
+        f"the torque of {large.joint} reaches {large.torque:.3g}, its limit in the URDF is "
+        f"{large.limit:.3g} N·m (or N): check its unit and side (motor or joint)"
+    )
+
+
+@worded.register
+def _(size: TorqueSize) -> str:
+    reference = "those of the URDF's masses" if size.by_masses else "the effort limits of the URDF"
+    listing = ", ".join(f"{name}: {ratio:.2g}" for name, ratio in size.ratios.items())
+    which = "large" if size.too_large else "small"
+    start = f"the torques are too {which} for this arm: measured over {reference} {listing}; check "
+    if size.too_large:
+        return start + (
+            "their unit (mN·m read as N·m would be 1000 times too large), side (motor or joint) "
+            "and the masses of the URDF"
+        )
+    return start + (
+        "their unit (N·m read as mN·m would be 1000 times too small) and side (motor or joint)"
+    )
+
+
+@worded.register
+def _(constant: ConstantPositions) -> str:
+    return (
+        f"the position of {', '.join(constant.joints)} is the same in all {constant.samples}"
+        " samples: it is assumed to stand still; if it moved, its encoder or its column is wrong"
+    )

@@ -1,0 +1,647 @@
+"""Sentences about a look: the only place that makes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from functools import singledispatch
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from hil.importers import messages as import_messages
+from hil.importers.conclusions import (
+    ChannelMeaning,
+    ConcludedUnit,
+    FixedFingers,
+    JointOrder,
+    OutsideLimits,
+    RecordedArm,
+    StatedUnit,
+    UnitBasis,
+)
+from hil.look.readings import (
+    AngleUnit,
+    ArmChange,
+    Basis,
+    BeyondEffort,
+    BeyondMasses,
+    BeyondRange,
+    BeyondSpeed,
+    Changes,
+    Channels,
+    Clock,
+    ColumnOrder,
+    Contradiction,
+    Correlation,
+    DelayInterval,
+    DelayProblem,
+    DoubtfulArm,
+    Either,
+    ErrorAsRead,
+    ErrorRatio,
+    ExplainedTorque,
+    Fact,
+    FilterShape,
+    GravityOption,
+    LastBody,
+    LateVelocity,
+    LowPassedTorque,
+    MapEntries,
+    MotorCurrents,
+    MotorTorque,
+    Mounting,
+    NearestZero,
+    NextBest,
+    NotSlopes,
+    OtherAxes,
+    OtherLengths,
+    Setting,
+    SizeRatio,
+    SlopeFactors,
+    SlopeRatio,
+    SmoothPositions,
+    StatedPayload,
+    Step,
+    StillJoints,
+    StillUnexplained,
+    TorqueDelay,
+    TorqueUnit,
+    Travel,
+    UnexplainedTorque,
+    UnseenFriction,
+    UnseenZeros,
+    Vector,
+    Wrapped,
+)
+from hil.look.result import ChangedReading, Choice, Look, Row
+from identification.text import percentage
+from identification.validation.faults import COUPLED
+from identification.validation.reading_changes import IN_ORDER, Meaning
+
+_FACTS: Final[Mapping[Fact, str]] = {
+    Fact.EVERY_JOINT_MOVES: "every joint moves",
+    Fact.CONTINUOUS: "continuous, no wrap",
+    Fact.WITHIN_LIMITS: "within the limits of the URDF",
+    Fact.COMMANDED: "commanded",
+    Fact.MEASURED: "measured",
+    Fact.SLOPE: "slope of the position, same unit, sign and order",
+    Fact.SCALED_SLOPE: "times the slope of the position",
+    Fact.SLOPE_IN_DEGREES: "deg/s beside rad",
+    Fact.SLOPE_OF_DEGREES: "rad/s beside deg",
+    Fact.NEGATED_SLOPE: "negated",
+    Fact.SLOPE_IN_REVOLUTIONS: "rev/min beside rad/s",
+    Fact.NOT_EXAMINED: "not examined",
+    Fact.ORDER_OF_URDF: "joints in the order of the URDF",
+    Fact.SIGNS_OF_URDF: "as the URDF's axes",
+    Fact.UNIT_AS_READ: "unit as read",
+    Fact.ZERO_OF_URDF: "as the URDF",
+    Fact.UNCOUPLED: "no angle contains another's",
+    Fact.WITH_GRAVITY: "torque with gravity",
+    Fact.WITHOUT_GRAVITY: "torque without gravity",
+    Fact.STATED_MOUNTING: "as stated, else upright",
+    Fact.JOINT_SIDE: "joint side",
+    Fact.JOINT_TORQUE: "joint side, a torque",
+    Fact.LARGE_TORQUE: "larger than the arm needs",
+    Fact.MOTOR_SIDE: "motor side (before the gears), or a current",
+    Fact.PAYLOAD_UNDETERMINED: "none stated; not determined",
+    Fact.PAYLOAD_IN_LAST_BODY: "none stated; part of the last body",
+    Fact.NO_TORQUE: "none, and no motor current",
+    Fact.MOTOR_CURRENT: "none; motor currents",
+    Fact.TORQUE_UNEXAMINED: "side, gravity, signs and order of the joints not examined",
+    Fact.DELAY_UNDETERMINED: "not determined",
+    Fact.NO_DELAY: "none",
+    Fact.NO_DELAY_SEEN: "none seen",
+    Fact.NO_LOW_PASS: "none in the torque",
+    Fact.OTHER_ARM: "may be another than that of the URDF",
+}
+_BASES: Final[Mapping[Basis, str]] = {
+    Basis.GIVEN_RATE: "at the rate that was given",
+    Basis.MESSAGE_TYPE: "by the message type",
+    Basis.USUAL_RATE: "that unit gives a usual rate",
+    Basis.STATED_UNIT: "by the name and the unit that is stated",
+    Basis.NAME_AND_RATE: "by the name; a usual rate",
+    Basis.ROW_NAMES: "in the order of the names in the rows",
+    Basis.NO_TURN: "no step of a turn",
+    Basis.TURNS: "steps of a turn",
+    Basis.EVERY_ROW: "every row of every joint",
+    Basis.LIMITS: "limits of the URDF",
+    Basis.NAME: "by the name",
+    Basis.NAME_OR_UNIT: "by name or unit",
+    Basis.CHANNELS: "by the channels",
+    Basis.ENCODER_NOISE: "noise of an encoder at all frequencies",
+    Basis.NO_NOISE: "no noise above that frequency",
+    Basis.NO_MOTION: "no joint moves",
+    Basis.DRIVING_FRICTION: "friction would drive the joint otherwise",
+    Basis.DISSIPATION: "friction takes energy in every joint",
+    Basis.NOT_EXAMINED: "not examined",
+    Basis.SIZE_UNTESTED: "no masses in the URDF and little weight: size not tested",
+    Basis.CELL: "by the cell",
+    Basis.LAST_BODY_UNDETERMINED: "the motion determines no parameter of the last body",
+    Basis.NO_GEOMETRY: "a torque says them only together with the arm's geometry",
+    Basis.NO_ROW: "no usable row",
+    Basis.NO_FILTER_BETTER: "none predicts it better",
+    Basis.FREE_PARAMETERS: "with free parameters, before a fit of the friction law",
+}
+_STEPS: Final[Mapping[Step, str]] = {
+    Step.STATE_TIME_UNIT: 'state [time] unit = "..."',
+    Step.STATE_UNIT_OR_GEARS: "state unit, sign or gears of both",
+    Step.STATE_GRAVITY: "state --gravity X Y Z",
+    Step.STATE_DRIVE: "state gear ratios or torque constants ([drive] of a map) if not",
+    Step.STATE_TORQUE_CONSTANT: (
+        "[drive] torque_constant of a map (N·m/A), or `hil torque-constants`"
+    ),
+    Step.NAME_JOINTS: "name the joint of each column",
+    Step.ESTIMATE_DELAY: "--delay auto",
+    Step.GIVE_URDF: "add --urdf ARM.urdf",
+    Step.GIVE_URDF_OF_THIS_ARM: "give the URDF of this arm",
+    Step.CHECK_COLUMNS: "check the order of the columns of both",
+    Step.CHECK_UNIT: "check the unit",
+    Step.MOVE_ALL_OR_LOCK: "record a motion of all joints, or fix these (--locked NAME)",
+    Step.MOVE_EACH_JOINT: "move the joints one by one",
+    Step.PUSH_A_JOINT: "push one joint by hand and see its torque",
+    Step.COMPARE_A_POSTURE: "compare a posture with the URDF's (viewer)",
+    Step.TURN_ONE_JOINT: "turn one joint alone and see which angles change",
+    Step.HOLD_STILL: "hold the arm still, stretched out, and see the torque",
+    Step.RECORD_MEASURED: "record the measured ones",
+    Step.RECORD_MEASURED_IF_ANY: "record the measured ones if the controller has them",
+    Step.RECORD_TORQUE: "record it",
+    Step.RECORD_FASTER: "record faster motion",
+    Step.RECORD_PAYLOAD: "record with and without it (`hil payload`)",
+    Step.IMPORT_COMMANDS: "import it: `hil rollout --polish` identifies servo and friction",
+    Step.ASK_FOR_POSITIONS: "ask for the raw encoder positions",
+    Step.ASK_FOR_UNIT: "ask for the unit of the channel",
+    Step.ASK_FOR_FILTER: "ask for the filter of the channel",
+}
+_CHANGES: Final[Mapping[Meaning, str]] = {
+    "torque sign": "torque negated",
+    "position sign": "position negated",
+    "axis sign": "position and torque negated",
+    "torque order": "torques",
+    "position order": "positions",
+    "joint order": "joints",
+    "degrees": "degrees",
+    "radians": "radians",
+    "no gravity": "without gravity",
+    "angle sum": "plus",
+    "angle difference": "less",
+}
+
+
+class RowText(NamedTuple):
+    """A row in words."""
+
+    reading: str
+    reason: str
+    decide: str  #: what would decide it; "" if there is nothing
+
+
+def row_text(row: Row) -> RowText:
+    """Return a row in words."""
+    decide = "" if row.decider is None else worded(row.decider)
+    if isinstance(row.decider, OutsideLimits):
+        decide = import_messages.remedy_of(row.decider)
+    return RowText(worded(row.reading), "; ".join(map(worded, row.evidence)), decide)
+
+
+def choice_text(choice: Choice) -> str:
+    """Return one of the readings that fit alike in words."""
+    if choice.reading is not None:
+        return described(choice.reading)
+    return "motor current" if isinstance(choice.setting, MotorCurrents) else "torque of the motors"
+
+
+def setting_text(setting: Setting | None) -> str:
+    """Return the line of a column map, or the option, that states a reading; "" if none does."""
+    return "" if setting is None else worded(setting)
+
+
+def gravity_option(gravity: Vector) -> str:
+    """Return the option that states a gravity."""
+    return f"--gravity {' '.join(f'{part:g}' for part in gravity)}"
+
+
+def fit_alike(choices: Sequence[Choice]) -> str:
+    """Return how many readings fit alike, in words."""
+    return f"{'two' if len(choices) == 2 else 'three'} readings fit alike"
+
+
+def as_json(look: Look) -> dict[str, Any]:
+    """Return a look for programs."""
+    questions = [
+        [
+            {
+                "aspect": choice.aspect,
+                "reading": choice_text(choice),
+                "error": choice.error,
+                "line": setting_text(choice.setting),
+            }
+            for choice in choices
+        ]
+        for choices in look.questions
+    ]
+    rows = [
+        {
+            "aspect": row.aspect,
+            "reading": text.reading,
+            "certainty": row.certainty.value,
+            "reason": text.reason,
+            "decide": text.decide,
+        }
+        for row, text in zip(look.rows, map(row_text, look.rows), strict=True)
+    ]
+    return {
+        "source": look.source,
+        "rows": rows,
+        "questions": questions,
+        "determines": [asdict(group) for group in look.groups],
+        "map": look.map_text,
+        "options": [] if look.gravity is None else [gravity_option(look.gravity)],
+        "error": look.error,
+    }
+
+
+def described(change: ArmChange) -> str:
+    """Return a change in words."""
+    meaning = change.change.meaning
+    if meaning == "mounting":
+        text = f"mounted {change.change.name}"
+    elif meaning == "zero":
+        text = f"zero moved by {np.degrees(change.change.size):.0f} deg"
+    else:
+        text = _CHANGES[meaning]
+    if meaning in COUPLED:
+        joint, other = _names(change)
+        return f"the angle of {joint} is recorded {text} that of {other}"
+    if meaning in IN_ORDER:
+        return f"{text} {_exchanged(change)}"
+    if not change.change.joints:
+        return text
+    joints = change.change.joints
+    all_of_them = len(joints) == len(change.joints)
+    return f"{text}: {'all joints' if all_of_them else ', '.join(_names(change))}"
+
+
+def _exchanged(change: ArmChange) -> str:
+    found = change.change
+    if len(found.joints) > 2 and found.order:
+        names = change.joints
+        pairs = zip(found.joints, found.order, strict=True)
+        listing = ", ".join(f"{names[joint]} in place of {names[at]}" for joint, at in pairs)
+        return f"in another order: {listing}"
+    all_of_them = len(found.joints) == len(change.joints)
+    return f"exchanged: {'all joints' if all_of_them else ', '.join(_names(change))}"
+
+
+def _names(change: ArmChange) -> list[str]:
+    return [change.joints[joint] for joint in change.change.joints]
+
+
+def sentences(found: Sequence[Contradiction]) -> str:
+    """Return contradictions of an arm in words."""
+    return "; ".join(map(worded, found))
+
+
+def _expected(size: SizeRatio | BeyondMasses) -> str:
+    return "the URDF's masses" if size.by_masses else "the masses of arms of its reach"
+
+
+# --- one function for each type
+
+
+@singledispatch
+def _worded(value: object) -> str:
+    raise NotImplementedError(type(value).__name__)
+
+
+def worded(value: object) -> str:
+    """Return a reading, the evidence of one, or what decides it, in words."""
+    return _worded(value)
+
+
+@_worded.register
+def _(fact: Fact) -> str:
+    return _FACTS[fact]
+
+
+@_worded.register
+def _(basis: Basis) -> str:
+    return _BASES[basis]
+
+
+@_worded.register
+def _(step: Step) -> str:
+    return _STEPS[step]
+
+
+@_worded.register
+def _(clock: Clock) -> str:
+    unit = "stamps of the messages; " if clock.of_messages else ""
+    unit = f"{clock.unit}; " if clock.unit is not None else unit
+    return f"{unit}{'; '.join(clock.base.describe())}"
+
+
+@_worded.register
+def _(channels: Channels) -> str:
+    return channels.channels if channels.unit is None else f"{channels.channels}: {channels.unit}"
+
+
+@_worded.register
+def _(order: JointOrder) -> str:
+    return ", ".join(order.joints)
+
+
+@_worded.register
+def _(joints: NotSlopes) -> str:
+    return f"not the slope of the position: {', '.join(joints.joints)}"
+
+
+@_worded.register
+def _(joints: StillJoints) -> str:
+    return f"never move: {', '.join(joints.joints)}"
+
+
+@_worded.register
+def _(wrapped: Wrapped) -> str:
+    return f"wrapped by a turn, continued: {wrapped.joints}"
+
+
+@_worded.register
+def _(positions: SmoothPositions) -> str:
+    return f"low-passed below {positions.above:.2g} Hz, or commanded"
+
+
+@_worded.register
+def _(changes: Changes) -> str:
+    return "; ".join(map(described, changes.changes))
+
+
+@_worded.register
+def _(order: ColumnOrder) -> str:
+    columns = {"torque": order.torque, "position": order.position}
+    return "; ".join(
+        f"{kind} columns are of {', '.join(joints)}"
+        for kind, joints in columns.items()
+        if joints is not None
+    )
+
+
+@_worded.register
+def _(unit: AngleUnit) -> str:
+    return f"in {unit.unit}"
+
+
+@_worded.register
+def _(mounting: Mounting) -> str:
+    return mounting.name
+
+
+@_worded.register
+def _(either: Either) -> str:
+    return f"{worded(either.recorded)}, or {described(either.change)}"
+
+
+@_worded.register
+def _(zeros: UnseenZeros) -> str:
+    return f"as the URDF where the torque shows it; not shown: {', '.join(zeros.joints)}"
+
+
+@_worded.register
+def _(unit: TorqueUnit) -> str:
+    return f"torque in {unit.unit}"
+
+
+@_worded.register
+def _(payload: StatedPayload) -> str:
+    return f"{payload.mass:g} kg as stated"
+
+
+@_worded.register
+def _(error: ErrorAsRead) -> str:
+    return f"torque predicted to {100.0 * error.error:.2g} % from other parts"
+
+
+@_worded.register
+def _(delay: TorqueDelay) -> str:
+    if delay.confirmed:
+        return f"torque {1e3 * delay.delay:.0f} ms behind the position"
+    side = "behind" if delay.delay > 0.0 else "before"
+    return f"perhaps: torque {1e3 * abs(delay.delay):.0f} ms {side} the position"
+
+
+@_worded.register
+def _(low_pass: LowPassedTorque) -> str:
+    return f"torque low-passed at {low_pass.bandwidth:.2g} Hz"
+
+
+@_worded.register
+def _(meaning: ChannelMeaning) -> str:
+    if meaning.kind in ("position", "velocity") and meaning.unit_basis is UnitBasis.NUMBERS:
+        return import_messages.basis_of(meaning)
+    return import_messages.reason_of(meaning)
+
+
+@_worded.register
+def _(unit: ConcludedUnit) -> str:
+    return import_messages.source_of(unit)
+
+
+@_worded.register
+def _(unit: StatedUnit) -> str:
+    return import_messages.source_of(unit)
+
+
+@_worded.register
+def _(fixed: FixedFingers) -> str:
+    return import_messages.places_of(fixed)
+
+
+@_worded.register
+def _(arm: RecordedArm) -> str:
+    return import_messages.links_of(arm)
+
+
+@_worded.register
+def _(outside: OutsideLimits) -> str:
+    return import_messages.problem_of(outside)
+
+
+@_worded.register
+def _(travel: Travel) -> str:
+    return f"{'at least' if travel.at_least else 'less than'} {travel.travel:.2g} rad or m"
+
+
+@_worded.register
+def _(found: Correlation) -> str:
+    return f"correlation {found.correlation:.2f}"
+
+
+@_worded.register
+def _(slope: SlopeRatio) -> str:
+    return f"slope over velocity {slope.ratio:.3f}"
+
+
+@_worded.register
+def _(slope: SlopeFactors) -> str:
+    return ", ".join(f"{name} {factor:.4g}" for name, factor in slope.factors.items())
+
+
+@_worded.register
+def _(velocity: LateVelocity) -> str:
+    return f"the velocity comes {1e3 * velocity.lag:.0f} ms after their slope"
+
+
+@_worded.register
+def _(error: ErrorRatio) -> str:
+    return f"error {error.ratio:.2f} times that as recorded ({-error.sigmas:.0f} standard errors)"
+
+
+@_worded.register
+def _(nearest: NextBest) -> str:
+    return f"next best: {described(nearest.change)}, error {nearest.ratio:.2f} times"
+
+
+@_worded.register
+def _(nearest: NearestZero) -> str:
+    return f"{described(nearest.change)}: error {nearest.ratio:.2f} times"
+
+
+@_worded.register
+def _(unseen: UnseenFriction) -> str:
+    return f"friction is not seen in {', '.join(unseen.joints)}"
+
+
+@_worded.register
+def _(error: StillUnexplained) -> str:
+    return f"but {percentage(error.error)} of the torque stays unexplained"
+
+
+@_worded.register
+def _(size: SizeRatio) -> str:
+    return f"measured over expected by {_expected(size)}: {size.ratio:.2g}"
+
+
+@_worded.register
+def _(body: LastBody) -> str:
+    return (
+        f"the motion determines {body.determined} of the {body.total} parameters of the body of"
+        f" {body.joint}, with all that it carried"
+    )
+
+
+@_worded.register
+def _(interval: DelayInterval) -> str:
+    text = f"± {1e3 * interval.half:.1g} ms"
+    if interval.delay is not None:
+        return f"{1e3 * interval.delay:.1f} {text}"
+    return f"{text}; other parts are not predicted better" if interval.unconfirmed else text
+
+
+@_worded.register
+def _(problem: DelayProblem) -> str:
+    return problem.problem
+
+
+@_worded.register
+def _(shape: FilterShape) -> str:
+    return f"order {shape.order}, {'causal' if shape.causal else 'without phase'}, fits better"
+
+
+@_worded.register
+def _(found: BeyondRange) -> str:
+    far = f"{np.degrees(found.excess):.0f}°" if found.turns else f"{found.excess:.2g} m"
+    return f"{found.joint} moves {far} beyond its range"
+
+
+@_worded.register
+def _(found: BeyondSpeed) -> str:
+    return f"{found.joint} moves at {found.ratio:.3g} times its largest speed"
+
+
+@_worded.register
+def _(found: BeyondEffort) -> str:
+    return f"the torque of {found.joint} reaches {found.ratio:.3g} times its limit"
+
+
+@_worded.register
+def _(found: BeyondMasses) -> str:
+    return f"the torque is {found.ratio:.2g} times that of {_expected(found)}"
+
+
+@_worded.register
+def _(lengths: OtherLengths) -> str:
+    return (
+        f"the torque fits links {lengths.factor:.2g} times as long (error "
+        f"{percentage(lengths.error)}, with those of the URDF {percentage(lengths.stated)})"
+    )
+
+
+@_worded.register
+def _(torque: UnexplainedTorque) -> str:
+    return f"{percentage(torque.error)} of the torque stays unexplained, whatever the masses"
+
+
+@_worded.register
+def _(axes: OtherAxes) -> str:
+    return f"the torque follows it with other {' and '.join(axes.aspects)} only"
+
+
+@_worded.register
+def _(entries: MapEntries) -> str:
+    return "; ".join(
+        f"[{key.rpartition('.')[0]}] {key.rpartition('.')[2]} = {_toml(value)}"
+        if "." in key
+        else f"{key} = {_toml(value)}"
+        for key, value in entries.entries
+    )
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return f"{value:g}"
+
+
+@_worded.register
+def _(option: GravityOption) -> str:
+    return gravity_option(option.gravity)
+
+
+@_worded.register
+def _(torque: MotorTorque) -> str:
+    each = ", ".join([f"{torque.ratio:.0f}"] * torque.count)
+    return f'[torque] side = "motor"; [drive] gear_ratio = [{each}] (about; the maker\'s)'
+
+
+@_worded.register
+def _(currents: MotorCurrents) -> str:
+    each = ", ".join([f"{currents.ratio:.0f}"] * currents.count)
+    return (
+        f"[motor_current] in place of [torque]; [drive] torque_constant = [{each}] "
+        "(about, N·m/A with gears)"
+    )
+
+
+# --- what an identification says of a log that it has looked at
+
+
+@import_messages.worded.register
+def _(explained: ExplainedTorque) -> str:
+    parts = (
+        f"low-passed at {explained.low_pass:.2g} Hz" if explained.low_pass else "",
+        "with rotors heavier than the links" if explained.heavy_rotors else "",
+    )
+    return f"torque: follows the arm of the URDF, {', '.join(filter(None, parts))}"
+
+
+@import_messages.worded.register
+def _(arm: DoubtfulArm) -> str:
+    return f"warning: the URDF may be that of another arm: {sentences(arm.found)}"
+
+
+@import_messages.worded.register
+def _(changed: ChangedReading) -> str:
+    text = row_text(changed.row)
+    return f"{changed.row.aspect}: {text.reading}, concluded; {text.reason}"

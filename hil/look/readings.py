@@ -1,0 +1,546 @@
+"""What the rows of a look conclude, from what, and what decides it; `messages` words them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Any, Literal
+
+from hil.importers.conclusions import (
+    ChannelMeaning,
+    ConcludedUnit,
+    Conclusion,
+    FixedFingers,
+    JointOrder,
+    OutsideLimits,
+    RecordedArm,
+    StatedUnit,
+)
+from identification.signals.clock import TimeBase
+from identification.validation.reading_changes import Change
+
+Vector = tuple[float, ...]
+
+
+class Fact(Enum):
+    """Conclusions without a figure."""
+
+    EVERY_JOINT_MOVES = auto()
+    CONTINUOUS = auto()
+    WITHIN_LIMITS = auto()
+    COMMANDED = auto()
+    MEASURED = auto()
+    SLOPE = auto()  #: the velocity is that of the position
+    SCALED_SLOPE = auto()
+    SLOPE_IN_DEGREES = auto()
+    SLOPE_OF_DEGREES = auto()
+    NEGATED_SLOPE = auto()
+    SLOPE_IN_REVOLUTIONS = auto()
+    NOT_EXAMINED = auto()
+    ORDER_OF_URDF = auto()
+    SIGNS_OF_URDF = auto()
+    UNIT_AS_READ = auto()
+    ZERO_OF_URDF = auto()
+    UNCOUPLED = auto()
+    WITH_GRAVITY = auto()
+    WITHOUT_GRAVITY = auto()
+    STATED_MOUNTING = auto()
+    JOINT_SIDE = auto()  #: untested
+    JOINT_TORQUE = auto()
+    LARGE_TORQUE = auto()
+    MOTOR_SIDE = auto()
+    PAYLOAD_UNDETERMINED = auto()
+    PAYLOAD_IN_LAST_BODY = auto()
+    NO_TORQUE = auto()
+    MOTOR_CURRENT = auto()
+    TORQUE_UNEXAMINED = auto()
+    DELAY_UNDETERMINED = auto()
+    NO_DELAY = auto()
+    NO_DELAY_SEEN = auto()
+    NO_LOW_PASS = auto()
+    OTHER_ARM = auto()
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Time base, with the unit of a log's time, or the stamps of messages."""
+
+    base: TimeBase
+    unit: str | None = None
+    of_messages: bool = False
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Channels, with the unit that was concluded."""
+
+    channels: str
+    unit: str | None = None
+
+
+@dataclass(frozen=True)
+class NotSlopes:
+    """Joints whose velocity is not the slope of their position."""
+
+    joints: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class StillJoints:
+    """Joints that never move."""
+
+    joints: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Wrapped:
+    """Joints, as the recording lists them, that were continued over a turn."""
+
+    joints: str
+
+
+@dataclass(frozen=True)
+class SmoothPositions:
+    """Positions without noise above a frequency [Hz]."""
+
+    above: float
+
+
+@dataclass(frozen=True)
+class ArmChange:
+    """A change of what was recorded, of an arm with these joints."""
+
+    change: Change
+    joints: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Changes that were found."""
+
+    changes: tuple[ArmChange, ...]
+
+
+@dataclass(frozen=True)
+class ColumnOrder:
+    """Joints of the columns of torque and position, where they are not those of the URDF."""
+
+    torque: tuple[str, ...] | None
+    position: tuple[str, ...] | None
+
+
+@dataclass(frozen=True)
+class AngleUnit:
+    """The unit of the angles."""
+
+    unit: Literal["deg", "rad"]
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """How the arm is mounted."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Either:
+    """What was recorded, or a change of it that fits alike."""
+
+    recorded: Fact
+    change: ArmChange
+
+
+@dataclass(frozen=True)
+class UnseenZeros:
+    """Joints of which the torque does not show the zero."""
+
+    joints: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TorqueUnit:
+    """The unit of the torque, by its size."""
+
+    unit: Literal["mN.m", "kN.m"]
+
+
+@dataclass(frozen=True)
+class StatedPayload:
+    """Mass of the payload of the cell [kg]."""
+
+    mass: float
+
+
+@dataclass(frozen=True)
+class ErrorAsRead:
+    """Error of the torque as read, as a share of it."""
+
+    error: float
+
+
+@dataclass(frozen=True)
+class TorqueDelay:
+    """Delay of the torque behind the position [s], negative before it."""
+
+    delay: float
+    confirmed: bool
+
+
+@dataclass(frozen=True)
+class LowPassedTorque:
+    """Bandwidth of the torque [Hz]."""
+
+    bandwidth: float
+
+
+Reading = (
+    Fact
+    | Clock
+    | Channels
+    | JointOrder
+    | NotSlopes
+    | StillJoints
+    | Wrapped
+    | OutsideLimits
+    | SmoothPositions
+    | Changes
+    | ColumnOrder
+    | AngleUnit
+    | Mounting
+    | Either
+    | UnseenZeros
+    | TorqueUnit
+    | StatedPayload
+    | ErrorAsRead
+    | TorqueDelay
+    | LowPassedTorque
+)
+"""What a row concludes."""
+
+
+class Basis(Enum):
+    """Evidence without a figure."""
+
+    GIVEN_RATE = auto()
+    MESSAGE_TYPE = auto()
+    USUAL_RATE = auto()
+    STATED_UNIT = auto()
+    NAME_AND_RATE = auto()
+    ROW_NAMES = auto()
+    NO_TURN = auto()
+    TURNS = auto()
+    EVERY_ROW = auto()
+    LIMITS = auto()
+    NAME = auto()
+    NAME_OR_UNIT = auto()
+    CHANNELS = auto()
+    ENCODER_NOISE = auto()
+    NO_NOISE = auto()
+    NO_MOTION = auto()
+    DRIVING_FRICTION = auto()  #: of the reading as recorded
+    DISSIPATION = auto()  #: in every joint
+    NOT_EXAMINED = auto()
+    SIZE_UNTESTED = auto()
+    CELL = auto()
+    LAST_BODY_UNDETERMINED = auto()
+    NO_GEOMETRY = auto()
+    NO_ROW = auto()
+    NO_FILTER_BETTER = auto()
+    FREE_PARAMETERS = auto()
+
+
+@dataclass(frozen=True)
+class Travel:
+    """The shortest way of a joint, or the longest of those that do not move [rad or m]."""
+
+    travel: float
+    at_least: bool
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """The smallest correlation of a velocity with the slope of its position."""
+
+    correlation: float
+
+
+@dataclass(frozen=True)
+class SlopeRatio:
+    """Slope of the positions over velocity, the mean of all joints."""
+
+    ratio: float
+
+
+@dataclass(frozen=True)
+class SlopeFactors:
+    """Velocity over slope of the position, by joint."""
+
+    factors: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class LateVelocity:
+    """By how much the velocity comes after the slope of the positions [s]."""
+
+    lag: float
+
+
+@dataclass(frozen=True)
+class ErrorRatio:
+    """Error of the torque over that as recorded, and their difference in standard errors."""
+
+    ratio: float
+    sigmas: float
+
+
+@dataclass(frozen=True)
+class NextBest:
+    """The change that comes nearest, with the ratio of its error."""
+
+    change: ArmChange
+    ratio: float
+
+
+@dataclass(frozen=True)
+class NearestZero:
+    """The zero that comes nearest, with the ratio of its error."""
+
+    change: ArmChange
+    ratio: float
+
+
+@dataclass(frozen=True)
+class UnseenFriction:
+    """Joints in which friction is not seen."""
+
+    joints: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class StillUnexplained:
+    """Share of the torque that the arm does not explain, for which no row is certain."""
+
+    error: float
+
+
+@dataclass(frozen=True)
+class SizeRatio:
+    """Measured torque over that which the arm needs, by its masses or by its reach."""
+
+    ratio: float
+    by_masses: bool
+
+
+@dataclass(frozen=True)
+class LastBody:
+    """Parameters of the last body that the motion determines."""
+
+    determined: int
+    total: int
+    joint: str
+
+
+@dataclass(frozen=True)
+class DelayInterval:
+    """Half of a 95 % interval [s], with the delay where that is within it.
+
+    `unconfirmed` says that other parts of the recording are not predicted better with the delay.
+    """
+
+    half: float
+    delay: float | None = None
+    unconfirmed: bool = False
+
+
+@dataclass(frozen=True)
+class DelayProblem:
+    """Why no delay is seen."""
+
+    problem: str
+
+
+@dataclass(frozen=True)
+class FilterShape:
+    """The shape of the low-pass that fits better."""
+
+    order: int
+    causal: bool
+
+
+@dataclass(frozen=True)
+class BeyondRange:
+    """How far a joint moves beyond its range [rad or m]."""
+
+    joint: str
+    excess: float
+    turns: bool
+
+
+@dataclass(frozen=True)
+class BeyondSpeed:
+    """Speed of a joint over its largest."""
+
+    joint: str
+    ratio: float
+
+
+@dataclass(frozen=True)
+class BeyondEffort:
+    """Torque of a joint over its limit."""
+
+    joint: str
+    ratio: float
+
+
+@dataclass(frozen=True)
+class BeyondMasses:
+    """Torque over that which the arm needs, by its masses or by its reach."""
+
+    ratio: float
+    by_masses: bool
+
+
+@dataclass(frozen=True)
+class OtherLengths:
+    """Lengths of the links over those of the URDF, with the errors of both."""
+
+    factor: float
+    error: float
+    stated: float
+
+
+@dataclass(frozen=True)
+class UnexplainedTorque:
+    """Share of the torque that no masses explain."""
+
+    error: float
+
+
+@dataclass(frozen=True)
+class OtherAxes:
+    """Aspects of the axes that had to be changed."""
+
+    aspects: tuple[str, ...]
+
+
+Contradiction = (
+    BeyondRange
+    | BeyondSpeed
+    | BeyondEffort
+    | BeyondMasses
+    | OtherLengths
+    | UnexplainedTorque
+    | OtherAxes
+)
+"""What contradicts the arm of the URDF."""
+
+Evidence = (
+    Basis
+    | ChannelMeaning
+    | ConcludedUnit
+    | StatedUnit
+    | FixedFingers
+    | RecordedArm
+    | Travel
+    | Correlation
+    | SlopeRatio
+    | SlopeFactors
+    | LateVelocity
+    | ErrorRatio
+    | NextBest
+    | NearestZero
+    | UnseenFriction
+    | StillUnexplained
+    | SizeRatio
+    | LastBody
+    | DelayInterval
+    | DelayProblem
+    | FilterShape
+    | Contradiction
+)
+"""From what a row concludes."""
+
+
+class Step(Enum):
+    """What a person does to decide a row: states an option or a key, measures, or asks."""
+
+    STATE_TIME_UNIT = auto()
+    STATE_UNIT_OR_GEARS = auto()
+    STATE_GRAVITY = auto()
+    STATE_DRIVE = auto()
+    STATE_TORQUE_CONSTANT = auto()
+    NAME_JOINTS = auto()
+    ESTIMATE_DELAY = auto()
+    GIVE_URDF = auto()
+    GIVE_URDF_OF_THIS_ARM = auto()
+    CHECK_COLUMNS = auto()
+    CHECK_UNIT = auto()
+    MOVE_ALL_OR_LOCK = auto()
+    MOVE_EACH_JOINT = auto()
+    PUSH_A_JOINT = auto()
+    COMPARE_A_POSTURE = auto()
+    TURN_ONE_JOINT = auto()
+    HOLD_STILL = auto()
+    RECORD_MEASURED = auto()
+    RECORD_MEASURED_IF_ANY = auto()
+    RECORD_TORQUE = auto()
+    RECORD_FASTER = auto()
+    RECORD_PAYLOAD = auto()
+    IMPORT_COMMANDS = auto()
+    ASK_FOR_POSITIONS = auto()
+    ASK_FOR_UNIT = auto()
+    ASK_FOR_FILTER = auto()
+
+
+@dataclass(frozen=True)
+class MapEntries:
+    """Entries of a column map, by dotted key."""
+
+    entries: tuple[tuple[str, Any], ...]
+
+
+@dataclass(frozen=True)
+class GravityOption:
+    """``--gravity`` [m/s²]."""
+
+    gravity: Vector
+
+
+@dataclass(frozen=True)
+class MotorTorque:
+    """Torques of motors, behind gears of about this ratio for each of `count` joints."""
+
+    ratio: float
+    count: int
+
+
+@dataclass(frozen=True)
+class MotorCurrents:
+    """Currents of motors, of about this torque constant [N·m/A, with gears] for each joint."""
+
+    ratio: float
+    count: int
+
+
+Decider = Step | MapEntries | GravityOption | OutsideLimits
+"""What decides a row; positions outside the limits say by what they would be within them."""
+
+Setting = MapEntries | GravityOption | MotorTorque | MotorCurrents
+"""What states one of the readings that fit alike."""
+
+
+@dataclass(frozen=True)
+class ExplainedTorque(Conclusion):
+    """A torque that follows the arm through a low-pass [Hz] or with heavy rotors."""
+
+    low_pass: float | None
+    heavy_rotors: bool
+
+
+@dataclass(frozen=True)
+class DoubtfulArm(Conclusion):
+    """What contradicts the arm of the URDF."""
+
+    found: tuple[Contradiction, ...]
