@@ -371,10 +371,10 @@ def log(
     )
     proposed = reading.columns is None and recording.text is not None
     if proposed:
-        write_output(recording.archive.with_suffix(".map.toml"), recording.text or "")
+        write_output(recording.archive.path.with_suffix(".map.toml"), recording.text or "")
     _print(recording, json=json)
     if proposed and not json:
-        say(f"wrote {recording.archive.with_suffix('.map.toml')}")
+        say(f"wrote {recording.archive.path.with_suffix('.map.toml')}")
 
 
 app.command("log")(log)
@@ -407,13 +407,13 @@ def _print(recording: ImportedRecording, *, json: bool) -> None:
     found = [*map(sentence, recording.concluded), *map(sentence, recording.examined.found)]
     warnings = [*map(sentence, recording.examined.warnings)]
     if json:
-        print_json({"archive": str(recording.archive), "found": found, "warnings": warnings})
+        print_json({"archive": str(recording.archive.path), "found": found, "warnings": warnings})
         return
     for line in found:
         say(line)
     for warning in warnings:
         typer.secho(printable(f"warning: {warning}"), fg=typer.colors.YELLOW)
-    say(f"wrote {recording.archive}")
+    say(f"wrote {recording.archive.path}")
 
 
 def _names(renamed: list[str]) -> dict[str, str]:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import base64
-import weakref
 from collections.abc import Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from html import escape
 from io import BytesIO
@@ -17,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hil.archive import Archive, place_of
 from hil.archive.recorded_campaign import RecordedCampaign
 from hil.base.errors import InputError
 from hil.base.files import make_folder, write_output
@@ -61,7 +60,7 @@ class IdentifiedArm:
         predicted: recordings that were predicted and not fitted.
         identification: the estimate, and everything that it was computed from.
         channels: a line for each group of channels of imported recordings: what it is, and why.
-        staging: imported archives in a temporary folder, which lasts as long as this object.
+        staging: imported recordings, whose archives are written with the result.
     """
 
     recordings: tuple[Path, ...]
@@ -255,29 +254,29 @@ def identify_recordings(
         _require_archives((*recordings, *predict))
         identification = _identified(recordings, predict, options, reporter)
         return IdentifiedArm(tuple(recordings), tuple(predict), identification, ())
-    with ExitStack() as stack:
-        staging = stack.enter_context(staged(recordings, predict, robot_of, reading, reporter))
+    with staged(recordings, predict, robot_of, reading, reporter) as staging:
         if output is not None:
             staging.check_places(output)
         identification = _identified(staging.fitted, staging.predicted, options, reporter)
-        arm = IdentifiedArm(
-            tuple(recordings), tuple(predict), identification, _channels(staging), staging
-        )
-        # The imported archives live as long as the result, which may be saved.
-        weakref.finalize(arm, stack.pop_all().close)
-    return arm
+    return IdentifiedArm(
+        tuple(recordings), tuple(predict), identification, _channels(staging), staging
+    )
 
 
 def _identified(
-    archives: Sequence[Path], predict: Sequence[Path], options: Options, reporter: Reporter
+    archives: Sequence[Path | Archive],
+    predict: Sequence[Path | Archive],
+    options: Options,
+    reporter: Reporter,
 ) -> Identification:
     """Identify from archives or a folder of them; a campaign with its conduct."""
     identification = identify_paths(archives, reporter, options, predict=predict)
-    if not RecordedCampaign(archives[0]).sealed:
+    first = place_of(archives[0])
+    if not RecordedCampaign(first).sealed:
         return identification
     from hil.campaign.identified import with_conduct  # which loads what executes a campaign
 
-    return with_conduct(identification, archives[0])
+    return with_conduct(identification, first)
 
 
 def write_arm(
@@ -301,10 +300,7 @@ def write_arm(
         staging.check_places(place)
     make_folder(place)
     if staging is not None:
-        places = staging.move_to(place)
-        identification = replace(
-            identification, paths=tuple(places.get(path, path) for path in identification.paths)
-        )
+        identification = identification.moved(staging.write_to(place))
     results = write_outcome(place, identification, reporter)
     if annotate:
         copies = write_annotated(identification, place)

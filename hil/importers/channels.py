@@ -21,6 +21,7 @@ from hil.importers.bags import SUFFIXES, open_bag
 from hil.importers.column_map import Format
 from hil.importers.commands import as_joint_state, measured_topics
 from hil.importers.dialect import is_date
+from hil.importers.log_files import LogFiles
 from hil.importers.name_words import is_other, kind_by_words
 from hil.importers.rosbag2 import joint_state_topics
 from hil.importers.stamps import concluded_unit
@@ -99,8 +100,12 @@ class Channel:
     is_repeated: bool = False
 
 
-def channels_of(path: Path, form: Format | None = None) -> tuple[Channel, ...]:
+def channels_of(
+    path: Path, form: Format | None = None, files: LogFiles | None = None
+) -> tuple[Channel, ...]:
     """Return the channels of a log, an array file, a bag or an MCAP file.
+
+    `files` are those that were parsed before.
 
     Raises:
         SourceError: it cannot be read.
@@ -110,9 +115,10 @@ def channels_of(path: Path, form: Format | None = None) -> tuple[Channel, ...]:
         bag = _of_bag(path)
         if bag or suffix != ".mcap":
             return bag
+    files = files or LogFiles()
     if suffix in READERS:
-        return tuple(_of_arrays(ArrayFile(path)))
-    return tuple(_of_table(Table.read(path, form or Format())))
+        return tuple(_of_arrays(files.arrays(path)))
+    return tuple(_of_table(files.table(path, form or Format())))
 
 
 def kind_of(name: str, unit: str | None = None) -> tuple[Kind | None, int | None]:

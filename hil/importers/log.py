@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hil.archive import Samples
 from hil.base.errors import SourceError, UnrecordedJointError
-from hil.importers.arrays import READERS, ArrayFile
+from hil.importers.arrays import ArrayFile
 from hil.importers.column_map import HOLE, KINEMATIC, ColumnMap, Quantity, TimeColumn
 from hil.importers.conclusions import (
     ConcludedUnit,
@@ -28,6 +28,7 @@ from hil.importers.conclusions import (
     StatedUnit,
 )
 from hil.importers.findings import are_degrees, has_degrees_per_second
+from hil.importers.log_files import LogFiles
 from hil.importers.publishers import second_publisher
 from hil.importers.robot import NOT_RECORDED, RecordingContent, Robot, Use
 from hil.importers.row_names import row_names
@@ -76,15 +77,20 @@ def import_log(
 
 
 def read_log(
-    source: str | PathLike[str], *, robot: Robot, columns: ColumnMap, coupled: bool = True
+    source: str | PathLike[str],
+    *,
+    robot: Robot,
+    columns: ColumnMap,
+    coupled: bool = True,
+    files: LogFiles | None = None,
 ) -> RecordingContent:
-    """Read a log; see :func:`import_log`.
+    """Read a log; see :func:`import_log`. `files` are those that were parsed before.
 
     Raises:
         SourceError: a file cannot be read, a column is missing, a cell is not a number, or the map
             does not fit the robot.
     """
-    log = _Log(Path(source), columns, robot)
+    log = _Log(Path(source), columns, robot, files or LogFiles())
     with np.errstate(over="ignore", invalid="ignore"):  # such numbers are refused later
         values = {name: log.read(name) for name in columns.quantities()}
     clock = log.clock(len(values["position"]))
@@ -135,8 +141,9 @@ class _Log:
         concluded: where neither map nor file states it.
     """
 
-    def __init__(self, path: Path, columns: ColumnMap, robot: Robot) -> None:
+    def __init__(self, path: Path, columns: ColumnMap, robot: Robot, parsed: LogFiles) -> None:
         self.path = path
+        self._parsed = parsed
         self._folder = path if path.is_dir() else path.parent
         self._map = columns
         self.files: dict[Path, Table | ArrayFile] = {}
@@ -485,9 +492,7 @@ class _Log:
             raise SourceError(self.path, problem, field=field, remedy=remedy)
         path = self.path if name is None else self._folder / name
         if path not in self.files:
-            arrays = path.suffix.lower() in READERS
-            read = ArrayFile(path) if arrays else Table.read(path, self._map.format)
-            self.files[path] = read
+            self.files[path] = self._parsed.file(path, self._map.format)
         return self.files[path]
 
     def _row_names(self, joints: tuple[str, ...]) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ from hil.importers.conclusions import (
     UnitBasis,
     UnusedChannels,
 )
+from hil.importers.log_files import LogFiles
 from hil.importers.name_words import is_measured, kind_by_words, kinds_said, words_of
 from hil.importers.robot import Robot
 from hil.importers.row_names import row_names
@@ -117,13 +118,15 @@ def proposed_map(
     *,
     sample_rate: float | None = None,
     drop_missing: bool = False,
+    files: LogFiles | None = None,
 ) -> Proposal:
     """Return the column map that the channels of a log suggest for a robot.
 
     A ready map whose columns the log has comes first, then the names of
     :data:`hil.importers.channels.CHANNEL_NAMES`. `chosen` are channels by quantity that are given:
     a name with ``{}`` for the joint, or names separated by commas. `sample_rate` [Hz] replaces the
-    time; `drop_missing` leaves out rows in which a number is missing.
+    time; `drop_missing` leaves out rows in which a number is missing; `files` are those that were
+    parsed before.
 
     Raises:
         SourceError: the log cannot be read, or its channels leave a quantity open.
@@ -131,7 +134,7 @@ def proposed_map(
     chosen = dict(chosen or {})
     joints = robot.joint_names
     form = Format(missing="drop") if drop_missing else None
-    channels = channels_of(log, form)
+    channels = channels_of(log, form, files)
     _refuse_row_for_each_joint(log, channels, joints)
     groups = _groups([channel for channel in channels if not channel.is_repeated], joints)
     names = row_names([channel.text for channel in channels], joints)

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from hil.archive import open_archive
+from hil.archive import Archive, open_archive
 from hil.base.errors import ArchiveError, NotAnArchiveError, SourceError, UnrecordedJointError
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
@@ -27,8 +27,9 @@ from hil.importers.conclusions import (
     UnitBasis,
 )
 from hil.importers.log import read_log
+from hil.importers.log_files import LogFiles
 from hil.importers.proposal import proposed_map
-from hil.importers.robot import Robot, Use
+from hil.importers.robot import RecordingContent, Robot, Use, require_writable, write_to
 from hil.importers.rosbag2 import Effort, joint_state_topics, read_rosbag2, recorded_joints
 from hil.importers.units import UNITS, Kind
 
@@ -64,10 +65,11 @@ class ImportOptions:
 
 @dataclass(frozen=True)
 class ImportedRecording:
-    """An imported recording.
+    """An imported recording, in memory.
 
     Attributes:
-        archive: that was written.
+        archive: its content.
+        sources: the files that it was read from.
         map_text: the column map, TOML; None for joint states of a bag, which need none.
         bag: how those were read; None for a log.
         concluded: the meaning of each group of channels, what was fixed for it, and what the motion
@@ -75,16 +77,28 @@ class ImportedRecording:
         examined: what was found in its samples, and warnings.
     """
 
-    archive: Path
+    archive: Archive
+    sources: tuple[Path, ...]
     map_text: str | None
     concluded: tuple[Conclusion, ...]
     examined: Examined
     bag: BagMap | None = None
+    #: of a log, parsed
+    files: LogFiles = field(default_factory=LogFiles, compare=False, repr=False)
 
     @property
     def text(self) -> str | None:
         """The map with which the recording is read again as it was, TOML."""
         return self.map_text if self.bag is None else self.bag.text
+
+    def write(self, output: Path, *, force: bool = False) -> None:
+        """Write the archive; with `force` it replaces another once it is complete.
+
+        Raises:
+            ArchiveWriteError: the archive exists or cannot be written.
+        """
+        require_writable(output, self.sources, force=force)
+        write_to(output, self.archive, force=force)
 
 
 def is_archive(path: Path) -> bool:
@@ -115,6 +129,86 @@ def has_joint_states(path: Path) -> bool:
     return bool(topics) or path.suffix.lower() != ".mcap"
 
 
+@dataclass(frozen=True)
+class _Request:
+    """What is read, and what the archive is for.
+
+    Attributes:
+        source: the recording.
+        place: path of the archive.
+        files: of a log, parsed before.
+        held_joints, use, coupled, outside_limits: as of :func:`hil.import_log`.
+    """
+
+    source: Path
+    place: Path
+    held_joints: tuple[str, ...]
+    use: Use
+    coupled: bool
+    outside_limits: bool
+    files: LogFiles = field(default_factory=LogFiles)
+
+    def imported(
+        self,
+        content: RecordingContent,
+        text: str | None,
+        concluded: tuple[Conclusion, ...],
+        bag: BagMap | None = None,
+    ) -> ImportedRecording:
+        """Return what was read, with the text of its column map or the map of its bag."""
+        archive, examined = content.archive(
+            self.place,
+            held_joints=self.held_joints,
+            use=self.use,
+            outside_limits=self.outside_limits,
+        )
+        return ImportedRecording(
+            archive, content.source, text, concluded, examined, bag, self.files
+        )
+
+
+def read_recording(
+    source: Path,
+    robot_of: RobotOf,
+    options: ImportOptions = ImportOptions(),
+    *,
+    place: Path | None = None,
+    held_joints: Sequence[str] = (),
+    use: Use = "excitation",
+    coupled: bool = True,
+    files: LogFiles | None = None,
+) -> ImportedRecording:
+    """Read a log or a bag; what no column map states is concluded from names and units.
+
+    Joints of a gripper that were not recorded are fixed, and of a robot with several arms all
+    joints but those of the recorded one.
+
+    Args:
+        source: the recording.
+        robot_of: its robot, see :data:`RobotOf`.
+        options: how it is read.
+        place: path of the archive that may be written.
+        held_joints: of :func:`hil.import_log`, as the following.
+        use: what identification uses it for.
+        coupled: whether the model gets inertia and friction of coupled motors.
+        files: of a log, parsed before.
+
+    Raises:
+        SourceError: it cannot be read, or its channels leave a quantity open.
+    """
+    place = place or source.with_suffix(".mcap")
+    request = _Request(
+        source,
+        place,
+        tuple(held_joints),
+        use,
+        coupled,
+        options.outside_limits,
+        files or LogFiles(),
+    )
+    return _of_recorded_joints(partial(_imported, request, options=options), robot_of, source)
+
+
 def import_recording(
     source: Path,
     output: Path,
@@ -126,26 +220,44 @@ def import_recording(
     coupled: bool = True,
     force: bool = False,
 ) -> ImportedRecording:
-    """Import a log or a bag; what no column map states is concluded from names and units.
-
-    Joints of a gripper that were not recorded are fixed, and of a robot with several arms all
-    joints but those of the recorded one. `held_joints` and the following are those of
-    :func:`hil.import_log`.
+    """Read a recording and write its archive; see :func:`read_recording`.
 
     Raises:
         SourceError: it cannot be read, or its channels leave a quantity open.
         ArchiveWriteError: the archive exists or cannot be written.
     """
-    read = partial(
-        _imported,
+    require_writable(output, [source], force=force)
+    imported = read_recording(
         source,
-        output,
-        options=options,
+        robot_of,
+        options,
+        place=output,
         held_joints=held_joints,
         use=use,
         coupled=coupled,
-        force=force,
     )
+    imported.write(output, force=force)
+    return imported
+
+
+def read_again(
+    imported: ImportedRecording, source: Path, robot_of: RobotOf, text: str, use: Use
+) -> ImportedRecording:
+    """Read a log by another column map, TOML; its files are not parsed again.
+
+    Raises:
+        SourceError: the map leaves a quantity open.
+    """
+    columns = ColumnMap.model_validate(parse_toml(text))
+    request = _Request(
+        source, imported.archive.path, (), use, coupled=True, outside_limits=False,
+        files=imported.files,
+    )  # fmt: skip
+
+    def read(robots: RobotOf) -> ImportedRecording:
+        robot = robots(lambda: _joints_of(columns, source))
+        return _of_map(request, _arm_of_map(robot, columns.arm, source), columns, text)
+
     return _of_recorded_joints(read, robot_of, source)
 
 
@@ -161,11 +273,18 @@ def import_bag(
     force: bool = False,
 ) -> ImportedRecording:
     """Import the joint states of a bag that `bag` describes; see :func:`import_recording`."""
+    require_writable(output, [source], force=force)
+    request = _Request(
+        source, output, tuple(held_joints), use, coupled=True,
+        outside_limits=options.outside_limits,
+    )  # fmt: skip
 
     def read(robots: RobotOf) -> ImportedRecording:
-        return _import_bag(source, output, robots, bag, options, held_joints, use, force=force)
+        return _read_bag(request, robots, bag, options.columns)
 
-    return _of_recorded_joints(read, robot_of, source)
+    imported = _of_recorded_joints(read, robot_of, source)
+    imported.write(output, force=force)
+    return imported
 
 
 def _of_recorded_joints(
@@ -272,50 +391,47 @@ def _arm_of_map(robot: Robot, links: Links, path: Path | None) -> Robot:
     return robot.between(links, path)
 
 
-def _imported(
-    source: Path,
-    output: Path,
-    robot_of: RobotOf,
-    *,
-    options: ImportOptions,
-    held_joints: Sequence[str],
-    use: Use,
-    coupled: bool,
-    force: bool,
-) -> ImportedRecording:
-    """Import with the robot as it is described; see :func:`import_recording`."""
-    stated = None if options.columns is None else BagMap.load(options.columns)
+def _imported(request: _Request, robot_of: RobotOf, *, options: ImportOptions) -> ImportedRecording:
+    """Read with the robot as it is described; see :func:`read_recording`."""
+    source = request.source
+    path = options.columns
+    stated = None if path is None else BagMap.load(path)
     if stated is not None:
-        return _import_bag(source, output, robot_of, stated, options, held_joints, use, force=force)
-    if options.columns is None and has_joint_states(source) and not _read_as_log(source, options):
-        bag = _bag_map(options)
-        return _import_bag(source, output, robot_of, bag, options, held_joints, use, force=force)
-    concluded: tuple[Conclusion, ...] = ()
-    if options.columns is not None:
-        robot = robot_of(partial(_joints_of_map, options.columns))
-        columns = ColumnMap.load(options.columns)
-        robot = _arm_of_map(robot, columns.arm, options.columns)
-        text = map_text(options.columns)
-    else:
-        robot = robot_of(partial(_no_joints, source))
-        proposal = proposed_map(
-            source,
-            robot,
-            options.chosen,
-            sample_rate=options.sample_rate,
-            drop_missing=options.drop_missing,
-        )
-        columns = proposal.columns
-        text = proposal.text
-        concluded = proposal.concluded
-    examined = read_log(source, robot=robot, columns=columns, coupled=coupled).write(
-        output,
-        held_joints=held_joints,
-        use=use,
-        force=force,
-        outside_limits=options.outside_limits,
+        return _read_bag(request, robot_of, stated, path)
+    if path is None and has_joint_states(source) and not _read_as_log(source, options):
+        return _read_bag(request, robot_of, _bag_map(options), None)
+    if path is not None:
+        robot = robot_of(lambda: _joints_of(ColumnMap.load(path), path))
+        columns = ColumnMap.load(path)
+        return _of_map(request, _arm_of_map(robot, columns.arm, path), columns, map_text(path))
+    robot = robot_of(partial(_no_joints, source))
+    proposal = proposed_map(
+        source,
+        robot,
+        options.chosen,
+        sample_rate=options.sample_rate,
+        drop_missing=options.drop_missing,
+        files=request.files,
     )
-    return ImportedRecording(output, with_arm(text, robot.links), concluded, examined)
+    return _of_map(request, robot, proposal.columns, proposal.text, proposal.concluded)
+
+
+def _of_map(
+    request: _Request,
+    robot: Robot,
+    columns: ColumnMap,
+    text: str,
+    concluded: tuple[Conclusion, ...] = (),
+) -> ImportedRecording:
+    """Read a log by a column map and its text."""
+    content = read_log(
+        request.source,
+        robot=robot,
+        columns=columns,
+        coupled=request.coupled,
+        files=request.files,
+    )
+    return request.imported(content, with_arm(text, robot.links), concluded)
 
 
 def _bag_map(options: ImportOptions) -> BagMap:
@@ -335,21 +451,15 @@ def _read_as_log(source: Path, options: ImportOptions) -> bool:
     raise SourceError(source, "is a bag, which names its quantities", field=field, remedy=remedy)
 
 
-def _import_bag(
-    source: Path,
-    output: Path,
-    robot_of: RobotOf,
-    stated: BagMap,
-    options: ImportOptions,
-    held_joints: Sequence[str],
-    use: Use,
-    *,
-    force: bool,
+def _read_bag(
+    request: _Request, robot_of: RobotOf, stated: BagMap, path: Path | None
 ) -> ImportedRecording:
+    """Read joint states by a map of a bag, from a path if it has one."""
+    source = request.source
     topic = stated.topic
     names = stated.rename
     robot = robot_of(lambda: recorded_joints(source, topic, names))
-    robot = _arm_of_map(robot, stated.arm, options.columns)
+    robot = _arm_of_map(robot, stated.arm, path)
     content = read_rosbag2(
         source,
         robot=robot,
@@ -359,14 +469,7 @@ def _import_bag(
         joint_names=names,
         command_topic=stated.command_topic,
     )
-    examined = content.write(
-        output,
-        held_joints=held_joints,
-        use=use,
-        force=force,
-        outside_limits=options.outside_limits,
-    )
-    entries = open_archive(output, fields=()).header.entries
+    entries = content.metadata
     keys = ("topic", "clock", "effort", "command_topic")
     read = {key: entries[key] for key in keys if key in entries}
     bag = BagMap.model_validate({**read, "rename": dict(names), "arm": robot.links})
@@ -383,7 +486,7 @@ def _import_bag(
         how = str(entries["command"])
         meaning = ChannelMeaning(topic, "commanded_position", commands[0], None, commands[1], how)
         concluded = (*concluded, meaning)
-    return ImportedRecording(output, None, concluded, examined, bag)
+    return request.imported(content, None, concluded, bag)
 
 
 def _content(kind: Kind | None, effort: Effort) -> Kind | None:
@@ -393,13 +496,12 @@ def _content(kind: Kind | None, effort: Effort) -> Kind | None:
     return "motor_current" if effort == "motor_current" else None
 
 
-def _joints_of_map(columns: Path) -> tuple[str, ...]:
-    joints = ColumnMap.load(columns).joints
-    if joints is None:
+def _joints_of(columns: ColumnMap, path: Path) -> tuple[str, ...]:
+    if columns.joints is None:
         problem = "does not name the recorded joints"
         remedy = "--lock-others needs joints = [...], the URDF's joint of each column"
-        raise SourceError(columns, problem, field="joints", remedy=remedy)
-    return joints
+        raise SourceError(path, problem, field="joints", remedy=remedy)
+    return columns.joints
 
 
 def _no_joints(source: Path) -> tuple[str, ...]:

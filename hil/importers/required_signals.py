@@ -7,19 +7,19 @@ from typing import Final
 
 import numpy as np
 
-from hil.archive import open_archive
+from hil.archive import Archive
 from hil.base.errors import SourceError
 
 _SHORTEST: Final = 1.0  # s
 
 
-def require_motion(archive: Path, recording: Path) -> None:
-    """Check that the archive of a recording has a motion, and torques that vary if it has any.
+def require_motion(archive: Archive, recording: Path) -> None:
+    """Check that a recording has a motion, and torques that vary if it has any.
 
     Raises:
         SourceError: it is shorter than a second, no joint moves, or all torques are constant.
     """
-    columns = open_archive(archive, fields=("position", "torque")).columns
+    columns = archive.columns
     stamp = columns["stamp"]
     duration = float(stamp[-1] - stamp[0]) * 1e-9
     if duration < _SHORTEST:
@@ -41,14 +41,13 @@ def require_motion(archive: Path, recording: Path) -> None:
         raise SourceError(recording, problem, field="torque", remedy=remedy)
 
 
-def require_torque(archive: Path, recording: Path) -> None:
-    """Check that the archive of a recording has joint torques.
+def require_torque(archive: Archive, recording: Path) -> None:
+    """Check that a recording has joint torques.
 
     Raises:
         SourceError: it has motor currents only, or not even these.
     """
-    fields = ("torque", "motor_current", "commanded_position")
-    columns = open_archive(archive, fields=fields).columns
+    columns = archive.columns
     if "torque" in columns:
         return
     if "motor_current" not in columns:

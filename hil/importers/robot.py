@@ -14,7 +14,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Samples, write_samples
+from hil.archive import Archive, Samples, imported_archive, write_archive
 from hil.base.errors import ArchiveWriteError, SourceError
 from hil.base.files import file_digest, make_folder, replace_file
 from hil.base.safe_input import path_exists, read_input
@@ -247,7 +247,7 @@ def _writable_names(positions: Mapping[str, float]) -> dict[str, float]:
     return {_writable(name): float(position) for name, position in positions.items()}
 
 
-def _require_writable(output: Path, source: Sequence[Path], *, force: bool) -> None:
+def require_writable(output: Path, source: Sequence[Path], *, force: bool) -> None:
     """Raise ArchiveWriteError for an output that is a recording, or exists without `force`."""
     if any(output.resolve() == path.resolve() for path in source):
         problem = "is the recording itself"
@@ -301,20 +301,40 @@ class RecordingContent:
     ) -> Examined:
         """Write the recording as an archive, and return what was found in it.
 
-        The archive has the same in words. With `force` an existing archive is replaced once the new
-        one is complete; `outside_limits` accepts positions of which no row is within the limits of
-        the URDF.
+        With `force` an existing archive is replaced once the new one is complete; the others as of
+        :meth:`archive`.
+
+        Raises:
+            SourceError: as of :meth:`archive`.
+            ArchiveWriteError: the archive exists or cannot be written.
+        """
+        require_writable(Path(output), self.source, force=force)
+        archive, found = self.archive(
+            Path(output), held_joints=held_joints, use=use, outside_limits=outside_limits
+        )
+        write_to(Path(output), archive, force=force)
+        return found
+
+    def archive(
+        self,
+        path: Path,
+        *,
+        held_joints: Sequence[str] = (),
+        use: Use = "excitation",
+        outside_limits: bool = False,
+    ) -> tuple[Archive, Examined]:
+        """Return the recording as an archive in memory, and what was found in it.
+
+        The archive has the same in words. `path` is that of the file that may be written;
+        `outside_limits` accepts positions of which no row is within the limits of the URDF.
 
         Raises:
             SourceError: no sample, a value that is not finite or above 1e12, an invalid clock, or
                 no row within the limits of the URDF.
-            ArchiveWriteError: the archive exists or cannot be written.
         """
-        output = Path(output)
         samples = self.samples
         source = self.source
         robot = self.robot
-        _require_writable(output, source, force=force)
         _check(samples, source[0], robot.joint_names)
         check_clock(samples.stamp, self.clock or source[0], self.clock_remedy)
         if not outside_limits:
@@ -329,17 +349,15 @@ class RecordingContent:
             "use": use,
             "findings": json.dumps(as_findings(found).model_dump()),
         }
-        make_folder(output.parent)
-        with _replaced(output) if force else nullcontext(output) as path:
-            write_samples(
-                path,
-                samples,
-                joint_names=robot.joint_names,
-                metadata=entries,
-                attachments=robot.attachments(),
-                period=self.period,
-            )
-        return found
+        archive = imported_archive(
+            path,
+            samples,
+            joint_names=robot.joint_names,
+            metadata=entries,
+            attachments=robot.attachments(),
+            period=self.period,
+        )
+        return archive, found
 
     def _examined(self, held_joints: Sequence[str]) -> Examined:
         """Return the findings of an import, what was concluded first."""
@@ -352,6 +370,17 @@ class RecordingContent:
             held_joints=held_joints,
         )
         return Examined((*self.concluded, *found.found), found.warnings)
+
+
+def write_to(output: Path, archive: Archive, *, force: bool) -> None:
+    """Write an archive in memory to a file; with `force` it replaces another once it is complete.
+
+    Raises:
+        ArchiveWriteError: the archive exists or cannot be written.
+    """
+    make_folder(output.parent)
+    with _replaced(output) if force else nullcontext(output) as path:
+        write_archive(archive, path)
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import csv
 import io
 import re
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -71,6 +71,7 @@ class Table:
     dialect: Dialect
     gaps: bool  #: whether rows may lack numbers
     left_out: tuple[LeftOut, ...] = ()
+    _converted: dict[tuple[int, ...], Array] = field(default_factory=dict, compare=False)
 
     @classmethod
     def read(cls, path: Path, form: Format) -> Table:
@@ -138,10 +139,20 @@ class Table:
     def numbers(self, columns: Sequence[Column], field: str, _array: str | None = None) -> Array:
         """Return columns as numbers, shape (rows, columns), NaN where missing ones are allowed.
 
+        They are converted once, and read-only.
+
         Raises:
             SourceError: no such column, or a cell that is not a finite number.
         """
         indices = [self._index(column, field) for column in columns]
+        key = tuple(indices)
+        if key not in self._converted:
+            values = self._numbers(indices, field)
+            values.flags.writeable = False
+            self._converted[key] = values
+        return self._converted[key]
+
+    def _numbers(self, indices: Sequence[int], field: str) -> Array:
         try:
             frame = self._frame(
                 indices,
@@ -150,7 +161,7 @@ class Table:
                 keep_default_na=False,
                 na_values=MISSING,
             )
-            values = frame[indices].to_numpy()
+            values = frame[list(indices)].to_numpy(copy=True)
         except ValueError:  # a cell is not a number as written in this dialect
             values = np.full((len(self.lines), 1), np.nan)
         if np.isfinite(values).all():

@@ -8,12 +8,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from hil.archive import open_archive
+from hil.archive import Archive
 from hil.base.errors import SourceError
 from hil.base.terminal_text import typed
 from hil.cell import Cell
 from hil.importers.conclusions import Certainty
-from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, import_recording
+from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, read_again
 from hil.importers.robot import Robot, Use
 from hil.look.messages import choice_text, fit_alike, sentences, setting_text
 from hil.look.other_arm import Contradictions
@@ -97,12 +97,11 @@ def concluded(
     return imported
 
 
-def _few_rows(archive: Path) -> tuple[Cell, Samples, Score] | None:
+def _few_rows(archive: Archive) -> tuple[Cell, Samples, Score] | None:
     """Return the arm, some rows of an archive and their score; None if they cannot be used."""
-    opened = open_archive(archive)
-    cell = cell_of(opened)
+    cell = cell_of(archive)
     try:
-        recording = source_of(opened, cell).recording
+        recording = source_of(archive, cell).recording
         samples = prepare(recording, cell.model, options=SETTINGS)
         few = samples.thinned(max(1, len(samples.torque) // _ROWS))
         return cell, few, score_of(cell.model, few)
@@ -117,17 +116,16 @@ class _Explained(NamedTuple):
     how: ExplainedTorque
 
 
-def _explained(archive: Path) -> _Explained | None:
+def _explained(archive: Archive) -> _Explained | None:
     """Return how a low-pass or heavy rotors explain the torque as it is read; None: they do not.
 
     They explain it if they halve the error of the same rows, and no friction drives a joint. Other
     units, signs and orders are searched without them, and may then seem to fit.
     """
-    opened = open_archive(archive)
-    cell = cell_of(opened)
+    cell = cell_of(archive)
     model = cell.model
     try:
-        recording = source_of(opened, cell).recording
+        recording = source_of(archive, cell).recording
         unfiltered = prepare(recording, model, options=SETTINGS)
         least = min(_OTHER_ARM, _EXPLAINS * score_of(model, unfiltered).overall)
         low_passes = possible_low_passes(recording, model, options=SETTINGS)
@@ -179,20 +177,15 @@ def _changed(look: Look) -> list[Row]:
 def _again(
     imported: ImportedRecording, source: Path, robot_of: RobotOf, look: Look, use: Use
 ) -> ImportedRecording:
-    """Import a log again with a map and the gravity that were found."""
+    """Read a log again with a map and the gravity that were found."""
     assert look.map_text is not None
-    column_map = imported.archive.with_suffix(".found.toml")
-    column_map.write_text(look.map_text, encoding="utf-8")
     gravity = look.gravity
 
     def robot(recorded: object) -> Robot:
         described = robot_of(recorded)  # type: ignore[arg-type]
         return described if gravity is None else described.with_gravity(gravity)
 
-    again = import_recording(
-        source, imported.archive, robot, ImportOptions(column_map), use=use, force=True
-    )
-    column_map.unlink()
+    again = read_again(imported, source, robot, look.map_text, use)
     return replace(again, concluded=(*imported.concluded, *map(ChangedReading, _changed(look))))
 
 

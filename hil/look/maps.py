@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
-from hil.importers.channels import channels_of
 from identification.validation.reading_changes import Axes
 
 _COMMENT = "Proposed by hil from names, units, the URDF and the motion of the recording"
@@ -29,8 +27,12 @@ def with_entries(text: str, entries: Mapping[str, Any]) -> str:
     return to_text(table, {"": _COMMENT})
 
 
-def entries_of(axes: Axes, text: str, source: Path, joints: Sequence[str]) -> dict[str, Any]:
+def entries_of(
+    axes: Axes, text: str, channels: Collection[str], joints: Sequence[str]
+) -> dict[str, Any]:
     """Return the entries of a map that make an import read what `axes` say.
+
+    `channels` are the names of the channels of the log.
 
     Angles of `zero` are in the unit of the map, before its scale and coupling.
     """
@@ -51,7 +53,7 @@ def entries_of(axes: Axes, text: str, source: Path, joints: Sequence[str]) -> di
         if name not in table:
             continue
         if not same and not np.array_equal(order, count):
-            columns = _names(table[name].get("columns"), source, joints)
+            columns = _names(table[name].get("columns"), channels, joints)
             if columns is not None:
                 entries[f"{name}.columns"] = [columns[int(column)] for column in order]
         by_column = sign[place] if same else sign
@@ -80,16 +82,15 @@ def _terms(axes: Axes, columns: NDArray[np.intp]) -> list[list[float]]:
     return [[int(j) + 1, int(k) + 1, float(coupling[j, k])] for j, k in others]
 
 
-def _names(columns: Any, source: Path, joints: Sequence[str]) -> list[Any] | None:
+def _names(columns: Any, channels: Collection[str], joints: Sequence[str]) -> list[Any] | None:
     """Return the columns of a quantity one by one; None where they are those of one array."""
     if isinstance(columns, list):
         return list(columns)
     if not isinstance(columns, str) or "{}" not in columns:
         return None
-    names = {channel.name for channel in channels_of(source)}
     numbers = range(len(joints) + 1)
     for parts in ([str(k) for k in numbers[1:]], [str(k) for k in numbers[:-1]], joints):
         series = [columns.replace("{}", part) for part in parts]
-        if names.issuperset(series):
+        if {*channels}.issuperset(series):
             return series
     return None

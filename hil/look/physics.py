@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.cell.nominal import nominal_of
+from hil.importers.channels import channels_of
 from hil.importers.conclusions import Certainty
+from hil.importers.log_files import LogFiles
 from hil.look.maps import entries_of
 from hil.look.readings import (
     AngleUnit,
@@ -176,6 +178,7 @@ class Finding:
 
     Attributes:
         map_text: the column map of the import; None for a bag.
+        files: the recording, parsed.
     """
 
     cell: Cell
@@ -184,6 +187,7 @@ class Finding:
     axes: Axes
     map_text: str | None
     source: Path
+    files: LogFiles
 
     @cached_property
     def size(self) -> Size:
@@ -386,7 +390,7 @@ class Finding:
         axes = Axes.of(others, self.cell.model.n_joints)
         entries: Mapping[str, Any] = {}
         if self.map_text is not None:
-            entries = entries_of(axes, self.map_text, self.source, self.cell.joint_names)
+            entries = self._entries_of(axes, self.map_text)
         setting: Setting | None = MapEntries(tuple(entries.items())) if entries else None
         if setting is None and change.meaning in ("no gravity", "mounting"):
             gravity = (0.0, 0.0, 0.0) if change.meaning == "no gravity" else MOUNTINGS[change.name]
@@ -399,13 +403,17 @@ class Finding:
         settings = (MotorTorque(ratio, count), MotorCurrents(ratio, count))
         return tuple(Choice("side", None, None, setting) for setting in settings)
 
+    def _entries_of(self, axes: Axes, text: str) -> dict[str, Any]:
+        names = {channel.name for channel in channels_of(self.source, files=self.files)}
+        return entries_of(axes, text, names, self.cell.joint_names)
+
     def entries(self) -> dict[str, Any]:
         """Return the entries of the map for the sure conclusions."""
         if self.map_text is None:
             return {}
         sure = [step.change for step in self.readings.steps if step.sure]
         axes = Axes.of(sure, self.cell.model.n_joints)
-        entries = entries_of(axes, self.map_text, self.source, self.cell.joint_names)
+        entries = self._entries_of(axes, self.map_text)
         if self.size.is_off and self.size.is_thousand:
             entries["torque.unit"] = "mN.m" if (self.size.factor or 1.0) > 1.0 else "kN.m"
         return entries

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Final
 
 import numpy as np
 
-from hil.archive import open_archive
 from hil.base.errors import SourceError
 from hil.cell import Cell
 from hil.importers.conclusions import Certainty, ChannelMeaning, UnitBasis
-from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, import_recording
+from hil.importers.log_files import LogFiles
+from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, read_recording
 from hil.importers.required_signals import require_motion
 from hil.look import physics, signals
 from hil.look.maps import with_entries
@@ -43,24 +42,22 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
     Raises:
         SourceError: it cannot be read, or its names leave a quantity open.
     """
-    with TemporaryDirectory(prefix="hil-") as folder:
-        archive = Path(folder) / "look.mcap"
-        robot = robot_of or (lambda _: undescribed_robot(source, options))
-        lenient = replace(options, outside_limits=True)
-        imported = import_recording(source, archive, robot, lenient)
-        require_motion(archive, source)
-        opened = open_archive(archive)
-        cell = cell_of(opened)
-        try:
-            recorded = source_of(opened, cell, to_fit=False)
-            recorded.recording.checked(cell.joint_names)
-        except (RecordingError, SourceError) as error:
-            raise SourceError(source, str(error)) from error
-        rows = signals.rows(recorded.recording, imported, None if robot_of is None else cell)
-        if robot_of is None:
-            rows.append(_without_robot(recorded.recording))
-            return Look(source.name, tuple(rows), (), (), imported.map_text)
-        return _with_torque(source, recorded, imported, cell, rows)
+    files = LogFiles()
+    robot = robot_of or (lambda _: undescribed_robot(source, options, files))
+    lenient = replace(options, outside_limits=True)
+    imported = read_recording(source, robot, lenient, files=files)
+    require_motion(imported.archive, source)
+    cell = cell_of(imported.archive)
+    try:
+        recorded = source_of(imported.archive, cell, to_fit=False)
+        recorded.recording.checked(cell.joint_names)
+    except (RecordingError, SourceError) as error:
+        raise SourceError(source, str(error)) from error
+    rows = signals.rows(recorded.recording, imported, None if robot_of is None else cell)
+    if robot_of is None:
+        rows.append(_without_robot(recorded.recording))
+        return Look(source.name, tuple(rows), (), (), imported.map_text)
+    return _with_torque(source, recorded, imported, cell, rows)
 
 
 def _without_robot(recording: Recording) -> Row:
@@ -92,9 +89,8 @@ def look_at_joints(source: Path, imported: ImportedRecording) -> Look:
     Raises:
         SourceError: the recording cannot be used.
     """
-    opened = open_archive(imported.archive)
-    cell = cell_of(opened)
-    finding = _finding(source, imported, cell, source_of(opened, cell).recording)
+    cell = cell_of(imported.archive)
+    finding = _finding(source, imported, cell, source_of(imported.archive, cell).recording)
     return _look_of(finding, finding.rows(), ())
 
 
@@ -103,7 +99,9 @@ def _finding(
 ) -> physics.Finding:
     readings = _readings(cell, recording, imported)
     axes = Axes.of((step.change for step in readings.steps), cell.model.n_joints)
-    return physics.Finding(cell, recording, readings, axes, imported.map_text, source)
+    return physics.Finding(
+        cell, recording, readings, axes, imported.map_text, source, imported.files
+    )
 
 
 def _look_of(finding: physics.Finding, rows: Sequence[Row], groups: tuple[Group, ...]) -> Look:

@@ -7,17 +7,18 @@ from tempfile import TemporaryDirectory
 
 from hil.base.errors import SourceError
 from hil.importers.channels import CHANNEL_NAMES, channels_of
+from hil.importers.log_files import LogFiles
 from hil.importers.recording import ImportOptions
 from hil.importers.robot import Robot
 
 
-def undescribed_robot(source: Path, options: ImportOptions) -> Robot:
-    """Return a robot with as many joints as the recording has positions.
+def undescribed_robot(source: Path, options: ImportOptions, files: LogFiles) -> Robot:
+    """Return a robot with as many joints as the recording has positions; `files` are parsed once.
 
     Raises:
         SourceError: no channel is named as position.
     """
-    channels = channels_of(source)
+    channels = channels_of(source, files=files)
     names = next((channel.joints for channel in channels if channel.joints), ())
     if not names:
         given = options.chosen.get("position", "").split(",")

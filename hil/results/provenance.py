@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hil.base.files import file_digest
+from hil.base.safe_input import path_exists
 from hil.results.results import Results
 
 RESULTS = "results.json"
@@ -25,8 +26,14 @@ def archive_digests(provenance: Mapping[str, str]) -> set[str]:
 
 
 def provenance_of(results: Results, archives: Sequence[Path]) -> dict[str, str]:
-    """Return the origin of a result: cell, archives with digests, software and verdict."""
-    digests = (f"{path.name} sha256 {file_digest(path)}" for path in archives)
+    """Return the origin of a result: cell, archives with digests, software and verdict.
+
+    Archives of imported recordings have none before the result is saved.
+    """
+    digests = (
+        f"{path.name} sha256 {file_digest(path)}" if path_exists(path) else f"{path.name} unsaved"
+        for path in archives
+    )
     return {
         "robot": results.cell,
         "simulated": "yes" if results.simulated else "no",

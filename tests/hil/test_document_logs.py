@@ -13,7 +13,6 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import Writer
 from pyarrow import parquet
 
-from hil.archive import open_archive
 from hil.base.errors import SourceError
 from hil.importers.recording import import_recording
 from hil.importers.robot import Robot
@@ -31,7 +30,7 @@ def robot(tmp_path: Path) -> Robot:
 
 def read(path: Path, robot: Robot) -> Mapping[str, np.ndarray]:
     imported = import_recording(path, path.with_name("imported.mcap"), lambda _: robot)
-    return open_archive(imported.archive).columns
+    return imported.archive.columns
 
 
 def lerobot(path: Path, **more: object) -> Path:

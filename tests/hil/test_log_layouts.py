@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hil.archive import open_archive
 from hil.base.errors import SourceError
 from hil.importers.channels import kind_of
 from hil.importers.conclusions import ChannelMeaning, JointOrder, UnusedChannels
@@ -223,7 +222,7 @@ def imported(path: Path, robot: Robot) -> ImportedRecording:
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_layout_is_read(tmp_path: Path, robot: Robot, layout: str) -> None:
     recording = imported(LAYOUTS[layout](tmp_path / "log.csv"), robot)
-    columns = open_archive(recording.archive).columns
+    columns = recording.archive.columns
     turns = np.rint((columns["position"] - POSITION) / (2.0 * np.pi))
     assert np.allclose(columns["position"], POSITION + 2.0 * np.pi * turns, rtol=0.0, atol=1e-6)
     assert np.allclose(columns["torque"], TORQUE, rtol=0.0, atol=1e-6)
@@ -238,7 +237,7 @@ def test_its_map_reads_it_again(tmp_path: Path, robot: Robot, layout: str) -> No
     (tmp_path / "map.toml").write_text(first.text or "")
     options = ImportOptions(tmp_path / "map.toml")
     again = import_recording(path, tmp_path / "b.mcap", lambda _: robot, options)
-    columns = [open_archive(recording.archive).columns for recording in (first, again)]
+    columns = [recording.archive.columns for recording in (first, again)]
     assert all(np.array_equal(columns[0][name], columns[1][name]) for name in columns[1])
 
 
@@ -265,7 +264,7 @@ def test_a_row_for_each_joint(tmp_path: Path, robot: Robot) -> None:
     wide = frame.pivot(index="time", columns="joint")
     wide.columns = pd.Index(["_".join(name) for name in wide.columns])
     wide.to_csv(tmp_path / "wide.csv")
-    columns = open_archive(imported(tmp_path / "wide.csv", robot).archive).columns
+    columns = imported(tmp_path / "wide.csv", robot).archive.columns
     assert np.allclose(columns["position"], POSITION, rtol=0.0, atol=1e-6)
 
 
@@ -285,7 +284,7 @@ class TestListsOfAnotherLength:
             imported(path, robot)
         without = ImportOptions(drop_missing=True)
         archive = import_recording(path, tmp_path / "b.mcap", lambda _: robot, without).archive
-        assert len(open_archive(archive).columns["stamp"]) == len(TIME) - 1
+        assert len(archive.columns["stamp"]) == len(TIME) - 1
 
     def test_of_a_parquet_are_named(self, tmp_path: Path, robot: Robot) -> None:
         path = tmp_path / "log.parquet"
@@ -316,7 +315,7 @@ def test_a_ready_map_leaves_the_order_to_the_names(tmp_path: Path, robot: Robot)
     path = echo_with_header(tmp_path / "log.csv")
     options = ImportOptions(Path("ros_joint_states"))
     recording = import_recording(path, tmp_path / "a.mcap", lambda _: robot, options)
-    archive = open_archive(recording.archive)
+    archive = recording.archive
     assert np.allclose(archive.columns["position"], POSITION, rtol=0.0, atol=1e-6)
     assert np.allclose(archive.columns["torque"], TORQUE, rtol=0.0, atol=1e-6)
 

@@ -87,7 +87,7 @@ class TestProposedMap:
         torque = "axis1 (Nm) .. axis3 (Nm)", "torque", NameBasis.UNIT, "N.m", UnitBasis.LOG
         assert ChannelMeaning(*torque) in proposal.concluded
         imported = import_recording(path, tmp_path / "a.mcap", lambda _: robot)
-        columns = open_archive(imported.archive).columns
+        columns = imported.archive.columns
         assert np.allclose(columns["position"], POSITION, rtol=0.0, atol=1e-8)
 
     @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ class TestProposedMap:
         head = [*names, "q{}", "rad_per_sec{}", "tau{}"]
         path = log(tmp_path / "a.csv", head, *columns, POSITION, SLOPE, TORQUE)
         imported = import_recording(path, tmp_path / "a.mcap", lambda _: Robot.from_urdf(urdf))
-        stamp = open_archive(imported.archive).columns["stamp"]
+        stamp = imported.archive.columns["stamp"]
         scale = 2.0 if "nsecs" in names else 1.0
         assert np.allclose((stamp - stamp[0]) * 1e-9, scale * TIME, rtol=0.0, atol=1e-6)
 
@@ -459,7 +459,7 @@ class TestGripperThatWasNotRecorded:
     ) -> None:
         path = log(tmp_path / "a.csv", ["t", "q{}", "tau{}"], TIME, POSITION, TORQUE)
         imported = import_recording(path, tmp_path / "a.mcap", lambda _: Robot.from_urdf(urdf))
-        locked = cell_of(open_archive(imported.archive)).file.robot.locked
+        locked = cell_of(imported.archive).file.robot.locked
         assert locked == {"finger_joint": pytest.approx(0.03)}
         said = "finger_joint: fixed, at 0.03 (rad or m), as of an unrecorded gripper"
         assert said in map(sentence, imported.concluded)
@@ -487,7 +487,7 @@ class TestGripperThatWasNotRecorded:
         for name, messages, joints in (("both", both, 4), ("arm", arm, 3)):
             source = bag(tmp_path / f"{name}.db3", {"/joint_states": (STATE, messages)})
             imported = import_recording(source, tmp_path / f"{name}.mcap", lambda _: robot)
-            assert open_archive(imported.archive).columns["position"].shape[1] == joints
+            assert imported.archive.columns["position"].shape[1] == joints
 
 
 REAL: Sequence[tuple[str, str]] = [

@@ -95,7 +95,7 @@ class TestConcluded:
     def test_by_the_names_of_its_joints(self, tmp_path: Path, urdf: Path) -> None:
         path = by_joint(tmp_path / "a.csv", RIGHT)
         imported = import_recording(path, tmp_path / "a.mcap", lambda _: Robot.from_urdf(urdf))
-        assert joints_of(imported.archive) == RIGHT
+        assert joints_of(imported.archive.path) == RIGHT
         assert (
             "arm: right_j1 .. right_j3, between torso_l1 and right_l3, by the names of the recorded"
             " joints; all others are fixed"
@@ -105,7 +105,7 @@ class TestConcluded:
         urdf = robot_of_arms(tmp_path, ("arm", 3), ("head", 1))
         path = generic(tmp_path / "a.csv")
         imported = import_recording(path, tmp_path / "a.mcap", lambda _: Robot.from_urdf(urdf))
-        assert joints_of(imported.archive) == ("arm_j1", "arm_j2", "arm_j3")
+        assert joints_of(imported.archive.path) == ("arm_j1", "arm_j2", "arm_j3")
 
     @pytest.mark.parametrize("command", [("import", "log"), ("import", "rosbag2")])
     def test_of_a_bag(self, tmp_path: Path, urdf: Path, command: tuple[str, str]) -> None:

@@ -9,6 +9,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import pytest
+
 import hil
 from hil.base.progress import Silent
 from hil.cli import identify as command
@@ -21,13 +23,14 @@ from tests.hil.simulated_logs import write_moving_log
 from tests.hil.test_log_kinds import URDF
 
 ROOT = Path(hil.__file__).parents[1]
-MOST = 20  # files
+MOST = {"From a log to a recording": 12, "From an archive to the verdict": 20}
+"""Files of each walk, at most."""
 
 
-def walk() -> list[str]:
-    """Return the files of the list, in its order."""
+def walk(title: str) -> list[str]:
+    """Return the files of a list, in its order."""
     text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
-    _, _, section = text.partition("## From an archive to the verdict")
+    _, _, section = text.partition(f"## {title}")
     section, _, _ = section.partition("\n## ")
     return re.findall(r"^\d+\. `([^`]+\.py)`", section, re.MULTILINE)
 
@@ -55,22 +58,36 @@ def callers_during(function: Any) -> tuple[Any, dict[str, set[str]]]:
     return result, callers
 
 
-def test_each_file_is_called_by_one_before_it(tmp_path: Path) -> None:
-    """So that a reader never needs a file beside the list to get on. The log is simulated."""
-    (tmp_path / "three.urdf").write_text(URDF)
-    write_moving_log(tmp_path / "log.csv", URDF)
-    robot = Robot.from_urdf(tmp_path / "three.urdf")
+@pytest.fixture(scope="module")
+def traced(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
+    """Which files call each one while a simulated log is identified."""
+    folder = tmp_path_factory.mktemp("log")
+    (folder / "three.urdf").write_text(URDF)
+    write_moving_log(folder / "log.csv", URDF)
+    robot = Robot.from_urdf(folder / "three.urdf")
     arm, callers = callers_during(
         lambda: identify_recordings(
-            [tmp_path / "log.csv"], [], lambda _: robot, ImportOptions(), Options(), Silent()
+            [folder / "log.csv"], [], lambda _: robot, ImportOptions(), Options(), Silent()
         )
     )
-    files = walk()
     assert isinstance(arm.verdict, Verdict)
-    assert 0 < len(files) == len(set(files)) <= MOST
-    assert files[0] == "hil/cli/identify.py"
+    return callers
+
+
+@pytest.mark.parametrize("title", MOST)
+def test_each_file_is_called_by_one_before_it(title: str, traced: dict[str, set[str]]) -> None:
+    """So that a reader never needs a file beside the list to get on."""
+    files = walk(title)
+    assert 0 < len(files) == len(set(files)) <= MOST[title]
+    start = files.index("hil/identified/identified_arm.py")
+    for number, name in enumerate(files[start + 1 :], start=start + 1):
+        assert traced[name] & set(files[start:number]), f"{name} is called by {traced[name]}"
+
+
+def test_the_walks_begin_with_the_command_and_end_with_the_verdict() -> None:
     assert command.identify_recordings is identify_recordings  # which the command calls
-    assert files[1] == "hil/identified/identified_arm.py"
-    assert files[-1] == "identification/validation/verdict.py"
-    for number, name in enumerate(files[2:], start=2):
-        assert callers[name] & set(files[1:number]), f"{name} is called by {callers[name]}"
+    first, second = map(walk, MOST)
+    assert first[0] == "hil/identified/identified_arm.py"
+    assert second[:2] == ["hil/cli/identify.py", "hil/identified/identified_arm.py"]
+    assert first[-1] in second
+    assert second[-1] == "identification/validation/verdict.py"

@@ -1,0 +1,42 @@
+"""Files of logs, each parsed once however often a recording is read from it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hil.importers.arrays import READERS, ArrayFile
+from hil.importers.column_map import Format
+from hil.importers.table import Table
+
+
+class LogFiles:
+    """Parsed files by path and format; a file is not read again when it changes."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[Path, ArrayFile] = {}
+        self._tables: dict[tuple[Path, str], Table] = {}
+
+    def arrays(self, path: Path) -> ArrayFile:
+        """Return a file of arrays.
+
+        Raises:
+            SourceError: it cannot be read, or has no array of numbers.
+        """
+        if path not in self._arrays:
+            self._arrays[path] = ArrayFile(path)
+        return self._arrays[path]
+
+    def table(self, path: Path, form: Format) -> Table:
+        """Return a text table.
+
+        Raises:
+            SourceError: it cannot be read, or has no row of numbers.
+        """
+        key = path, form.model_dump_json()
+        if key not in self._tables:
+            self._tables[key] = Table.read(path, form)
+        return self._tables[key]
+
+    def file(self, path: Path, form: Format) -> Table | ArrayFile:
+        """Return arrays or a table, by the suffix of the file; see both."""
+        return self.arrays(path) if path.suffix.lower() in READERS else self.table(path, form)
