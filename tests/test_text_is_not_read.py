@@ -56,8 +56,7 @@ FOREIGN: Final[Mapping[str, str]] = {
 OURS: Final[Mapping[str, str]] = {
     "hil.batch.graph": "the reason of an unusable archive begins with its path",
     "hil.control.errors": "an outcome that begins the reason is not said twice",
-    "hil.cli.batch": "reasons are counted without the name of another archive",
-    "hil.compare.comparison": "copies are told by the reason why they were skipped",
+    "hil.cli.record": "an end by the operator is told by the reason of the recording",
     "hil.control.simulator_process": "the last error that the simulated controller printed",
     "hil.report.drawing": "the lines of a label make its height",
     "hil.report.numbers": "figures are typeset",
@@ -92,6 +91,11 @@ def is_phrase(node: ast.expr) -> bool:
     return isinstance(node, ast.JoinedStr) or is_string
 
 
+def is_sentence(node: ast.expr) -> bool:
+    """Return whether an expression is a text of several words."""
+    return isinstance(node, ast.Constant) and " " in str(node.value).strip()
+
+
 def readings(tree: ast.AST) -> Iterator[int]:
     """Yield the lines of a module in which a text is read."""
     for node in ast.walk(tree):
@@ -105,6 +109,10 @@ def readings(tree: ast.AST) -> Iterator[int]:
                     yield node.lineno
             case ast.Compare(left=left, ops=[ast.In() | ast.NotIn()], comparators=[right]):
                 if is_text(right) and (is_phrase(left) or last_name(left).isupper()):
+                    yield node.lineno
+            case ast.Compare(left=left, ops=[ast.Eq() | ast.NotEq()], comparators=[right]):
+                sides = (left, right)
+                if any(map(is_text, sides)) and any(map(is_sentence, sides)):
                     yield node.lineno
 
 
@@ -152,6 +160,7 @@ def test_no_page_reads_a_text_of_ours() -> None:
         're.search(r"read as (\\w+)", note)',
         '"position" in row.reason',
         "ELEMENTS in message",
+        'done.reason == "ended by the operator"',
         'problem, _, remedy = str(error).partition("; ")',
     ],
 )

@@ -67,10 +67,25 @@ _CONFIGURATION: Final = {
 
 
 class SkippedArchive(NamedTuple):
-    """An archive or campaign that was not used, and why."""
+    """An archive or campaign that was not used, and why.
+
+    Attributes:
+        reason: without the archive that it is a copy of.
+        copy_of: that archive, "" for none.
+    """
 
     path: str
     reason: str
+    copy_of: str = ""
+
+    @property
+    def message(self) -> str:
+        """The whole reason."""
+        return f"{self.reason} of {self.copy_of}" if self.copy_of else self.reason
+
+    def as_json(self) -> dict[str, str]:
+        """Return it for programs."""
+        return {"path": self.path, "reason": self.message}
 
 
 class ClusterError(HilError):

@@ -161,7 +161,7 @@ def discover(
     if not places:
         reasons = [
             "there is no archive (*.mcap) in it",
-            *(" ".join(unused) for unused in refused[:1]),
+            *(f"{unused.path} {unused.message}" for unused in refused[:1]),
         ]
         raise InputError(", ".join(roots), "; ".join(reasons), remedy="name others")
     refs: dict[str, ArchiveRef | SkippedArchive] = {}
@@ -447,9 +447,6 @@ def _campaign_of(place: str) -> str:
 
 # Selection
 
-COPY: Final = "is a copy"
-"""Begin of the reason why a copy is not used."""
-
 _Attempts = dict[tuple[str, str, int], int]
 """The last attempt by folder, kind and index."""
 
@@ -489,8 +486,10 @@ def _select(inspected: dict[str, ArchiveRef | SkippedArchive]) -> Discovery:
     seen: dict[str, str] = {}
     refs: list[ArchiveRef] = []
     for ref in read:
-        if reason := _exclusion(ref, latest, seen):
+        if reason := _exclusion(ref, latest):
             skipped.append(SkippedArchive(ref.location, reason))
+        elif (copy := _copy(ref, seen)) is not None:
+            skipped.append(copy)
         else:
             refs.append(ref)
     refs.sort(key=lambda ref: ref.order)
@@ -538,8 +537,8 @@ def _not_needed(place: str, latest: _Attempts) -> str:
     return f"was replaced by attempt {last}" if name.attempt < last else ""
 
 
-def _exclusion(ref: ArchiveRef, latest: _Attempts, seen: dict[str, str]) -> str:
-    """Return why an archive is not to be fitted; "" if it is, and then add it to `seen`."""
+def _exclusion(ref: ArchiveRef, latest: _Attempts) -> str:
+    """Return why an archive is not to be fitted, "" if it is unless it is a copy."""
     if ref.use not in USES:
         return f"is a {ref.use}"
     if ref.simulated and _REHEARSAL in ref.location:
@@ -549,13 +548,16 @@ def _exclusion(ref: ArchiveRef, latest: _Attempts, seen: dict[str, str]) -> str:
     if ref.outcome != _COMPLETED:
         return f"ended {ref.outcome}"
     last = latest.get((ref.folder, ref.kind, ref.index), ref.attempt)
-    if ref.attempt and ref.attempt < last:
-        return f"was replaced by attempt {last}"
+    return f"was replaced by attempt {last}" if ref.attempt and ref.attempt < last else ""
+
+
+def _copy(ref: ArchiveRef, seen: dict[str, str]) -> SkippedArchive | None:
+    """Return an archive that is a copy of one `seen`; else None, and add it to those."""
     if ref.sha256 in seen and ref.use != "standstill":
-        return f"{COPY} of {seen[ref.sha256]}"
+        return SkippedArchive(ref.location, "is a copy", seen[ref.sha256])
     if ref.attempt:
         first = seen.setdefault(f"{ref.folder} {ref.record}", ref.name)
         if first != ref.name:
-            return f"{COPY} or a repaired version of {first}"
+            return SkippedArchive(ref.location, "is a copy or a repaired version", first)
     seen[ref.sha256] = ref.location
-    return ""
+    return None

@@ -326,14 +326,14 @@ class _Batch:
         lost = [unused for result in results for unused in result.broken]
         # Some reasons begin with the path.
         reasons = (
-            SkippedArchive(path, text.removeprefix(f"{path}: "))
-            for path, text in [*self.broken, *lost]
+            unused._replace(reason=unused.reason.removeprefix(f"{unused.path}: "))
+            for unused in [*self.broken, *lost]
         )
         broken = tuple(dict.fromkeys(reasons))
         repetitions = tuple(estimate for estimate in estimates if estimate.level == "repetition")
         if not repetitions:
             problem = "there is no excitation and no imported recording that can be fitted"
-            first = [f"{path} could not be used: {reason}" for path, reason in broken[:1]]
+            first = [f"{each.path} could not be used: {each.message}" for each in broken[:1]]
             raise InputError(None, "; ".join([problem, *first]))
         return BatchResult(
             estimator=self.options.estimator,

@@ -105,7 +105,7 @@ def _write_parquet(path: Path, columns: Sequence[str], table: Path) -> None:
 def _unused_rows(result: BatchResult) -> Iterator[Row]:
     for kind, archives in (("broken", result.broken), ("skipped", result.skipped)):
         for unused in archives:
-            yield {**unused._asdict(), "kind": kind}
+            yield {**unused.as_json(), "kind": kind}
 
 
 def _levels(result: BatchResult) -> Iterator[tuple[BatchEstimate, Row]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -79,7 +78,9 @@ def batch(
         if written:
             names = ", ".join(path.name for path in written)
             reporter.say(f"written to {written[0].parent}: {names}")
-        for line in _last([f"{path} could not be used: {why}" for path, why in result.broken]):
+        for line in _last(
+            [f"{each.path} could not be used: {each.message}" for each in result.broken]
+        ):
             typer.echo(printable(line), err=True)
         if result.skipped and not quiet:
             typer.echo(printable(skipped_line(result.skipped)))
@@ -134,7 +135,10 @@ def _last(lines: Sequence[str]) -> Iterator[str]:
 
 def skipped_line(skipped: Sequence[SkippedArchive]) -> str:
     """Count the skipped archives by reason, without the name of another archive in it."""
-    counts = Counter(re.sub(r"\S*(/|\.mcap)\S*", "another", unused.reason) for unused in skipped)
+    others = [
+        unused._replace(copy_of="another") if unused.copy_of else unused for unused in skipped
+    ]
+    counts = Counter(unused.message for unused in others)
     reasons = "; ".join(f"{count} {reason}" for reason, count in counts.most_common())
     return f"skipped, not for fitting: {reasons}"
 
@@ -160,8 +164,8 @@ def as_dict(result: BatchResult, written: Sequence[Path]) -> dict[str, Any]:
         },
         "read": result.read,
         "cached": result.cached,
-        "broken": [unused._asdict() for unused in result.broken],
-        "skipped": [unused._asdict() for unused in result.skipped],
+        "broken": [unused.as_json() for unused in result.broken],
+        "skipped": [unused.as_json() for unused in result.skipped],
         "written": [str(path) for path in written],
     }
 

@@ -23,7 +23,7 @@ from hil.base.errors import InputError
 from hil.base.progress import Reporter
 from hil.batch import graph as run
 from hil.batch.cluster import Cluster
-from hil.batch.discovery import COPY, ArchiveRef, Discovery, cell_in, open_ref
+from hil.batch.discovery import ArchiveRef, Discovery, cell_in, open_ref
 from hil.batch.estimates import Arm, BatchEstimate
 from hil.pipeline.options import Options
 from hil.pipeline.sources import arm_differences
@@ -174,7 +174,7 @@ def compare(places: Sequence[str], cluster: Cluster, reporter: Reporter) -> Comp
         for campaign in campaigns
     ]
     comparison = compare_campaigns(result.arms[campaigns[0].arm], campaigns, repetitions)
-    lost = [f"{path} could not be used: {reason}" for path, reason in result.broken]
+    lost = [f"{each.path} could not be used: {each.message}" for each in result.broken]
     # All archives of an arm are simulated, or none.
     return replace(comparison, simulated=refs[0].simulated, warnings=(*lost, *comparison.warnings))
 
@@ -197,9 +197,9 @@ def _require_campaigns_of_one_arm(discovery: Discovery) -> None:
             )
     if len(campaigns) < 2:
         unused = [
-            f", as {each.path} {each.reason}"
+            f", as {each.path} {each.message}"
             for each in discovery.skipped
-            if COPY in each.reason and not Path(each.path).is_relative_to(first.campaign)
+            if each.copy_of and not Path(each.path).is_relative_to(first.campaign)
         ]
         unused += [f"; {each.path}: {each.reason}" for each in discovery.broken]
         problem = f"is the only campaign given{unused[0] if unused else ''}"

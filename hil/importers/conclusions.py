@@ -78,11 +78,6 @@ class ChannelMeaning(Conclusion):
         """Names are custom; a unit that the log states belongs to one quantity."""
         return Certainty.CERTAIN if self.unit_basis is UnitBasis.LOG else Certainty.LIKELY
 
-    @property
-    def decided_by(self) -> str:
-        """The key of a column map that states otherwise."""
-        return f"{self.kind}.unit" if self.unit is None else f"{self.kind}.columns"
-
 
 @dataclass(frozen=True)
 class UnusedChannels(Conclusion):

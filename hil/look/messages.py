@@ -48,6 +48,7 @@ from hil.look.readings import (
     LateVelocity,
     LowPassedTorque,
     MapEntries,
+    MapKey,
     MotorCurrents,
     MotorTorque,
     Mounting,
@@ -144,7 +145,6 @@ _BASES: Final[Mapping[Basis, str]] = {
     Basis.FREE_PARAMETERS: "with free parameters, before a fit of the friction law",
 }
 _STEPS: Final[Mapping[Step, str]] = {
-    Step.STATE_TIME_UNIT: 'state [time] unit = "..."',
     Step.STATE_UNIT_OR_GEARS: "state unit, sign or gears of both",
     Step.STATE_GRAVITY: "state --gravity X Y Z",
     Step.STATE_DRIVE: "state gear ratios or torque constants ([drive] of a map) if not",
@@ -584,6 +584,12 @@ def _(torque: UnexplainedTorque) -> str:
 @_worded.register
 def _(axes: OtherAxes) -> str:
     return f"the torque follows it with other {' and '.join(axes.aspects)} only"
+
+
+@_worded.register
+def _(state: MapKey) -> str:
+    table, _, key = state.key.rpartition(".")
+    return f'state [{table}] {key} = "..."'
 
 
 @_worded.register

@@ -466,7 +466,6 @@ Evidence = (
 class Step(Enum):
     """What a person does to decide a row: states an option or a key, measures, or asks."""
 
-    STATE_TIME_UNIT = auto()
     STATE_UNIT_OR_GEARS = auto()
     STATE_GRAVITY = auto()
     STATE_DRIVE = auto()
@@ -492,6 +491,13 @@ class Step(Enum):
     ASK_FOR_POSITIONS = auto()
     ASK_FOR_UNIT = auto()
     ASK_FOR_FILTER = auto()
+
+
+@dataclass(frozen=True)
+class MapKey:
+    """A dotted key of a column map, whose value the user knows."""
+
+    key: str
 
 
 @dataclass(frozen=True)
@@ -524,7 +530,7 @@ class MotorCurrents:
     count: int
 
 
-Decider = Step | MapEntries | GravityOption | OutsideLimits
+Decider = Step | MapKey | MapEntries | GravityOption | OutsideLimits
 """What decides a row; positions outside the limits say by what they would be within them."""
 
 Setting = MapEntries | GravityOption | MotorTorque | MotorCurrents

@@ -33,6 +33,7 @@ from hil.look.readings import (
     Correlation,
     Fact,
     LateVelocity,
+    MapKey,
     NotSlopes,
     SlopeFactors,
     SlopeRatio,
@@ -92,7 +93,7 @@ def _time(recording: Recording, concluded: Sequence[Conclusion], units: Sequence
     stated = next((each for each in meanings if each.kind == "time"), None)
     unit = next((each for each in units if each.kind == "time"), None)
     if isinstance(unit, ConcludedUnit):
-        decider = Step.STATE_TIME_UNIT
+        decider = MapKey(unit.decided_by)
         return Row("time", Clock(base, unit.unit), unit.certainty, (Basis.USUAL_RATE,), decider)
     if any(each.basis is NameBasis.MESSAGE for each in meanings):
         clock = Clock(base, of_messages=True)
