@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 import hil
 from hil.base.errors import InputError, SourceError
 from hil.cli import app
+from hil.importers.table import Table
 from hil.report.figures import joints_of, torque_charts
 from hil.results.results import Results
 from tests.hil.browser import OpenedPage, chromium
@@ -152,12 +153,25 @@ class TestSaved:
             tmp_path / "a" / "a.mcap", predict=tmp_path / "a" / "b.mcap"
         ).verdict.good
 
-    def test_temporary_archives_go_with_the_result(self, folder: Path) -> None:
+    def test_the_archive_is_in_memory_until_it_is_saved(
+        self, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Nor is a temporary file written."""
+        monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "no such folder"))
         result = hil.identify(folder / "a.csv", urdf=folder / "three.urdf")
         (archive,) = result.identification.paths
-        assert archive.exists()
-        del result
-        assert not archive.parent.exists()
+        assert not archive.exists()
+        place = result.save(tmp_path / "saved")
+        assert (place / archive.name).is_file()
+
+    def test_the_log_is_parsed_once(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        parsed = []
+        read = Table.read
+        monkeypatch.setattr(
+            Table, "read", lambda path, form: parsed.append(path) or read(path, form)
+        )
+        hil.identify(folder / "a.csv", urdf=folder / "three.urdf")
+        assert parsed == [folder / "a.csv"]
 
 
 class TestRefused:
