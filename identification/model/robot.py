@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -450,6 +450,39 @@ def _base_parameters(
     friction: JointFriction,
     elements: JointElements,
 ) -> BaseParameters:
+    bodies = _base_of_bodies(_Geometry(chain, gravity), layout)
+    base = _without_carried_rotors(layout, friction, bodies.rows, bodies.base)
+    _require_separate_elements(friction, elements, bodies.rows[:, base.pivots], bodies.position)
+    return base
+
+
+class _Geometry:
+    """A chain under a gravity, equal to those with the same joints, whatever their links weigh."""
+
+    def __init__(self, chain: Chain, gravity: Array) -> None:
+        self.chain = chain
+        self.gravity = gravity
+        parts = (chain.parents, chain.rotation, chain.translation, chain.axis, chain.revolute)
+        self._content = tuple(part.tobytes() for part in (*parts, gravity))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Geometry) and self._content == other._content
+
+    def __hash__(self) -> int:
+        return hash(self._content)
+
+
+class _BaseOfBodies(NamedTuple):
+    """Base parameters of bodies and rotors, with what they were found by."""
+
+    base: BaseParameters
+    rows: Array  # regressor of standard parameters (m n, s) at random states
+    position: Array  # of these states (m, n)
+
+
+@lru_cache(maxsize=32)  # one arm has models of several mountings, and of drives and friction
+def _base_of_bodies(geometry: _Geometry, layout: StandardLayout) -> _BaseOfBodies:
+    chain, gravity = geometry.chain, geometry.gravity
     everything = np.arange(layout.size, dtype=np.intp)
     random = np.random.default_rng(_SEED)
     shape = (_N_STATES, chain.n_joints)
@@ -459,10 +492,7 @@ def _base_parameters(
     states = Motion.of_states(q, qd, qdd)
     plan = _plan(chain, gravity, layout, everything, None)
     rows = plan.evaluate(states).dense(layout.size).reshape(-1, layout.size)
-    base = select_base(rows, layout.names, layout.units)
-    base = _without_carried_rotors(layout, friction, rows, base)
-    _require_separate_elements(friction, elements, rows[:, base.pivots], q)
-    return base
+    return _BaseOfBodies(select_base(rows, layout.names, layout.units), rows, q)
 
 
 def _without_carried_rotors(

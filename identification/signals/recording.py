@@ -9,7 +9,6 @@ from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from identification.arrays import Array
@@ -377,11 +376,19 @@ def _lag(a: Array, b: Array) -> int | None:
         return None
     common = np.zeros(len(lags))
     for x, y in zip(a.T, b.T, strict=True):
-        common += scipy.signal.correlate(y, x, method="fft")
+        common += _correlated(y, x)
     power_a, power_b = (np.append(0.0, np.cumsum((signal**2).sum(axis=1))) for signal in (a, b))
     powers = power_a[last] - power_a[first] + power_b[last + lags] - power_b[first + lags]
     squares = np.where(enough, (powers - 2.0 * common) / np.maximum(rows, 1), np.inf)
     return int(lags[np.argmin(squares)])
+
+
+def _correlated(first: Array, second: Array) -> Array:
+    """Return the sums of products of two signals (k,), (l,) at all lags (k + l - 1,)."""
+    length = len(first) + len(second) - 1
+    whole = 1 << (length - 1).bit_length()
+    spectrum = np.fft.rfft(first, whole) * np.fft.rfft(second[::-1], whole)
+    return np.asarray(np.fft.irfft(spectrum, whole)[:length])
 
 
 def _difference(time: Array, a: Array, other_time: Array, b: Array) -> float:

@@ -12,11 +12,11 @@ off-diagonals; knots are refined to the tolerance.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from math import comb, factorial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import scipy
@@ -187,7 +187,7 @@ def fit_smoothing_spline(
     """
     for samples_per_knot in (4, 2, 1):
         problem = _Problem.of(time, values, samples_per_knot * float(np.median(np.diff(time))))
-        fine = problem.spacing <= _KNOT_OF_CUTOFF / (2.0 * np.pi * widest)
+        fine = problem.design.spacing <= _KNOT_OF_CUTOFF / (2.0 * np.pi * widest)
         # Without the squares of all samples, which are the largest array of a long recording.
         squares = np.einsum("mc,mc->c", problem.closest_residual, problem.closest_residual)
         if fine or np.all(squares / len(time) <= tolerance):
@@ -198,8 +198,9 @@ def fit_smoothing_spline(
     coefficients = problem.closest.copy()
     for channel, penalty in enumerate(penalties.tolist()):
         coefficients[:, channel] += problem.correction(channel, penalty)
-    bandwidth = (problem.density / penalties) ** (1 / 6) / (2.0 * np.pi * problem.spacing)
-    return SmoothingSpline(float(time[0]), problem.spacing, coefficients, bandwidth)
+    spacing = problem.design.spacing
+    bandwidth = (problem.design.density / penalties) ** (1 / 6) / (2.0 * np.pi * spacing)
+    return SmoothingSpline(float(time[0]), spacing, coefficients, bandwidth)
 
 
 def low_pass(time: Array, values: Array, bandwidth: float) -> Array:
@@ -207,18 +208,41 @@ def low_pass(time: Array, values: Array, bandwidth: float) -> Array:
     step = float(np.median(np.diff(time)))
     problem = _Problem.of(time, values, max(step, _KNOT_OF_CUTOFF / (2.0 * np.pi * bandwidth)))
     correction = problem.correction(slice(None), problem.penalty_at(bandwidth))
-    return np.asarray(problem.rows @ (problem.closest + correction))
+    return np.asarray(problem.design.rows @ (problem.closest + correction))
+
+
+class _Design(NamedTuple):
+    """Normal equations of a spline, which the times alone determine, in knot units."""
+
+    spacing: float  # [s]
+    density: float  # samples per knot interval
+    rows: scipy.sparse.csr_array  # (m, k) values of the basis at the samples
+    transposed: scipy.sparse.csc_array  # (k, m)
+    gram: Array  # (6, k) lower band of rows' rows
+    penalty: Array  # (6, k) lower band of the roughness
+    lightest: Array  # (6, k) factor with the lightest penalty
+
+
+@lru_cache(maxsize=2)  # torques and columns of one recording are filtered one after the other
+def _design(times: bytes, spacing: float) -> _Design:
+    """Return the design for times (m,) as float64, with about this knot spacing [s]."""
+    time = np.frombuffer(times)
+    span = float(time[-1] - time[0])
+    intervals = max(1, round(span / spacing))
+    spacing = span / intervals
+    density = len(time) / intervals
+    rows = _rows(float(time[0]), spacing, intervals, time)
+    gram = _gram_band(rows)
+    penalty = _penalty_band(intervals)
+    lightest = _banded_factor(gram + _LIGHTEST * density * penalty)
+    return _Design(spacing, density, rows, rows.T, gram, penalty, lightest)
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """Normal equations of samples in knot units, and their least smoothed solution."""
 
-    spacing: float  # [s]
-    density: float  # samples per knot interval
-    rows: scipy.sparse.csr_array  # (m, k) values of the basis at the samples
-    gram: Array  # (6, k) lower band of rows' rows
-    penalty: Array  # (6, k) lower band of the roughness
+    design: _Design
     closest: Array  # (k, c) coefficients with the lightest penalty
     closest_residual: Array  # (m, c)
     roughness: Array  # (k, c) penalty matrix times closest
@@ -226,22 +250,15 @@ class _Problem:
     @classmethod
     def of(cls, time: Array, values: Array, spacing: float) -> _Problem:
         """Set up the problem with about this knot spacing [s]."""
-        span = float(time[-1] - time[0])
-        intervals = max(1, round(span / spacing))
-        spacing = span / intervals
-        density = len(time) / intervals
-        rows = _rows(float(time[0]), spacing, intervals, time)
-        gram = _gram_band(rows)
-        penalty = _penalty_band(intervals)
-        lightest = _LIGHTEST * density
-        factor = _banded_factor(gram + lightest * penalty)
-        closest = _banded_solution(factor, rows.T @ values)
-        residual = rows @ closest
+        design = _design(time.tobytes(), spacing)
+        closest = _banded_solution(design.lightest, design.transposed @ values)
+        residual = design.rows @ closest
         np.subtract(values, residual, out=residual)
-        refined = rows.T @ residual - lightest * _roughness(closest)
-        closest += _banded_solution(factor, refined)
-        np.subtract(values, rows @ closest, out=residual)
-        return cls(spacing, density, rows, gram, penalty, closest, residual, _roughness(closest))
+        light = _LIGHTEST * design.density
+        refined = design.transposed @ residual - light * _roughness(closest)
+        closest += _banded_solution(design.lightest, refined)
+        np.subtract(values, design.rows @ closest, out=residual)
+        return cls(design, closest, residual, _roughness(closest))
 
     def correction(self, channel: int | slice, penalty: float) -> Array:
         """Return the change of coefficients from the least smoothed ones."""
@@ -249,15 +266,16 @@ class _Problem:
 
     def _corrected(self, penalty: float, roughness: Array) -> tuple[Array, Array]:
         """Return the factor (6, k) of the normal equations, and the change of coefficients."""
-        factor = _banded_factor(self.gram + penalty * self.penalty)
-        change = penalty - _LIGHTEST * self.density
+        design = self.design
+        factor = _banded_factor(design.gram + penalty * design.penalty)
+        change = penalty - _LIGHTEST * design.density
         return factor, _banded_solution(factor, -change * roughness)
 
     def penalty_at(self, bandwidth: float) -> float:
         """Return the penalty of a bandwidth [Hz], within the limits of the knots."""
-        cutoff = 2.0 * np.pi * bandwidth * self.spacing  # rad per knot
+        cutoff = 2.0 * np.pi * bandwidth * self.design.spacing  # rad per knot
         share = np.clip(1.0 / max(cutoff, 1e-3) ** 6, _LIGHTEST, _HEAVIEST)
-        return float(self.density * share)
+        return float(self.design.density * share)
 
     def penalty_for(self, channel: int, tolerance: float, widest: float) -> float:
         """Return the penalty at which a channel's mean squared residual equals the tolerance.
@@ -298,7 +316,7 @@ class _Problem:
         `roughness` (k,) that of its coefficients.
         """
         factor, correction = self._corrected(penalty, roughness)
-        residual = closest - self.rows @ correction
+        residual = closest - self.design.rows @ correction
         variance = max(float(np.mean(residual**2)), np.finfo(np.float64).tiny)
         bending = roughness + _roughness(correction)
         sensitivity = float(bending @ _banded_solution(factor, bending))
@@ -475,10 +493,36 @@ def _filtered(columns: Array, cycles: float, shape: LowPassShape) -> Array:
     cycles = min(cycles, _HIGHEST)
     if not shape.causal:
         return _filtered_without_phase(columns, cycles, shape.order)
-    sections = scipy.signal.butter(shape.order, cycles, fs=1.0, output="sos")
     # Initially at rest with the first sample.
-    state = scipy.signal.sosfilt_zi(sections)[:, :, None] * columns[0]
-    return np.asarray(scipy.signal.sosfilt(sections, columns, axis=0, zi=state)[0])
+    filtered = columns - columns[0]
+    for numerator, denominator in _sections(shape.order, cycles):
+        filtered = _recursively_filtered(filtered, numerator, denominator)
+    return np.asarray(filtered + columns[0])
+
+
+def _sections(order: int, cycles: float) -> Iterator[tuple[Array, Array]]:
+    """Yield numerators and denominators of a digital Butterworth filter in first and second order.
+
+    By the bilinear transform of pairs of poles; importing `scipy.signal` takes a second.
+    """
+    ratio = math.tan(math.pi * cycles)
+    if order % 2:
+        yield np.array([ratio, ratio]) / (ratio + 1.0), np.array([1.0, (ratio - 1) / (ratio + 1)])
+    for pair in range(order // 2):
+        damping = 2.0 * math.sin(math.pi * (2 * pair + 1) / (2 * order))
+        whole = 1.0 + damping * ratio + ratio**2
+        rest = np.array([2.0 * (ratio**2 - 1.0), 1.0 - damping * ratio + ratio**2])
+        yield ratio**2 * np.array([1.0, 2.0, 1.0]) / whole, np.append(1.0, rest / whole)
+
+
+def _recursively_filtered(columns: Array, numerator: Array, denominator: Array) -> Array:
+    """Filter columns (m, c), from rest at zero; the denominator starts with 1."""
+    driven = numerator[0] * columns
+    for lag, share in enumerate(numerator[1:], 1):
+        driven[lag:] += share * columns[:-lag]
+    # The recursion is the solution of a triangular system with these bands.
+    band = np.tile(denominator[:, None], len(columns))
+    return np.asarray(scipy.linalg.lapack.dtbtrs(band, driven, uplo=b"L", diag=b"U")[0])
 
 
 def _filtered_without_phase(columns: Array, cycles: float, order: int) -> Array:
