@@ -99,7 +99,8 @@ class TorqueSums(NamedTuple):
 
     def squared_errors(self, values: Array) -> Array:
         """Return the squared errors of parameters (p,) of one torque, per joint (n,)."""
-        augmented = np.append(-values, 1.0)
+        augmented = np.ones(len(values) + 1)
+        np.negative(values, out=augmented[:-1])
         return np.maximum((self.gram @ augmented) @ augmented, 0.0)
 
     def each(self) -> Iterator[TorqueSums]:
@@ -124,8 +125,9 @@ class TorqueSums(NamedTuple):
         weights = np.zeros(len(gram))
         if start is not None:
             variance = np.where(start > 0.0, 1.0 / np.where(start > 0.0, start, 1.0), variance)
+        has_rows = samples > 0
         for _ in range(_ROUNDS):
-            weights = np.where(samples > 0, 1.0 / np.maximum(variance, floor), 0.0)
+            weights = np.where(has_rows, 1.0 / np.maximum(variance, floor), 0.0)
             # One product of flat matrices: a general sum takes several times as long.
             total = (weights @ flat).reshape(gram.shape[1:])
             information = total[:-1, :-1]
@@ -140,7 +142,7 @@ class TorqueSums(NamedTuple):
             )
             before = variance
             variance = self.squared_errors(values) / rows
-            if np.all(np.abs(variance - before) <= _SETTLED * before):
+            if (np.abs(variance - before) <= _SETTLED * before).all():
                 break
         return values, weights
 
