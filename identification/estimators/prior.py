@@ -558,7 +558,7 @@ def _mean_and_deviations(
         std[~placeholder, :size] = _standard_deviations(model, share, masses, length)
     if placeholder.any():
         alike = _standard_deviations(model, 1.0, np.full(model.n_joints, _UNKNOWN_MASS), length)
-        scale = _torque_scale(model, TorqueSums(*(part[placeholder] for part in sums)), alike)
+        scale = _torque_scale(model, TorqueSums(sums.gram[placeholder], sums.samples[placeholder]), alike)
         std[placeholder, :size] = scale[..., None] * alike
     # Motors of a wrist are heavier, seen through their gears, than what they move.
     widened = layout.rotors if wide_rotors else np.intersect1d(layout.rotors, model.base.pivots)
@@ -725,14 +725,15 @@ def _torque_scale(model: RobotModel, sums: TorqueSums, std: Array) -> Array:
     Geometric mean over the joints, which gears and mechanisms make differ.
     """
     links = model.layout.links.ravel()
-    b = model.base.rank
-    spread = model.base.grouping[:, links] * std[links]
-    products = sums.gram[..., :b, :b].reshape(*sums.samples.shape, b * b)
-    expected = products @ (spread @ spread.T).ravel()
+    spread = _of_model(model).combinations[:, links] * std[links]
+    gram = sums.gram[..., :-1, :-1].reshape(-1, *spread.shape[:1] * 2)
+    expected = np.einsum("pk,jpq,qk->j", spread, gram, spread, optimize=True)
+    expected = expected.reshape(sums.samples.shape)
     measured = sums.gram[..., -1, -1]
     both = (expected > 0.0) & (measured > 0.0)
     ratio = np.where(both, measured, 1.0) / np.where(both, expected, 1.0)
-    return np.exp(0.5 * np.log(ratio).sum(axis=-1) / np.maximum(1, both.sum(axis=-1)))
+    logarithm = np.log(ratio).sum(axis=-1) / np.maximum(1, both.sum(axis=-1))
+    return np.asarray(np.exp(0.5 * logarithm))
 
 
 def without_masses(model: RobotModel) -> str:
