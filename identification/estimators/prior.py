@@ -558,7 +558,9 @@ def _mean_and_deviations(
         std[~placeholder, :size] = _standard_deviations(model, share, masses, length)
     if placeholder.any():
         alike = _standard_deviations(model, 1.0, np.full(model.n_joints, _UNKNOWN_MASS), length)
-        scale = _torque_scale(model, TorqueSums(sums.gram[placeholder], sums.samples[placeholder]), alike)
+        scale = _torque_scale(
+            model, TorqueSums(sums.gram[placeholder], sums.samples[placeholder]), alike
+        )
         std[placeholder, :size] = scale[..., None] * alike
     # Motors of a wrist are heavier, seen through their gears, than what they move.
     widened = layout.rotors if wide_rotors else np.intersect1d(layout.rotors, model.base.pivots)
