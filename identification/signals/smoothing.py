@@ -543,19 +543,21 @@ def _filtered_without_phase(columns: Array, cycles: float, order: int) -> Array:
     after = (length - count) // 2
     before = length - count - after
     ratio = np.tan(np.pi * np.arange(length // 2 + 1) / length) / math.tan(np.pi * cycles)
-    gain = (1.0 / (1.0 + ratio ** (2 * order)))[:, None]
-    share = np.linspace(0.0, 1.0, count)[:, None]
+    gain = 1.0 / (1.0 + ratio ** (2 * order))
+    share = np.linspace(0.0, 1.0, count)
     filtered = np.empty_like(columns)
     for first in range(0, columns.shape[1], _AT_ONCE):
-        part = columns[:, first : first + _AT_ONCE]
-        line = part[0] + share * (part[-1] - part[0])
-        extended = np.empty((length, part.shape[1]))
-        extended[:count] = part - line
-        extended[count : count + after] = -extended[count - 1 - after : count - 1][::-1]
-        extended[count + after :] = -extended[1 : before + 1][::-1]
-        spectrum = gain * np.fft.rfft(extended, axis=0)
-        line += np.fft.irfft(spectrum, length, axis=0)[:count]
-        filtered[:, first : first + _AT_ONCE] = line
+        # Transforms of rows take three quarters of the time.
+        part = columns[:, first : first + _AT_ONCE].T
+        line = part[:, :1] + share * (part[:, -1:] - part[:, :1])
+        extended = np.empty((len(part), length))
+        extended[:, :count] = part - line
+        extended[:, count : count + after] = -extended[:, count - 1 - after : count - 1][:, ::-1]
+        extended[:, count + after :] = -extended[:, 1 : before + 1][:, ::-1]
+        spectrum = np.fft.rfft(extended, axis=1)
+        spectrum *= gain
+        line += np.fft.irfft(spectrum, length, axis=1)[:, :count]
+        filtered[:, first : first + _AT_ONCE] = line.T
     return filtered
 
 
