@@ -782,8 +782,8 @@ def _nominal_ratio(model: RobotModel, sums: TorqueSums) -> tuple[Array, Array]:
     matrix = total[..., :-1, :-1] / (scale[..., :, None] * scale[..., None, :])
     eigenvalues, vectors = np.linalg.eigh(matrix)
     size = np.abs(eigenvalues)
-    kept = size > _SMALLEST_EIGENVALUE * size.max(axis=-1, keepdims=True)
-    inverse = np.where(kept, 1.0 / np.where(kept, eigenvalues, 1.0), 0.0)
+    significant = size > _SMALLEST_EIGENVALUE * size.max(axis=-1, keepdims=True)
+    inverse = np.where(significant, 1.0 / np.where(significant, eigenvalues, 1.0), 0.0)
     first = vectors[..., 0, :]
     right = (vectors * (total[..., :-1, -1] / scale)[..., None]).sum(axis=-2)
     left = total[..., -1, -1] - (inverse * right**2).sum(axis=-1)

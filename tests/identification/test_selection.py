@@ -821,7 +821,7 @@ class TestLowPassShape:
 
     @pytest.mark.parametrize("order", [1, 2, 3, 4])
     @pytest.mark.parametrize("bandwidth", [0.2, 4.0, 60.0])
-    def test_a_causal_one_is_that_of_scipy_at_rest_with_the_first_sample(self, order, bandwidth):
+    def test_forwards_it_is_the_filter_of_scipy_from_rest(self, order, bandwidth):
         time = np.arange(600) / RATE
         columns = np.cumsum(np.random.default_rng(2).standard_normal((600, 3)), axis=0)
         sections = butter(order, bandwidth, fs=RATE, output="sos")
